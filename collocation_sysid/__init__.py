@@ -39,24 +39,12 @@ if TYPE_CHECKING:
     from .methods.interior_point import InteriorPoint
     from .methods.reduced_space import ReducedSpace
     from .methods.solution import Iteration, Solution, Status
-    from .model.parameters import (
-        FieldCoefficients,
-        Parameter,
-        Parameters,
-        Tied,
-        Unknown,
-    )
+    from .model.parameters import FieldCoefficients, Parameter, Parameters, Tied, Unknown
     from .model.schemes import Scheme, Stencil
     from .pipeline import Run, run, solve
     from .problem import Problem, RolloutOptions, UncertaintyOptions
     from .program.collocation import Collocation
-    from .program.simulation import (
-        Trajectory,
-        simulate,
-        with_markers,
-        with_readings,
-        with_wrenches,
-    )
+    from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
     from .recording import (
         Capsule,
         Cuboid,
@@ -175,33 +163,21 @@ __all__ = [
 
 
 # Public names that are packages themselves.
-_SUBPACKAGES = {
-    "datasets": ".datasets",
-    "live": ".extras.live",
-    "testing": ".testing",
-}
+_SUBPACKAGES = {"datasets": ".datasets", "live": ".extras.live", "testing": ".testing"}
 
 
 def _modules_of_names() -> dict[str, str]:
     """Return the module of each public name, from the imports for type checkers above."""
     tree = _ast.parse(_Path(__file__).read_text(encoding="utf-8"))
-    (block,) = (
-        each
-        for each in tree.body
-        if isinstance(each, _ast.If) and _is_for_types(each)
-    )
+    (block,) = (each for each in tree.body if isinstance(each, _ast.If) and _is_for_types(each))
     imports = (each for each in block.body if isinstance(each, _ast.ImportFrom))
-    modules = {
-        a.name: f".{each.module}" for each in imports for a in each.names
-    }
+    modules = {a.name: f".{each.module}" for each in imports for a in each.names}
     return modules | _SUBPACKAGES
 
 
 def _is_for_types(block: _ast.If) -> bool:
     """Return whether a block is executed by type checkers alone."""
-    return (
-        isinstance(block.test, _ast.Name) and block.test.id == "TYPE_CHECKING"
-    )
+    return isinstance(block.test, _ast.Name) and block.test.id == "TYPE_CHECKING"
 
 
 # Type checkers do not see the function, so that they report misspelt names.
@@ -213,9 +189,7 @@ if not TYPE_CHECKING:
         if name == "__version__":
             return _version("collocation-sysid")
         if name not in _MODULES:
-            raise AttributeError(
-                f"module {__name__!r} has no attribute {name!r}"
-            )
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module = _import_module(_MODULES[name], __name__)
         attribute = module if name in _SUBPACKAGES else getattr(module, name)
         return globals().setdefault(name, attribute)

@@ -18,12 +18,8 @@ def hint_at(name: str, known: Iterable[str]) -> str:
     then the most similar one (`difflib.get_close_matches`). Known names of one or two letters are
     never suggested.
     """
-    names = [
-        other for other in known if len(other) > 2
-    ]  # each of two letters is near another
-    longer = [
-        other for other in names if len(name) > 1 and other.startswith(name)
-    ]
+    names = [other for other in known if len(other) > 2]  # each of two letters is near another
+    longer = [other for other in names if len(name) > 1 and other.startswith(name)]
     close = longer or difflib.get_close_matches(name, names, n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
@@ -33,10 +29,7 @@ def hint_at(name: str, known: Iterable[str]) -> str:
 _MARKS = (
     {code: 0x2400 + code for code in range(0x20) if code not in (0x09, 0x0A)}
     | {0x7F: 0x2421}
-    | dict.fromkeys(
-        (*range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)),
-        0xFFFD,
-    )
+    | dict.fromkeys((*range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)), 0xFFFD)
     | dict.fromkeys((*range(0xD800, 0xE000), 0xFFFE, 0xFFFF), 0xFFFD)
 )
 # Longest message [characters]: a screen of text, so that quoted input cannot flood a terminal.
@@ -86,10 +79,7 @@ class InputError(ValueError):
     """
 
     def __init__(
-        self,
-        message: str,
-        source: str | Path | None = None,
-        where: str | None = None,
+        self, message: str, source: str | Path | None = None, where: str | None = None
     ) -> None:
         self.message = message
         self.source = source
@@ -98,20 +88,14 @@ class InputError(ValueError):
         line = printable(text).replace("\n", "␊")
         super().__init__(excerpt(_ENDLESS_WORD.sub(r"\1…", line), LONGEST))
 
-    def __reduce__(
-        self,
-    ) -> tuple[type[InputError], tuple[str, str | Path | None, str | None]]:
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str | Path | None, str | None]]:
         return type(self), (self.message, self.source, self.where)
 
-    def located(
-        self, source: str | Path | None = None, where: str | None = None
-    ) -> InputError:
+    def located(self, source: str | Path | None = None, where: str | None = None) -> InputError:
         """Return a copy of the error with `source` and `where` filled in where they are missing;
         those that the error has already are kept.
         """
-        return InputError(
-            self.message, self.source or source, where=self.where or where
-        )
+        return InputError(self.message, self.source or source, where=self.where or where)
 
 
 def require_among(
@@ -141,16 +125,12 @@ def require_among(
     """
     names = list(known)
     if name not in names:
-        expected = (
-            f"expected {count} of {', '.join(names)}{hint_at(name, names)}"
-        )
+        expected = f"expected {count} of {', '.join(names)}{hint_at(name, names)}"
         raise InputError(f"found {name!r}; {expected}", source, where=where)
 
 
 @contextmanager
-def located(
-    source: str | Path | None = None, where: str | None = None
-) -> Iterator[None]:
+def located(source: str | Path | None = None, where: str | None = None) -> Iterator[None]:
     """Add file and key to `InputError`s raised in the context, where they are missing; other
     exceptions pass unchanged.
 
@@ -189,28 +169,15 @@ class SimulationError(RuntimeError):
     stability_loss: Any = None
 
     def __init__(
-        self,
-        message: str,
-        time_s: float,
-        element: int | None = None,
-        state_m: Any = None,
+        self, message: str, time_s: float, element: int | None = None, state_m: Any = None
     ) -> None:
         self.state_m = state_m
         self.message = message
         self.time_s = time_s
         self.element = element
-        at = f"t = {time_s:.6g} s" + (
-            f", element {element}" if element is not None else ""
-        )
+        at = f"t = {time_s:.6g} s" + (f", element {element}" if element is not None else "")
         super().__init__(f"{message} ({at})")
 
-    def __reduce__(
-        self,
-    ) -> tuple[type[SimulationError], tuple[str, float, int | None, Any]]:
+    def __reduce__(self) -> tuple[type[SimulationError], tuple[str, float, int | None, Any]]:
         # Else a process would hand on the text alone, from which the other cannot build it anew.
-        return type(self), (
-            self.message,
-            self.time_s,
-            self.element,
-            self.state_m,
-        )
+        return type(self), (self.message, self.time_s, self.element, self.state_m)

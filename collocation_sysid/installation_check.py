@@ -234,9 +234,7 @@ class InstallationReport:
     @property
     def is_working(self) -> bool:
         """Whether all required packages are suitable and the self test passed."""
-        return self.self_test.is_passed and all(
-            each.is_suitable for each in self.dependencies
-        )
+        return self.self_test.is_passed and all(each.is_suitable for each in self.dependencies)
 
 
 def check_installation() -> InstallationReport:
@@ -285,9 +283,7 @@ def optional_packages() -> Iterator[Extra]:
     for name in sorted(set(names) - set(DEVELOPMENT_EXTRAS)):
         packages = map(_dependency, _requirements(name))
         missing = sorted(each.name for each in packages if not each.is_suitable)
-        yield Extra(
-            name, tuple(missing), install=f'pip install "{PACKAGE}[{name}]"'
-        )
+        yield Extra(name, tuple(missing), install=f'pip install "{PACKAGE}[{name}]"')
 
 
 def _requirements(extra: str) -> Iterator[Requirement]:
@@ -344,9 +340,7 @@ def available_solvers() -> Solvers | None:
     except ImportError:
         return None
     return Solvers(
-        nonlinear=tuple(
-            name for name in NONLINEAR_SOLVERS if ca.has_nlpsol(name)
-        ),
+        nonlinear=tuple(name for name in NONLINEAR_SOLVERS if ca.has_nlpsol(name)),
         ipopt_linear=tuple(_working_linear_solvers(IPOPT_LINEAR_SOLVERS)),
         supernodal=load_mkl() is not None,
     )
@@ -373,15 +367,9 @@ def _working_linear_solvers(names: Sequence[str]) -> Iterator[str]:
         except subprocess.TimeoutExpired:
             return
         statuses = dict(
-            line.split(maxsplit=1)
-            for line in done.stdout.splitlines()
-            if len(line.split()) == 2
+            line.split(maxsplit=1) for line in done.stdout.splitlines() if len(line.split()) == 2
         )
-        yield from (
-            name
-            for name in remaining
-            if statuses.get(name) == "Solve_Succeeded"
-        )
+        yield from (name for name in remaining if statuses.get(name) == "Solve_Succeeded")
         tried = [name for name in remaining if name in statuses]
         remaining = remaining[len(tried) + 1 :]
 
@@ -399,9 +387,7 @@ def kernel_state() -> Kernels | None:
     except ImportError:
         return None
     folder = cache_folder()
-    files = (
-        [file.stat() for file in folder.glob("*.o")] if folder.is_dir() else []
-    )
+    files = [file.stat() for file in folder.glob("*.o")] if folder.is_dir() else []
     llvm_version = ".".join(map(str, llvm.llvm_version_info))
     compilers = (shutil.which(name) for name in C_COMPILERS)
     return Kernels(
@@ -434,10 +420,7 @@ def thread_state() -> Threads:
         count = 1
         source = f"{variable} = {override!r} is not a whole number"
     return Threads(
-        count=count,
-        cores=os.cpu_count() or 1,
-        source=source,
-        memory_mb=machine_memory_mb(),
+        count=count, cores=os.cpu_count() or 1, source=source, memory_mb=machine_memory_mb()
     )
 
 
@@ -447,9 +430,7 @@ def _self_test_unless_missing(dependencies: Sequence[Dependency]) -> SelfTest:
     """
     missing = [each.name for each in dependencies if each.installed is None]
     if missing:
-        return SelfTest(
-            False, f"not attempted: {', '.join(missing)} missing", time_s=0.0
-        )
+        return SelfTest(False, f"not attempted: {', '.join(missing)} missing", time_s=0.0)
     began_s = time.perf_counter()
     try:
         message, is_passed = identify_small_body()
@@ -485,9 +466,7 @@ def identify_small_body() -> tuple[str, bool]:
     poses[:, 0, 3] = 0.03 * (1 - np.cos(25 * t_s))
     hand = Grasp(Box((-1, -1, 0.079), (1, 1, 1)), poses)
     places_m = [(0.0, 0.0, 0.0), (0.04, 0.04, 0.0)]
-    markers = Markers(
-        t_s, np.zeros((len(t_s), 2, 3)), sigma_m=1e-3, places_m=places_m
-    )
+    markers = Markers(t_s, np.zeros((len(t_s), 2, 3)), sigma_m=1e-3, places_m=places_m)
     body = Body(box_mesh((0.04, 0.04, 0.08), (1, 1, 2)), density_kg_m3=100.0)
     swing = Experiment(
         body,
@@ -510,10 +489,7 @@ def identify_small_body() -> tuple[str, bool]:
     )
     solution = solve(problem, "reduced-space")
     if not solution.status.converged:
-        return (
-            f"the search did not converge ({solution.status.value}: {solution.message})",
-            False,
-        )
+        return (f"the search did not converge ({solution.status.value}: {solution.message})", False)
     deviation = abs(solution.parameters["mu_pa"] / truth_pa - 1)
     message = f"relative error of an identified shear modulus {deviation:.1e}"
     return message, deviation < SELF_TEST_TOLERANCE

@@ -31,31 +31,17 @@ from .runs.numerical_error import refine
 from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
 from .runs.solved_problem import SolvedProblem
-from .runs.solving import (
-    solve,
-    solve_with_renewed_correspondences,
-    with_workers,
-)
+from .runs.solving import solve, solve_with_renewed_correspondences, with_workers
 from .runs.warm_start import WarmStart
 from .statistics.assessment import rotation_step_concerns
-from .statistics.budget.consider_analysis import (
-    ResidualChanges,
-    changes_of_assumptions,
-)
+from .statistics.budget.consider_analysis import ResidualChanges, changes_of_assumptions
 from .statistics.budget.discretisation_error import MOST_SUBSTEPS
 from .statistics.budget.uncertainty_budget import VarianceSources
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
-from .statistics.probes.deep_probes import (
-    deep_probes,
-    routine_probes_with_steps,
-)
+from .statistics.probes.deep_probes import deep_probes, routine_probes_with_steps
 from .statistics.probes.profile_likelihood import Profile, profile_of_solution
-from .statistics.probes.relaxed_assumptions import (
-    Probe,
-    SolvedFit,
-    probed_changes,
-)
+from .statistics.probes.relaxed_assumptions import Probe, SolvedFit, probed_changes
 from .statistics.probes.routine_probes import probed_deviations
 from .statistics.residuals.residual_diagnostics import diagnose_markers
 from .statistics.specimen_notes import one_kind_notes
@@ -94,10 +80,7 @@ class Run(SolvedProblem):
         return plain_text(estimate_sections(self.result))
 
     def plot(
-        self,
-        experiment: str | None = None,
-        field: str | None = "von_mises_pa",
-        count: int = 6,
+        self, experiment: str | None = None, field: str | None = "von_mises_pa", count: int = 6
     ) -> Figure:
         """Draw a sequence of deformed shapes with the markers.
 
@@ -130,11 +113,7 @@ class Run(SolvedProblem):
         replay = experiment_named(replays(self), experiment)
         bodies = {each.name: each.body for each in self.problem.experiments}
         return field_shapes(
-            replay,
-            bodies[replay.name],
-            constants=self.parameters,
-            field=field,
-            count=count,
+            replay, bodies[replay.name], constants=self.parameters, field=field, count=count
         )
 
     def interactive(self, experiment: str | None = None) -> Widget:
@@ -163,9 +142,7 @@ class Run(SolvedProblem):
 
         return ParameterSliders.from_run(self, experiment).widget
 
-    def save(
-        self, folder: str | Path, frames: bool = True, pictures: bool = True
-    ) -> Path:
+    def save(self, folder: str | Path, frames: bool = True, pictures: bool = True) -> Path:
         """Write the run folder, completely or not at all, and return its path.
 
         An earlier run in the folder is replaced. The pictures are drawn after the folder is in its
@@ -228,9 +205,7 @@ def run(
     """
     say = log or (lambda _: None)
     began_s = time.perf_counter()
-    solution = solve(
-        problem, method, watch=watch, start=start, scheduler=scheduler
-    )
+    solution = solve(problem, method, watch=watch, start=start, scheduler=scheduler)
     searched_s = time.perf_counter()
 
     def timed(answer: Run) -> Run:
@@ -239,9 +214,7 @@ def run(
         """
         finer_s = answer.solution.timing.total - solution.timing.total
         checks_s = time.perf_counter() - searched_s - finer_s
-        return replace(
-            answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s)
-        )
+        return replace(answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s))
 
     problem = _with_estimated_fields(problem, solution)
     answer = Run(problem, solution, rollouts={}, uncertainty=None)
@@ -265,33 +238,22 @@ def run(
         if answer.uncertainty is not None and fit is not None:
             profiles = profile_likelihoods(answer, fit, say=say)
             changes = _changes(answer, say)
-            sources = _sources(
-                answer, fit, known=answer.uncertainty, changes=changes
-            )
+            sources = _sources(answer, fit, known=answer.uncertainty, changes=changes)
+            answer = replace(answer, profiles=profiles, systematic_effects=sources)
             answer = replace(
-                answer, profiles=profiles, systematic_effects=sources
-            )
-            answer = replace(
-                answer,
-                probes=_probes(
-                    answer, fit, changes=changes, say=say, deep=probe
-                ),
+                answer, probes=_probes(answer, fit, changes=changes, say=say, deep=probe)
             )
             answer = _with_offset_notes(answer, fit)
         if answer.solution.status is Status.INTERRUPTED:
             return timed(answer)
         if seek_causes:
             say("testing possible causes of the misfit")
-            answer = replace(
-                answer, causes=find_misspecifications(answer.solution)
-            )
+            answer = replace(answer, causes=find_misspecifications(answer.solution))
         if problem.uncertainty.numerical and answer.uncertainty is not None:
             answer = refine(answer, report_progress=say, watch=watch)
         return timed(answer)
     except KeyboardInterrupt:
-        unsimulated = dict.fromkeys(
-            (e.name for e in problem.experiments), "interrupted"
-        )
+        unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
         rollouts = unsimulated | dict(answer.rollouts)
         return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
 
@@ -302,17 +264,13 @@ def _with_estimated_fields(problem: Problem, solution: Solution) -> Problem:
     """
     fields = {
         part.field_name: part.field
-        for segment in solution.collocation.transcriptions
-        for part in segment.body.parts
+        for transcription in solution.collocation.transcriptions
+        for part in transcription.body.parts
         if part.field
     }
-    problem = problem.with_lengths(
-        {name: field.length_m for name, field in fields.items()}
-    )
+    problem = problem.with_lengths({name: field.length_m for name, field in fields.items()})
     two_phase_fields = {
-        name: field
-        for name, field in fields.items()
-        if isinstance(field, TwoPhaseModes)
+        name: field for name, field in fields.items() if isinstance(field, TwoPhaseModes)
     }
     if two_phase_fields:
         return problem.with_fields(two_phase_fields)
@@ -338,27 +296,18 @@ def _with_offset_notes(answer: Run, fit: LinearisedFit) -> Run:
     """Return the run with notes on constant offsets of the stresses of specimens after its other
     notes; `fit` is its linearised fit.
     """
-    fitted = [
-        each.experiment for each in answer.solution.collocation.transcriptions
-    ]
+    fitted = [each.experiment for each in answer.solution.collocation.transcriptions]
     offsets = stress_offset_notes(fit, fitted)
     return replace(answer, notes=(*answer.notes, *offsets))
 
 
-def _checked(
-    problem: Problem, solution: Solution, say: Log
-) -> tuple[Run, LinearisedFit | None]:
+def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:
     """Return a solution with forward simulations, uncertainties and step error, and the linearised
     fit.
 
     The fit is None if the solution did not converge or cannot be linearised; the run then has
     forward simulations only, and in the latter case a note. A problem without free parameters has a
     fit and diagnoses of the residuals, but no uncertainties.
-
-    Raises
-    ------
-    InputError
-        If the stated uncertainties do not fit the problem; the error names its file.
     """
     say("checking the result by a forward simulation")
     rollouts = simulate_experiments(problem, solution)
@@ -371,9 +320,7 @@ def _checked(
             fit = linearise_fit(solution.collocation, solution.z)
         say("computing the effect of noise of the poses")
         with counted_phase(StepUnit.TIME_STEP, rows):
-            fit, noises = with_pose_noise(
-                fit, solution.collocation, z=solution.z
-            )
+            fit, noises = with_pose_noise(fit, solution.collocation, z=solution.z)
     except SimulationError as error:
         return Run(
             problem,
@@ -383,11 +330,7 @@ def _checked(
             notes=(f"no error bars: {error}",),
         ), None
     answer = Run(
-        problem,
-        solution,
-        rollouts=rollouts,
-        uncertainty=None,
-        diagnoses=diagnose_markers(fit),
+        problem, solution, rollouts=rollouts, uncertainty=None, diagnoses=diagnose_markers(fit)
     )
     if not solution.collocation.nq:
         return answer, fit
@@ -398,14 +341,8 @@ def _checked(
         )
     except InputError as error:
         raise error.located(problem.path) from error
-    answer = replace(
-        answer,
-        uncertainty=uncertainty,
-        notes=tuple(n.describe() for n in noises),
-    )
-    error = step_error(
-        problem, solution, fit=fit, rollouts=rollouts, estimates=answer.optimum
-    )
+    answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.describe() for n in noises))
+    error = step_error(problem, solution, fit=fit, rollouts=rollouts, estimates=answer.optimum)
     return replace(answer, refinement=error), fit
 
 
@@ -415,80 +352,38 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
     """
     say("computing the effects of assumptions")
     solution = answer.solution
-    deviations = probed_deviations(
-        answer.problem.uncertainty.collect_considered()
-    )
+    deviations = probed_deviations(answer.problem.uncertainty.collect_considered())
     # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
     with counted_phase(StepUnit.TIME_STEP, 2 * _row_count(solution)):
-        return changes_of_assumptions(
-            solution.collocation, solution.z, deviations=deviations
-        )
+        return changes_of_assumptions(solution.collocation, solution.z, deviations=deviations)
 
 
 def _row_count(solution: Solution) -> int:
     """Return the number of time steps in one sweep over all fitted experiments."""
-    return sum(
-        s.grid_times - s.dynamics.first_row
-        for s in solution.collocation.transcriptions
-    )
+    return sum(s.grid_times - s.dynamics.first_row for s in solution.collocation.transcriptions)
 
 
 def _sources(
-    answer: Run,
-    fit: LinearisedFit,
-    known: Uncertainty,
-    changes: ResidualChanges,
+    answer: Run, fit: LinearisedFit, known: Uncertainty, changes: ResidualChanges
 ) -> VarianceSources:
     """Return the systematic contributions to the uncertainty, without effects stated as exact (a
     deviation of None).
-
-    Parameters
-    ----------
-    answer : Run
-    fit : LinearisedFit
-        Fit at the solution.
-    known : Uncertainty
-        Statistical uncertainty.
-    changes : ResidualChanges
-        Changes of the residuals by all effects.
     """
     solution = answer.solution
     deviations = answer.problem.uncertainty.assumptions.collect_deviations()
     parameters = solution.collocation.parameters
-    budgeted = changes.without(
-        name for name, deviation in deviations.items() if deviation is None
-    )
+    budgeted = changes.without(name for name, deviation in deviations.items() if deviation is None)
     means = answer.problem.uncertainty.assumptions.collect_means()
     return VarianceSources.from_fit(
-        fit,
-        budgeted,
-        parameters=parameters,
-        q=solution.q,
-        uncertainty=known,
-        means=means,
+        fit, budgeted, parameters=parameters, q=solution.q, uncertainty=known, means=means
     )
 
 
 def _probes(
-    answer: Run,
-    fit: LinearisedFit,
-    changes: ResidualChanges,
-    say: Log,
-    deep: bool,
+    answer: Run, fit: LinearisedFit, changes: ResidualChanges, say: Log, deep: bool
 ) -> tuple[Probe, ...]:
     """Return the routine probes, or for a `deep` check those of subsets and of every assumption,
     with a text to `say` before.
-
-    Parameters
-    ----------
-    answer : Run
-        Run with uncertainties and systematic effects.
-    fit : LinearisedFit
-        Fit at the solution.
-    changes : ResidualChanges
-        Changes of the residuals by all effects, as of `_changes`.
-    say : callable
-    deep : bool
     """
     solution = answer.solution
     options = answer.problem.uncertainty
@@ -503,9 +398,7 @@ def _probes(
         statistical=answer.optimum,
         budget=answer.budget,
         deviations=deviations,
-        changes=probed_changes(
-            collocation, z, deviations=deviations, changes=changes
-        ),
+        changes=probed_changes(collocation, z, deviations=deviations, changes=changes),
     )
     if not deep:
         return routine_probes_with_steps(solved_fit)
@@ -513,9 +406,7 @@ def _probes(
     return deep_probes(solved_fit)
 
 
-def profile_likelihoods(
-    answer: Run, fit: LinearisedFit, say: Log
-) -> tuple[Profile, ...]:
+def profile_likelihoods(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
     """Return the profile likelihoods that the problem requests, in that order; the run must have
     uncertainties.
 
@@ -530,12 +421,7 @@ def profile_likelihoods(
         say(f"profile likelihood of {name}")
         try:
             profiles.append(
-                profile_of_solution(
-                    answer.solution,
-                    fit,
-                    uncertainty=answer.uncertainty,
-                    name=name,
-                )
+                profile_of_solution(answer.solution, fit, uncertainty=answer.uncertainty, name=name)
             )
         except InputError as error:
             raise error.located(answer.problem.path) from error
@@ -557,41 +443,13 @@ def _fine_enough(
     that ended at a bound has no standard error, and coarse steps may have driven it there: it
     starts from its guess again. If every parameter ended at a bound, the largest number of substeps
     is used.
-
-    Parameters
-    ----------
-    coarse : Run
-    fit : LinearisedFit or None
-        Fit of that run.
-    solver : Method
-        Method of the second solve.
-    watch : callable or None
-        Called with each entry of its history.
-    say : callable
-        Called with a text before it.
-    scheduler : str or None
-        Address of a Dask scheduler; None to solve in this process.
-
-    Returns
-    -------
-    Run
-        `coarse` with a note if the solve with finer steps failed or did not converge.
-    LinearisedFit or None
-        The fit of the returned run.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If the second solve was interrupted.
     """
     if coarse.refinement is None or fit is None:
         return coarse, fit
     first = coarse.solution
     problem = coarse.problem
     before = first.collocation.substeps
-    factor = coarse.refinement.suggested_substeps(
-        coarse.optimum, as_scheme(problem.scheme).order
-    )
+    factor = coarse.refinement.suggested_substeps(coarse.optimum, as_scheme(problem.scheme).order)
     substeps = min(before * factor, MOST_SUBSTEPS)
     steps = "one time step" if before == 1 else f"{before} time steps"
     worst, many = coarse.refinement.largest_correction(coarse.optimum)
@@ -610,9 +468,7 @@ def _fine_enough(
     p = np.where(fit.at_bound, again.guess_p, p)
     try:
         require_memory(problem, again, method=solver)
-        finer = _solve_from_parameters(
-            again, p, solver=solver, watch=watch, scheduler=scheduler
-        )
+        finer = _solve_from_parameters(again, p, solver=solver, watch=watch, scheduler=scheduler)
         failure = None if finer.status.converged else finer.message
     except (InputError, SimulationError) as error:
         finer = first
@@ -620,41 +476,15 @@ def _fine_enough(
     if failure is not None:
         note = f"{why}; the solve with {substeps} steps per sample failed: {failure}"
         return replace(coarse, notes=(note, *coarse.notes)), fit
-    most = (
-        ", the largest number that is chosen automatically"
-        if substeps == MOST_SUBSTEPS
-        else ""
-    )
+    most = ", the largest number that is chosen automatically" if substeps == MOST_SUBSTEPS else ""
     reason = f"{why}; therefore the problem was solved again with {substeps} steps per sample{most}"
     return _checked(problem, finer.after(first, reason), say=say)
 
 
 def _solve_from_parameters(
-    collocation: Collocation,
-    p: Array,
-    solver: Method,
-    watch: Watch | None,
-    scheduler: str | None,
+    collocation: Collocation, p: Array, solver: Method, watch: Watch | None, scheduler: str | None
 ) -> Solution:
-    """Return the solution of a problem, started from a simulation at parameters p (np,).
-
-    Parameters
-    ----------
-    collocation : Collocation
-    p : (np,) array
-        Parameters (q, φ).
-    solver, watch, scheduler
-        See `_fine_enough`.
-
-    Raises
-    ------
-    SimulationError
-        If the body cannot be simulated at p.
-    InputError
-        If the scheduler cannot be used.
-    KeyboardInterrupt
-        If the solve was interrupted.
-    """
+    """Return the solution of a problem, started from a simulation at parameters p (np,)."""
     positions, failure = simulate_trajectories(collocation, p)
     if failure is not None:
         raise failure

@@ -46,11 +46,7 @@ _measured = {
     "measured_tentacle": "soft_tentacle/m1_u01_markers.csv",
 }
 _here = Path(__file__).parent
-_fetched = [
-    name
-    for name, file in _measured.items()
-    if (_here / "../problems" / file).is_file()
-]
+_fetched = [name for name, file in _measured.items() if (_here / "../problems" / file).is_file()]
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",
     "gallery_dirs": "generated/gallery",
@@ -63,22 +59,16 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "write_computation_times": False,
 }
-html_math_renderer = (
-    "mathml"  # which browsers draw themselves, without a network
-)
+html_math_renderer = "mathml"  # which browsers draw themselves, without a network
 html_title = f"collocation_sysid {release}"
 html_show_copyright = False
 
 templates_path = ["_templates"]  # of a page for each name
 autosummary_generate = True
-autosummary_filename_map = {
-    "collocation_sysid.Run": "collocation_sysid.run-class"
-}  # beside `run`
+autosummary_filename_map = {"collocation_sysid.Run": "collocation_sysid.run-class"}  # beside `run`
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
-autodoc_typehints = (
-    "none"  # the docstrings give shapes and units, which types cannot
-)
+autodoc_typehints = "none"  # the docstrings give shapes and units, which types cannot
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
@@ -88,9 +78,7 @@ NumpyDocstring._parse_attribute_docstring = lambda self: list(self._lines)
 suppress_warnings = ["ref.python"]
 
 
-def _absolute_values(
-    _app, _what, _name, _object, _options, lines: list[str]
-) -> None:
+def _absolute_values(_app, _what, _name, _object, _options, lines: list[str]) -> None:
     """|φ| in a docstring is a length, not a substitution."""
     lines[:] = [line.replace("|", r"\|") for line in lines]
 

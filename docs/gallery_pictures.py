@@ -12,9 +12,7 @@ from sphinx_gallery.scrapers import figure_rst
 from collocation_sysid.result.figure_style import RESOLUTION_DPI
 
 
-def last_figure(
-    _block: object, variables: Mapping[str, Any], gallery: Mapping[str, Any]
-) -> str:
+def last_figure(_block: object, variables: Mapping[str, Any], gallery: Mapping[str, Any]) -> str:
     """Save the figure that is the value of a cell's last line, and return its reStructuredText."""
     values = variables["example_globals"]
     figure = values.get("___")

@@ -48,16 +48,12 @@ def problem_file() -> str:
         "Unknown keys are refused. A key must be stated if its table has neither a default nor "
         "“optional” for it. `collocation-sysid new NAME` writes a commented problem file; "
         "`collocation-sysid schema` prints the keys as a JSON schema for editors.",
-        *dict.fromkeys(
-            "\n\n".join(t) for t in _tables("", schema, schema["$defs"])
-        ),
+        *dict.fromkeys("\n\n".join(t) for t in _tables("", schema, schema["$defs"])),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _tables(
-    name: str, table: Schema, known: Schema, listed: bool = False
-) -> Iterator[list[str]]:
+def _tables(name: str, table: Schema, known: Schema, listed: bool = False) -> Iterator[list[str]]:
     """A table of the file and those inside, each a heading, a sentence and its keys."""
     rows, inner = [], []
     required = table.get("required", ())
@@ -66,35 +62,23 @@ def _tables(
         inner += [(where, each, many) for each, many in _models(entry, known)]
         default = "" if key in required else _default(entry)
         said = " ".join(entry.get("description", "").split())
-        rows.append(
-            f"| `{key}` | {_kind(entry, known)} | {default} | {_cell(said)} |"
-        )
+        rows.append(f"| `{key}` | {_kind(entry, known)} | {default} | {_cell(said)} |")
     title = f"`[[{name}]]`" if listed else f"`[{name}]`"
     if rows:
         head = "| key | value | default | what it is |\n|---|---|---|---|"
         said = [_prose(table.get("description", ""))] if name else []
         keys = f"{head}\n" + "\n".join(rows)
-        yield [
-            f"## {title}" if name else "## Top level",
-            *filter(None, said),
-            keys,
-        ]
+        yield [f"## {title}" if name else "## Top level", *filter(None, said), keys]
     for where, each, many in inner:
         yield from _tables(where, each, known, many)
 
 
 def _default(entry: Schema) -> str:
     value = entry.get("default")
-    return (
-        "optional"
-        if value in (None, []) or isinstance(value, dict)
-        else f"`{_toml(value)}`"
-    )
+    return "optional" if value in (None, []) or isinstance(value, dict) else f"`{_toml(value)}`"
 
 
-def _models(
-    entry: Schema, known: Schema, listed: bool = False
-) -> Iterator[tuple[Schema, bool]]:
+def _models(entry: Schema, known: Schema, listed: bool = False) -> Iterator[tuple[Schema, bool]]:
     """Tables that a value may be, and whether there may be several."""
     if "$ref" in entry:
         found = known[entry["$ref"].rpartition("/")[2]]
@@ -118,9 +102,7 @@ def _kind(entry: Schema, known: Schema) -> str:
         return "table" if "properties" in found else _kind(found, known)
     several = [*entry.get("anyOf", ()), *entry.get("oneOf", ())]
     if several:
-        kinds = [
-            _kind(each, known) for each in several if each.get("type") != "null"
-        ]
+        kinds = [_kind(each, known) for each in several if each.get("type") != "null"]
         return " or ".join(dict.fromkeys(kinds))
     if "enum" in entry:
         return ", ".join(f"`{_toml(each)}`" for each in entry["enum"])
@@ -128,11 +110,7 @@ def _kind(entry: Schema, known: Schema) -> str:
         return f"`{_toml(entry['const'])}`"
     if entry.get("type") == "array":
         inside = entry.get("items")
-        return (
-            f"list of {_kind(inside, known)}s"
-            if isinstance(inside, Mapping)
-            else "list"
-        )
+        return f"list of {_kind(inside, known)}s" if isinstance(inside, Mapping) else "list"
     return KINDS.get(entry.get("type", ""), "value")
 
 
@@ -149,18 +127,10 @@ def _toml(value: Any) -> str:
 
 def nuisances() -> str:
     """The table of what may be unknown of a recording, as the page on motion capture has it."""
-    lines = [
-        "| key of `[experiment.nuisance]` | meaning | default prior |",
-        "|---|---|---|",
-    ]
+    lines = ["| key of `[experiment.nuisance]` | meaning | default prior |", "|---|---|---|"]
     for key, rows in KEYS.items():
-        said = " ".join(
-            f"{row.description[0].upper()}{row.description[1:]}."
-            for row in rows
-        )
-        priors = ", ".join(
-            f"{row.prior_key()} = {row.sigma:.4g}" for row in rows if row.sigma
-        )
+        said = " ".join(f"{row.description[0].upper()}{row.description[1:]}." for row in rows)
+        priors = ", ".join(f"{row.prior_key()} = {row.sigma:.4g}" for row in rows if row.sigma)
         usual = ", ".join(row.usual for row in rows if row.unit != "σ")
         default = f"`{{ {priors} }}` {usual}".strip() if priors else '"none"'
         lines.append(f"| `{key}` | {said} | {default} |")
@@ -179,15 +149,9 @@ def command_line() -> str:
         command = group.get_command(None, name)
         parts += [f"## {name}", _prose(command.help or "")]
         head = "| argument or option | default | what it is |\n|---|---|---|"
-        rows = [
-            _parameter(each)
-            for each in command.params
-            if not getattr(each, "hidden", False)
-        ]
+        rows = [_parameter(each) for each in command.params if not getattr(each, "hidden", False)]
         parts.append(f"{head}\n" + "\n".join(rows))
-        examples = re.findall(
-            r"^ *(collocation-sysid .*)$", command.epilog or "", re.MULTILINE
-        )
+        examples = re.findall(r"^ *(collocation-sysid .*)$", command.epilog or "", re.MULTILINE)
         if examples:
             parts.append("```sh\n" + "\n".join(examples) + "\n```")
     return "\n\n".join(parts) + "\n"
@@ -199,16 +163,8 @@ def _parameter(given: Any) -> str:
     names = ", ".join(f"`{each}`" for each in opts)
     if option and not given.is_flag:
         names += f" {_cell(given.metavar or 'VALUE')}"
-    simple = (
-        given.default is not None
-        and not callable(given.default)
-        and given.default is not ...
-    )
-    default = (
-        f"`{given.default}`"
-        if simple and not getattr(given, "is_flag", False)
-        else ""
-    )
+    simple = given.default is not None and not callable(given.default) and given.default is not ...
+    default = f"`{given.default}`" if simple and not getattr(given, "is_flag", False) else ""
     return f"| {names} | {'required' if given.required else default} | {_cell(given.help or '')} |"
 
 

@@ -29,9 +29,7 @@ from collocation_sysid import (
 from collocation_sysid.fem.air import DRAG_COEFFICIENT, FACING_SHARE
 from collocation_sysid.fem.laws.constants import GAMMA_R
 from collocation_sysid.fem.laws.materials import DAMPINGS, DampingLaw, rayleigh
-from collocation_sysid.statistics.budget.systematic_effects import (
-    OBJECTIVE_DAMPINGS,
-)
+from collocation_sysid.statistics.budget.systematic_effects import OBJECTIVE_DAMPINGS
 
 Array = NDArray[np.float64]
 SCHEME = "midpoint"
@@ -41,9 +39,7 @@ PIECE_STEPS = 2
 
 
 def with_wrong_assumptions(
-    experiment: Experiment,
-    values: Mapping[str, float],
-    errors: Mapping[str, float],
+    experiment: Experiment, values: Mapping[str, float], errors: Mapping[str, float]
 ) -> Experiment:
     """Return the experiment with the marker tracks of a body that deviates from the assumptions.
 
@@ -61,9 +57,7 @@ def with_wrong_assumptions(
     (grasp,) = experiment.grasps
     slower_clock = 1 - errors.get("time_scale", 0.0)
     poses = grasp.poses
-    slowed_poses = PoseSequence(
-        slower_clock * poses.t_s, poses.positions_m, poses.quaternions_xyzw
-    )
+    slowed_poses = PoseSequence(slower_clock * poses.t_s, poses.positions_m, poses.quaternions_xyzw)
     # Added mass is that of denser air; buoyancy and drag of this denser air are corrected below.
     denser_air = 1 + errors.get("added_mass", 0.0)
     truth = replace(
@@ -71,24 +65,18 @@ def with_wrong_assumptions(
         body=body,
         t_s=slower_clock * experiment.t_s,
         grasps=(Grasp(grasp.nodes, slowed_poses),),
-        markers=replace(
-            experiment.markers, t_s=slower_clock * experiment.t_s, located=None
-        ),
+        markers=replace(experiment.markers, t_s=slower_clock * experiment.t_s, located=None),
         forces=_buoyancy_errors(experiment, body, errors),
         air_density_kg_m3=denser_air * experiment.air_density_kg_m3,
     )
-    values = dict(
-        values, poisson=values["poisson"] + errors.get("poisson", 0.0)
-    )
-    return with_markers(
-        experiment, _tracks(truth, values, errors.get("stiffness_drift", 0.0))
-    )
+    values = dict(values, poisson=values["poisson"] + errors.get("poisson", 0.0))
+    return with_markers(experiment, _tracks(truth, values, errors.get("stiffness_drift", 0.0)))
 
 
-def _tracks(
-    truth: Experiment, values: Mapping[str, float], drift: float
-) -> Array:
-    """Return the tracks (T, M, 3) [m] of a body whose stiffness changes by a share `drift` in total."""
+def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Array:
+    """Return the tracks (T, M, 3) [m] of a body whose stiffness changes by a share `drift` in
+    total.
+    """
     values = _lame(truth, values)
     if not drift:
         return simulate(truth, values, SCHEME, substeps=1).markers_m
@@ -99,24 +87,16 @@ def _tracks(
     start = {}
     velocity = 0.0
     steps = len(t_s) - 1
-    for first in range(
-        0, steps - 1, PIECE_STEPS
-    ):  # the last piece has the remaining steps
+    for first in range(0, steps - 1, PIECE_STEPS):  # the last piece has the remaining steps
         samples = slice(
-            first,
-            (first + PIECE_STEPS if first + 2 * PIECE_STEPS <= steps else steps)
-            + 1,
+            first, (first + PIECE_STEPS if first + 2 * PIECE_STEPS <= steps else steps) + 1
         )
         elapsed_share = (t_s[samples].mean() - t_s.mean()) / np.ptp(t_s)
         current_values = {
-            n: v * (1 + drift * elapsed_share) if n in moduli else v
-            for n, v in values.items()
+            n: v * (1 + drift * elapsed_share) if n in moduli else v for n, v in values.items()
         }
         piece_markers = replace(
-            markers,
-            t_s=t_s[samples],
-            positions_m=markers.positions_m[samples],
-            located=None,
+            markers, t_s=t_s[samples], positions_m=markers.positions_m[samples], located=None
         )
         piece = replace(truth, t_s=t_s[samples], markers=piece_markers, **start)
         forward_run = simulate(piece, current_values, SCHEME, substeps=1)
@@ -139,42 +119,24 @@ def _lame(truth: Experiment, values: Mapping[str, float]) -> dict[str, float]:
         return dict(values)
     young = values["young_pa"]
     poisson = values["poisson"]
-    others = {
-        n: v for n, v in values.items() if n not in ("young_pa", "poisson")
-    }
+    others = {n: v for n, v in values.items() if n not in ("young_pa", "poisson")}
     mu = young / 2 / (1 + poisson)
-    return others | {
-        "mu_pa": mu,
-        "lambda_pa": 2 * mu * poisson / (1 - 2 * poisson),
-    }
+    return others | {"mu_pa": mu, "lambda_pa": 2 * mu * poisson / (1 - 2 * poisson)}
 
 
-def _body(
-    experiment: Experiment,
-    values: Mapping[str, float],
-    errors: Mapping[str, float],
-) -> Body:
+def _body(experiment: Experiment, values: Mapping[str, float], errors: Mapping[str, float]) -> Body:
     old = experiment.body
     (grasp,) = experiment.grasps
     pivot_m = old.nodes_m[grasp.nodes].mean(axis=0)
     scale = 1 + errors.get("body_scale", 0.0)
-    mesh = TetMesh(
-        pivot_m + scale * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra
-    )
+    mesh = TetMesh(pivot_m + scale * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra)
     extra_stiffness = [errors.get(f"anisotropy {axis}", 0.0) for axis in AXES]
-    body_options: dict[str, Any] = {
-        "damping": _damping(old.parts[0].damping, errors)
-    }
+    body_options: dict[str, Any] = {"damping": _damping(old.parts[0].damping, errors)}
     if any(extra_stiffness):
-        body_options |= {
-            "material": _anisotropic_law(extra_stiffness),
-            "evaluator": "casadi",
-        }
+        body_options |= {"material": _anisotropic_law(extra_stiffness), "evaluator": "casadi"}
     more_drag = errors.get("air_drag", 0.0) - errors.get("added_mass", 0.0)
     if more_drag:
-        body_options["forces"] = [
-            _drag(more_drag * experiment.air_density_kg_m3)
-        ]
+        body_options["forces"] = [_drag(more_drag * experiment.air_density_kg_m3)]
     density = old.mass_kg / old.mesh.volume_m3 * (1 + errors.get("mass", 0.0))
     body = Body(mesh, density_kg_m3=density, **body_options)
     body = body.with_stiffness_factors(_stiffness_factors(body, errors))
@@ -184,13 +146,9 @@ def _body(
             body.nodes_m[:, axis], weights=body.node_mass
         )
         factor += (
-            errors.get(f"density_gradient {name}", 0.0)
-            * distance_m
-            / np.abs(distance_m).max()
+            errors.get(f"density_gradient {name}", 0.0) * distance_m / np.abs(distance_m).max()
         )
-    body._lumped_m3 = [
-        lumped * np.repeat(factor, 3) for lumped in body._lumped_m3
-    ]
+    body._lumped_m3 = [lumped * np.repeat(factor, 3) for lumped in body._lumped_m3]
     body.node_mass = body.node_mass * factor
     return body
 
@@ -218,9 +176,7 @@ def _anisotropic_law(shares: Sequence[float]) -> Material:
         green = 0.5 * (f.T @ f - ca.SX.eye(3))
         isotropic = 0.5 * mu_pa * (2 * ca.trace(green) - 2 * ca.log(j))
         isotropic += 0.5 * lambda_pa * ca.log(j) ** 2
-        return isotropic + 0.5 * young_pa * sum(
-            s * green[k, k] ** 2 for k, s in enumerate(shares)
-        )
+        return isotropic + 0.5 * young_pa * sum(s * green[k, k] ** 2 for k, s in enumerate(shares))
 
     return Material.from_energy(energy)
 
@@ -272,12 +228,7 @@ def _buoyancy_errors(
 ) -> tuple[Force, ...]:
     """Return the forces that correct the buoyancy of air whose density gives the true added mass."""
     more_buoyancy = errors.get("buoyancy", 0.0) - errors.get("added_mass", 0.0)
-    air_kg = (
-        experiment.air_density_kg_m3
-        * body.node_mass
-        * body.mesh.volume_m3
-        / body.mass_kg
-    )
+    air_kg = experiment.air_density_kg_m3 * body.node_mass * body.mesh.volume_m3 / body.mass_kg
     return tuple(
         Force([k], [0, 0, 9.81 * more_buoyancy * m])
         for k, m in enumerate(air_kg)

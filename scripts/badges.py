@@ -42,9 +42,7 @@ def repository_url(pyproject: str) -> str | None:
         If it is no web address.
     """
     urls = tomllib.loads(pyproject)["project"].get("urls", {})
-    address = next(
-        (url for key, url in urls.items() if key.lower() == "repository"), None
-    )
+    address = next((url for key, url in urls.items() if key.lower() == "repository"), None)
     if address is None:
         return None
     parts = urlsplit(address)
@@ -86,9 +84,7 @@ def badges(repository: str | None) -> str:
         return ""
     lines = []
     for notebook, title in NAMES.items():
-        badge = (
-            f"[![Binder]({BINDER_IMAGE})]({binder_url(repository, notebook)})"
-        )
+        badge = f"[![Binder]({BINDER_IMAGE})]({binder_url(repository, notebook)})"
         colab = colab_url(repository, notebook)
         if colab is not None:
             badge = f"[![Colab]({COLAB_IMAGE})]({colab}) {badge}"

@@ -60,9 +60,7 @@ def main() -> None:
     options = parser.parse_args()
     problem = swung_problem(SIZES[options.size], options.steps)
     starts = [options.only] if options.only else ["auto", "false"]
-    measurements = {
-        start: measure(problem, start, nodes=options.nodes) for start in starts
-    }
+    measurements = {start: measure(problem, start, nodes=options.nodes) for start in starts}
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"peak memory {peak_mb:.0f} MB")
     if len(measurements) == 2:
@@ -79,16 +77,13 @@ def swung_problem(mesh: str, steps: int) -> Problem:
     steps : int
         Number of samples.
     """
-    body = Body(
-        cylinder(mesh), density_kg_m3=20.0, damping="rayleigh", threads=1
-    )
+    body = Body(cylinder(mesh), density_kg_m3=20.0, damping="rayleigh", threads=1)
     experiment = swung_cylinder(body, steps)
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     noise_m = NOISE_M * np.random.default_rng(0).normal(size=tracks.shape)
     print(f"{len(body.nodes_m):,} nodes, {steps} samples", flush=True)
     return Problem(
-        [with_markers(experiment, tracks + noise_m)],
-        {name: Unknown() for name in TRUTH},
+        [with_markers(experiment, tracks + noise_m)], {name: Unknown() for name in TRUTH}
     )
 
 

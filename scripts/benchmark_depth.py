@@ -1,7 +1,7 @@
 """Time of the search with one depth image of 18,900 points, compared with that with ten markers.
 
-A bar of 875 nodes hangs from one end. Its Young's modulus has no guess, and the pose, bias and scale
-of the camera are estimated. An earlier revision and this one solve both in turn, in separate
+A bar of 875 nodes hangs from one end. Its Young's modulus has no guess, and the pose, bias and
+scale of the camera are estimated. An earlier revision and this one solve both in turn, in separate
 processes on one thread, so that other work on the machine slows all. The output has the smallest
 processor times of `solve`, without imports and the reading of data, their ratio for both revisions,
 and the relative difference of the estimates.
@@ -26,12 +26,7 @@ from benchmark_static_friction import ROOT, checkout
 
 import collocation_sysid as cs
 
-TRUTH = {
-    "young_pa": 1.5e5,
-    "poisson": 0.45,
-    "gamma_r_s": 1e-3,
-    "gamma_m_1_s": 0.1,
-}
+TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 # Edges of the bar [m], and numbers of cells along them.
 SIZE_M = (0.12, 0.03, 0.02)
 CELLS = (24, 4, 6)
@@ -41,7 +36,8 @@ FOCAL_PX = 750.0
 # Noise of the image and of the markers [m].
 NOISE_M = 1e-4
 MARKER_COUNT = 10
-# Smallest distance of two points that are used [m]: about that of the pixels, so that few are omitted.
+# Smallest distance of two points that are used [m]: about that of the pixels, so that few are
+# omitted.
 SPACING_M = 4e-4
 KINDS = ("markers", "depth")
 
@@ -64,19 +60,14 @@ def main() -> None:
             for (name, kind), results in runs.items():
                 results.append(solve_in_own_process(trees[name], kind))
     for name in trees:
-        best_s = {
-            kind: min(each["spent_s"] for each in runs[name, kind])
-            for kind in KINDS
-        }
+        best_s = {kind: min(each["spent_s"] for each in runs[name, kind]) for kind in KINDS}
         print(
             f"{name}: markers {best_s['markers']:.2f} s, "
             f"{runs[name, 'depth'][0]['points']} points {best_s['depth']:.2f} s, "
             f"the latter over the former {best_s['depth'] / best_s['markers']:.2f}"
         )
     for kind in KINDS:
-        baseline_pa, current_pa = (
-            runs[name, kind][0]["young_pa"] for name in trees
-        )
+        baseline_pa, current_pa = (runs[name, kind][0]["young_pa"] for name in trees)
         print(f"{kind}: E differs by {abs(current_pa / baseline_pa - 1):.1e}")
 
 
@@ -115,52 +106,28 @@ def solve_once(kind: str) -> dict:
 def make_experiment(kind: str) -> cs.Experiment:
     """Return the hanging bar with its markers, or with one image of a camera."""
     body = cs.Body(cs.box_mesh(SIZE_M, CELLS), density_kg_m3=1070.0)
-    clamp = cs.Grasp(
-        np.flatnonzero(body.nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
-    )
+    clamp = cs.Grasp(np.flatnonzero(body.nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
     rng = np.random.default_rng(0)
-    places_m = body.nodes_m[
-        np.linspace(0, len(body.nodes_m) - 1, MARKER_COUNT + 1).astype(int)[1:]
-    ]
-    markers = cs.Markers(
-        np.zeros(1), np.zeros((1, MARKER_COUNT, 3)), NOISE_M, places_m=places_m
-    )
+    places_m = body.nodes_m[np.linspace(0, len(body.nodes_m) - 1, MARKER_COUNT + 1).astype(int)[1:]]
+    markers = cs.Markers(np.zeros(1), np.zeros((1, MARKER_COUNT, 3)), NOISE_M, places_m=places_m)
     experiment = cs.Experiment(
-        body,
-        [0.0],
-        [clamp],
-        markers,
-        kind="static",
-        nuisance=cs.Nuisance.none(),
+        body, [0.0], [clamp], markers, kind="static", nuisance=cs.Nuisance.none()
     )
     motion = cs.simulate(experiment, TRUTH)
     if kind == "markers":
-        positions_m = motion.markers_m + NOISE_M * rng.normal(
-            size=motion.markers_m.shape
-        )
-        return replace(
-            experiment, markers=replace(markers, positions_m=positions_m)
-        )
+        positions_m = motion.markers_m + NOISE_M * rng.normal(size=motion.markers_m.shape)
+        return replace(experiment, markers=replace(markers, positions_m=positions_m))
     x = motion.positions_m[0]
     corners_m = x[body.mesh.surface]
     camera = camera_at(x.mean(axis=0))
     rotations, translations = camera.pose_at([0.0])
-    image_m = cs.depth_image(
-        camera, SHAPE_PX, (corners_m - translations[0]) @ rotations[0]
-    )
+    image_m = cs.depth_image(camera, SHAPE_PX, (corners_m - translations[0]) @ rotations[0])
     image_m += NOISE_M * rng.normal(size=SHAPE_PX)
     unknown = cs.Nuisance.none(
-        depth_turn_rad=0.09,
-        depth_shift_m=0.02,
-        depth_bias_m=0.005,
-        depth_scale=0.005,
+        depth_turn_rad=0.09, depth_shift_m=0.02, depth_bias_m=0.005, depth_scale=0.005
     )
-    depth = cs.Depth.of_images(
-        "front", image_m, camera, NOISE_M, spacing_m=SPACING_M
-    )
-    return cs.Experiment(
-        body, [0.0], [clamp], kind="static", depths=[depth], nuisance=unknown
-    )
+    depth = cs.Depth.of_images("front", image_m, camera, NOISE_M, spacing_m=SPACING_M)
+    return cs.Experiment(body, [0.0], [clamp], kind="static", depths=[depth], nuisance=unknown)
 
 
 def camera_at(centre_m: np.ndarray) -> cs.DepthCamera:
@@ -171,19 +138,10 @@ def camera_at(centre_m: np.ndarray) -> cs.DepthCamera:
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3] = np.column_stack(
-        [
-            right,
-            np.cross(optical_axis, right),
-            optical_axis,
-            centre_m - 0.33 * optical_axis,
-        ]
+        [right, np.cross(optical_axis, right), optical_axis, centre_m - 0.33 * optical_axis]
     )
     height, width = SHAPE_PX
-    matrix = [
-        [FOCAL_PX, 0, width / 2],
-        [0, FOCAL_PX, height / 2],
-        [0, 0, 1],
-    ]
+    matrix = [[FOCAL_PX, 0, width / 2], [0, FOCAL_PX, height / 2], [0, 0, 1]]
     return cs.DepthCamera(matrix, pose=pose)
 
 

@@ -4,7 +4,8 @@ A soft bar (90 nodes, 91 samples) is clamped at one end and swung. Its nine mark
 places, the nuisance parameters are those that are estimated by default, the number of time steps
 per sample is chosen by the run, and the four parameters are guessed wrong by factors of 3, 3, 3.6
 and 3. Prints processor time, iterations of IPOPT (of all solves together, where the run solves
-again with more steps), and the largest difference of the logarithm of a parameter from that of reduced space.
+again with more steps), and the largest difference of the logarithm of a parameter from that of
+reduced space.
 
     python scripts/benchmark_distant_guesses.py                    # the full size, all cases
     python scripts/benchmark_distant_guesses.py --cells 5 2 2 --samples 41 --cases distant warm
@@ -33,19 +34,9 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
 
-TRUTH = {
-    "lambda_pa": 1300.0,
-    "mu_pa": 870.0,
-    "gamma_r_s": 0.01,
-    "gamma_m_1_s": 0.5,
-}
+TRUTH = {"lambda_pa": 1300.0, "mu_pa": 870.0, "gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
 # Initial guesses over true values.
-GUESS_FACTORS = {
-    "lambda_pa": 1 / 3,
-    "mu_pa": 1 / 3,
-    "gamma_r_s": 3.6,
-    "gamma_m_1_s": 3.0,
-}
+GUESS_FACTORS = {"lambda_pa": 1 / 3, "mu_pa": 1 / 3, "gamma_r_s": 3.6, "gamma_m_1_s": 3.0}
 BOUNDS = {
     "lambda_pa": (1.0, 1e6),
     "mu_pa": (1.0, 1e6),
@@ -61,8 +52,8 @@ NOISE_M = 5e-4
 MARKER_COUNT = 9
 # Seed of the choice of marked nodes and of the noise.
 SEED = 1
-# "none": without nuisance parameters; "distant": with the default ones; "warm": as "distant", started
-# from the run folder of reduced space.
+# "none": without nuisance parameters; "distant": with the default ones; "warm": as "distant",
+# started from the run folder of reduced space.
 CASES = ("none", "distant", "warm")
 
 
@@ -91,32 +82,20 @@ def bar(divisions: Sequence[int], samples: int, *, ideal: bool) -> Problem:
     clamped_nodes = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
     free_nodes = np.flatnonzero(body.nodes_m[:, 0] >= 1e-9)
     rng = np.random.default_rng(SEED)
-    places_m = body.nodes_m[
-        np.sort(rng.choice(free_nodes, MARKER_COUNT, replace=False))
-    ]
-    markers = Markers(
-        poses.t_s,
-        np.zeros((samples, MARKER_COUNT, 3)),
-        NOISE_M,
-        places_m=places_m,
-    )
+    places_m = body.nodes_m[np.sort(rng.choice(free_nodes, MARKER_COUNT, replace=False))]
+    markers = Markers(poses.t_s, np.zeros((samples, MARKER_COUNT, 3)), NOISE_M, places_m=places_m)
     experiment = Experiment(
         body, poses.t_s, [Grasp(clamped_nodes, poses)], markers, name="soft bar"
     )
     tracks = simulate(experiment, TRUTH, timestep_s=STEP_S / 8).markers_m
     tracks = tracks + NOISE_M * rng.normal(size=tracks.shape)
     if ideal:
-        description = replace(
-            with_markers(experiment, tracks), nuisance=Nuisance.none()
-        )
+        description = replace(with_markers(experiment, tracks), nuisance=Nuisance.none())
     else:
         unplaced_markers = Markers(poses.t_s, tracks, NOISE_M, markers.names)
-        description = replace(
-            experiment, markers=unplaced_markers, nuisance=Nuisance()
-        )
+        description = replace(experiment, markers=unplaced_markers, nuisance=Nuisance())
     guesses = {
-        name: Unknown(value * GUESS_FACTORS[name], *BOUNDS[name])
-        for name, value in TRUTH.items()
+        name: Unknown(value * GUESS_FACTORS[name], *BOUNDS[name]) for name, value in TRUTH.items()
     }
     return Problem([description], guesses, scheme="midpoint")
 
@@ -131,22 +110,13 @@ def print_comparison(case: str, divisions: Sequence[int], samples: int) -> None:
     reference = pipeline.run(problem, ReducedSpace(), seek_causes=False)
     reference_s = time.process_time() - began_s
     with tempfile.TemporaryDirectory() as folder:
-        start = (
-            reference.save(Path(folder) / "reduced-space")
-            if case == "warm"
-            else None
-        )
+        start = reference.save(Path(folder) / "reduced-space") if case == "warm" else None
         began_s = time.process_time()
-        answer = pipeline.run(
-            problem, InteriorPoint(), start=start, seek_causes=False
-        )
+        answer = pipeline.run(problem, InteriorPoint(), start=start, seek_causes=False)
         answer_s = time.process_time() - began_s
     solution = answer.solution
     log_differences = np.log(
-        [
-            solution.parameters[n] / reference.solution.parameters[n]
-            for n in TRUTH
-        ]
+        [solution.parameters[n] / reference.solution.parameters[n] for n in TRUTH]
     )
     print(
         f"{case}: {solution.status.value}, {solution.iterations} iterations of IPOPT, "
@@ -162,8 +132,7 @@ def print_comparison(case: str, divisions: Sequence[int], samples: int) -> None:
 def main() -> None:
     """Run the cases that the command line names."""
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
         "--cells",
@@ -173,9 +142,7 @@ def main() -> None:
         help="cells of the mesh along the three edges",
     )
     parser.add_argument("--samples", type=int, default=91)
-    parser.add_argument(
-        "--cases", nargs="*", default=list(CASES), choices=CASES
-    )
+    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=CASES)
     arguments = parser.parse_args()
     for case in arguments.cases:
         print_comparison(case, arguments.cells, arguments.samples)

@@ -32,15 +32,11 @@ PAPER_JACOBIAN_MS = 57.0
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problem", type=Path, default=PROBLEM)
-    parser.add_argument(
-        "--scheme", default="backward-euler", help="the paper's by default"
-    )
+    parser.add_argument("--scheme", default="backward-euler", help="the paper's by default")
     parser.add_argument("--repeats", type=int, default=21)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    measurements = measure(
-        arguments.problem, arguments.scheme, arguments.repeats
-    )
+    measurements = measure(arguments.problem, arguments.scheme, arguments.repeats)
     if arguments.json:
         print(json.dumps(measurements, indent=1))
     else:
@@ -48,34 +44,27 @@ def main() -> None:
 
 
 def measure(path: Path, scheme: str, repeats: int) -> dict:
-    """Return the median times of Jacobian and Hessian by evaluator [ms]; evaluators alternate in one run."""
+    """Return the median times of Jacobian and Hessian by evaluator [ms]; evaluators alternate in
+    one run.
+    """
     problem = Problem.read(path)
     threads = max(2, available_threads())
-    evaluators = {
-        "simd_1_ms": ("simd", 1),
-        f"simd_{threads}_ms": ("simd", threads),
-    }
+    evaluators = {"simd_1_ms": ("simd", 1), f"simd_{threads}_ms": ("simd", threads)}
     evaluators["casadi_map_ms"] = ("casadi", 1)
     collocations: dict[str, Collocation] = {}
     for evaluator_name, (evaluator, thread_count) in evaluators.items():
         body = Body(
             problem.bodies[0].mesh,
-            density_kg_m3=problem.bodies[0].mass_kg
-            / problem.bodies[0].mesh.volume_m3,
+            density_kg_m3=problem.bodies[0].mass_kg / problem.bodies[0].mesh.volume_m3,
             damping="rayleigh",
             evaluator=evaluator,
             threads=thread_count,
         )
         experiments = [replace(e, body=body) for e in problem.experiments]
-        collocations[evaluator_name] = Collocation(
-            experiments, problem.parameters, scheme
-        )
+        collocations[evaluator_name] = Collocation(experiments, problem.parameters, scheme)
     first = collocations["simd_1_ms"]
     rng = np.random.default_rng(0)
-    rest_positions_m = [
-        s.experiment.rigid_positions(s.dynamics.t_s)
-        for s in first.transcriptions
-    ]
+    rest_positions_m = [s.experiment.rigid_positions(s.dynamics.t_s) for s in first.transcriptions]
     z = first.pack(first.parameters.guess_q, rest_positions_m)
     z[first.nq :] += 1e-3 * rng.normal(size=len(z) - first.nq)
     multipliers = rng.normal(size=first.constraint_count)
@@ -95,29 +84,22 @@ def measure(path: Path, scheme: str, repeats: int) -> dict:
             "steps": sum(s.grid_times for s in first.transcriptions),
             "scheme": scheme,
         },
-        "jacobian": _median_times_ms(
-            collocations, residual_and_jacobian, repeats
-        )
+        "jacobian": _median_times_ms(collocations, residual_and_jacobian, repeats)
         | {
             "nonzeros": len(jacobian),
             "extra_memory_ratio": _extra_memory_ratio(first, z, jacobian),
         },
-        "hessian": _median_times_ms(collocations, lagrangian, repeats)
-        | {"nonzeros": len(hessian)},
+        "hessian": _median_times_ms(collocations, lagrangian, repeats) | {"nonzeros": len(hessian)},
         "paper_jacobian_ms": PAPER_JACOBIAN_MS,
     }
 
 
 def _median_times_ms(
-    collocations: dict[str, Collocation],
-    evaluate: Callable[[Collocation], None],
-    repeats: int,
+    collocations: dict[str, Collocation], evaluate: Callable[[Collocation], None], repeats: int
 ) -> dict[str, float]:
     for collocation in collocations.values():
         evaluate(collocation)
-    seconds: dict[str, list[float]] = {
-        evaluator_name: [] for evaluator_name in collocations
-    }
+    seconds: dict[str, list[float]] = {evaluator_name: [] for evaluator_name in collocations}
     for repeat in range(repeats):
         for evaluator_name, collocation in collocations.items():
             if "casadi" in evaluator_name and repeat >= 3:
@@ -131,16 +113,14 @@ def _median_times_ms(
     }
 
 
-def _extra_memory_ratio(
-    collocation: Collocation, z: np.ndarray, values: np.ndarray
-) -> float:
-    """Return the peak memory of residual and Jacobian without the values, over the size of the values.
+def _extra_memory_ratio(collocation: Collocation, z: np.ndarray, values: np.ndarray) -> float:
+    """Return the peak memory of residual and Jacobian without the values, over the size of the
+    values.
 
     Arrays that are kept between calls count as well.
     """
     buffer_bytes = sum(
-        segment.linearisation_buffer.nbytes
-        for segment in collocation.transcriptions
+        transcription.linearisation_buffer.nbytes for transcription in collocation.transcriptions
     )
     tracemalloc.start()
     collocation.constraints_and_jacobian(z, values)
@@ -159,9 +139,7 @@ def report(measurements: dict) -> None:
     for name in ("jacobian", "hessian"):
         row = measurements[name]
         baseline = row["casadi_map_ms"]
-        print(
-            f"\n{name}, {row['nonzeros']:,} nonzeros in the final sparse matrix"
-        )
+        print(f"\n{name}, {row['nonzeros']:,} nonzeros in the final sparse matrix")
         for evaluator_name, value in row.items():
             if evaluator_name.endswith("_ms"):
                 print(
@@ -172,9 +150,7 @@ def report(measurements: dict) -> None:
                 f"  {'paper':12s} {measurements['paper_jacobian_ms']:8.1f} ms   "
                 "(on the machine of its authors)"
             )
-            print(
-                f"  peak extra memory {row['extra_memory_ratio']:.2f} × the sparse values"
-            )
+            print(f"  peak extra memory {row['extra_memory_ratio']:.2f} × the sparse values")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Latency of live estimates, and their difference from the answer of the batch.
 
 Streams table1 (171 nodes, with noise of sigma_m) and foam_cylinder at 100 Hz. Times are processor
-times of this process, which other work on the machine changes little; they are compared with the time
-of one row in a sweep over the complete recording.
+times of this process, which other work on the machine changes little; they are compared with the
+time of one row in a sweep over the complete recording.
 
     python scripts/benchmark_live.py
     python scripts/benchmark_live.py --frames 360000 --problem block --rows 1   # an hour
@@ -23,10 +23,7 @@ import numpy as np
 from twins import SOFT, twin
 
 from collocation_sysid.extras.live import Frame, LiveEstimator, LiveOptions
-from collocation_sysid.extras.live.sources import (
-    frames_of_recording,
-    without_garbage_of_startup,
-)
+from collocation_sysid.extras.live.sources import frames_of_recording, without_garbage_of_startup
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
@@ -37,18 +34,8 @@ PROBLEMS = Path(__file__).parent.parent / "problems"
 # Standard deviation of the noise that is added to the tracks [m]; foam_cylinder has noise already.
 NOISE_M = {"table1": 1e-3, "foam_cylinder": 0.0}
 TRUTH = {
-    "table1": {
-        "lambda_pa": 200.0,
-        "mu_pa": 300.0,
-        "gamma_r_s": 0.009,
-        "gamma_m_1_s": 1.0,
-    },
-    "foam_cylinder": {
-        "lambda_pa": 800.0,
-        "mu_pa": 600.0,
-        "gamma_r_s": 0.006,
-        "gamma_m_1_s": 1.5,
-    },
+    "table1": {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0},
+    "foam_cylinder": {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5},
     "block": SOFT,
 }
 # Time at which the errors of the estimates are printed [s].
@@ -70,9 +57,7 @@ def main() -> None:
     )
     parser.add_argument("--budget-ms", type=float)
     parser.add_argument(
-        "--frames",
-        type=int,
-        help="stream the recording to and fro for this number of frames",
+        "--frames", type=int, help="stream the recording to and fro for this number of frames"
     )
     parser.add_argument(
         "--recorded",
@@ -80,9 +65,7 @@ def main() -> None:
         help="number of samples of a block that moves at random; compare with the batch",
     )
     arguments = parser.parse_args()
-    budget_s = (
-        None if arguments.budget_ms is None else 1e-3 * arguments.budget_ms
-    )
+    budget_s = None if arguments.budget_ms is None else 1e-3 * arguments.budget_ms
     options = LiveOptions(budget_s=budget_s, rows=arguments.rows)
     if arguments.recorded:
         compare_long_recording(arguments.recorded, options)
@@ -104,25 +87,18 @@ def noisy_problem(name: str) -> Problem:
     problem = Problem.read(PROBLEMS / name / "problem.toml")
     (experiment,) = problem.experiments
     tracks = experiment.markers.positions_m
-    noise = np.random.default_rng(0).normal(
-        scale=NOISE_M[name] or 1.0, size=tracks.shape
-    )
+    noise = np.random.default_rng(0).normal(scale=NOISE_M[name] or 1.0, size=tracks.shape)
     tracks = tracks + noise * bool(NOISE_M[name])
-    noisy_recording = replace(
-        experiment, markers=replace(experiment.markers, positions_m=tracks)
-    )
+    noisy_recording = replace(experiment, markers=replace(experiment.markers, positions_m=tracks))
     return Problem(
-        [noisy_recording],
-        problem.parameters,
-        scheme=problem.scheme,
-        substeps=problem.substeps,
+        [noisy_recording], problem.parameters, scheme=problem.scheme, substeps=problem.substeps
     )
 
 
-def print_comparison(
-    name: str, problem: Problem, live: LiveEstimator, frames: list[Frame]
-) -> None:
-    """Stream a recording, solve it as a batch, and print latencies and differences of the estimates."""
+def print_comparison(name: str, problem: Problem, live: LiveEstimator, frames: list[Frame]) -> None:
+    """Stream a recording, solve it as a batch, and print latencies and differences of the
+    estimates.
+    """
     latencies_s = []
     relinearised_rows = []
     with without_garbage_of_startup():
@@ -154,8 +130,7 @@ def print_comparison(
         live_estimate = update.estimates[key]
         batch_estimate = batch[key]
         difference, settled_difference = (
-            abs(each.value - reference.value)
-            / (reference.statistical_std_error or np.nan)
+            abs(each.value - reference.value) / (reference.statistical_std_error or np.nan)
             for each, reference in (
                 (live_estimate, batch_estimate),
                 (settled.estimates[key], complete[key]),
@@ -170,9 +145,7 @@ def print_comparison(
             f"error {error_percent:+.1f} % at {EARLY_S:g} s"
         )
     print(f"    verdict: {update.trust.verdict} {update.trust.reasons}")
-    print(
-        f"    settled in {1e3 * settled.latency_s:.0f} ms: {settled.trust.verdict}"
-    )
+    print(f"    settled in {1e3 * settled.latency_s:.0f} ms: {settled.trust.verdict}")
 
 
 def row_time_s(problem: Problem) -> float:
@@ -194,9 +167,7 @@ def _frames_to_and_fro(frames: list[Frame]) -> Iterator[Frame]:
     there_and_back = [*frames, *frames[-2:0:-1]]
     interval_s = frames[1].t_s - frames[0].t_s
     for k in count():
-        yield replace(
-            there_and_back[k % len(there_and_back)], t_s=k * interval_s
-        )
+        yield replace(there_and_back[k % len(there_and_back)], t_s=k * interval_s)
 
 
 def stream_repeatedly(
@@ -206,14 +177,9 @@ def stream_repeatedly(
 
     `frame_count` is the number of frames.
     """
-    for k, frame in zip(
-        range(frame_count), _frames_to_and_fro(frames), strict=False
-    ):
+    for k, frame in zip(range(frame_count), _frames_to_and_fro(frames), strict=False):
         live.process_frame(frame)
-        if (
-            k in (999, frame_count - 1)
-            or (k + 1) % max(1, frame_count // 10) == 0
-        ):
+        if k in (999, frame_count - 1) or (k + 1) % max(1, frame_count // 10) == 0:
             used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             print(
                 f"{name}: {k + 1} frames, {len(live.log)} rows kept, peak memory {used_mb:.0f} MB"
@@ -252,9 +218,7 @@ def compare_long_recording(samples: int, options: LiveOptions) -> None:
             latencies_s[k] = update.latency_s
             if k in (999, len(frames) - 1):
                 print(f"block: {k + 1} frames, {peak_memory_mb():.0f} MB")
-    median_ms, upper_ms, worst_ms = 1e3 * np.percentile(
-        latencies_s, [50, 99, 100]
-    )
+    median_ms, upper_ms, worst_ms = 1e3 * np.percentile(latencies_s, [50, 99, 100])
     print(
         f"    median {median_ms:.2f} ms, 99 % below {upper_ms:.2f} ms, longest {worst_ms:.2f} ms; "
         f"{100 * np.mean(latencies_s < FRAME_S):.2f} % within {1e3 * FRAME_S:g} ms"

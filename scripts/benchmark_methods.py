@@ -1,14 +1,15 @@
 """Time of complete identifications: one simulation, reduced space, and interior point.
 
-A cylinder with the material of table1 hangs and is swung; its tracks are simulated with the midpoint
-scheme. Every run starts from the guess of table1, in a separate process. Writes a table, JSON and
-plots.
+A cylinder with the material of table1 hangs and is swung; its tracks are simulated with the
+midpoint scheme. Every run starts from the guess of table1, in a separate process. Writes a table,
+JSON and plots.
 
     python scripts/benchmark_methods.py                      # the paper's size, both methods
     python scripts/benchmark_methods.py --scaling            # T = 50 … 1600, 95 … 5000 nodes
     python scripts/benchmark_methods.py --mesh 4x32 --steps 1000 --methods reduced-space
     python scripts/benchmark_methods.py --cluster --mesh 3x12 --steps 50   # one and two workers
-    python scripts/benchmark_methods.py --unknown --mesh 2x4 --steps 50    # cost of nuisance parameters
+    python scripts/benchmark_methods.py --unknown --mesh 2x4 --steps 50    # cost of nuisance
+    parameters
 """
 
 from __future__ import annotations
@@ -52,12 +53,7 @@ from collocation_sysid.program.simulation import with_markers, with_wrenches
 from collocation_sysid.recording import Nuisance, Wrench, place_markers
 
 DEFAULT_METHODS = ["interior-point", "reduced-space"]
-TRUTH = {
-    "lambda_pa": 200.0,
-    "mu_pa": 300.0,
-    "gamma_r_s": 0.009,
-    "gamma_m_1_s": 1.0,
-}
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 PARAMETERS = Parameters(
     (
         Parameter("lambda_pa", 400.0, 10.0, 1e5),
@@ -101,9 +97,7 @@ class MethodRow:
         return 1e6 * self.total_s / self.nodes / self.steps
 
 
-def experiment_of(
-    mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0
-) -> Experiment:
+def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) -> Experiment:
     """Return the swung cylinder with tracks of the midpoint scheme and noise [m].
 
     `mesh` has the numbers of rings and layers, such as 2x8; `steps` is the number of samples.
@@ -111,9 +105,7 @@ def experiment_of(
     body = Body(cylinder(mesh), density_kg_m3=20.0, damping="rayleigh")
     experiment = swung_cylinder(body, steps)
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
-    tracks = tracks + noise_m * np.random.default_rng(seed).normal(
-        size=tracks.shape
-    )
+    tracks = tracks + noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
     return with_markers(experiment, tracks)
 
 
@@ -136,21 +128,19 @@ def swung_cylinder(body: Body, steps: int) -> Experiment:
     )
     angle = np.arange(8) * 2.4
     height = np.linspace(0.04, 0.16, 8)
-    places_m = np.column_stack(
-        [0.035 * np.cos(angle), 0.035 * np.sin(angle), height]
-    )
+    places_m = np.column_stack([0.035 * np.cos(angle), 0.035 * np.sin(angle), height])
     placement = place_markers(places_m, body.nodes_m, body, "vertex")
     markers = Markers(t_s, np.zeros((steps, 8, 3)), 0.001, placement=placement)
     clamped_nodes = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
     grasp = Grasp(clamped_nodes, poses)
     no_nuisance = Nuisance.none()
-    return Experiment(
-        body, t_s, [grasp], markers, name="swing", nuisance=no_nuisance
-    )
+    return Experiment(body, t_s, [grasp], markers, name="swing", nuisance=no_nuisance)
 
 
 def measure(mesh: str, steps: int, method: str) -> MethodRow:
-    """Identify once from the guess with compiled kernels; call this in a new process for its memory."""
+    """Identify once from the guess with compiled kernels; call this in a new process for its
+    memory.
+    """
     experiment = experiment_of(mesh, steps)
     began = time.perf_counter()
     simulate(experiment, TRUTH, "midpoint", substeps=1)
@@ -192,29 +182,20 @@ def measure_in_own_process(mesh: str, steps: int, method: str) -> MethodRow:
 
 
 # Cases with nuisance parameters; each is compared with the same recording without them.
-UNKNOWN_CASES = (
-    "clock, gravity, grasp",
-    "places as well",
-    "with a wrench",
-    "with memory",
-)
+UNKNOWN_CASES = ("clock, gravity, grasp", "places as well", "with a wrench", "with memory")
 MEMORY = {"prony_1.share": 0.3, "prony_1.tau_s": 0.05}
 # Standard deviations of force [N] and torque [N m].
 WRENCH_SIGMAS = 0.01, 0.001
 
 
-def problem_with_unknowns(
-    mesh: str, steps: int, case: str, is_ideal: bool
-) -> Problem:
+def problem_with_unknowns(mesh: str, steps: int, case: str, is_ideal: bool) -> Problem:
     """Return the noisy problem of a case of `UNKNOWN_CASES`.
 
     If `is_ideal`, no nuisance parameters are estimated, and the places of the markers are known.
     """
     draw_noise = np.random.default_rng(0).normal
     memory = MEMORY if case == "with memory" else {}
-    body = Body(
-        cylinder(mesh), density_kg_m3=20.0, prony=["prony_1"] if memory else []
-    )
+    body = Body(cylinder(mesh), density_kg_m3=20.0, prony=["prony_1"] if memory else [])
     experiment = swung_cylinder(body, steps)
     if case == "with a wrench":
         sensor = Wrench(experiment.t_s, np.zeros((steps, 6)), *WRENCH_SIGMAS)
@@ -224,27 +205,17 @@ def problem_with_unknowns(
     markers = experiment.markers
     sigmas = np.repeat(WRENCH_SIGMAS, 3)
     noisy_wrenches = [
-        wrench + sigmas * draw_noise(size=wrench.shape)
-        for wrench in simulation.wrenches
+        wrench + sigmas * draw_noise(size=wrench.shape) for wrench in simulation.wrenches
     ]
-    placement = (
-        None if case == "places as well" and not is_ideal else markers.placement
-    )
-    tracks = simulation.markers_m + 1e-3 * draw_noise(
-        size=simulation.markers_m.shape
-    )
-    noisy_markers = Markers(
-        markers.t_s, tracks, markers.sigma_m, placement=placement
-    )
+    placement = None if case == "places as well" and not is_ideal else markers.placement
+    tracks = simulation.markers_m + 1e-3 * draw_noise(size=simulation.markers_m.shape)
+    noisy_markers = Markers(markers.t_s, tracks, markers.sigma_m, placement=placement)
     nuisance = Nuisance.none() if is_ideal else Nuisance()
     experiment = replace(
-        with_wrenches(experiment, noisy_wrenches),
-        markers=noisy_markers,
-        nuisance=nuisance,
+        with_wrenches(experiment, noisy_wrenches), markers=noisy_markers, nuisance=nuisance
     )
     guesses = {
-        item.name: Unknown(item.guess, item.lower, item.upper)
-        for item in PARAMETERS.scalars
+        item.name: Unknown(item.guess, item.lower, item.upper) for item in PARAMETERS.scalars
     }
     return Problem([experiment], guesses | memory, scheme="midpoint")
 
@@ -252,7 +223,8 @@ def problem_with_unknowns(
 def measure_interior_point(
     mesh: str, steps: int, case: str, is_ideal: bool
 ) -> tuple[float, int, float]:
-    """Return processor time [s] and iterations of interior point, and its difference from reduced space.
+    """Return processor time [s] and iterations of interior point, and its difference from reduced
+    space.
 
     The difference is the largest one of the transformed parameters.
 
@@ -261,21 +233,13 @@ def measure_interior_point(
     SystemExit
         If interior point does not converge.
     """
-    reference = solve(
-        problem_with_unknowns(mesh, steps, case, is_ideal), ReducedSpace()
-    )
+    reference = solve(problem_with_unknowns(mesh, steps, case, is_ideal), ReducedSpace())
     began = time.process_time()
-    solution = InteriorPoint()(
-        reference.collocation
-    )  # with the same association of the markers
+    solution = InteriorPoint()(reference.collocation)  # with the same association of the markers
     spent_s = time.process_time() - began
     if not solution.status.converged:
         raise SystemExit(f"{case}: {solution.message}")
-    return (
-        spent_s,
-        solution.iterations,
-        float(np.abs(solution.q - reference.q).max()),
-    )
+    return (spent_s, solution.iterations, float(np.abs(solution.q - reference.q).max()))
 
 
 def show_unknown(mesh: str, steps: int) -> None:
@@ -283,8 +247,7 @@ def show_unknown(mesh: str, steps: int) -> None:
     for case in UNKNOWN_CASES:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             without, with_nuisance = (
-                pool.apply(measure_interior_point, (mesh, steps, case, e))
-                for e in (True, False)
+                pool.apply(measure_interior_point, (mesh, steps, case, e)) for e in (True, False)
             )
         print(
             f"{case:22} {mesh}, {steps} steps: {without[0]:7.2f} s, {without[1]} iterations without; "
@@ -294,9 +257,7 @@ def show_unknown(mesh: str, steps: int) -> None:
         )
 
 
-def print_parallel_speed(
-    mesh: str, steps: int, experiments: int = 4, repeats: int = 3
-) -> None:
+def print_parallel_speed(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) -> None:
     """Print the times of a solve with one and two workers, and with one and two threads, in turns.
 
     The processor times are those of the busiest worker and of this process, which other work on the
@@ -317,9 +278,7 @@ def print_parallel_speed(
 
     collocation = Collocation(recordings, PARAMETERS)
 
-    def solve(
-        workers: DaskExecutor | None, threads: int
-    ) -> tuple[float, float, float]:
+    def solve(workers: DaskExecutor | None, threads: int) -> tuple[float, float, float]:
         first_recording.body.threads = threads
         busy_s = workers.client.run(time.process_time) if workers else {}
         own_s = time.process_time()
@@ -330,21 +289,14 @@ def print_parallel_speed(
         busiest_s = 0.0
         if workers:
             after_s = workers.client.run(time.process_time)
-            busiest_s = max(
-                after_s[address] - spent_s
-                for address, spent_s in busy_s.items()
-            )
-        print(
-            f"  {solution.status.value} after {solution.iterations} sweeps: {wall_s:.2f} s"
-        )
+            busiest_s = max(after_s[address] - spent_s for address, spent_s in busy_s.items())
+        print(f"  {solution.status.value} after {solution.iterations} sweeps: {wall_s:.2f} s")
         return wall_s, busiest_s, own_s
 
     with ExitStack() as stack:
         clusters: list[DaskExecutor] = []
         for count in (1, 2):
-            cluster = LocalCluster(
-                n_workers=count, threads_per_worker=1, dashboard_address=":0"
-            )
+            cluster = LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0")
             client = stack.enter_context(Client(stack.enter_context(cluster)))
             clusters.append(DaskExecutor(client))
         cases = {
@@ -386,32 +338,21 @@ def print_row(row: MethodRow) -> None:
 def plot(rows: list[MethodRow], folder: Path) -> None:
     """Write a figure of the times over steps and over nodes to `benchmark_methods.png`."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
-    for panel, (key, fixed) in enumerate(
-        (("steps", "nodes"), ("nodes", "steps"))
-    ):
+    for panel, (key, fixed) in enumerate((("steps", "nodes"), ("nodes", "steps"))):
         axes = figure.add_subplot(1, 2, panel + 1)
         for method in sorted({row.method for row in rows}):
             method_rows = [row for row in rows if row.method == method]
             values = [getattr(row, fixed) for row in method_rows]
             common_value = max(set(values), key=values.count)
             chosen = sorted(
-                (
-                    row
-                    for row in method_rows
-                    if getattr(row, fixed) == common_value
-                ),
+                (row for row in method_rows if getattr(row, fixed) == common_value),
                 key=lambda row: getattr(row, key),
             )
             x = [getattr(row, key) for row in chosen]
             axes.loglog(
-                x,
-                [row.total_s for row in chosen],
-                "o-",
-                label=f"{method}, {common_value} {fixed}",
+                x, [row.total_s for row in chosen], "o-", label=f"{method}, {common_value} {fixed}"
             )
-            axes.loglog(
-                x, [row.simulation_s for row in chosen], ":", color="0.5"
-            )
+            axes.loglog(x, [row.simulation_s for row in chosen], ":", color="0.5")
         axes.set(xlabel=key, ylabel="s (dotted: one simulation)")
         axes.legend(frameon=False, fontsize=8)
     figure.savefig(folder / "benchmark_methods.png", dpi=150)
@@ -419,16 +360,11 @@ def plot(rows: list[MethodRow], folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--mesh", nargs="*", default=[PAPER_SIZE[0]], help="rings x layers"
-    )
+    parser.add_argument("--mesh", nargs="*", default=[PAPER_SIZE[0]], help="rings x layers")
     parser.add_argument("--steps", nargs="*", type=int, default=[PAPER_SIZE[1]])
-    parser.add_argument(
-        "--methods", nargs="*", default=DEFAULT_METHODS, choices=list(METHODS)
-    )
+    parser.add_argument("--methods", nargs="*", default=DEFAULT_METHODS, choices=list(METHODS))
     parser.add_argument(
         "--scaling",
         action="store_true",
@@ -437,9 +373,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results"))
     parser.add_argument("--json", action="store_true")
     parser.add_argument(
-        "--cluster",
-        action="store_true",
-        help="four experiments on one and two workers",
+        "--cluster", action="store_true", help="four experiments on one and two workers"
     )
     parser.add_argument(
         "--unknown",
@@ -453,19 +387,10 @@ def main() -> None:
     if arguments.cluster:
         print_parallel_speed(arguments.mesh[0], arguments.steps[0])
         return
-    cases = [
-        (m, t, k)
-        for m in arguments.mesh
-        for t in arguments.steps
-        for k in arguments.methods
-    ]
+    cases = [(m, t, k) for m in arguments.mesh for t in arguments.steps for k in arguments.methods]
     if arguments.scaling:
         cases = [(PAPER_SIZE[0], steps, "reduced-space") for steps in STEPS]
-        cases += [
-            (mesh, PAPER_SIZE[1], "reduced-space")
-            for mesh in MESHES
-            if mesh != "2x8"
-        ]
+        cases += [(mesh, PAPER_SIZE[1], "reduced-space") for mesh in MESHES if mesh != "2x8"]
     rows = []
     for case in cases:
         rows.append(measure_in_own_process(*case))

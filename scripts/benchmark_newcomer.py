@@ -25,17 +25,13 @@ def main() -> None:
     arguments = parser.parse_args()
     body = CASES[arguments.body]()
     described_body, undescribed_body = (
-        with_noise(
-            with_description(body, unplaced, ideal=False), body.noise_m, 0
-        )
+        with_noise(with_description(body, unplaced, ideal=False), body.noise_m, 0)
         for unplaced in (False, True)
     )
     truth = np.array(list(described_body.truth.values()))
     problems = {
         "with guess and places": problem_of(described_body, 2 * truth),
-        "with neither": problem_of(
-            undescribed_body, np.full(len(truth), np.nan)
-        ),
+        "with neither": problem_of(undescribed_body, np.full(len(truth), np.nan)),
     }
     times_s: dict[str, list[float]] = {name: [] for name in problems}
     run(problems["with guess and places"])
@@ -50,9 +46,7 @@ def main() -> None:
     for name, median_s in medians.items():
         print(f"{name}: {median_s:.2f} s (median of {arguments.repeats})")
     time_with_both_s, time_with_neither_s = medians.values()
-    print(
-        f"time with neither over time with both: {time_with_neither_s / time_with_both_s:.2f}"
-    )
+    print(f"time with neither over time with both: {time_with_neither_s / time_with_both_s:.2f}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Time of sweeps with materials in powers of the stretches over that with neo-Hookean material.
 
-A sweep is the cost of one iteration of reduced space: all time steps are evaluated, their blocks are
-factorised, and the feasibility step and the sensitivities are computed. Rounds of all materials
+A sweep is the cost of one iteration of reduced space: all time steps are evaluated, their blocks
+are factorised, and the feasibility step and the sensitivities are computed. Rounds of all materials
 alternate; the ratios of the best times are printed.
 
     python scripts/benchmark_ogden.py
@@ -30,12 +30,7 @@ REFERENCE = "neo-hookean"
 LAME = {"lambda_pa": 200.0, "mu_pa": 300.0}
 BULK = {"kappa_pa": 400.0}
 ONE_TERM = {"mu_1_pa": 200.0, "alpha_1": 3.0}
-TWO_TERMS = {
-    "mu_1_pa": 160.0,
-    "alpha_1": 2.5,
-    "mu_2_pa": -100.0,
-    "alpha_2": -2.0,
-}
+TWO_TERMS = {"mu_1_pa": 160.0, "alpha_1": 2.5, "mu_2_pa": -100.0, "alpha_2": -2.0}
 THREE_TERMS = {
     "mu_1_pa": 300.0,
     "alpha_1": 1.3,
@@ -59,9 +54,7 @@ DAMPING = {"gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 def main() -> None:
     """Parse the arguments and print the ratios."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--mesh", default=PAPER_SIZE[0], help="rings x layers of the cylinder"
-    )
+    parser.add_argument("--mesh", default=PAPER_SIZE[0], help="rings x layers of the cylinder")
     parser.add_argument("--steps", type=int, default=PAPER_SIZE[1])
     parser.add_argument("--damping", default="kelvin-voigt")
     parser.add_argument("--threads", type=int, default=1)
@@ -73,35 +66,25 @@ def main() -> None:
         print(json.dumps(ratios, indent=1))
         return
     for material, values in ratios.items():
-        text = ", ".join(
-            f"{name} {value:.2f}" for name, value in values.items()
-        )
+        text = ", ".join(f"{name} {value:.2f}" for name, value in values.items())
         print(f"{material:>13}: {text} times {REFERENCE}")
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Return the best times of each material over those of the reference, by part of a sweep."""
-    sweeps = {
-        material: make_sweep(material, arguments) for material in MATERIALS
-    }
+    sweeps = {material: make_sweep(material, arguments) for material in MATERIALS}
     part_names = ("sweep", "evaluation", "linear algebra")
-    best = {
-        material: np.full(len(part_names), np.inf) for material in MATERIALS
-    }
+    best = {material: np.full(len(part_names), np.inf) for material in MATERIALS}
     for _ in range(arguments.rounds):
         for material, sweep in sweeps.items():
             best[material] = np.minimum(best[material], sweep())
     return {
-        material: dict(
-            zip(part_names, (times / best[REFERENCE]).tolist(), strict=True)
-        )
+        material: dict(zip(part_names, (times / best[REFERENCE]).tolist(), strict=True))
         for material, times in best.items()
     }
 
 
-def make_sweep(
-    material: str, arguments: argparse.Namespace
-) -> Callable[[], tuple[float, ...]]:
+def make_sweep(material: str, arguments: argparse.Namespace) -> Callable[[], tuple[float, ...]]:
     """Return a function that sweeps over the swung cylinder, and returns times [s].
 
     All constants are estimated, so that their sensitivities are part of the sweep.
@@ -121,17 +104,14 @@ def make_sweep(
     experiment = replace(recording, body=body, grasps=(grasp,), markers=markers)
     values = {**MATERIALS[material], **DAMPING}
     unknowns = {
-        name: Unknown(
-            value, scale="linear" if value < 0 else None, typical=abs(value)
-        )
+        name: Unknown(value, scale="linear" if value < 0 else None, typical=abs(value))
         for name, value in values.items()
     }
     collocation = Collocation([experiment], Parameters.from_mapping(unknowns))
-    (segment,) = collocation.transcriptions
+    (transcription,) = collocation.transcriptions
     theta = body.theta_from_values(values)
     x = simulate_scheme(
-        experiment,
-        Dynamics.from_experiment(experiment, "midpoint").with_theta(theta),
+        experiment, Dynamics.from_experiment(experiment, "midpoint").with_theta(theta)
     )
     (part,) = collocation.iterates_at(collocation.guess_p, [x])
 
@@ -139,12 +119,8 @@ def make_sweep(
         """Return the times of a sweep, of its evaluations and of its linear algebra [s]."""
         watch = Stopwatch()
         began = time.perf_counter()
-        Sweep(segment, stopwatch=watch).forward(part.x, part.equations)
-        return (
-            time.perf_counter() - began,
-            watch.evaluations,
-            watch.linear_algebra,
-        )
+        Sweep(transcription, stopwatch=watch).forward(part.x, part.equations)
+        return (time.perf_counter() - began, watch.evaluations, watch.linear_algebra)
 
     sweep()
     return sweep

@@ -36,14 +36,7 @@ STATISTICS_LEVEL = 2
 # Line of a child process that begins its result.
 RESULT = "RESULT "
 # Number of the ordering that MUMPS states, by name.
-ORDERINGS = {
-    "0": "AMD",
-    "2": "AMF",
-    "3": "SCOTCH",
-    "4": "PORD",
-    "5": "METIS",
-    "6": "QAMD",
-}
+ORDERINGS = {"0": "AMD", "2": "AMF", "3": "SCOTCH", "4": "PORD", "5": "METIS", "6": "QAMD"}
 
 
 @dataclass(frozen=True)
@@ -75,24 +68,17 @@ SETTINGS = {
     "qamd": Setting({"mumps_pivot_order": 6}),
     "automatic": Setting({"mumps_pivot_order": 7}),
     "no permutation": Setting({"mumps_permuting_scaling": 0}),
-    "permutation of the diagonal's product": Setting(
-        {"mumps_permuting_scaling": 5}
-    ),
+    "permutation of the diagonal's product": Setting({"mumps_permuting_scaling": 5}),
     "scaling by the diagonal": Setting({"mumps_scaling": 1}),
     "scaling by rows and columns, iterated": Setting({"mumps_scaling": 7}),
     "automatic scaling": Setting({"mumps_scaling": 77}),
     "IPOPT's defaults of MUMPS": Setting(
-        {
-            "mumps_pivot_order": 7,
-            "mumps_scaling": 77,
-            "mumps_pivtol": 1e-6,
-        }
+        {"mumps_pivot_order": 7, "mumps_scaling": 77, "mumps_pivtol": 1e-6}
     ),
     "two threads": Setting(threads=2),
     "spral": Setting(linear_solver="spral"),
     "spral, metis": Setting(
-        {"spral_ordering": "metis", "spral_scaling": "none"},
-        linear_solver="spral",
+        {"spral_ordering": "metis", "spral_scaling": "none"}, linear_solver="spral"
     ),
 }
 
@@ -143,9 +129,7 @@ class Factorisations:
         ordering = last(r"Ordering option effectively used\s*=\s*(\d+)")
         nonzeros = last(r"N, NNZ =\s*2\s+\d+\s+(\d+)")
         entries = last(r"INFOG \(29\) Number of entries in factors\s*=\s*(\d+)")
-        operations = last(
-            r"\(3\) Operations in node elimination\s*=\s*([\d.D+]+)"
-        )
+        operations = last(r"\(3\) Operations in node elimination\s*=\s*([\d.D+]+)")
         delayed = last(r"Number of delayed pivots\s*=\s*(\d+)")
         if None in (ordering, nonzeros, entries, operations, delayed):
             return None
@@ -187,9 +171,7 @@ class SolveTimes:
     loss: float
 
 
-def run_in_this_process(
-    problem: str, setting: Setting, iterations: int
-) -> SolveTimes:
+def run_in_this_process(problem: str, setting: Setting, iterations: int) -> SolveTimes:
     """Run IPOPT with a setting in this process; MUMPS prints its statistics.
 
     The markers are associated by reduced space, whose time does not count.
@@ -258,20 +240,11 @@ def run_in_own_process(
     command = [sys.executable, __file__, problem, "--here", name]
     command += ["--iterations", str(iterations)]
     finished = subprocess.run(
-        command,
-        env=environment,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        check=False,
+        command, env=environment, capture_output=True, text=True, errors="replace", check=False
     )
     lines = finished.stdout.splitlines()
     results = [line for line in lines if line.startswith(RESULT)]
-    times = (
-        SolveTimes(**json.loads(results[-1].removeprefix(RESULT)))
-        if results
-        else None
-    )
+    times = SolveTimes(**json.loads(results[-1].removeprefix(RESULT))) if results else None
     return times, Factorisations.from_output(finished.stdout)
 
 
@@ -320,13 +293,10 @@ def measure(problem: str, names: list[str], iterations: int) -> None:
 def main() -> None:
     """Measure the problems and settings that the command line names."""
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("problems", nargs="*", default=["foam_cylinder"])
-    parser.add_argument(
-        "--settings", nargs="*", default=list(SETTINGS), choices=list(SETTINGS)
-    )
+    parser.add_argument("--settings", nargs="*", default=list(SETTINGS), choices=list(SETTINGS))
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument(
         "--here",
@@ -336,9 +306,7 @@ def main() -> None:
     options = parser.parse_args()
     for problem in options.problems:
         if options.here:
-            times = run_in_this_process(
-                problem, SETTINGS[options.here], options.iterations
-            )
+            times = run_in_this_process(problem, SETTINGS[options.here], options.iterations)
             print(f"\n{RESULT}{json.dumps(asdict(times))}", flush=True)
         else:
             measure(problem, options.settings, options.iterations)

@@ -82,9 +82,7 @@ class LimitReachedError(Exception):
 def computing_time_s() -> float:
     """Return the computing time of this process and of its finished children [s]."""
     times = os.times()
-    return (
-        times.user + times.system + times.children_user + times.children_system
-    )
+    return times.user + times.system + times.children_user + times.children_system
 
 
 @dataclass
@@ -179,10 +177,7 @@ def solve_with(
     """Solve by a method of this project."""
     unknown = {name: cs.Unknown(GUESS[name], *BOUNDS[name]) for name in GUESS}
     problem = cs.Problem(
-        [experiment],
-        {**unknown, "gamma_m_1_s": 0.0},
-        substeps=steps_per_sample,
-        method=method,
+        [experiment], {**unknown, "gamma_m_1_s": 0.0}, substeps=steps_per_sample, method=method
     )
 
     def watch(entry: cs.Iteration) -> None:
@@ -196,9 +191,7 @@ def solve_with(
 
 
 def search(
-    simulate: Callable[[dict[str, float]], Array],
-    experiment: cs.Experiment,
-    progress: Progress,
+    simulate: Callable[[dict[str, float]], Array], experiment: cs.Experiment, progress: Progress
 ) -> None:
     """Minimise the residuals of a simulation by SciPy, with forward differences."""
     low, high = np.log(np.array(list(BOUNDS.values()))).T
@@ -213,9 +206,7 @@ def search(
 
 
 def counted_residuals(
-    simulate: Callable[[dict[str, float]], Array],
-    experiment: cs.Experiment,
-    progress: Progress,
+    simulate: Callable[[dict[str, float]], Array], experiment: cs.Experiment, progress: Progress
 ) -> Function:
     """Return the residuals as a function that records each simulation.
 
@@ -230,9 +221,7 @@ def counted_residuals(
             rows = np.full(measured_m.size, FAILED_RESIDUAL)
         else:
             distances_m = positions_m[:, list(MARKED_NODES)] - measured_m
-            rows = (distances_m.ravel() / NOISE_M).clip(
-                -FAILED_RESIDUAL, FAILED_RESIDUAL
-            )
+            rows = (distances_m.ravel() / NOISE_M).clip(-FAILED_RESIDUAL, FAILED_RESIDUAL)
         progress.record(parameter_values(x), float(rows @ rows))
         return rows
 
@@ -244,25 +233,18 @@ def parameter_values(x: Array) -> dict[str, float]:
     return dict(zip(GUESS, np.exp(x).tolist(), strict=True))
 
 
-def search_with_own_simulation(
-    experiment: cs.Experiment, progress: Progress
-) -> None:
+def search_with_own_simulation(experiment: cs.Experiment, progress: Progress) -> None:
     """Search by SciPy with the simulation of this project."""
 
     def simulate(values: dict[str, float]) -> Array:
         return cs.simulate(
-            experiment,
-            {**values, "gamma_m_1_s": 0.0},
-            "midpoint",
-            substeps=STEPS_PER_SAMPLE,
+            experiment, {**values, "gamma_m_1_s": 0.0}, "midpoint", substeps=STEPS_PER_SAMPLE
         ).positions_m
 
     search(simulate, experiment, progress)
 
 
-def search_with_scikit_fem(
-    experiment: cs.Experiment, progress: Progress
-) -> None:
+def search_with_scikit_fem(experiment: cs.Experiment, progress: Progress) -> None:
     """Search by SciPy with a simulation of scikit-fem."""
     from peer_scikit_fem import ScikitFemCylinder
 
@@ -382,21 +364,14 @@ class Candidate:
         if self.package is not None:
             return f"{self.package} {version(self.package)}"
         if self.program is not None:
-            done = subprocess.run(
-                [self.program, "-v"],
-                capture_output=True,
-                text=True,
-                check=False,
-            )
+            done = subprocess.run([self.program, "-v"], capture_output=True, text=True, check=False)
             return f"{self.program}: {done.stdout.strip()}"
         return None
 
 
 CANDIDATES = {
     "reduced-space": Candidate(
-        "this project, reduced space",
-        partial(solve_with, "reduced-space"),
-        is_compiled=True,
+        "this project, reduced space", partial(solve_with, "reduced-space"), is_compiled=True
     ),
     "interior-point": Candidate(
         "this project, interior point (IPOPT)",
@@ -410,32 +385,17 @@ CANDIDATES = {
     ),
     "mujoco-sysid": Candidate(
         "`mujoco.sysid`, SciPy's trust region, explicit steps of 0.05 ms",
-        partial(
-            solve_with_mujoco,
-            step_s=MUJOCO_STEP_S,
-            integrator="Euler",
-            backend="scipy",
-        ),
+        partial(solve_with_mujoco, step_s=MUJOCO_STEP_S, integrator="Euler", backend="scipy"),
         package="mujoco",
     ),
     "mujoco-sysid-implicit": Candidate(
         "`mujoco.sysid`, SciPy's trust region, implicit steps of 0.5 ms",
-        partial(
-            solve_with_mujoco,
-            step_s=DISCRETE_STEP_S,
-            integrator="discrete",
-            backend="scipy",
-        ),
+        partial(solve_with_mujoco, step_s=DISCRETE_STEP_S, integrator="discrete", backend="scipy"),
         package="mujoco",
     ),
     "mujoco-sysid-default": Candidate(
         "`mujoco.sysid`, its default optimiser, explicit steps of 0.05 ms",
-        partial(
-            solve_with_mujoco,
-            step_s=MUJOCO_STEP_S,
-            integrator="Euler",
-            backend="mujoco",
-        ),
+        partial(solve_with_mujoco, step_s=MUJOCO_STEP_S, integrator="Euler", backend="mujoco"),
         package="mujoco",
     ),
     "warp": Candidate(
@@ -446,9 +406,7 @@ CANDIDATES = {
         is_compiled=True,
     ),
     "calculix": Candidate(
-        "SciPy `least_squares` with CalculiX",
-        search_with_calculix,
-        program="ccx",
+        "SciPy `least_squares` with CalculiX", search_with_calculix, program="ccx"
     ),
     "scikit-fem": Candidate(
         "SciPy `least_squares` with scikit-fem",
@@ -472,9 +430,7 @@ def reached_entry(track: Track, best: Mapping[str, float]) -> int | None:
     if not track.values:
         return None
     values = np.array([[each[name] for name in best] for each in track.values])
-    largest_error = np.abs(values / np.array(list(best.values())) - 1).max(
-        axis=1
-    )
+    largest_error = np.abs(values / np.array(list(best.values())) - 1).max(axis=1)
     outside_entries = np.flatnonzero(largest_error > REACHED_SHARE)
     first_inside = int(outside_entries[-1]) + 1 if len(outside_entries) else 0
     return first_inside if first_inside < len(values) else None
@@ -490,10 +446,7 @@ def measure(name: str) -> Track:
     try:
         if name == BEST:
             solve_with(
-                "reduced-space",
-                experiment,
-                progress,
-                steps_per_sample=BEST_STEPS_PER_SAMPLE,
+                "reduced-space", experiment, progress, steps_per_sample=BEST_STEPS_PER_SAMPLE
             )
         else:
             CANDIDATES[name].run(experiment, progress)
@@ -514,11 +467,7 @@ def measure_in_own_process(name: str) -> Track:
 
     Raises subprocess.CalledProcessError when it fails; its messages are on standard error.
     """
-    limits = {
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-        "COLLOCATION_SYSID_THREADS": "1",
-    }
+    limits = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, __file__, "--candidate", name],
         stdout=subprocess.PIPE,
@@ -530,10 +479,7 @@ def measure_in_own_process(name: str) -> Track:
 
 
 def row(
-    name: str,
-    track: Track,
-    best: Mapping[str, float],
-    reduced_space_s: float | None,
+    name: str, track: Track, best: Mapping[str, float], reduced_space_s: float | None
 ) -> tuple[str, ...]:
     """Return a row of the table.
 
@@ -550,9 +496,7 @@ def row(
     """
     entry = reached_entry(track, best)
     reached_s = None if entry is None else track.times_s[entry]
-    ratio = (
-        reached_s / reduced_space_s if reached_s and reduced_space_s else None
-    )
+    ratio = reached_s / reduced_space_s if reached_s and reduced_space_s else None
     last = track.values[-1] if track.values else {}
     return (
         CANDIDATES[name].title,
@@ -561,17 +505,12 @@ def row(
         "–" if entry is None else str(track.counts[entry]),
         f"{track.total_s:.3g}" + ("" if track.has_ended else " (limit)"),
         str(track.simulations),
-        *(
-            f"{100 * (last[each] / best[each] - 1):+.2f} %" if last else "–"
-            for each in best
-        ),
+        *(f"{100 * (last[each] / best[each] - 1):+.2f} %" if last else "–" for each in best),
     )
 
 
 def table(
-    tracks: Mapping[str, Track],
-    failures: Mapping[str, str],
-    best: Mapping[str, float],
+    tracks: Mapping[str, Track], failures: Mapping[str, str], best: Mapping[str, float]
 ) -> str:
     """Return the results as a Markdown table.
 
@@ -594,42 +533,24 @@ def table(
         *best,
     )
     reduced_space_track = tracks.get("reduced-space")
-    entry = (
-        None
-        if reduced_space_track is None
-        else reached_entry(reduced_space_track, best)
-    )
+    entry = None if reduced_space_track is None else reached_entry(reduced_space_track, best)
     reduced_space_s = (
-        None
-        if reduced_space_track is None or entry is None
-        else reduced_space_track.times_s[entry]
+        None if reduced_space_track is None or entry is None else reduced_space_track.times_s[entry]
     )
-    rows = [
-        row(name, track, best, reduced_space_s)
-        for name, track in tracks.items()
-    ]
+    rows = [row(name, track, best, reduced_space_s) for name, track in tracks.items()]
     empty = [""] * (len(heads) - 2)
-    rows += [
-        (CANDIDATES[name].title, reason, *empty)
-        for name, reason in failures.items()
-    ]
+    rows += [(CANDIDATES[name].title, reason, *empty) for name, reason in failures.items()]
     return markdown(heads, rows)
 
 
 def report(
-    tracks: Mapping[str, Track],
-    failures: Mapping[str, str],
-    best: Mapping[str, float],
+    tracks: Mapping[str, Track], failures: Mapping[str, str], best: Mapping[str, float]
 ) -> str:
     """Return the table with the best answer and the versions of the tools."""
-    errors = ", ".join(
-        f"{name} {100 * (best[name] / TRUTH[name] - 1):+.2f} %" for name in best
-    )
+    errors = ", ".join(f"{name} {100 * (best[name] / TRUTH[name] - 1):+.2f} %" for name in best)
     tool_versions = [CANDIDATES[name].version() for name in tracks]
     versions = dict.fromkeys(each for each in tool_versions if each is not None)
-    common_versions = (
-        f"{each} {version(each)}" for each in ("scipy", "casadi")
-    )
+    common_versions = (f"{each} {version(each)}" for each in ("scipy", "casadi"))
     return (
         f"{table(tracks, failures, best)}\n\n"
         f"Errors of the best answer: {errors}.\n"
@@ -673,18 +594,11 @@ def compare(names: list[str], out: Path | None) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit code, 2 if MuJoCo is missing."""
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--only", nargs="+", choices=list(CANDIDATES), default=list(CANDIDATES)
-    )
-    parser.add_argument(
-        "--out", type=Path, help="file for the table; without it, only print"
-    )
-    parser.add_argument(
-        "--candidate", choices=[*CANDIDATES, BEST], help=argparse.SUPPRESS
-    )
+    parser.add_argument("--only", nargs="+", choices=list(CANDIDATES), default=list(CANDIDATES))
+    parser.add_argument("--out", type=Path, help="file for the table; without it, only print")
+    parser.add_argument("--candidate", choices=[*CANDIDATES, BEST], help=argparse.SUPPRESS)
     options: Any = parser.parse_args(arguments)
     if find_spec("mujoco") is None:
         print(

@@ -68,9 +68,7 @@ def measure(name: str, cases: tuple[str, ...], max_time_s: float) -> None:
     for case in cases:
         start = WarmStart.of(reference) if case == "warm" else None
         began_s = time.process_time()
-        solution = solve(
-            problem, InteriorPoint(max_time_s=max_time_s), start=start
-        )
+        solution = solve(problem, InteriorPoint(max_time_s=max_time_s), start=start)
         solution_s = time.process_time() - began_s
         largest_difference = np.abs(solution.q - reference.q).max(initial=0.0)
         print(
@@ -87,8 +85,7 @@ def measure(name: str, cases: tuple[str, ...], max_time_s: float) -> None:
 def main() -> None:
     """Measure the problems that the command line names."""
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("problems", nargs="*", default=list(DEFAULT_PROBLEMS))
     parser.add_argument("--cases", nargs="*", default=CASES, choices=CASES)

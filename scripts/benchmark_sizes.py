@@ -1,10 +1,10 @@
 """Time and memory of a simulation and a sweep of bodies with 500 to 20,000 nodes.
 
 The body is the swung cylinder of `benchmark_methods.py`, with the default damping law or with
-Rayleigh's. Each line is measured in a separate process, so that the peak memory is that of the line.
-On one thread, times are processor times, which other work on the machine changes little; on more
-threads they are wall times. A sweep consists of a feasibility step and the sensitivities to four
-parameters; a few time steps are enough to measure the cost of one.
+Rayleigh's. Each line is measured in a separate process, so that the peak memory is that of the
+line. On one thread, times are processor times, which other work on the machine changes little; on
+more threads they are wall times. A sweep consists of a feasibility step and the sensitivities to
+four parameters; a few time steps are enough to measure the cost of one.
 
     python scripts/benchmark_sizes.py                              # all sizes, one and two threads
     python scripts/benchmark_sizes.py --size 5000 --steps 200      # peak memory of 200 steps
@@ -25,14 +25,13 @@ from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung_cylinder
 
 from collocation_sysid import Body, Collocation
 from collocation_sysid.program.forward.newton_solver import NewtonOptions
-from collocation_sysid.program.forward.scheme_simulation import (
-    continue_simulation,
-)
+from collocation_sysid.program.forward.scheme_simulation import continue_simulation
 from collocation_sysid.program.linear_algebra.factorisation import Choice
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
 
-# Rings x layers of the cylinder, element, and a sufficient number of time steps, by number of nodes.
+# Rings x layers of the cylinder, element, and a sufficient number of time steps, by number of
+# nodes.
 SIZES = {
     "500": ("3x12", "tet4", 40),
     "2000": ("4x32", "tet4", 20),
@@ -52,10 +51,7 @@ class PartCost:
     def as_text(self, steps: int) -> str:
         """Return the time per step and the shares of evaluation and linear algebra, as text."""
         stopwatch = self.stopwatch
-        shares = (
-            stopwatch.evaluations / self.total_s,
-            stopwatch.linear_algebra / self.total_s,
-        )
+        shares = (stopwatch.evaluations / self.total_s, stopwatch.linear_algebra / self.total_s)
         return (
             f"{1e3 * self.total_s / steps:8.1f} ms per step (elements {shares[0]:4.0%}, "
             f"linear algebra {shares[1]:4.0%})"
@@ -67,9 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", nargs="+", choices=[*SIZES], default=[*SIZES])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument(
-        "--factorisation", nargs="+", choices=get_args(Choice), default=["auto"]
-    )
+    parser.add_argument("--factorisation", nargs="+", choices=get_args(Choice), default=["auto"])
     parser.add_argument("--damping", default="kelvin-voigt")
     parser.add_argument("--steps", type=int)
     arguments = parser.parse_args()
@@ -81,9 +75,7 @@ def main() -> None:
                     print(pool.apply(measure_size, case), flush=True)
 
 
-def measure_size(
-    size: str, steps: int | None, threads: int, choice: Choice, damping: str
-) -> str:
+def measure_size(size: str, steps: int | None, threads: int, choice: Choice, damping: str) -> str:
     """Measure simulation and sweep of one body, and return a line of the table.
 
     `size` is a key of `SIZES`; if `steps` is None, the number of steps there is used.
@@ -91,15 +83,11 @@ def measure_size(
     mesh, element, default_steps = SIZES[size]
     steps = steps or default_steps
     body = Body(
-        cylinder(mesh),
-        density_kg_m3=20.0,
-        damping=damping,
-        element=element,
-        threads=threads,
+        cylinder(mesh), density_kg_m3=20.0, damping=damping, element=element, threads=threads
     )
     collocation = Collocation([swung_cylinder(body, steps + 1)], PARAMETERS)
-    (segment,) = collocation.transcriptions
-    equations = segment.equations_at(
+    (transcription,) = collocation.transcriptions
+    equations = transcription.equations_at(
         np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0)
     )
     before_mb = peak_mb()
@@ -107,7 +95,7 @@ def measure_size(
     began = clock()
     stopwatch = Stopwatch(clock)
     x, failure = continue_simulation(
-        segment.experiment,
+        transcription.experiment,
         equations.dynamics,
         options=NewtonOptions(tolerance=1e-6),
         stopwatch=stopwatch,
@@ -116,7 +104,7 @@ def measure_size(
         raise failure
     simulation_cost = PartCost(clock() - began, stopwatch)
     stopwatch = Stopwatch(clock)
-    solver = Sweep(segment, stopwatch=stopwatch, factorisation=choice)
+    solver = Sweep(transcription, stopwatch=stopwatch, factorisation=choice)
     # The symbolic factorisation is computed once for all sweeps; accessing this computes it.
     chunk_bytes = solver.estimate_chunk_bytes()
     began = clock()
@@ -137,11 +125,7 @@ def factorisation_name(solver: Sweep) -> str:
     if factoriser.skyline:
         return "skyline"
     return (
-        "band"
-        if factoriser.is_banded
-        else "supernodal"
-        if factoriser.is_supernodal
-        else "sparse"
+        "band" if factoriser.is_banded else "supernodal" if factoriser.is_supernodal else "sparse"
     )
 
 

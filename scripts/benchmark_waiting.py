@@ -21,9 +21,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-PROBLEM = (
-    Path(__file__).parents[1] / "problems" / "foam_cylinder" / "recording.toml"
-)
+PROBLEM = Path(__file__).parents[1] / "problems" / "foam_cylinder" / "recording.toml"
 # Program that runs the command line.
 PROGRAM = "from collocation_sysid.cli import main; main()"
 
@@ -45,9 +43,7 @@ def main() -> None:
     options = parser.parse_args()
     problem = str(options.problem)
     with tempfile.TemporaryDirectory() as folder:
-        run, warm, cold = (
-            str(Path(folder) / name) for name in ("run", "warm", "cold")
-        )
+        run, warm, cold = (str(Path(folder) / name) for name in ("run", "warm", "cold"))
         solve = ["solve", problem, "--out", run]
         commands = {
             "--help": (["--help"], warm),
@@ -66,14 +62,8 @@ def main() -> None:
                 shutil.rmtree(cold, ignore_errors=True)
                 times.append(time_command(arguments, cache))
             columns = ("first_s", "wall_s", "processor_s")
-            medians = [
-                statistics.median(getattr(t, c) for t in times) for c in columns
-            ]
-            print(
-                f"| {name} | "
-                + " | ".join(f"{value:.2f}" for value in medians)
-                + " |"
-            )
+            medians = [statistics.median(getattr(t, c) for t in times) for c in columns]
+            print(f"| {name} | " + " | ".join(f"{value:.2f}" for value in medians) + " |")
 
 
 def time_command(arguments: list[str], cache: str) -> WaitingTimes:
@@ -102,16 +92,16 @@ def time_command(arguments: list[str], cache: str) -> WaitingTimes:
     after = os.times()
     os.close(own_terminal)
     if process.returncode not in (0, 1):
-        raise SystemExit(
-            f"{' '.join(arguments)} ended with {process.returncode}"
-        )
+        raise SystemExit(f"{' '.join(arguments)} ended with {process.returncode}")
     processor_s = after.children_user + after.children_system
     processor_s -= before.children_user + before.children_system
     return WaitingTimes(first_s, time.perf_counter() - began, processor_s)
 
 
 def _time_of_first_text(terminal: int, began: float) -> float:
-    """Read the output to its end, and return the time of the first letter since `began` [s]; NaN if none."""
+    """Read the output to its end, and return the time of the first letter since `began` [s]; NaN if
+    none.
+    """
     first_s = float("nan")
     while select.select([terminal], [], [], 600.0)[0]:
         try:

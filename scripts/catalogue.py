@@ -162,29 +162,14 @@ class Catalogue:
 def catalogue_page(catalogue: Catalogue) -> str:
     """Return the page of the catalogue as Markdown."""
     parts = [INTRODUCTION.format(version=catalogue.version)]
-    for is_measured, heading in (
-        (True, "Measured materials"),
-        (False, "Twins"),
-    ):
-        entries = [
-            each
-            for each in catalogue.entries
-            if each.is_measured is is_measured
-        ]
+    for is_measured, heading in ((True, "Measured materials"), (False, "Twins")):
+        entries = [each for each in catalogue.entries if each.is_measured is is_measured]
         if entries:
-            parts += [
-                f"## {heading}\n",
-                _overview(entries) + "\n",
-                *map(_section, entries),
-            ]
+            parts += [f"## {heading}\n", _overview(entries) + "\n", *map(_section, entries)]
     if catalogue.omitted:
         parts.append("## Problems without an entry\n")
         parts.append(
-            "\n".join(
-                f"- `{each.problem}`: {each.reason}"
-                for each in catalogue.omitted
-            )
-            + "\n"
+            "\n".join(f"- `{each.problem}`: {each.reason}" for each in catalogue.omitted) + "\n"
         )
     return "\n".join(parts)
 
@@ -193,35 +178,20 @@ def _overview(entries: Sequence[CatalogueEntry]) -> str:
     """Return a table with one row per entry."""
     rows = []
     for entry in entries:
-        moduli = [
-            each for each in entry.constants if each.name.endswith("young_pa")
-        ]
-        shown = (
-            moduli
-            or [each for each in entry.constants if not each.is_stated][:1]
-        )
+        moduli = [each for each in entry.constants if each.name.endswith("young_pa")]
+        shown = moduli or [each for each in entry.constants if not each.is_stated][:1]
         rows.append(
             {
                 "specimen": f"[{entry.specimen}](#{entry.name})",
                 "law": ", ".join(entry.law),
-                "stiffness": "; ".join(
-                    f"{symbol_of(e.name)} {_with_interval(e)}" for e in shown
-                ),
+                "stiffness": "; ".join(f"{symbol_of(e.name)} {_with_interval(e)}" for e in shown),
                 "stretch": f"{entry.stretch.low:.3g} to {entry.stretch.high:.3g}",
                 "rate 1/s": _rate(entry.strain_rate_1_s),
                 "verdict": entry.verdict,
                 "licence": entry.licence,
             }
         )
-    heads = (
-        "specimen",
-        "law",
-        "stiffness",
-        "stretch",
-        "rate 1/s",
-        "verdict",
-        "licence",
-    )
+    heads = ("specimen", "law", "stiffness", "stretch", "rate 1/s", "verdict", "licence")
     return _table(heads, rows)
 
 
@@ -229,14 +199,7 @@ def _section(entry: CatalogueEntry) -> str:
     """Return the section of an entry: its constants, ranges, verdict and source."""
     has_truth = any(each.true_value is not None for each in entry.constants)
     rows = [_constant_row(each) for each in entry.constants]
-    heads = (
-        "constant",
-        "unit",
-        "value",
-        "combined 95 % interval",
-        "true value",
-        "note",
-    )
+    heads = ("constant", "unit", "value", "combined 95 % interval", "true value", "note")
     shown = [head for head in heads if head != "true value" or has_truth]
     stretch = entry.stretch
     lines = [
@@ -289,9 +252,7 @@ def _readable_unit(constant: CatalogueConstant) -> tuple[float, str]:
     """Return the factor to a readable unit, and the name of that unit."""
     units = READABLE_UNITS.get(constant.unit, ((0.0, 1.0, constant.unit),))
     size = abs(constant.value) if isfinite(constant.value) else 0.0
-    return next(
-        (factor, name) for smallest, factor, name in units if size >= smallest
-    )
+    return next((factor, name) for smallest, factor, name in units if size >= smallest)
 
 
 def _rate(rate: QuantileRange | None) -> str:
@@ -311,14 +272,12 @@ def _rate_sentence(rate: QuantileRange | None) -> str:
     """Return the line about the strain rate."""
     if rate is None:
         return "- Strain rate: none, because the samples are equilibria without times."
-    return f"- Strain rate: 95 % quantile {rate.high:.3g} 1/s, largest value {rate.maximum:.3g} 1/s."
+    return (
+        f"- Strain rate: 95 % quantile {rate.high:.3g} 1/s, largest value {rate.maximum:.3g} 1/s."
+    )
 
 
 def _table(heads: Sequence[str], rows: Sequence[Mapping[str, str]]) -> str:
     """Return rows, cells by heading, as a Markdown table."""
-    lines = [
-        heads,
-        ["---"] * len(heads),
-        *([row[head] for head in heads] for row in rows),
-    ]
+    lines = [heads, ["---"] * len(heads), *([row[head] for head in heads] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

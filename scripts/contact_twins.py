@@ -41,13 +41,13 @@ POKED_DEPTHS_M = 4e-4 * np.arange(6)
 POKED_NOISE_N = 2.5e-4
 # Standard deviation of the prior of the position of the surface [m].
 ONSET_M = 1e-4
-# The dragged block, its gap above the plate, and the shifts (T, 3) of the gripper: down, then along x.
+# The dragged block, its gap above the plate, and the shifts (T, 3) of the gripper: down, then along
+# x.
 BLOCK_M = (0.04, 0.04, 0.02)
 BLOCK_DIVISIONS = (2, 2, 1)
 GAP_M = 5e-4
 GRIPPER_SHIFTS_M = np.array(
-    [[0.0, 0.0, -4e-4 * k] for k in range(6)]
-    + [[5e-4 * k, 0.0, -2e-3] for k in range(1, 6)]
+    [[0.0, 0.0, -4e-4 * k] for k in range(6)] + [[5e-4 * k, 0.0, -2e-3] for k in range(1, 6)]
 )
 # Friction coefficient of the plate.
 FRICTION = 0.5
@@ -77,16 +77,9 @@ def _with_noise(experiment: Experiment, sigma_n: float, seed: int) -> Problem:
     """Return the problem of a simulated experiment with noise on the force of its obstacle."""
     (obstacle,) = experiment.obstacles
     assert obstacle.wrench is not None
-    noise = sigma_n * np.random.default_rng(seed).normal(
-        size=obstacle.wrench.values.shape
-    )
-    measured = _with_force(
-        obstacle, obstacle.wrench.values + noise, sigma_n=sigma_n
-    )
-    return Problem(
-        [experiment.with_obstacles([measured])],
-        Parameters.from_mapping(UNKNOWN),
-    )
+    noise = sigma_n * np.random.default_rng(seed).normal(size=obstacle.wrench.values.shape)
+    measured = _with_force(obstacle, obstacle.wrench.values + noise, sigma_n=sigma_n)
+    return Problem([experiment.with_obstacles([measured])], Parameters.from_mapping(UNKNOWN))
 
 
 def _with_force(obstacle: Obstacle, values: Array, sigma_n: float) -> Obstacle:
@@ -111,9 +104,7 @@ def _poked() -> Experiment:
     x, y, z = body.nodes_m.T
     glued_nodes = np.flatnonzero(z < z.min() + ROUND_OFF_M)
     side_nodes = np.flatnonzero((x < ROUND_OFF_M) & (z > z.min() + ROUND_OFF_M))
-    front_nodes = np.flatnonzero(
-        (y < ROUND_OFF_M) & (z > z.min() + ROUND_OFF_M)
-    )
+    front_nodes = np.flatnonzero((y < ROUND_OFF_M) & (z > z.min() + ROUND_OFF_M))
     fixed = PoseSequence.fixed()
     contact_edge_m = 0.0035
     tip = Obstacle(
@@ -130,22 +121,14 @@ def _poked() -> Experiment:
     experiment = _simulated(body, grasps, tip, sigma_n=POKED_NOISE_N)
     (tip,) = experiment.obstacles
     assert tip.wrench is not None
-    axial_forces_n = np.where(
-        np.arange(3) == 2, tip.wrench.values[:, :3], np.nan
-    )
-    return experiment.with_obstacles(
-        [_with_force(tip, axial_forces_n, sigma_n=POKED_NOISE_N)]
-    )
+    axial_forces_n = np.where(np.arange(3) == 2, tip.wrench.values[:, :3], np.nan)
+    return experiment.with_obstacles([_with_force(tip, axial_forces_n, sigma_n=POKED_NOISE_N)])
 
 
 @cache
 def _sheared() -> Experiment:
     """Return the dragged block with its exact forces; cached."""
-    body = Body(
-        box_mesh(BLOCK_M, BLOCK_DIVISIONS),
-        density_kg_m3=DENSITY_KG_M3,
-        element="tet10",
-    )
+    body = Body(box_mesh(BLOCK_M, BLOCK_DIVISIONS), density_kg_m3=DENSITY_KG_M3, element="tet10")
     top = np.flatnonzero(body.nodes_m[:, 2] > BLOCK_M[2] - ROUND_OFF_M)
     plate = Obstacle(
         shape=Plane(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -GAP_M])),
@@ -157,9 +140,7 @@ def _sheared() -> Experiment:
     return _simulated(body, [gripper], plate, sigma_n=DRAGGED_NOISE_N)
 
 
-def _simulated(
-    body: Body, grasps: list[Grasp], obstacle: Obstacle, sigma_n: float
-) -> Experiment:
+def _simulated(body: Body, grasps: list[Grasp], obstacle: Obstacle, sigma_n: float) -> Experiment:
     """Return a static experiment with the exact force of its obstacle."""
     count = max(len(each.poses.t_s) for each in [*grasps, obstacle])
     blank = _with_force(obstacle, np.zeros((count, 3)), sigma_n=sigma_n)
@@ -174,6 +155,4 @@ def _simulated(
         nuisance=Nuisance.none(obstacle_offset_m=ONSET_M),
     )
     (forces,) = simulate(experiment, TRUTH).wrenches
-    return experiment.with_obstacles(
-        [_with_force(obstacle, forces, sigma_n=sigma_n)]
-    )
+    return experiment.with_obstacles([_with_force(obstacle, forces, sigma_n=sigma_n)])

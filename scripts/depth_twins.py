@@ -34,12 +34,7 @@ from collocation_sysid.recording.depth_camera import depth_image
 SIZE_M = (0.12, 0.03, 0.02)
 DIVISIONS = (4, 1, 1)
 DENSITY_KG_M3 = 1070.0
-TRUTH = {
-    "young_pa": 1e5,
-    "poisson": 0.4,
-    "gamma_r_s": 5e-3,
-    "gamma_m_1_s": 0.1,
-}
+TRUTH = {"young_pa": 1e5, "poisson": 0.4, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
 UNKNOWN = {**TRUTH, "young_pa": Unknown(2e5)}
 # Camera matrix [px]; the principal point is not at the centre, as in a cropped image.
 MATRIX = [[260.0, 0.0, 66.0], [0.0, 260.0, 70.0], [0.0, 0.0, 1.0]]
@@ -64,11 +59,7 @@ IMAGE_SAMPLES = np.arange(0, SAMPLES, 5)
 @cache
 def bar() -> Body:
     """Return the bar; all twins share it, so that its kernels compile once."""
-    return Body(
-        box_mesh(SIZE_M, DIVISIONS),
-        density_kg_m3=DENSITY_KG_M3,
-        element="tet10",
-    )
+    return Body(box_mesh(SIZE_M, DIVISIONS), density_kg_m3=DENSITY_KG_M3, element="tet10")
 
 
 def camera_pose() -> Array:
@@ -84,9 +75,7 @@ def upright_pose(eye_m: Array, optical_axis: Array) -> Array:
     right = np.cross(optical_axis, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3] = np.column_stack(
-        [right, np.cross(optical_axis, right), optical_axis, eye_m]
-    )
+    pose[:3] = np.column_stack([right, np.cross(optical_axis, right), optical_axis, eye_m])
     return pose
 
 
@@ -100,9 +89,7 @@ def hanging_twin(seed: int) -> Problem:
 def swinging_twin(seed: int) -> Problem:
     """Return the problem of several images of the bar, whose clamp moves."""
     times_s: Array = STEP_S * np.arange(SAMPLES, dtype=np.float64)
-    return _problem(
-        times_s, _motion(times_s), image_samples=IMAGE_SAMPLES, seed=seed
-    )
+    return _problem(times_s, _motion(times_s), image_samples=IMAGE_SAMPLES, seed=seed)
 
 
 def _motion(times_s: Array) -> PoseSequence:
@@ -110,19 +97,11 @@ def _motion(times_s: Array) -> PoseSequence:
     rise = times_s**2 / (times_s**2 + 0.08**2)
     waves = np.sin(2 * np.pi * np.outer(times_s, [2.0, 2.7, 3.3]))
     positions_m = rise[:, None] * waves * np.array([0.01, 0.015, 0.03])
-    rotation_vectors_rad = (
-        rise[:, None] * waves[:, ::-1] * np.array([0.05, 0.2, 0.15])
-    )
-    return PoseSequence(
-        times_s,
-        positions_m,
-        Rotation.from_rotvec(rotation_vectors_rad).as_quat(),
-    )
+    rotation_vectors_rad = rise[:, None] * waves[:, ::-1] * np.array([0.05, 0.2, 0.15])
+    return PoseSequence(times_s, positions_m, Rotation.from_rotvec(rotation_vectors_rad).as_quat())
 
 
-def _experiment(
-    times_s: Array, clamp: PoseSequence, depth: Depth
-) -> Experiment:
+def _experiment(times_s: Array, clamp: PoseSequence, depth: Depth) -> Experiment:
     """Return the experiment of the bar in a clamp that a camera observes."""
     clamp_grasp = Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), clamp)
     return Experiment(
@@ -137,9 +116,7 @@ def _experiment(
     )
 
 
-def _problem(
-    times_s: Array, clamp: PoseSequence, image_samples: Index, seed: int
-) -> Problem:
+def _problem(times_s: Array, clamp: PoseSequence, image_samples: Index, seed: int) -> Problem:
     """Return the problem of one twin.
 
     Parameters
@@ -153,35 +130,24 @@ def _problem(
         Of noise and pose error.
     """
     rng = np.random.default_rng(seed)
-    images_m = np.array(
-        _images_m(tuple(times_s), tuple(image_samples))
-    ) + NOISE_M * rng.normal(size=(len(image_samples), *SHAPE_PX))
+    images_m = np.array(_images_m(tuple(times_s), tuple(image_samples))) + NOISE_M * rng.normal(
+        size=(len(image_samples), *SHAPE_PX)
+    )
     camera = DepthCamera(MATRIX, pose=_pose_with_error(rng))
     depth = Depth.of_images(
-        "front",
-        images_m,
-        camera,
-        SIGMA_M,
-        times_s[image_samples],
-        spacing_m=SPACING_M,
+        "front", images_m, camera, SIGMA_M, times_s[image_samples], spacing_m=SPACING_M
     )
     return Problem(
-        [_experiment(times_s, clamp, depth)],
-        Parameters.from_mapping(UNKNOWN),
-        substeps=1,
+        [_experiment(times_s, clamp, depth)], Parameters.from_mapping(UNKNOWN), substeps=1
     )
 
 
 @cache
-def _images_m(
-    times_s: tuple[float, ...], image_samples: tuple[int, ...]
-) -> Array:
+def _images_m(times_s: tuple[float, ...], image_samples: tuple[int, ...]) -> Array:
     """Return the images (S, rows, columns) without noise, NaN where the bar is not visible; cached."""
     times = np.array(times_s)
     image_times_s = times[list(image_samples)]
-    blank = Depth(
-        "none", image_times_s, [np.zeros((1, 3))] * len(image_times_s), SIGMA_M
-    )
+    blank = Depth("none", image_times_s, [np.zeros((1, 3))] * len(image_times_s), SIGMA_M)
     clamp = PoseSequence.fixed() if len(times) == 1 else _motion(times)
     experiment = _experiment(times, clamp, blank)
     positions_m = simulate(experiment, TRUTH).positions_m
@@ -190,9 +156,7 @@ def _images_m(
     camera = DepthCamera(MATRIX, pose=pose)
     images_m = []
     for sample in image_samples:
-        triangles_m = surface.subdivided_triangles(
-            positions_m[sample][surface.nodes]
-        )
+        triangles_m = surface.subdivided_triangles(positions_m[sample][surface.nodes])
         in_camera_m = (triangles_m - pose[:3, 3]) @ pose[:3, :3]
         images_m.append(depth_image(camera, SHAPE_PX, in_camera_m))
     return np.array(images_m)

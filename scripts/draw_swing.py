@@ -11,12 +11,7 @@ from collocation_sysid.result.pictures import save_pictures, shapes_picture
 from collocation_sysid.result.replay import MotionRecord
 
 ROOT = Path(__file__).parents[1]
-TRUTH = {
-    "lambda_pa": 800.0,
-    "mu_pa": 600.0,
-    "gamma_r_s": 0.006,
-    "gamma_m_1_s": 1.5,
-}
+TRUTH = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
 
 
 def main() -> None:

@@ -22,11 +22,7 @@ import collocation_sysid as cs
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.result.element_fields import ElementFields
 from collocation_sysid.result.pictures.projection import ParallelCamera
-from collocation_sysid.result.pictures.scene import (
-    BodyDrawing,
-    SheetView,
-    sheet,
-)
+from collocation_sysid.result.pictures.scene import BodyDrawing, SheetView, sheet
 from collocation_sysid.result.pictures.shapes import FIELD_COLOURS
 from collocation_sysid.result.replay import MotionRecord
 
@@ -55,9 +51,7 @@ EQUIBIAXIAL_STRETCH = 1.6
 class _FirstSimulation(Exception):
     """End of a script at its first simulation; contains the experiment and the motion."""
 
-    def __init__(
-        self, experiment: cs.Experiment, motion: Any, values: dict[str, float]
-    ) -> None:
+    def __init__(self, experiment: cs.Experiment, motion: Any, values: dict[str, float]) -> None:
         super().__init__()
         self.experiment = experiment
         self.motion = motion
@@ -94,9 +88,7 @@ def first_simulation(script: Path) -> _FirstSimulation:
     """Run a script up to its first simulation, in a temporary folder."""
     simulate = cs.simulate
 
-    def interrupting(
-        experiment: cs.Experiment, values: Any, *options: Any, **named: Any
-    ) -> Any:
+    def interrupting(experiment: cs.Experiment, values: Any, *options: Any, **named: Any) -> Any:
         motion = simulate(experiment, values, *options, **named)
         raise _FirstSimulation(experiment, motion, dict(values))
 
@@ -113,13 +105,9 @@ def first_simulation(script: Path) -> _FirstSimulation:
     raise SystemExit(f"{script}: no simulation before its end")
 
 
-def draw_body(
-    experiment: cs.Experiment, motion: Any, values: Mapping[str, float]
-) -> Figure:
+def draw_body(experiment: cs.Experiment, motion: Any, values: Mapping[str, float]) -> Figure:
     """Draw the body at the sample of its largest deflection, coloured by the von Mises stress."""
-    replay = MotionRecord.from_experiment(
-        experiment, (motion.positions_m, motion.markers_m)
-    )
+    replay = MotionRecord.from_experiment(experiment, (motion.positions_m, motion.markers_m))
     shapes_m = replay.shapes_m
     assert shapes_m is not None
     rigid_m = experiment.rigid_positions(experiment.t_s)[:, : shapes_m.shape[1]]
@@ -177,18 +165,9 @@ def draw_shape(
         corner_mm=(MARGIN_MM, MARGIN_MM),
     )
     drawing = BodyDrawing(
-        axes,
-        view,
-        surface=replay.surface,
-        parts=replay.surface_parts,
-        nodes=replay.surface_nodes,
+        axes, view, surface=replay.surface, parts=replay.surface_parts, nodes=replay.surface_nodes
     )
-    drawing.update(
-        positions_m,
-        is_grasped,
-        markers_m,
-        FIELD_COLOURS(shares)[:, :3],
-    )
+    drawing.update(positions_m, is_grasped, markers_m, FIELD_COLOURS(shares)[:, :3])
     return figure
 
 

@@ -36,9 +36,7 @@ def main() -> None:
         for run in RUNS:
             file = f"{material}_{run}.csv"
             if source is None:
-                content = urllib.request.urlopen(
-                    f"{SOURCE}/{material}/{file}"
-                ).read()
+                content = urllib.request.urlopen(f"{SOURCE}/{material}/{file}").read()
             elif (source / file).is_file():
                 content = (source / file).read_bytes()
             else:

@@ -43,9 +43,7 @@ BASE_M = np.array(
     ]
 )
 # Positions of the tip markers in the frame of the mesh [m], as the authors state them.
-TIP_M = np.array(
-    [[-0.009645, -0.0265, 0.0], [-0.009645, 0.0265, 0.0], [-0.0282, 0.0, 0.0]]
-)
+TIP_M = np.array([[-0.009645, -0.0265, 0.0], [-0.009645, 0.0265, 0.0], [-0.0282, 0.0, 0.0]])
 # The model is the half y > 0 of the arm: the marker at y < 0 is written as its mirror image.
 MIRRORED = "Tip - 1"
 # Written samples before the tip begins to move, and from there on; the sampling rate is 100 Hz.
@@ -88,8 +86,7 @@ class ArmShape:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
         "--from",
@@ -127,33 +124,19 @@ def table_of_tip(file: Path) -> str:
     rows = slice(start, start + SAMPLES_BEFORE + SAMPLES_AFTER + 1)
     names = [label.lower().replace(" - ", "_") for label in labels]
     columns = ["t_s", *(f"{name}_{axis}" for name in names for axis in "xyz")]
-    values = np.column_stack(
-        [t_s[rows] - t_s[start], tip_m[rows].reshape(-1, 3 * len(labels))]
-    )
-    lines = [
-        ",".join([f"{row[0]:.2f}", *(f"{v:.5f}" for v in row[1:])])
-        for row in values
-    ]
+    values = np.column_stack([t_s[rows] - t_s[start], tip_m[rows].reshape(-1, 3 * len(labels))])
+    lines = [",".join([f"{row[0]:.2f}", *(f"{v:.5f}" for v in row[1:])]) for row in values]
     return "\n".join([",".join(columns), *lines]) + "\n"
 
 
 def table_of_step(pressure_pa: float) -> str:
     """Return a table of a pressure that rises from zero at STEP_S."""
     end_s = (SAMPLES_BEFORE + SAMPLES_AFTER) / 100 + 1.0
-    rows = [
-        (0.0, 0.0),
-        (STEP_S, 0.0),
-        (STEP_S + RAMP_S, pressure_pa),
-        (end_s, pressure_pa),
-    ]
-    return "t_s,pressure_pa\n" + "".join(
-        f"{t_s:g},{value:g}\n" for t_s, value in rows
-    )
+    rows = [(0.0, 0.0), (STEP_S, 0.0), (STEP_S + RAMP_S, pressure_pa), (end_s, pressure_pa)]
+    return "t_s,pressure_pa\n" + "".join(f"{t_s:g},{value:g}\n" for t_s, value in rows)
 
 
-def tip_in_mesh_frame(
-    file: Path,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
+def tip_in_mesh_frame(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
     """Return the times (T,) [s], the tip markers (T, 3, 3) [m] in the frame of the mesh, and their
     labels.
 
@@ -165,9 +148,7 @@ def tip_in_mesh_frame(
     base = [k for k, label in enumerate(labels) if label.startswith("Base")]
     tip = [k for k, label in enumerate(labels) if label.startswith("Tip")]
     positions_m = tracks.positions_m
-    rotation, shift_m = rigid_transform(
-        positions_m[:, base].mean(axis=0), BASE_M
-    )
+    rotation, shift_m = rigid_transform(positions_m[:, base].mean(axis=0), BASE_M)
     tip_m = positions_m[:, tip] @ rotation.T + shift_m
     tip_m += TIP_M - tip_m[REST].mean(axis=0)
     tip_labels = [labels[k] for k in tip]
@@ -204,43 +185,27 @@ def arm_mesh(shape: ArmShape) -> TetMesh:
     The cell arrays `ring_1` to `ring_7` are 1 in sectors of the outer wall between `ring_angles`,
     without the end. The chambers are open at the base, where the nodes are clamped.
     """
-    section_m, wall_triangles, chamber_triangles, chamber_corners = (
-        cross_section(shape)
-    )
-    heights_m = np.append(
-        0.0, np.linspace(shape.cap_m, shape.length_m, shape.layers + 1)
-    )
+    section_m, wall_triangles, chamber_triangles, chamber_corners = cross_section(shape)
+    heights_m = np.append(0.0, np.linspace(shape.cap_m, shape.length_m, shape.layers + 1))
     points_m = np.vstack(
-        [
-            np.column_stack([section_m, np.full(len(section_m), z)])
-            for z in heights_m
-        ]
+        [np.column_stack([section_m, np.full(len(section_m), z)]) for z in heights_m]
     )
     tetrahedra = []
     for layer in range(len(heights_m) - 1):
         triangles = wall_triangles + chamber_triangles * (layer == 0)
         offset = layer * len(section_m)
         for triangle in triangles:
-            tetrahedra += prism_tetrahedra(
-                [offset + k for k in triangle], len(section_m)
-            )
+            tetrahedra += prism_tetrahedra([offset + k for k in triangle], len(section_m))
     on_wall = np.zeros((len(heights_m), len(section_m)), dtype=bool)
     on_wall[1:, chamber_corners] = True
     mesh = TetMesh(points_m, tetrahedra)
     x, y, z = mesh.centres_m.T
     # Chords of the arcs are closer to the axis than their ends; the arms of the cross end before.
-    in_ring = (np.hypot(x, y) > 0.9 * (shape.radius_m - shape.wall_m)) & (
-        z > shape.cap_m
-    )
+    in_ring = (np.hypot(x, y) > 0.9 * (shape.radius_m - shape.wall_m)) & (z > shape.cap_m)
     sectors = np.searchsorted(ring_angles(shape), np.arctan2(y, x))
-    rings = {
-        f"ring_{k}": (in_ring & (sectors == k)).astype(float)
-        for k in range(1, 8)
-    }
+    rings = {f"ring_{k}": (in_ring & (sectors == k)).astype(float) for k in range(1, 8)}
     chamber = {"chamber": on_wall.ravel().astype(float)}
-    return TetMesh(
-        points_m, mesh.tetrahedra, point_arrays=chamber, cell_arrays=rings
-    )
+    return TetMesh(points_m, mesh.tetrahedra, point_arrays=chamber, cell_arrays=rings)
 
 
 def prism_tetrahedra(corners: list[int], count: int) -> list[list[int]]:
@@ -265,33 +230,21 @@ def cross_section(
     Points are the core of the cross (0 to 2), the inside of the outer wall (3 to 10) and its
     outside (11 to 18).
     """
-    core_m = (
-        shape.cross_m
-        / np.sqrt(2)
-        * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-    )
+    core_m = shape.cross_m / np.sqrt(2) * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
     angles = ring_angles(shape)
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
     directions[-1] = (-1.0, 0.0)
     inner_m = shape.radius_m - shape.wall_m
-    points_m = np.vstack(
-        [core_m, inner_m * directions, shape.radius_m * directions]
-    )
+    points_m = np.vstack([core_m, inner_m * directions, shape.radius_m * directions])
     inside = list(range(3, 11))
     outside = list(range(11, 19))
     quads = [(0, inside[2], inside[3], 1), (1, inside[5], inside[6], 2)]
-    quads += [
-        (inside[k], outside[k], outside[k + 1], inside[k + 1]) for k in range(7)
-    ]
+    quads += [(inside[k], outside[k], outside[k + 1], inside[k + 1]) for k in range(7)]
     walls = [[0, 1, 2]]
     for a, b, c, d in quads:
         walls += [[a, b, c], [a, c, d]]
     chambers = [[inside[0], inside[1], 0], [inside[1], inside[2], 0]]
-    chambers += [
-        [inside[3], inside[4], 1],
-        [inside[4], inside[5], 1],
-        [inside[6], inside[7], 2],
-    ]
+    chambers += [[inside[3], inside[4], 1], [inside[4], inside[5], 1], [inside[6], inside[7], 2]]
     return points_m, walls, chambers, [0, *inside[:3]]
 
 
@@ -303,9 +256,7 @@ def ring_angles(shape: ArmShape) -> NDArray[np.float64]:
     half = np.arcsin(shape.cross_m / 2 / (shape.radius_m - shape.wall_m))
     quarter = np.pi / 4
     side = np.array([quarter - half, quarter + half])
-    return np.array(
-        [0.0, side[0] / 2, *side, np.pi / 2, *(np.pi - side[::-1]), np.pi]
-    )
+    return np.array([0.0, side[0] / 2, *side, np.pi / 2, *(np.pi - side[::-1]), np.pi])
 
 
 def fibre_angles(shape: ArmShape) -> NDArray[np.float64]:

@@ -27,9 +27,9 @@ FOLDER = Path(__file__).parents[1] / "problems" / "silicone_depth"
 IMAGES = ("h_e_c", "h_m_c", "h_em_c", "t_em_c")
 # Edge of the clamp on the bar [m].
 CLAMP_M = np.array([0.07, 0.0, 0.0])
-# Planes are fitted to squares of 2 · 6 + 1 pixels, at every second pixel. A square is on one face if
-# its depths differ by less than the first length, and its points are closer to the plane than the
-# second one (root mean square).
+# Planes are fitted to squares of 2 · 6 + 1 pixels, at every second pixel. A square is on one face
+# if its depths differ by less than the first length, and its points are closer to the plane than
+# the second one (root mean square).
 HALF_WIDTH_PX = 6
 STEP_PX = 2
 FACE_DEPTH_RANGE_M = 0.02
@@ -40,19 +40,12 @@ ANGLE_LIMITS_DEG = (15, 12, 10, 8, 6, 5, 4, 3, 3, 3, 3, 3)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--from", dest="source", type=Path, required=True, help="the folder"
-    )
+    parser.add_argument("--from", dest="source", type=Path, required=True, help="the folder")
     source = parser.parse_args().source
-    missing = [
-        name for name in IMAGES if not (source / f"{name}.json").is_file()
-    ]
+    missing = [name for name in IMAGES if not (source / f"{name}.json").is_file()]
     if missing:
         sys.exit(f"{source} has no {missing[0]}.json")
-    descriptions = {
-        name: json.loads((source / f"{name}.json").read_text())
-        for name in IMAGES
-    }
+    descriptions = {name: json.loads((source / f"{name}.json").read_text()) for name in IMAGES}
     to_world = np.array(descriptions[IMAGES[0]]["mesh_to_object"])
     for name, description in descriptions.items():
         stated_pose = np.array(description["object_to_camera"]) @ np.array(
@@ -62,13 +55,9 @@ def main() -> None:
         matrix = np.array(description["camera_matrix"])
         to_camera = np.eye(4)
         depth_m = image_data["depth_counts"] * float(image_data["count_m"])
-        rotation = aligned_rotation(
-            face_normals(depth_m, matrix), stated_pose[:3, :3]
-        )
+        rotation = aligned_rotation(face_normals(depth_m, matrix), stated_pose[:3, :3])
         to_camera[:3, :3] = rotation
-        to_camera[:3, 3] = (
-            stated_pose[:3, :3] - rotation
-        ) @ CLAMP_M + stated_pose[:3, 3]
+        to_camera[:3, 3] = (stated_pose[:3, :3] - rotation) @ CLAMP_M + stated_pose[:3, 3]
         np.savez_compressed(
             FOLDER / f"{name}.npz",
             depth_counts=image_data["depth_counts"],
@@ -82,45 +71,37 @@ def main() -> None:
 
 
 def face_normals(depth_m: Array, matrix: Array) -> Array:
-    """Return the normals (P, 3) of flat faces in an image, in the frame of the camera, of either sign."""
+    """Return the normals (P, 3) of flat faces in an image, in the frame of the camera, of either
+    sign.
+    """
     v, u = np.indices(depth_m.shape)
-    rays = np.linalg.solve(
-        matrix, np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
-    ).T
+    rays = np.linalg.solve(matrix, np.stack([u, v, np.ones_like(u)]).reshape(3, -1)).T
     points = rays.reshape(*depth_m.shape, 3) * depth_m[..., None]
     size = 2 * HALF_WIDTH_PX + 1
     smallest_depth, largest_depth = (
         each(depth_m, size) for each in (minimum_filter, maximum_filter)
     )
     is_tested = np.zeros(depth_m.shape, dtype=bool)
-    is_tested[
-        HALF_WIDTH_PX:-HALF_WIDTH_PX:STEP_PX,
-        HALF_WIDTH_PX:-HALF_WIDTH_PX:STEP_PX,
-    ] = True
+    is_tested[HALF_WIDTH_PX:-HALF_WIDTH_PX:STEP_PX, HALF_WIDTH_PX:-HALF_WIDTH_PX:STEP_PX] = True
     fitted_pixels = np.nonzero(
-        is_tested
-        & (smallest_depth > 0)
-        & (largest_depth - smallest_depth < FACE_DEPTH_RANGE_M)
+        is_tested & (smallest_depth > 0) & (largest_depth - smallest_depth < FACE_DEPTH_RANGE_M)
     )
-    mean = [
-        uniform_filter(points[..., i], size)[fitted_pixels] for i in range(3)
-    ]
+    mean = [uniform_filter(points[..., i], size)[fitted_pixels] for i in range(3)]
     covariance = [
         [
-            uniform_filter(points[..., i] * points[..., j], size)[fitted_pixels]
-            - mean[i] * mean[j]
+            uniform_filter(points[..., i] * points[..., j], size)[fitted_pixels] - mean[i] * mean[j]
             for j in range(3)
         ]
         for i in range(3)
     ]
     values, vectors = np.linalg.eigh(np.moveaxis(np.array(covariance), 2, 0))
-    return vectors[
-        np.sqrt(np.maximum(values[:, 0], 0)) < FACE_ROUGHNESS_M, :, 0
-    ]
+    return vectors[np.sqrt(np.maximum(values[:, 0], 0)) < FACE_ROUGHNESS_M, :, 0]
 
 
 def aligned_rotation(normals: Array, rotation: Array) -> Array:
-    """Return the rotation (3, 3), close to a given one, whose axes are parallel to most face normals."""
+    """Return the rotation (3, 3), close to a given one, whose axes are parallel to most face
+    normals.
+    """
     for degrees in ANGLE_LIMITS_DEG:
         cosines = normals @ rotation
         nearest = np.abs(cosines).argmax(axis=1)
@@ -137,7 +118,8 @@ def aligned_rotation(normals: Array, rotation: Array) -> Array:
 
 
 def bar(motion: np.ndarray, refinement: int = 2) -> TetMesh:
-    """Return the mesh of the bar: 30 mm square between heads of 60 mm, of which one is in the clamp.
+    """Return the mesh of the bar: 30 mm square between heads of 60 mm, of which one is in the
+    clamp.
 
     Parameters
     ----------
@@ -150,16 +132,10 @@ def bar(motion: np.ndarray, refinement: int = 2) -> TetMesh:
     grid = box_mesh((6.0, 2.0, 1.0), bricks)
     axial, up, across = grid.points_m.T
     points_m = np.column_stack(
-        [
-            np.interp(axial, [0, 1, 6], [-0.1, -0.07, 0.07]),
-            0.03 * up - 0.03,
-            0.03 * across - 0.015,
-        ]
+        [np.interp(axial, [0, 1, 6], [-0.1, -0.07, 0.07]), 0.03 * up - 0.03, 0.03 * across - 0.015]
     )
     centres_m = points_m[grid.tetrahedra].mean(axis=1)
-    cells = grid.tetrahedra[
-        (centres_m[:, 0] < -0.07) | (np.abs(centres_m[:, 1]) < 0.015)
-    ]
+    cells = grid.tetrahedra[(centres_m[:, 0] < -0.07) | (np.abs(centres_m[:, 1]) < 0.015)]
     masks = {
         "clamped": points_m[:, 0] >= 0.07 - 1e-9,
         "turned": points_m[:, 0] <= -0.07 + 1e-9,

@@ -23,9 +23,7 @@ SOURCE = (
     f"https://raw.githubusercontent.com/srl-ethz/diffPD_sim2real/{COMMIT}"
     "/python/realbeam_experiments/Measurement_data"
 )
-RECORDINGS = tuple(
-    f"beam_{trial}_V2_a.c3d" for trial in ("gravity", "load52", "load101")
-)
+RECORDINGS = tuple(f"beam_{trial}_V2_a.c3d" for trial in ("gravity", "load52", "load101"))
 # Edges of the beam and the corner with the smallest coordinates [m].
 SIZE_M = (0.10, 0.03, 0.03)
 ORIGIN_M = (-0.10, 0.0, 0.0)

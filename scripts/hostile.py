@@ -2,11 +2,11 @@
 
     nice -n 19 python scripts/hostile.py [--count 100] [--seed 0] [--only toml urdf] [--keep FOLDER]
 
-A case is a small problem of the tests with one damaged file, and a command that reads this file. The
-damage is drawn at random from the seed, the kind and the number of the case: files are truncated,
-some of their bytes are replaced, repeated or exchanged, and values with a special meaning in the
-format are inserted. Each case is run in a separate process with limits of time and memory. Its
-outcome is
+A case is a small problem of the tests with one damaged file, and a command that reads this file.
+The damage is drawn at random from the seed, the kind and the number of the case: files are
+truncated, some of their bytes are replaced, repeated or exchanged, and values with a special
+meaning in the format are inserted. Each case is run in a separate process with limits of time and
+memory. Its outcome is
 
     refused     exit code 2, one message of one line, and nothing written
     accepted    exit code 0 or 1
@@ -67,7 +67,8 @@ Rng = np.random.Generator
 OUTCOMES = ("refused", "accepted", "traceback", "unclear", "hang", "crash")
 # Largest address space of a case [bytes]; a reader that needs more trusts a forged size.
 MEMORY_LIMIT_BYTES = 8 << 30
-# Wall time over the limit of processor time after which a case is stopped: the machine does other work.
+# Wall time over the limit of processor time after which a case is stopped: the machine does other
+# work.
 WAITING_FACTOR = 10
 # User id for cases without privileges, if the script is started by root.
 NOBODY = 65534
@@ -80,14 +81,18 @@ COUNTS = (b"-1", b"0", b"4294967295", b"1e308", b"nan", b"99999999999999999999")
 
 @dataclass(frozen=True)
 class CommandEnd:
-    """End of a process: exit code, negative signal number or None after the time limit, and its output."""
+    """End of a process: exit code, negative signal number or None after the time limit, and its
+    output.
+    """
 
     code: int | None
     out: str
     err: str
 
     def outcome(self, is_clean: bool = True) -> str:
-        """Return one of `OUTCOMES`; `is_clean` states whether the command left the folder unchanged."""
+        """Return one of `OUTCOMES`; `is_clean` states whether the command left the folder
+        unchanged.
+        """
         if self.code is None or -self.code == signal.SIGXCPU:
             return "hang"
         if self.code < 0:
@@ -95,19 +100,10 @@ class CommandEnd:
         if "Traceback (most recent call last)" in self.err:
             return "traceback"
         output_text = self.err.strip().splitlines()
-        if (
-            self.code == 2
-            and len(output_text) == 1
-            and is_clean
-            and _is_printable(self.err)
-        ):
+        if self.code == 2 and len(output_text) == 1 and is_clean and _is_printable(self.err):
             return "refused"
         both = self.err + self.out
-        return (
-            "accepted"
-            if self.code in (0, 1) and _is_printable(both)
-            else "unclear"
-        )
+        return "accepted" if self.code in (0, 1) and _is_printable(both) else "unclear"
 
 
 def _is_printable(text: str) -> bool:
@@ -128,9 +124,7 @@ class RunningCommand:
     def finish(self, limit_s: float) -> CommandEnd:
         """Wait until the command ends; kill it at `WAITING_FACTOR` times the limit [s]."""
         code = _wait(self.process, limit_s)
-        return CommandEnd(
-            code, self.output_text(self.out), self.output_text(self.err)
-        )
+        return CommandEnd(code, self.output_text(self.out), self.output_text(self.err))
 
     def output_text(self, stream: Any) -> str:
         """Return all text written to a stream so far, without moving the position that forks share."""
@@ -163,14 +157,9 @@ def start(
         return replace(running, process=child)
     files = running.out.fileno(), running.err.fileno()
     seconds = int(np.ceil(limit_s))
-    resource_limits = {
-        resource.RLIMIT_AS: MEMORY_LIMIT_BYTES,
-        resource.RLIMIT_CORE: 0,
-    }
+    resource_limits = {resource.RLIMIT_AS: MEMORY_LIMIT_BYTES, resource.RLIMIT_CORE: 0}
     resource_limits[resource.RLIMIT_CPU] = seconds
-    _run_command_in_fork(
-        [str(word) for word in words], folder, files, resource_limits, before
-    )
+    _run_command_in_fork([str(word) for word in words], folder, files, resource_limits, before)
     raise AssertionError("the fork has ended")
 
 
@@ -198,14 +187,9 @@ def _run_command_in_fork(
         os.chdir(folder)
         for number, stream in enumerate(files, 1):
             os.dup2(stream, number)
-        sys.stdout = io.TextIOWrapper(
-            io.FileIO(1, "w", closefd=False), "utf-8", "surrogateescape"
-        )
+        sys.stdout = io.TextIOWrapper(io.FileIO(1, "w", closefd=False), "utf-8", "surrogateescape")
         sys.stderr = io.TextIOWrapper(
-            io.FileIO(2, "w", closefd=False),
-            "utf-8",
-            "backslashreplace",
-            line_buffering=True,
+            io.FileIO(2, "w", closefd=False), "utf-8", "backslashreplace", line_buffering=True
         )
         for kind, limit in limits.items():
             resource.setrlimit(kind, (limit, limit + 1))
@@ -215,11 +199,7 @@ def _run_command_in_fork(
         cli.main()
         code = 0
     except SystemExit as ended:
-        code = (
-            ended.code
-            if isinstance(ended.code, int)
-            else int(ended.code is not None)
-        )
+        code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     except BaseException:
         traceback.print_exc()
     finally:
@@ -298,11 +278,7 @@ def _with_gap(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
 
 def _repeated(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     at = _place(rng, content)
-    return (
-        content[:at]
-        + content[at : at + int(rng.integers(1, 200))] * 3
-        + content[at:]
-    )
+    return content[:at] + content[at : at + int(rng.integers(1, 200))] * 3 + content[at:]
 
 
 def _zeros(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
@@ -314,9 +290,7 @@ def _zeros(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
 def _largest(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     at = _place(rng, content)
     length = int(rng.choice([2, 4, 8]))
-    return (
-        content[:at] + b"\xff" * (length - 1) + b"\x7f" + content[at + length :]
-    )
+    return content[:at] + b"\xff" * (length - 1) + b"\x7f" + content[at + length :]
 
 
 def _with_word(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
@@ -327,25 +301,14 @@ def _with_word(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
     at = _place(rng, content)
     if rng.random() < 0.5:
         return content[:at] + word + content[at:]
-    parts = [
-        k for k in range(len(content)) if content[k : k + 1] in b' ,"<>=\n[]'
-    ]
+    parts = [k for k in range(len(content)) if content[k : k + 1] in b' ,"<>=\n[]']
     if len(parts) < 2:
         return content[:at] + word + content[at:]
     number = int(rng.integers(len(parts) - 1))
     return content[: parts[number] + 1] + word + content[parts[number + 1] :]
 
 
-DAMAGES = (
-    _truncated,
-    _replaced,
-    _with_gap,
-    _repeated,
-    _zeros,
-    _largest,
-    _with_word,
-    _with_word,
-)
+DAMAGES = (_truncated, _replaced, _with_gap, _repeated, _zeros, _largest, _with_word, _with_word)
 
 
 # Damaged files ------------------------------------------------------------------------------------
@@ -379,7 +342,8 @@ class FileKind:
     replacements: tuple[bytes, ...] = ()
 
     def run(self, cases: CaseSettings) -> Counter[str]:
-        """Run all cases and count the outcomes; no case if the package that reads the format is missing.
+        """Run all cases and count the outcomes; no case if the package that reads the format is
+        missing.
 
         Raises
         ------
@@ -392,14 +356,9 @@ class FileKind:
         in_fork(lambda: self.make(base))
         for words in self.commands:
             if (ended := run(words, base, cases.limit_s)).code not in (0, 1):
-                if (
-                    "No module named" in ended.err
-                    or "not installed" in ended.err
-                ):
+                if "No module named" in ended.err or "not installed" in ended.err:
                     return counts
-                raise RuntimeError(
-                    f"{self.name} is refused before it is damaged: {ended.err}"
-                )
+                raise RuntimeError(f"{self.name} is refused before it is damaged: {ended.err}")
         (file,) = base.glob(self.file)
         replacements = file.read_bytes()
         for number in range(cases.count):
@@ -408,14 +367,10 @@ class FileKind:
             shutil.copytree(base, folder)
             is_replaced = self.replacements and rng.random() < 0.2
             content = (
-                self.replacements[rng.integers(len(self.replacements))]
-                if is_replaced
-                else None
+                self.replacements[rng.integers(len(self.replacements))] if is_replaced else None
             )
             target = folder / file.relative_to(base)
-            target.write_bytes(
-                content or damaged(rng, replacements, self.words)
-            )
+            target.write_bytes(content or damaged(rng, replacements, self.words))
             before = problem_files.contents(folder)
             words = self.commands[rng.integers(len(self.commands))]
             ended = run(words, folder, cases.limit_s)
@@ -476,9 +431,7 @@ def _with_dataset(folder: Path) -> None:
     _state(folder, POSES, address)
 
 
-def _with_depth(
-    file: str, write: Callable[[Path], object]
-) -> Callable[[Path], object]:
+def _with_depth(file: str, write: Callable[[Path], object]) -> Callable[[Path], object]:
     """Return a function that adds a depth camera with images of a plane or clouds, or with an .npz."""
 
     def make(folder: Path) -> None:
@@ -488,16 +441,12 @@ def _with_depth(
         if place.parent == folder:
             data_keys = f'file = "{file}"\n'
         else:
-            data_keys = (
-                f'file = "{place.parent.name}"\nt_s = [0.0, 0.04, 0.08]\n'
-            )
+            data_keys = f'file = "{place.parent.name}"\nt_s = [0.0, 0.04, 0.08]\n'
             for number in (1, 2):
                 shutil.copy(place, place.with_stem(str(number)))
         camera = "camera = { matrix = [[100, 0, 16], [0, 100, 12], [0, 0, 1]] }"
         with (folder / "problem.toml").open("a") as problem:
-            problem.write(
-                f"\n[[experiment.depth]]\nsigma_m = 0.001\n{data_keys}{camera}\n"
-            )
+            problem.write(f"\n[[experiment.depth]]\nsigma_m = 0.001\n{data_keys}{camera}\n")
 
     return make
 
@@ -509,10 +458,7 @@ CLOUD_M = np.random.default_rng(0).normal(0.0, 0.05, (50, 3))
 def _exr(file: Path) -> None:
     import OpenEXR  # pyright: ignore[reportMissingImports]
 
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"Z": DEPTH_M}) as image:
         image.write(str(file))
 
@@ -524,24 +470,18 @@ def _png(file: Path) -> None:
 
 
 def _npz(file: Path) -> None:
-    np.savez(
-        file, depth_m=np.stack(3 * [DEPTH_M]), t_s=np.array([0.0, 0.04, 0.08])
-    )
+    np.savez(file, depth_m=np.stack(3 * [DEPTH_M]), t_s=np.array([0.0, 0.04, 0.08]))
 
 
 def _pcd(file: Path) -> None:
     head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 50\nHEIGHT 1\nPOINTS 50\n"
-    file.write_bytes(
-        f"{head}DATA binary\n".encode() + CLOUD_M.astype("<f4").tobytes()
-    )
+    file.write_bytes(f"{head}DATA binary\n".encode() + CLOUD_M.astype("<f4").tobytes())
 
 
 def _laughs(root: str, inner: str) -> bytes:
     """Return an XML file of 3 kB that expands to 10⁹ words."""
     levels = "".join(
-        f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">\n'
-        if k
-        else '<!ENTITY a0 "word">\n'
+        f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">\n' if k else '<!ENTITY a0 "word">\n'
         for k in range(10)
     )
     head = f'<?xml version="1.0"?>\n<!DOCTYPE x [\n{levels}]>\n'
@@ -588,25 +528,8 @@ DEFINITIONS = (
     b"unknown_msgs/Thing[] things\n",
 )
 BOTH: tuple[tuple[str, ...], ...] = (("check", "problem.toml"),)
-TOML = (
-    b"[[[[",
-    b"]",
-    b'"',
-    b"'''",
-    b"{",
-    b"= nan",
-    b"= -inf",
-    b"[a.b]",
-    b"[[experiment]]",
-)
-TOML += (
-    b'"\\u001b[2J"',
-    b"\xff",
-    b"_",
-    b"1e400",
-    b"true",
-    b'"../../etc/passwd"',
-)
+TOML = (b"[[[[", b"]", b'"', b"'''", b"{", b"= nan", b"= -inf", b"[a.b]", b"[[experiment]]")
+TOML += (b'"\\u001b[2J"', b"\xff", b"_", b"1e400", b"true", b'"../../etc/passwd"')
 CSV = (
     b"\x00",
     b"1e308",
@@ -620,17 +543,7 @@ CSV = (
     b"=1+1",
     b"\xef\xbb\xbf",
 )
-XML = (
-    b"&a9;",
-    b"<!--",
-    b"-->",
-    b"]]>",
-    b"<![CDATA[",
-    b"<a>",
-    b"</a>",
-    b'"',
-    *COUNTS,
-)
+XML = (b"&a9;", b"<!--", b"-->", b"]]>", b"<![CDATA[", b"<a>", b"</a>", b'"', *COUNTS)
 
 
 def _log_commands(name: str) -> tuple[tuple[str, ...], ...]:
@@ -638,35 +551,19 @@ def _log_commands(name: str) -> tuple[tuple[str, ...], ...]:
 
 
 FILES = (
-    FileKind(
-        "problem file", lambda _: None, "problem.toml", words=(*TOML, *COUNTS)
-    ),
+    FileKind("problem file", lambda _: None, "problem.toml", words=(*TOML, *COUNTS)),
     FileKind("tracks, CSV", lambda _: None, MARKERS, words=(*CSV, *COUNTS)),
     FileKind("poses, CSV", lambda _: None, POSES, words=(*CSV, *COUNTS)),
     FileKind("mesh, VTU", lambda _: None, "body.vtu", words=XML),
-    FileKind(
-        "mesh, XDMF", _with_xdmf, "body.xdmf", words=XML, replacements=XDMFS
-    ),
+    FileKind("mesh, XDMF", _with_xdmf, "body.xdmf", words=XML, replacements=XDMFS),
     FileKind(
         "bag, ROS 1",
         _with_bag("ros1"),
         "trial.bag",
         _log_commands("trial.bag"),
-        (
-            *DEFINITIONS,
-            *COUNTS,
-            b"message_definition=",
-            b"md5sum=*",
-            b"op=\x07",
-        ),
+        (*DEFINITIONS, *COUNTS, b"message_definition=", b"md5sum=*", b"op=\x07"),
     ),
-    FileKind(
-        "bag, SQLite",
-        _with_bag("sqlite3"),
-        "trial.db3",
-        _log_commands("trial.db3"),
-        COUNTS,
-    ),
+    FileKind("bag, SQLite", _with_bag("sqlite3"), "trial.db3", _log_commands("trial.db3"), COUNTS),
     FileKind(
         "log, MCAP",
         _with_bag("mcap file"),
@@ -688,20 +585,10 @@ FILES = (
         _log_commands("robot"),
         (b"{", b"[", b"null", b'"', b"NaN", b"1e999", b"[" * 5000, *COUNTS),
     ),
+    FileKind("robot, URDF", _with_dataset, "arm.urdf", words=XML, replacements=URDFS),
+    FileKind("depth, EXR", _with_depth("frames/0.exr", _exr), "frames/0.exr", words=COUNTS),
     FileKind(
-        "robot, URDF", _with_dataset, "arm.urdf", words=XML, replacements=URDFS
-    ),
-    FileKind(
-        "depth, EXR",
-        _with_depth("frames/0.exr", _exr),
-        "frames/0.exr",
-        words=COUNTS,
-    ),
-    FileKind(
-        "depth, PNG",
-        _with_depth("frames/0.png", _png),
-        "frames/0.png",
-        words=(b"IHDR", b"IDAT"),
+        "depth, PNG", _with_depth("frames/0.png", _png), "frames/0.png", words=(b"IHDR", b"IDAT")
     ),
     FileKind(
         "depth, NPZ",
@@ -750,28 +637,18 @@ class CaseSettings:
         """Return the random generator of a case, independent of the other cases that are run."""
         return np.random.default_rng([self.seed, number, *kind.encode()])
 
-    def keep(
-        self,
-        kind: str,
-        number: int,
-        folder: Path,
-        outcome: str,
-        ended: CommandEnd,
-    ) -> None:
+    def keep(self, kind: str, number: int, folder: Path, outcome: str, ended: CommandEnd) -> None:
         """Print a case that is neither refused nor accepted, and store its input and output."""
         if outcome in ("refused", "accepted"):
             return
         output_text = (ended.err.strip().splitlines() or ["no output"])[-1]
         print(
-            f"{kind} {number}: {outcome}, code {ended.code}: {output_text[:300]}",
-            file=sys.stderr,
+            f"{kind} {number}: {outcome}, code {ended.code}: {output_text[:300]}", file=sys.stderr
         )
         if self.failure_folder is not None:
             place = self.failure_folder / f"{kind.replace(' ', '_')}_{number}"
             shutil.copytree(folder, place, symlinks=True, dirs_exist_ok=True)
-            (place / "said.txt").write_text(
-                ended.out + ended.err, encoding="utf-8"
-            )
+            (place / "said.txt").write_text(ended.out + ended.err, encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -797,18 +674,16 @@ class OtherKind:
     solved: bool = False
 
     def run(self, cases: CaseSettings) -> Counter[str]:
-        """Run all cases and count the outcomes; no case if root is needed and the user is another one."""
+        """Run all cases and count the outcomes; no case if root is needed and the user is another
+        one.
+        """
         counts = Counter[str]()
         if self.needs_root and os.getuid() != 0:
             return counts
         for number in range(max(1, round(self.share * cases.count))):
             folder = cases.folder / "case"
-            shutil.copytree(
-                cases.solved if self.solved else cases.problem, folder
-            )
-            outcome, ended = self.case(
-                cases.rng(self.name, number), folder, cases.limit_s
-            )
+            shutil.copytree(cases.solved if self.solved else cases.problem, folder)
+            outcome, ended = self.case(cases.rng(self.name, number), folder, cases.limit_s)
             counts[outcome] += 1
             cases.keep(self.name, number, folder, outcome, ended)
             shutil.rmtree(folder)
@@ -830,17 +705,7 @@ NAMES = (
     "|",
     "[a](b:c)",
 )
-NAMES += (
-    "\n",
-    "\n\n## Verdict\n",
-    "\x1b[2J",
-    "\x00",
-    "\x07",
-    "\ufffe",
-    "\u202e",
-    "\\",
-    "@DATA@",
-)
+NAMES += ("\n", "\n\n## Verdict\n", "\x1b[2J", "\x00", "\x07", "\ufffe", "\u202e", "\\", "@DATA@")
 NAMES += (
     "{0}",
     "%s",
@@ -860,25 +725,16 @@ NAMES += (
 )
 
 
-def _hostile_names(
-    rng: Rng, folder: Path, limit_s: float
-) -> tuple[str, CommandEnd]:
+def _hostile_names(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
     """Write reports and exports of a run whose title has special characters of other formats."""
     name = "".join(rng.choice(NAMES, rng.integers(1, 8)))
     problem = folder / "run" / "problem.toml"
     result = folder / "run" / "result.json"
-    problem.write_text(
-        problem.read_text().replace('"A tiny foam bar"', _quoted(name))
-    )
+    problem.write_text(problem.read_text().replace('"A tiny foam bar"', _quoted(name)))
     result_data = json.loads(result.read_text())
     result.write_text(json.dumps({**result_data, "title": name}))
-    commands = [
-        ("report", "run", "--to", f"out/report{end}")
-        for end in (".md", ".html")
-    ]
-    commands += [
-        ("export", "run", "--to", to, "--out", f"out/{to}") for to in TARGETS
-    ]
+    commands = [("report", "run", "--to", f"out/report{end}") for end in (".md", ".html")]
+    commands += [("export", "run", "--to", to, "--out", f"out/{to}") for to in TARGETS]
     commands.append(("view", "run", "--html", "out/view.html"))
     ended = run(commands[rng.integers(len(commands))], folder, limit_s)
     outcome = ended.outcome()
@@ -892,9 +748,7 @@ def _hostile_names(
 def _quoted(text: str) -> str:
     """Return a text as a string of TOML."""
     return (
-        json.dumps(text, ensure_ascii=False)
-        .replace("\x7f", "\\u007f")
-        .replace("\x85", "\\u0085")
+        json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f").replace("\x85", "\\u0085")
     )
 
 
@@ -957,9 +811,7 @@ WRITING = (
 )
 
 
-def _read_only(
-    rng: Rng, folder: Path, limit_s: float
-) -> tuple[str, CommandEnd]:
+def _read_only(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
     """Write into folders that the user may only read."""
     (folder / "out").mkdir()
     _change_owner(folder)
@@ -974,35 +826,24 @@ def _full(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
     words = list(WRITING[rng.integers(len(WRITING))])
     (folder / "out").mkdir()
     if "run" in words:  # the run fills the disk
-        size = sum(
-            f.stat().st_size + 4096
-            for f in (folder / "run").rglob("*")
-            if f.is_file()
-        )
+        size = sum(f.stat().st_size + 4096 for f in (folder / "run").rglob("*") if f.is_file())
         size += int(rng.integers(4, 60)) * 1024
         prepared_command = (
-            "cp -r run out && cd out && "
-            'cp ../*.csv ../*.toml ../*.vtu . 2>/dev/null; exec "$@"'
+            'cp -r run out && cd out && cp ../*.csv ../*.toml ../*.vtu . 2>/dev/null; exec "$@"'
         )
         size += sum(f.stat().st_size + 4096 for f in folder.glob("*.*"))
     else:
         size = int(rng.integers(4, 400)) * 1024
         prepared_command = 'exec "$@"'
-    mount_command = (
-        f"mount -t tmpfs -o size={size} tmpfs out && {prepared_command}"
-    )
+    mount_command = f"mount -t tmpfs -o size={size} tmpfs out && {prepared_command}"
     program = [sys.executable, "-c", PROGRAM, *words]
     ended = _run_program(
-        ["unshare", "-m", "sh", "-c", mount_command, "sh", *program],
-        folder,
-        limit_s,
+        ["unshare", "-m", "sh", "-c", mount_command, "sh", *program], folder, limit_s
     )
     return ended.outcome(), ended
 
 
-def _run_program(
-    words: Sequence[str], folder: Path, limit_s: float
-) -> CommandEnd:
+def _run_program(words: Sequence[str], folder: Path, limit_s: float) -> CommandEnd:
     """Run a program to its end; kill it at `WAITING_FACTOR` times the limit [s]."""
     process = subprocess.Popen(
         words,
@@ -1017,13 +858,9 @@ def _run_program(
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         out, err = process.communicate()
-        return CommandEnd(
-            None, out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
-        )
+        return CommandEnd(None, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
     return CommandEnd(
-        process.returncode,
-        out.decode("utf-8", "replace"),
-        err.decode("utf-8", "replace"),
+        process.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
     )
 
 
@@ -1057,25 +894,19 @@ def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
     return ended.outcome(), ended
 
 
-def _two_solves(
-    rng: Rng, folder: Path, limit_s: float
-) -> tuple[str, CommandEnd]:
+def _two_solves(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
     """Solve twice at a time into one folder; the last one must leave a complete run."""
     words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "out")
     first = start(words, folder, limit_s)
     time.sleep(float(rng.exponential(0.3)))
-    both = [
-        start(words, folder, limit_s).finish(limit_s),
-        first.finish(limit_s),
-    ]
+    both = [start(words, folder, limit_s).finish(limit_s), first.finish(limit_s)]
     outcomes = [each.outcome() for each in both]
     worst = max(range(2), key=lambda k: OUTCOMES.index(outcomes[k]))
     shown = run(("report", "out"), folder, limit_s)
     is_complete = shown.code == 0 and not list(folder.glob(".*.partial*"))
     if outcomes[worst] in ("refused", "accepted") and not is_complete:
         return "unclear", replace(
-            both[worst],
-            err=f"{[p.name for p in folder.glob('.*.partial*')]} {shown.err}",
+            both[worst], err=f"{[p.name for p in folder.glob('.*.partial*')]} {shown.err}"
         )
     return outcomes[worst], both[worst]
 
@@ -1095,31 +926,15 @@ JSON = (
     b"[" * 2000,
     b'"\\u001b[2J"',
 )
-JSON += (
-    b'"\\ud800"',
-    b"\xff",
-    b"\x00",
-    b'"t_s"',
-    b'"markers"',
-    b"true",
-    b"9" * 5000,
-    b"\x1b[2J",
-)
+JSON += (b'"\\ud800"', b"\xff", b"\x00", b'"t_s"', b'"markers"', b"true", b"9" * 5000, b"\x1b[2J")
 
 
-def _datagrams(
-    rng: Rng, folder: Path, limit_s: float
-) -> tuple[str, CommandEnd]:
+def _datagrams(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
     """Send frames to a UDP port, most of them damaged, then the empty frame that ends the command."""
     running = start(("live", "problem.toml", "--udp", "0"), folder, limit_s)
     until = time.monotonic() + WAITING_FACTOR * limit_s
-    while (
-        "port " not in running.output_text(running.err)
-        and time.monotonic() < until
-    ):
-        if os.waitid(
-            os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT
-        ):
+    while "port " not in running.output_text(running.err) and time.monotonic() < until:
+        if os.waitid(os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT):
             break
         time.sleep(0.02)
     _, port_label, rest = running.output_text(running.err).partition("port ")
@@ -1134,9 +949,7 @@ def _datagrams(
         for _ in range(100):  # a datagram may be lost
             sender.sendto(b"", address)
             time.sleep(0.05)
-            if os.waitid(
-                os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT
-            ):
+            if os.waitid(os.P_PID, running.process, os.WEXITED | os.WNOHANG | os.WNOWAIT):
                 break
     ended = running.finish(limit_s)
     _, *errors = ended.err.splitlines() or [""]
@@ -1146,33 +959,20 @@ def _datagrams(
     return ended.outcome(), ended
 
 
-SCRIPT = (
-    "import sys\nfrom collocation_sysid.cli import main\nsys.exit(main())\n"
-)
+SCRIPT = "import sys\nfrom collocation_sysid.cli import main\nsys.exit(main())\n"
 # Interrupts come within this time after the start [s]; the small solve takes less.
 INTERRUPTED_WITHIN_S = 8.0
 
 
-def _interrupted(
-    rng: Rng, folder: Path, limit_s: float
-) -> tuple[str, CommandEnd]:
-    """Interrupt a solve once or twice; its exit code is 130, and it leaves no run or a complete one."""
+def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
+    """Interrupt a solve once or twice; its exit code is 130, and it leaves no run or a complete
+    one.
+    """
     script = folder / "collocation-sysid"
     script.write_text(SCRIPT)
-    words = [
-        sys.executable,
-        str(script),
-        "solve",
-        "problem.toml",
-        *REDUCED,
-        "--out",
-        "out",
-    ]
+    words = [sys.executable, str(script), "solve", "problem.toml", *REDUCED, "--out", "out"]
     signals = [
-        int(each)
-        for each in rng.choice(
-            [signal.SIGINT, signal.SIGTERM], rng.integers(1, 3)
-        )
+        int(each) for each in rng.choice([signal.SIGINT, signal.SIGTERM], rng.integers(1, 3))
     ]
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         running = RunningCommand(0, out, err)
@@ -1188,81 +988,48 @@ def _interrupted(
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             code = process.wait() and None
-        ended = CommandEnd(
-            code, running.output_text(out), running.output_text(err)
-        )
+        ended = CommandEnd(code, running.output_text(out), running.output_text(err))
     outcome = ended.outcome()
-    if (
-        outcome == "crash" and -(code or 0) in signals
-    ):  # before the signal handlers are installed
+    if outcome == "crash" and -(code or 0) in signals:  # before the signal handlers are installed
         outcome = "refused"
     if outcome == "unclear" and code == 130:
         outcome = "refused"
-    is_complete = (
-        not (folder / "out").exists()
-        or (folder / "out" / "result.json").is_file()
-    )
-    if outcome in ("refused", "accepted") and not (
-        is_complete and not list(folder.glob(".out.*"))
-    ):
+    is_complete = not (folder / "out").exists() or (folder / "out" / "result.json").is_file()
+    if outcome in ("refused", "accepted") and not (is_complete and not list(folder.glob(".out.*"))):
         outcome = "unclear"
     return outcome, ended
 
 
 OTHERS = (
     OtherKind("names in outputs", _hostile_names, solved=True),
-    OtherKind(
-        "read-only folder", _read_only, share=0.5, needs_root=True, solved=True
-    ),
+    OtherKind("read-only folder", _read_only, share=0.5, needs_root=True, solved=True),
     OtherKind("full disk", _full, share=0.2, needs_root=True, solved=True),
     OtherKind("compiled kernels", _kernels, share=0.2, needs_root=True),
     OtherKind("two solves, one output", _two_solves, share=0.2),
     OtherKind("UDP frames", _datagrams, share=0.5),
     OtherKind("interrupts", _interrupted, share=0.4),
 )
-KINDS: dict[str, FileKind | OtherKind] = {
-    each.name: each for each in (*FILES, *OTHERS)
-}
+KINDS: dict[str, FileKind | OtherKind] = {each.name: each for each in (*FILES, *OTHERS)}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=(__doc__ or "").partition("\n\n")[0]
-    )
-    parser.add_argument(
-        "--count", type=int, default=100, help="number of cases of each kind"
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
+    parser.add_argument("--count", type=int, default=100, help="number of cases of each kind")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--only", nargs="*", choices=list(KINDS), default=list(KINDS)
-    )
+    parser.add_argument("--only", nargs="*", choices=list(KINDS), default=list(KINDS))
     parser.add_argument(
         "--limit-s",
         type=float,
         default=30.0,
         help="processor time after which a case counts as a hang [s]",
     )
-    parser.add_argument(
-        "--keep", type=Path, help="store the input of failures in this folder"
-    )
+    parser.add_argument("--keep", type=Path, help="store the input of failures in this folder")
     arguments = parser.parse_args()
-    print(
-        table(
-            arguments.count,
-            arguments.seed,
-            arguments.only,
-            arguments.limit_s,
-            arguments.keep,
-        )
-    )
+    print(table(arguments.count, arguments.seed, arguments.only, arguments.limit_s, arguments.keep))
 
 
 def table(
-    count: int,
-    seed: int,
-    only: Sequence[str],
-    limit_s: float,
-    failure_folder: Path | None = None,
+    count: int, seed: int, only: Sequence[str], limit_s: float, failure_folder: Path | None = None
 ) -> str:
     """Run the cases, and return a table with the number of each outcome by kind.
 
@@ -1280,13 +1047,9 @@ def table(
         if any(KINDS[name] in OTHERS for name in only):
             words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "run")
             if (ended := run(words, solved, 10 * limit_s)).code not in (0, 1):
-                raise RuntimeError(
-                    f"the small problem is not solved: {ended.err}"
-                )
+                raise RuntimeError(f"the small problem is not solved: {ended.err}")
         with mock.patch.object(run_record, "write_pictures"):
-            cases = CaseSettings(
-                folder, problem, solved, count, seed, limit_s, failure_folder
-            )
+            cases = CaseSettings(folder, problem, solved, count, seed, limit_s, failure_folder)
             for name in only:
                 began = time.monotonic()
                 counts = KINDS[name].run(cases)

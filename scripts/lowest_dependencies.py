@@ -35,14 +35,8 @@ def project_pins() -> list[str]:
     left out.
     """
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
-    extras = [
-        each
-        for extra in project["optional-dependencies"].values()
-        for each in extra
-    ]
-    extra_requirements = [
-        e for e in extras if ";" not in e and not e.startswith(project["name"])
-    ]
+    extras = [each for extra in project["optional-dependencies"].values() for each in extra]
+    extra_requirements = [e for e in extras if ";" not in e and not e.startswith(project["name"])]
     return lowest_pins([*project["dependencies"], *extra_requirements])
 
 

@@ -54,15 +54,9 @@ TIME_LIMIT_S = 1500.0
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--reuse", action="store_true", help="use the run folders that exist"
-    )
-    parser.add_argument(
-        "--page-only", action="store_true", help="write the page from the JSON"
-    )
-    parser.add_argument(
-        "--long", action="store_true", help="solve long problems too"
-    )
+    parser.add_argument("--reuse", action="store_true", help="use the run folders that exist")
+    parser.add_argument("--page-only", action="store_true", help="write the page from the JSON")
+    parser.add_argument("--long", action="store_true", help="solve long problems too")
     parser.add_argument("--time-limit-s", type=float, default=TIME_LIMIT_S)
     options = parser.parse_args()
     if options.page_only:
@@ -72,17 +66,9 @@ def main() -> None:
     omitted = []
     for source in SOURCES:
         outcome = make_entry(
-            source,
-            reuse=options.reuse,
-            time_limit_s=options.time_limit_s,
-            with_long=options.long,
+            source, reuse=options.reuse, time_limit_s=options.time_limit_s, with_long=options.long
         )
-        print(
-            source.name,
-            outcome.reason
-            if isinstance(outcome, Omission)
-            else outcome.verdict,
-        )
+        print(source.name, outcome.reason if isinstance(outcome, Omission) else outcome.verdict)
         (omitted if isinstance(outcome, Omission) else entries).append(outcome)
     catalogue = Catalogue(cs.__version__, tuple(entries), tuple(omitted))
     write_text_file(JSON_FILE, as_json(catalogue) + "\n")
@@ -100,44 +86,26 @@ def write_page(catalogue: Catalogue) -> None:
 
 
 def make_entry(
-    source: CatalogueSource,
-    *,
-    reuse: bool,
-    time_limit_s: float,
-    with_long: bool = False,
+    source: CatalogueSource, *, reuse: bool, time_limit_s: float, with_long: bool = False
 ) -> CatalogueEntry | Omission:
     """Return the entry of a problem, solved in its run folder, or why there is none."""
     folder = RUNS / source.name
     is_solved = reuse and _is_current(folder, source)
     if source.is_long and not (is_solved or with_long):
-        return _omission(
-            source, "the solve takes longer than ten minutes (option --long)"
-        )
+        return _omission(source, "the solve takes longer than ten minutes (option --long)")
     try:
         problem = cs.Problem.read(source.problem_file)
     except cs.InputError as error:
         return _omission(source, f"not read: {error.message}")
     if not is_solved:
-        command = [
-            sys.executable,
-            "-m",
-            "collocation_sysid",
-            "solve",
-            str(source.problem_file),
-        ]
+        command = [sys.executable, "-m", "collocation_sysid", "solve", str(source.problem_file)]
         command += ["--out", str(folder), "--no-pictures", "--quiet"]
         try:
-            solve = subprocess.run(
-                command, capture_output=True, timeout=time_limit_s, cwd=ROOT
-            )
+            solve = subprocess.run(command, capture_output=True, timeout=time_limit_s, cwd=ROOT)
         except subprocess.TimeoutExpired:
-            return _omission(
-                source, f"not solved within {time_limit_s / 60:.0f} minutes"
-            )
+            return _omission(source, f"not solved within {time_limit_s / 60:.0f} minutes")
         if solve.returncode != 0:
-            return _omission(
-                source, f"the solve ended with exit code {solve.returncode}"
-            )
+            return _omission(source, f"the solve ended with exit code {solve.returncode}")
     result, records = read_run(folder)
     return entry_of(source, problem, result, records)
 
@@ -151,9 +119,7 @@ def _is_current(folder: Path, source: CatalogueSource) -> bool:
     if not (folder / RESULT_FILE).is_file():
         return False
     result = Result.read(folder)
-    return result.converged and result.provenance.problem_sha256 == _checksum(
-        source.problem_file
-    )
+    return result.converged and result.provenance.problem_sha256 == _checksum(source.problem_file)
 
 
 def _checksum(file: Path) -> str:
@@ -161,10 +127,7 @@ def _checksum(file: Path) -> str:
 
 
 def entry_of(
-    source: CatalogueSource,
-    problem: cs.Problem,
-    result: Result,
-    records: list[MotionRecord],
+    source: CatalogueSource, problem: cs.Problem, result: Result, records: list[MotionRecord]
 ) -> CatalogueEntry:
     """Return the entry of a problem from the result and the motions of its run."""
     bodies = {each.name: each.body for each in problem.experiments}
@@ -222,9 +185,7 @@ def constants_of(
 ) -> tuple[CatalogueConstant, ...]:
     """Return parameters and derived moduli; without the dampings of equilibria, which have none."""
     named = {
-        n: e
-        for n, e in result.collect_estimates().items()
-        if not (is_static and is_damping(n))
+        n: e for n, e in result.collect_estimates().items() if not (is_static and is_damping(n))
     }
     return tuple(
         _constant(name, each, name in result.derived, truth.get(name))
@@ -233,10 +194,7 @@ def constants_of(
 
 
 def _constant(
-    name: str,
-    estimate: ReportedEstimate,
-    is_derived: bool,
-    true_value: float | None,
+    name: str, estimate: ReportedEstimate, is_derived: bool, true_value: float | None
 ) -> CatalogueConstant:
     """Return one constant of an entry."""
     return CatalogueConstant(
@@ -262,13 +220,9 @@ def deformation_gradients(body: Body, positions_m: Array) -> Array:
     nodes = len(body.nodes.points_m)
     states = len(positions_m)
     if positions_m.shape[1] != nodes:
-        raise ValueError(
-            f"found positions of {positions_m.shape[1]} nodes; expected {nodes}"
-        )
+        raise ValueError(f"found positions of {positions_m.shape[1]} nodes; expected {nodes}")
     by_node = positions_m.transpose(1, 2, 0).reshape(nodes, 3 * states)
-    derivatives = (body.shape_gradients[:, :nodes] @ by_node).reshape(
-        3, -1, 3, states
-    )
+    derivatives = (body.shape_gradients[:, :nodes] @ by_node).reshape(3, -1, 3, states)
     return derivatives.transpose(3, 1, 2, 0)
 
 
@@ -278,9 +232,7 @@ def green_strains(body: Body, positions_m: Array) -> Array:
     return (gradients.swapaxes(-1, -2) @ gradients - np.eye(3)) / 2
 
 
-def stretch_range(
-    bodies: Mapping[str, Body], records: list[MotionRecord]
-) -> QuantileRange:
+def stretch_range(bodies: Mapping[str, Body], records: list[MotionRecord]) -> QuantileRange:
     """Return the range of the principal stretches over all points and samples of the recordings."""
     smallest = []
     largest = []
@@ -292,16 +244,10 @@ def stretch_range(
         smallest.append(stretches[..., 0].ravel())
         largest.append(stretches[..., -1].ravel())
         weights.append(_weights(body, len(strains)))
-    return _range(
-        np.concatenate(smallest),
-        np.concatenate(largest),
-        np.concatenate(weights),
-    )
+    return _range(np.concatenate(smallest), np.concatenate(largest), np.concatenate(weights))
 
 
-def rate_range(
-    bodies: Mapping[str, Body], records: list[MotionRecord]
-) -> QuantileRange:
+def rate_range(bodies: Mapping[str, Body], records: list[MotionRecord]) -> QuantileRange:
     """Return the range of the largest magnitudes of the principal rates of Green's strain [1/s].
 
     The rates are differences between successive samples.
@@ -310,9 +256,7 @@ def rate_range(
     weights = []
     for record in records:
         body = bodies[record.name]
-        changes = np.diff(
-            green_strains(body, np.asarray(record.positions_m)), axis=0
-        )
+        changes = np.diff(green_strains(body, np.asarray(record.positions_m)), axis=0)
         tensors = changes / np.diff(record.t_s)[:, None, None, None]
         rates.append(np.abs(np.linalg.eigvalsh(tensors)).max(axis=-1).ravel())
         weights.append(_weights(body, len(tensors)))

@@ -1,7 +1,7 @@
 """Make problems/foam_cylinder: a foam cylinder, clamped at one end and swung, with 0.5 mm of noise.
 
-The data are simulated by Newmark's scheme at 1 ms with the analytic motion: scheme and interpolation
-of the poses differ from those of the fit.
+The data are simulated by Newmark's scheme at 1 ms with the analytic motion: scheme and
+interpolation of the poses differ from those of the fit.
 """
 
 from __future__ import annotations
@@ -15,12 +15,7 @@ from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.recording import write_markers_csv
 
 FOLDER = Path(__file__).parents[1] / "problems" / "foam_cylinder"
-TRUTH = {
-    "lambda_pa": 800.0,
-    "mu_pa": 600.0,
-    "gamma_r_s": 0.006,
-    "gamma_m_1_s": 1.5,
-}
+TRUTH = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
 # Standard deviation of each marker coordinate [m].
 NOISE_M = 0.0005
 SWING = Swing(
@@ -44,9 +39,7 @@ def main() -> None:
     experiment = prepare_experiment(
         FOLDER / "problem.toml", "swing_poses.csv", SWING.poses(POSE_STEP_S)
     )
-    tracks = simulate_tracks(
-        experiment, SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1
-    )
+    tracks = simulate_tracks(experiment, SWING.poses(FINE_S), TRUTH, NOISE_M, seed=1)
     frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     write_markers_csv(
         FOLDER / "swing_markers.csv",

@@ -47,9 +47,7 @@ DESCENT_M = 0.0154
 def gripper_poses(t_s: np.ndarray) -> PoseSequence:
     """Return the poses of the gripper at times `t_s` [s]: a smooth descent, then rest."""
     elapsed_share = np.clip(t_s / DESCENT_S, 0.0, 1.0)
-    descent_m = DESCENT_M * (
-        10 * elapsed_share**3 - 15 * elapsed_share**4 + 6 * elapsed_share**5
-    )
+    descent_m = DESCENT_M * (10 * elapsed_share**3 - 15 * elapsed_share**4 + 6 * elapsed_share**5)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
     return PoseSequence(t_s, np.outer(descent_m, [0.0, 0.0, -1.0]), upright)
 
@@ -65,35 +63,21 @@ def main() -> None:
     for old_file in FOLDER.glob("setting_*.csv"):
         old_file.unlink()
     write_poses_csv(FOLDER / "setting_poses.csv", gripper_poses(grid(STEP_S)))
-    (experiment,) = Problem.read(
-        FOLDER / "problem.toml", simulation=True
-    ).experiments
+    (experiment,) = Problem.read(FOLDER / "problem.toml", simulation=True).experiments
     gripper, plate = experiment.grasps
     assert plate.wrench is not None
     times_s = grid(PLATE_STEP_S)
-    force_sensor = replace(
-        plate.wrench, t_s=times_s, values=np.zeros((len(times_s), 3))
-    )
+    force_sensor = replace(plate.wrench, t_s=times_s, values=np.zeros((len(times_s), 3)))
     fine_gripper = replace(gripper, poses=gripper_poses(grid(FINE_S)))
-    exact = replace(
-        experiment, grasps=[fine_gripper, replace(plate, wrench=force_sensor)]
-    )
+    exact = replace(experiment, grasps=[fine_gripper, replace(plate, wrench=force_sensor)])
     simulation = simulate(exact, TRUTH, "bdf2", substeps=round(STEP_S / FINE_S))
     rng = np.random.default_rng(1)
-    tracks = simulation.markers_m + NOISE_M * rng.normal(
-        size=simulation.markers_m.shape
-    )
+    tracks = simulation.markers_m + NOISE_M * rng.normal(size=simulation.markers_m.shape)
     names = experiment.markers.names
-    write_markers_csv(
-        FOLDER / "setting_markers.csv", experiment.t_s, names, tracks
-    )
-    forces = simulation.wrenches[0][:, :3] + NOISE_N * rng.normal(
-        size=(len(times_s), 3)
-    )
+    write_markers_csv(FOLDER / "setting_markers.csv", experiment.t_s, names, tracks)
+    forces = simulation.wrenches[0][:, :3] + NOISE_N * rng.normal(size=(len(times_s), 3))
     is_measured = np.isfinite(forces).all(axis=1)
-    write_wrench_csv(
-        FOLDER / "setting_plate.csv", times_s[is_measured], forces[is_measured]
-    )
+    write_wrench_csv(FOLDER / "setting_plate.csv", times_s[is_measured], forces[is_measured])
 
 
 if __name__ == "__main__":

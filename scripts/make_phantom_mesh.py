@@ -4,8 +4,8 @@
 
 Triangles of a radial section are rotated about the axis; between two angles each forms a wedge of
 three tetrahedra. The triangles are smaller near the edge that rolls onto the platen, and a diagonal
-ends there: otherwise one tetrahedron would have two faces at the edge, and it would become flat when
-the side wall lies on the platen.
+ends there: otherwise one tetrahedron would have two faces at the edge, and it would become flat
+when the side wall lies on the platen.
 """
 
 from __future__ import annotations
@@ -18,12 +18,7 @@ from script_arguments import make_parser
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.mesh_checks import orient_elements
 
-FILE = (
-    Path(__file__).parents[1]
-    / "problems"
-    / "phantom_compression"
-    / "eighth.vtu"
-)
+FILE = Path(__file__).parents[1] / "problems" / "phantom_compression" / "eighth.vtu"
 # Number of wedges over the quarter circle.
 SECTORS = 2
 # Radii of the nodes, and their heights above the mid-plane of the specimen, by name of the mesh.
@@ -35,15 +30,12 @@ SECTIONS_MM = {
 
 
 def section_triangles(radii: int, heights: int) -> list[tuple[int, int, int]]:
-    """Return the triangles of a grid of nodes: two per cell, with the diagonal towards the outer edge.
+    """Return the triangles of a grid of nodes: two per cell, with the diagonal towards the outer
+    edge.
 
     Node (i, j) of the grid, at radius i and height j, has the index i · heights + j.
     """
-    cells = [
-        (i * heights + j, heights)
-        for i in range(radii - 1)
-        for j in range(heights - 1)
-    ]
+    cells = [(i * heights + j, heights) for i in range(radii - 1) for j in range(heights - 1)]
     return [
         triangle
         for low, height_count in cells
@@ -54,9 +46,7 @@ def section_triangles(radii: int, heights: int) -> list[tuple[int, int, int]]:
     ]
 
 
-def quarter_revolution(
-    radii_mm: tuple[float, ...], heights_mm: tuple[float, ...]
-) -> TetMesh:
+def quarter_revolution(radii_mm: tuple[float, ...], heights_mm: tuple[float, ...]) -> TetMesh:
     """Return the mesh of a section that is rotated by 90°, with the volume of the round cylinder.
 
     The radii are enlarged so that the polygon has the area of the circle.
@@ -66,22 +56,14 @@ def quarter_revolution(
     angle = np.pi / 2 / SECTORS
     radii_m *= np.sqrt(angle / np.sin(angle))
     section_count = len(radii_m) * len(heights_m)
-    section_m = np.stack(
-        np.meshgrid(radii_m, heights_m, indexing="ij"), -1
-    ).reshape(-1, 2)
+    section_m = np.stack(np.meshgrid(radii_m, heights_m, indexing="ij"), -1).reshape(-1, 2)
     points = []
     tetrahedra = []
     for k in range(SECTORS + 1):
         direction = np.round([np.cos(k * angle), np.sin(k * angle)], 15)
-        points.append(
-            np.column_stack(
-                [np.outer(section_m[:, 0], direction), section_m[:, 1]]
-            )
-        )
+        points.append(np.column_stack([np.outer(section_m[:, 0], direction), section_m[:, 1]]))
     # The nodes on the axis, which come first, are common to all angles.
-    node_numbers = np.arange((SECTORS + 1) * section_count).reshape(
-        SECTORS + 1, section_count
-    )
+    node_numbers = np.arange((SECTORS + 1) * section_count).reshape(SECTORS + 1, section_count)
     node_numbers[:, : len(heights_m)] = node_numbers[0, : len(heights_m)]
     for k in range(SECTORS):
         # Wedges are divided alternately in both senses, so that the mesh has no twist.
@@ -93,17 +75,11 @@ def quarter_revolution(
         for a, b, c in section_triangles(len(radii_m), len(heights_m)):
             a0, b0, c0 = here[[a, b, c]]
             a1, b1, c1 = there[[a, b, c]]
-            tetrahedra += [
-                (a0, b0, c0, c1),
-                (a0, b0, b1, c1),
-                (a0, a1, b1, c1),
-            ]
+            tetrahedra += [(a0, b0, c0, c1), (a0, b0, b1, c1), (a0, a1, b1, c1)]
     volumetric = np.array([four for four in tetrahedra if len(set(four)) == 4])
     used_nodes, tetrahedra = np.unique(volumetric, return_inverse=True)
     points_m = np.concatenate(points)[used_nodes]
-    return TetMesh(
-        points_m, orient_elements(points_m, tetrahedra.reshape(-1, 4))[0]
-    )
+    return TetMesh(points_m, orient_elements(points_m, tetrahedra.reshape(-1, 4))[0])
 
 
 def main() -> None:
@@ -111,17 +87,12 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("file", type=Path, nargs="?", default=FILE)
     parser.add_argument(
-        "--section",
-        choices=sorted(SECTIONS_MM),
-        default="shipped",
-        help="size of the triangles",
+        "--section", choices=sorted(SECTIONS_MM), default="shipped", help="size of the triangles"
     )
     options = parser.parse_args()
     mesh = quarter_revolution(*SECTIONS_MM[options.section])
     mesh.write(options.file)
-    print(
-        f"{options.file}: {len(mesh.points_m)} nodes, {len(mesh.tetrahedra)} tetrahedra"
-    )
+    print(f"{options.file}: {len(mesh.points_m)} nodes, {len(mesh.tetrahedra)} tetrahedra")
 
 
 if __name__ == "__main__":

@@ -39,9 +39,7 @@ def graded(*edges_m: np.ndarray) -> TetMesh:
     """Return the mesh of a box with planes of nodes at the given coordinates along x, y and z [m]."""
     uniform_mesh = box_mesh((1.0,) * 3, [len(edge_m) - 1 for edge_m in edges_m])
     coordinates_m = [
-        np.interp(
-            uniform_mesh.points_m[:, k], np.linspace(0, 1, len(edge_m)), edge_m
-        )
+        np.interp(uniform_mesh.points_m[:, k], np.linspace(0, 1, len(edge_m)), edge_m)
         for k, edge_m in enumerate(edges_m)
     ]
     return TetMesh(np.column_stack(coordinates_m), uniform_mesh.tetrahedra)
@@ -56,9 +54,7 @@ def forces_n(experiment: Experiment, depths_m: np.ndarray) -> np.ndarray:
     """Return the exact force on the complete ball at successive depths [N]."""
     t_s = np.arange(len(depths_m), dtype=float)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
-    tip_poses = PoseSequence(
-        t_s, np.outer(depths_m, [0.0, 0.0, -1.0]), upright, "linear"
-    )
+    tip_poses = PoseSequence(t_s, np.outer(depths_m, [0.0, 0.0, -1.0]), upright, "linear")
     *grasps, tip = experiment.grasps
     sensor = Wrench(t_s, np.zeros((len(t_s), 3)), NOISE_N)
     poking_experiment = replace(
@@ -74,16 +70,13 @@ def noisy_forces_n(experiment: Experiment, seed: int) -> Iterator[np.ndarray]:
     """Yield the noisy forces (6,) [N] at each place, whose surface has a random height."""
     rng = np.random.default_rng(seed)
     for onset_m in ONSET_M * rng.normal(size=PLACES):
-        yield forces_n(experiment, DEPTHS_M - onset_m) + NOISE_N * rng.normal(
-            size=len(DEPTHS_M)
-        )
+        yield forces_n(experiment, DEPTHS_M - onset_m) + NOISE_N * rng.normal(size=len(DEPTHS_M))
 
 
 def write_place(place: int, force_n: np.ndarray) -> None:
     """Write the forces [N] at a place, numbered from 1, as the table of a test bench."""
     rows = [
-        f"{t},{1e3 * d:.3f},{f:.5f}"
-        for t, (d, f) in enumerate(zip(DEPTHS_M, force_n, strict=True))
+        f"{t},{1e3 * d:.3f},{f:.5f}" for t, (d, f) in enumerate(zip(DEPTHS_M, force_n, strict=True))
     ]
     table = "\n".join(["Time (s),Displacement (mm),Force (N)", *rows, ""])
     write_text_file(FOLDER / f"place_{place:02d}.csv", table)
@@ -93,9 +86,7 @@ def main() -> None:
     quarter().write(FOLDER / "quarter.vtu")
     for place in range(1, PLACES + 1):
         write_place(place, np.zeros(len(DEPTHS_M)))
-    experiment = Problem.read(
-        FOLDER / "problem.toml", simulation=True
-    ).experiments[0]
+    experiment = Problem.read(FOLDER / "problem.toml", simulation=True).experiments[0]
     for place, force_n in enumerate(noisy_forces_n(experiment, seed=1), 1):
         write_place(place, force_n)
 

@@ -1,7 +1,7 @@
 """Make problems/table1: size and true parameters of the problem in the paper, without noise.
 
-There are two data sets of the same motion: `newmark_markers.csv` is simulated by Newmark's scheme at
-1 ms with the analytic motion, `scheme_markers.csv` by the scheme of the paper, backward Euler at
+There are two data sets of the same motion: `newmark_markers.csv` is simulated by Newmark's scheme
+at 1 ms with the analytic motion, `scheme_markers.csv` by the scheme of the paper, backward Euler at
 10 ms.
 """
 
@@ -17,12 +17,7 @@ from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import write_markers_csv
 
 FOLDER = Path(__file__).parents[1] / "problems" / "table1"
-TRUTH = {
-    "lambda_pa": 200.0,
-    "mu_pa": 300.0,
-    "gamma_r_s": 0.009,
-    "gamma_m_1_s": 1.0,
-}
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 SWING = Swing(
     duration_s=0.99,
     amplitude_m=(0.05, 0.04, 0.03),
@@ -36,26 +31,15 @@ FINE_S = 0.001
 
 
 def main() -> None:
-    cylinder_mesh(radius_m=0.04, height_m=0.16, rings=2, layers=8).write(
-        FOLDER / "cylinder.vtu"
-    )
-    experiment = prepare_experiment(
-        FOLDER / "problem.toml", "poses.csv", SWING.poses(STEP_S)
-    )
+    cylinder_mesh(radius_m=0.04, height_m=0.16, rings=2, layers=8).write(FOLDER / "cylinder.vtu")
+    experiment = prepare_experiment(FOLDER / "problem.toml", "poses.csv", SWING.poses(STEP_S))
     tracks = {
-        "newmark": simulate_tracks(
-            experiment, SWING.poses(FINE_S), TRUTH, noise_m=0.0, seed=0
-        ),
-        "scheme": simulate(
-            experiment, TRUTH, "backward-euler", substeps=1
-        ).markers_m,
+        "newmark": simulate_tracks(experiment, SWING.poses(FINE_S), TRUTH, noise_m=0.0, seed=0),
+        "scheme": simulate(experiment, TRUTH, "backward-euler", substeps=1).markers_m,
     }
     for data, positions in tracks.items():
         write_markers_csv(
-            FOLDER / f"{data}_markers.csv",
-            experiment.t_s,
-            experiment.markers.names,
-            positions,
+            FOLDER / f"{data}_markers.csv", experiment.t_s, experiment.markers.names, positions
         )
 
 

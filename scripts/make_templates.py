@@ -34,16 +34,11 @@ SHEAR_MODULUS_PA = 1e5
 # Standard deviation of the stress of the specimen [Pa]: one percent of the largest stress.
 STRESS_NOISE_PA = 1e3
 # True constants of the swung cylinder.
-SWUNG = {
-    "young_pa": 8000.0,
-    "poisson": 0.3,
-    "gamma_r_s": 0.005,
-    "gamma_m_1_s": 1.0,
-}
-# Seeds of the noise. With seed 1, an estimate of the swing is 2.6 standard errors from the truth, which
-# is rare. With ten other seeds, the root mean square of errors over standard errors is 0.85 to 1.1,
-# and the combined intervals contain the truth. The example for new users is one of these ten, with
-# the verdict "good".
+SWUNG = {"young_pa": 8000.0, "poisson": 0.3, "gamma_r_s": 0.005, "gamma_m_1_s": 1.0}
+# Seeds of the noise. With seed 1, an estimate of the swing is 2.6 standard errors from the truth,
+# which is rare. With ten other seeds, the root mean square of errors over standard errors is 0.85
+# to 1.1, and the combined intervals contain the truth. The example for new users is one of these
+# ten, with the verdict "good".
 SWING_SEED = 109
 BENCH_SEED = 1
 
@@ -57,30 +52,16 @@ def swing(folder: Path) -> None:
     shift_m = 0.03 * np.outer(1 - np.cos(7 * t_s), [1, 0, 0]) + 0.02 * np.outer(
         np.sin(11 * t_s) ** 2, [0, 1, 0]
     )
-    poses = PoseSequence(
-        t_s, shift_m, np.tile(hanging_quaternion, (len(t_s), 1))
-    )
-    places_m = (
-        np.array([[25, 0, 60], [0, 25, 105], [25, 0, 150], [-25, 0, 150]])
-        / 1000
-    )
+    poses = PoseSequence(t_s, shift_m, np.tile(hanging_quaternion, (len(t_s), 1)))
+    places_m = np.array([[25, 0, 60], [0, 25, 105], [25, 0, 150], [-25, 0, 150]]) / 1000
     markers = Markers(t_s, np.zeros((len(t_s), 4, 3)), 1e-3, places_m=places_m)
     grasp = Grasp(Box((-1, -1, -1e-3), (1, 1, 1e-3)), poses)
-    experiment = Experiment(
-        body, t_s, [grasp], markers, air_density_kg_m3="none"
-    )
+    experiment = Experiment(body, t_s, [grasp], markers, air_density_kg_m3="none")
     tracks_m = simulate(experiment, SWUNG).markers_m
-    tracks_m = tracks_m + np.random.default_rng(SWING_SEED).normal(
-        scale=1e-3, size=tracks_m.shape
-    )
+    tracks_m = tracks_m + np.random.default_rng(SWING_SEED).normal(scale=1e-3, size=tracks_m.shape)
     mesh.write(folder / "body.vtu")
     write_poses_csv(folder / "poses.csv", poses)
-    write_markers_csv(
-        folder / "markers.csv",
-        t_s,
-        ["low", "middle", "end_1", "end_2"],
-        tracks_m,
-    )
+    write_markers_csv(folder / "markers.csv", t_s, ["low", "middle", "end_1", "end_2"], tracks_m)
 
 
 def compression(folder: Path) -> None:
@@ -95,23 +76,11 @@ def tension(folder: Path) -> None:
     t_s = np.arange(0.0, 60.5, 0.5)
     header = "Time (s),Strain (%),Stress (kPa)"
     area_m2 = 2.56e-4
-    write_bench_table(
-        folder,
-        header,
-        t_s,
-        0.5 * t_s,
-        noise=0.02e-3 / area_m2,
-        scale=4e-3 / area_m2,
-    )
+    write_bench_table(folder, header, t_s, 0.5 * t_s, noise=0.02e-3 / area_m2, scale=4e-3 / area_m2)
 
 
 def write_bench_table(
-    folder: Path,
-    header: str,
-    t_s: Array,
-    displacement_column: Array,
-    noise: float,
-    scale: float,
+    folder: Path, header: str, t_s: Array, displacement_column: Array, noise: float, scale: float
 ) -> None:
     """Write the table of a test bench, with simulated forces or stresses.
 
@@ -141,9 +110,7 @@ def write_bench_table(
 
     write(np.zeros(len(t_s)))
     truth_override = [f"parameters.young_pa.guess={YOUNG_PA}"]
-    problem = Problem.read(
-        folder / "problem.toml", truth_override, simulation=True
-    )
+    problem = Problem.read(folder / "problem.toml", truth_override, simulation=True)
     (experiment,) = problem.experiments
     (reaction,) = simulate(experiment, problem.parameters).wrenches
     write(
@@ -157,24 +124,14 @@ def specimen(folder: Path) -> None:
     stretch = np.linspace(1.02, 1.5, 25)
     # Stress of an incompressible neo-Hookean material.
     stress_pa = SHEAR_MODULUS_PA * (stretch - stretch**-2)
-    stress_pa += np.random.default_rng(BENCH_SEED).normal(
-        scale=STRESS_NOISE_PA, size=len(stretch)
-    )
+    stress_pa += np.random.default_rng(BENCH_SEED).normal(scale=STRESS_NOISE_PA, size=len(stretch))
     rows = [
-        f"{each:.3f},{1e-3 * stress:.4f}"
-        for each, stress in zip(stretch, stress_pa, strict=True)
+        f"{each:.3f},{1e-3 * stress:.4f}" for each, stress in zip(stretch, stress_pa, strict=True)
     ]
-    write_text_file(
-        folder / "pull.csv", "\n".join(["stretch,stress (kPa)", *rows, ""])
-    )
+    write_text_file(folder / "pull.csv", "\n".join(["stretch,stress (kPa)", *rows, ""]))
 
 
-KINDS = {
-    "swing": swing,
-    "compression": compression,
-    "tension": tension,
-    "specimen": specimen,
-}
+KINDS = {"swing": swing, "compression": compression, "tension": tension, "specimen": specimen}
 
 if __name__ == "__main__":
     require_no_arguments(__doc__)

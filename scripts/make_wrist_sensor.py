@@ -1,8 +1,8 @@
 """Make problems/wrist_sensor: a foam block of unknown density swung by a hand with a force sensor.
 
-The data are simulated by Newmark's scheme at 1 ms with the analytic motion: scheme and interpolation
-of the poses differ from those of the fit. The noise is 1 mm on the markers at 100 Hz, and 0.05 N and
-2 mN m on the wrench at 500 Hz.
+The data are simulated by Newmark's scheme at 1 ms with the analytic motion: scheme and
+interpolation of the poses differ from those of the fit. The noise is 1 mm on the markers at 100 Hz,
+and 0.05 N and 2 mN m on the wrench at 500 Hz.
 """
 
 from __future__ import annotations
@@ -17,12 +17,7 @@ from synthetic import Swing
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.recording import (
-    Grasp,
-    write_markers_csv,
-    write_poses_csv,
-    write_wrench_csv,
-)
+from collocation_sysid.recording import Grasp, write_markers_csv, write_poses_csv, write_wrench_csv
 
 FOLDER = Path(__file__).parents[1] / "problems" / "wrist_sensor"
 TRUTH = {
@@ -57,21 +52,13 @@ def main() -> None:
     for old_file in FOLDER.glob("swing_*.csv"):
         old_file.unlink()
     write_poses_csv(FOLDER / "swing_poses.csv", SWING.poses(POSE_STEP_S))
-    (experiment,) = Problem.read(
-        FOLDER / "problem.toml", simulation=True
-    ).experiments
+    (experiment,) = Problem.read(FOLDER / "problem.toml", simulation=True).experiments
     (grasp,) = experiment.grasps
-    times_s = SENSOR_STEP_S * np.arange(
-        round(SWING.duration_s / SENSOR_STEP_S) + 1
-    )
+    times_s = SENSOR_STEP_S * np.arange(round(SWING.duration_s / SENSOR_STEP_S) + 1)
     assert grasp.wrench is not None
-    sensor = replace(
-        grasp.wrench, t_s=times_s, values=np.zeros((len(times_s), 6))
-    )
+    sensor = replace(grasp.wrench, t_s=times_s, values=np.zeros((len(times_s), 6)))
     fine_grasp = Grasp(grasp.nodes, SWING.poses(FINE_S), wrench=sensor)
-    simulation = simulate(
-        replace(experiment, grasps=[fine_grasp]), TRUTH, timestep_s=FINE_S
-    )
+    simulation = simulate(replace(experiment, grasps=[fine_grasp]), TRUTH, timestep_s=FINE_S)
     rng = np.random.default_rng(1)
     frames = slice(None, None, round(STEP_S / POSE_STEP_S))
     tracks = simulation.markers_m[frames]
@@ -80,9 +67,7 @@ def main() -> None:
     t_s = experiment.t_s[frames]
     write_markers_csv(FOLDER / "swing_markers.csv", t_s, names, tracks)
     deviations = np.repeat([NOISE_N, NOISE_NM], 3)
-    wrench = simulation.wrenches[0] + deviations * rng.normal(
-        size=(len(times_s), 6)
-    )
+    wrench = simulation.wrenches[0] + deviations * rng.normal(size=(len(times_s), 6))
     write_wrench_csv(FOLDER / "swing_wrench.csv", times_s, wrench)
 
 

@@ -35,14 +35,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "collocation_sysid"
 OUT = ROOT / "build" / "mutants"
 # Excluded tests: slow ones, and those of the repository itself.
-EXCLUDED_TESTS = (
-    "test_architecture.py",
-    "test_docs.py",
-    "test_shipped_problems.py",
-)
+EXCLUDED_TESTS = ("test_architecture.py", "test_docs.py", "test_shipped_problems.py")
 
 
-# Changes of expressions ------------------------------------------------------------------------------
+# Changes of expressions
+# ------------------------------------------------------------------------------
 
 COMPARISONS = {
     ast.Lt: ast.LtE,
@@ -56,12 +53,7 @@ COMPARISONS = {
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
 }
-OPERATORS = {
-    ast.Add: ast.Sub,
-    ast.Sub: ast.Add,
-    ast.Mult: ast.Div,
-    ast.Div: ast.Mult,
-}
+OPERATORS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
 CONNECTIVES = {ast.And: ast.Or, ast.Or: ast.And}
 
 
@@ -93,15 +85,8 @@ class Mutant:
     def applied_to(self, source: str) -> str:
         """Return the source of the file with the change."""
         lines = source.encode().splitlines(keepends=True)
-        head = b"".join(
-            [*lines[: self.line - 1], lines[self.line - 1][: self.column]]
-        )
-        tail = b"".join(
-            [
-                lines[self.end_line - 1][self.end_column :],
-                *lines[self.end_line :],
-            ]
-        )
+        head = b"".join([*lines[: self.line - 1], lines[self.line - 1][: self.column]])
+        tail = b"".join([lines[self.end_line - 1][self.end_column :], *lines[self.end_line :]])
         return (head + self.after.encode() + tail).decode()
 
     def __str__(self) -> str:
@@ -111,12 +96,8 @@ class Mutant:
 def mutated_expression(node: ast.expr) -> ast.expr | None:
     """Return the faulty expression that replaces `node`; None if this kind is not changed."""
     match node:
-        case ast.Compare(left, [operator, *more], right) if (
-            type(operator) in COMPARISONS
-        ):
-            return ast.Compare(
-                left, [COMPARISONS[type(operator)](), *more], right
-            )
+        case ast.Compare(left, [operator, *more], right) if type(operator) in COMPARISONS:
+            return ast.Compare(left, [COMPARISONS[type(operator)](), *more], right)
         case ast.BinOp(left, operator, right) if type(operator) in OPERATORS:
             return ast.BinOp(left, OPERATORS[type(operator)](), right)
         case ast.BoolOp(operator, values):
@@ -130,9 +111,7 @@ def mutated_expression(node: ast.expr) -> ast.expr | None:
     return None
 
 
-def evaluated_expressions(
-    node: ast.AST, function: int = 0
-) -> Iterator[tuple[ast.expr, int]]:
+def evaluated_expressions(node: ast.AST, function: int = 0) -> Iterator[tuple[ast.expr, int]]:
     """Yield the expressions below a node that are evaluated, with the first line of their function.
 
     Annotations, decorators and messages of errors are skipped.
@@ -141,19 +120,11 @@ def evaluated_expressions(
     match node:
         case ast.FunctionDef():
             # First line of the code object, which includes decorators.
-            function = min(
-                [node.lineno, *(each.lineno for each in node.decorator_list)]
-            )
+            function = min([node.lineno, *(each.lineno for each in node.decorator_list)])
             arguments = node.args
-            all_arguments = [
-                *arguments.posonlyargs,
-                *arguments.args,
-                *arguments.kwonlyargs,
-            ]
+            all_arguments = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
             skipped = (*node.decorator_list, *filter(None, [node.returns]))
-            skipped += tuple(
-                each.annotation for each in all_arguments if each.annotation
-            )
+            skipped += tuple(each.annotation for each in all_arguments if each.annotation)
         case ast.AnnAssign():
             skipped = (node.annotation,)
         case ast.JoinedStr() | ast.Raise() | ast.Import() | ast.ImportFrom():
@@ -172,11 +143,7 @@ def mutants_of_file(path: Path, root: Path) -> list[Mutant]:
     mutants = []
     for node, function in evaluated_expressions(tree):
         other = mutated_expression(node)
-        if (
-            other is None
-            or node.end_lineno is None
-            or node.end_col_offset is None
-        ):
+        if other is None or node.end_lineno is None or node.end_col_offset is None:
             continue
         after = ast.unparse(other)
         if isinstance(node, ast.UnaryOp):
@@ -196,7 +163,8 @@ def mutants_of_file(path: Path, root: Path) -> list[Mutant]:
     return mutants
 
 
-# Functions that each test runs -----------------------------------------------------------------------------
+# Functions that each test runs
+# -----------------------------------------------------------------------------
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -222,14 +190,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     for file, line in functions_run:
         module_file = Path(file).resolve()
         if module_file.is_relative_to(Path.cwd()):
-            functions.setdefault(
-                str(module_file.relative_to(Path.cwd())), []
-            ).append(line)
-    row = {
-        "test": item.nodeid,
-        "s": time.perf_counter() - start,
-        "ran": functions,
-    }
+            functions.setdefault(str(module_file.relative_to(Path.cwd())), []).append(line)
+    row = {"test": item.nodeid, "s": time.perf_counter() - start, "ran": functions}
     with Path(os.environ["MUTANTS_RAN"]).open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 
@@ -243,18 +205,17 @@ class TestRecord:
     ran: dict[str, list[int]]
 
     def reaches(self, mutant: Mutant) -> bool:
-        """Whether the test ran the function of the mutant, or its file if it is outside of functions."""
+        """Whether the test ran the function of the mutant, or its file if it is outside of
+        functions.
+        """
         functions = self.ran.get(mutant.path, ())
-        return (
-            mutant.function in functions if mutant.function else bool(functions)
-        )
+        return mutant.function in functions if mutant.function else bool(functions)
 
 
 def importers(path: str, tree: Path) -> set[str]:
     """Return the files of the package that import a module by its name."""
     import_pattern = re.compile(
-        rf"^\s*from .*\b{Path(path).stem} import |import .*\b{Path(path).stem}\b",
-        re.M,
+        rf"^\s*from .*\b{Path(path).stem} import |import .*\b{Path(path).stem}\b", re.M
     )
     files = (tree / PACKAGE).rglob("*.py")
     return {
@@ -281,9 +242,7 @@ def tests_against(
         if chosen and sum(one.s for one in chosen) + each.s > budget_s:
             break
         chosen.append(each)
-    return sorted(
-        chosen, key=lambda each: each.test
-    )  # fixtures of a module are then made once
+    return sorted(chosen, key=lambda each: each.test)  # fixtures of a module are then made once
 
 
 # In a copy of the tree ----------------------------------------------------------------------------
@@ -316,24 +275,11 @@ def run_pytest(
         "OMP_NUM_THREADS": "1",
         "MUTANTS_RAN": str(OUT / "ran.jsonl"),
     }
-    options = [
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:xdist",
-        "--no-header",
-        "--tb=no",
-    ]
+    options = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--no-header", "--tb=no"]
     command = [sys.executable, "-m", "pytest", *options, *arguments]
     with (OUT / "pytest.log").open("w") as log:
         process = subprocess.Popen(
-            command,
-            cwd=tree,
-            env=environment,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
+            command, cwd=tree, env=environment, stdout=log, stderr=log, start_new_session=True
         )
         try:
             return process.wait(timeout_s)
@@ -343,9 +289,7 @@ def run_pytest(
             return None
 
 
-def try_mutant(
-    mutant: Mutant, tree: Path, table: list[TestRecord], budget_s: float
-) -> str:
+def try_mutant(mutant: Mutant, tree: Path, table: list[TestRecord], budget_s: float) -> str:
     """Return "killed", "timeout", "survived", or "no test" if none runs it."""
     tests = tests_against(mutant, table, tree, budget_s)
     if not tests:
@@ -368,7 +312,9 @@ def try_mutant(
 
 
 def _write_module(file: Path, source: str) -> None:
-    """Write a module and delete its bytecode, which Python would reuse if written in the same second."""
+    """Write a module and delete its bytecode, which Python would reuse if written in the same
+    second.
+    """
     file.write_text(source, encoding="utf-8")
     for compiled in (file.parent / "__pycache__").glob(f"{file.stem}.*.pyc"):
         compiled.unlink()
@@ -390,42 +336,19 @@ def record_what_tests_run(tree: Path, ran: Path, tests: list[str]) -> None:
 
 def read_rows(path: Path) -> list[dict]:
     """Return the rows of a file with one JSON object per line."""
-    return [
-        json.loads(line)
-        for line in path.read_text(encoding="utf-8").splitlines()
-    ]
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=(__doc__ or "").splitlines()[0]
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--count", type=int, default=100, help="number of mutants (default: 100)")
     parser.add_argument(
-        "--count",
-        type=int,
-        default=100,
-        help="number of mutants (default: 100)",
+        "--seed", type=int, default=1, help="seed of their random choice (default: 1)"
     )
+    parser.add_argument("--under", nargs="*", default=[""], help="folders or files of the package")
+    parser.add_argument("--tests", nargs="*", default=[], help="test files; all by default")
     parser.add_argument(
-        "--seed",
-        type=int,
-        default=1,
-        help="seed of their random choice (default: 1)",
-    )
-    parser.add_argument(
-        "--under",
-        nargs="*",
-        default=[""],
-        help="folders or files of the package",
-    )
-    parser.add_argument(
-        "--tests", nargs="*", default=[], help="test files; all by default"
-    )
-    parser.add_argument(
-        "--budget",
-        type=float,
-        default=20.0,
-        help="duration of the tests of a mutant [s]",
+        "--budget", type=float, default=20.0, help="duration of the tests of a mutant [s]"
     )
     parser.add_argument(
         "--ran",
@@ -444,8 +367,7 @@ def main() -> None:
         mutant
         for path in sorted((tree / PACKAGE).rglob("*.py"))
         if any(
-            str(path.relative_to(tree / PACKAGE)).startswith(prefix)
-            for prefix in arguments.under
+            str(path.relative_to(tree / PACKAGE)).startswith(prefix) for prefix in arguments.under
         )
         for mutant in mutants_of_file(path, tree)
     ]
@@ -461,37 +383,19 @@ def main() -> None:
     }
     for number, mutant in enumerate(chosen, 1):
         if str(mutant) not in done:
-            done[str(mutant)] = end = try_mutant(
-                mutant, tree, table, arguments.budget
-            )
+            done[str(mutant)] = end = try_mutant(mutant, tree, table, arguments.budget)
             with results.open("a", encoding="utf-8") as file:
                 file.write(
-                    json.dumps(
-                        {
-                            "mutant": asdict(mutant),
-                            "end": end,
-                            "budget": arguments.budget,
-                        }
-                    )
+                    json.dumps({"mutant": asdict(mutant), "end": end, "budget": arguments.budget})
                     + "\n"
                 )
-        print(
-            f"{number}/{len(chosen)} {done[str(mutant)]:9} {mutant}", flush=True
-        )
+        print(f"{number}/{len(chosen)} {done[str(mutant)]:9} {mutant}", flush=True)
     outcomes = [done[str(mutant)] for mutant in chosen]
-    print(
-        ", ".join(
-            f"{outcomes.count(end)} {end}" for end in sorted(set(outcomes))
-        )
-    )
+    print(", ".join(f"{outcomes.count(end)} {end}" for end in sorted(set(outcomes))))
     for mutant in chosen:
         if done[str(mutant)] in ("survived", "no test"):
-            lines = (
-                (tree / mutant.path).read_text(encoding="utf-8").splitlines()
-            )
-            print(
-                f"{done[str(mutant)]:9} {mutant}\n{'':10}{lines[mutant.line - 1].strip()}"
-            )
+            lines = (tree / mutant.path).read_text(encoding="utf-8").splitlines()
+            print(f"{done[str(mutant)]:9} {mutant}\n{'':10}{lines[mutant.line - 1].strip()}")
 
 
 if __name__ == "__main__":

@@ -22,11 +22,7 @@ TRUTH = {"young_pa": 20e3, "poisson": 0.3, "gamma_r_s": 4e-3}
 # Initial guess of every candidate.
 GUESS = {"young_pa": 30e3, "poisson": 0.2, "gamma_r_s": 2e-3}
 # Bounds of the search of every candidate.
-BOUNDS = {
-    "young_pa": (2e3, 2e5),
-    "poisson": (0.05, 0.45),
-    "gamma_r_s": (2e-4, 5e-2),
-}
+BOUNDS = {"young_pa": (2e3, 2e5), "poisson": (0.05, 0.45), "gamma_r_s": (2e-4, 5e-2)}
 GRAVITY_M_S2 = np.array([0.0, 0.0, -9.81])
 RADIUS_M = 0.02
 HEIGHT_M = 0.12
@@ -70,9 +66,7 @@ def lame_constants(values: Mapping[str, float]) -> tuple[float, float]:
 
 def cylinder() -> cs.TetMesh:
     """Return the mesh of the cylinder, whose top is grasped."""
-    return cs.cylinder_mesh(
-        radius_m=RADIUS_M, height_m=HEIGHT_M, rings=RINGS, layers=LAYERS
-    )
+    return cs.cylinder_mesh(radius_m=RADIUS_M, height_m=HEIGHT_M, rings=RINGS, layers=LAYERS)
 
 
 def grasped_nodes(mesh: cs.TetMesh) -> NDArray[np.intp]:
@@ -129,24 +123,13 @@ def recording(mesh: cs.TetMesh, positions_m: Array) -> cs.Experiment:
     free_nodes = np.setdiff1d(np.arange(len(mesh.points_m)), grasped)
     volumes_m3 = cs.Body(mesh, density_kg_m3=1.0).node_mass
     density = 0.999 * (NODE_MASS_KG / volumes_m3[free_nodes]).min()
-    body = cs.Body(
-        mesh,
-        "st-venant-kirchhoff",
-        density_kg_m3=density,
-        damping="material",
-    )
-    point_masses = [
-        cs.PointMass([n], float(NODE_MASS_KG - body.node_mass[n]))
-        for n in free_nodes
-    ]
+    body = cs.Body(mesh, "st-venant-kirchhoff", density_kg_m3=density, damping="material")
+    point_masses = [cs.PointMass([n], float(NODE_MASS_KG - body.node_mass[n])) for n in free_nodes]
     marked = list(MARKED_NODES)
     tracks_m = positions_m[:, marked]
     noise = np.random.default_rng(SEED).normal(size=tracks_m.shape)
     markers = cs.Markers(
-        t_s,
-        tracks_m + NOISE_M * noise,
-        sigma_m=NOISE_M,
-        places_m=mesh.points_m[marked],
+        t_s, tracks_m + NOISE_M * noise, sigma_m=NOISE_M, places_m=mesh.points_m[marked]
     )
     return cs.Experiment(
         body,

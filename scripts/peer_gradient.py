@@ -52,10 +52,7 @@ FIRST_CHANGE = 0.2
 
 
 @wp.kernel
-def set_constants(
-    logarithms: FloatArray,
-    constants: FloatArray,
-):
+def set_constants(logarithms: FloatArray, constants: FloatArray):
     """Set λ, μ and γ_r from the logarithms of E, ν and γ_r."""
     young = wp.exp(logarithms[0])
     poisson = wp.exp(logarithms[1])
@@ -84,14 +81,10 @@ def add_forces(
     c = tetrahedra[k, 2]
     d = tetrahedra[k, 3]
     edges = wp.matrix_from_cols(
-        x[step, b] - x[step, a],
-        x[step, c] - x[step, a],
-        x[step, d] - x[step, a],
+        x[step, b] - x[step, a], x[step, c] - x[step, a], x[step, d] - x[step, a]
     )
     edge_rates = wp.matrix_from_cols(
-        v[step, b] - v[step, a],
-        v[step, c] - v[step, a],
-        v[step, d] - v[step, a],
+        v[step, b] - v[step, a], v[step, c] - v[step, a], v[step, d] - v[step, a]
     )
     half = wp.float64(0.5)
     unit = wp.identity(n=3, dtype=wp.float64)
@@ -101,10 +94,7 @@ def add_forces(
     strain = half * (wp.transpose(F) * F - unit)
     strain_rate = half * (product + wp.transpose(product))
     delayed = strain + constants[2] * strain_rate
-    stress = (
-        constants[0] * wp.trace(delayed) * unit
-        + wp.float64(2.0) * constants[1] * delayed
-    )
+    stress = constants[0] * wp.trace(delayed) * unit + wp.float64(2.0) * constants[1] * delayed
     columns = -volumes[k] * (F * stress * wp.transpose(inverses[k]))
     f1 = wp.vec3d(columns[0, 0], columns[1, 0], columns[2, 0])
     f2 = wp.vec3d(columns[0, 1], columns[1, 1], columns[2, 1])
@@ -134,14 +124,10 @@ def advance(
     row = grasp_rows[n]
     if row >= 0:
         x[step + 1, n] = grasp_positions_m[step + 1, row]
-        v[step + 1, n] = (
-            grasp_positions_m[step + 1, row] - grasp_positions_m[step, row]
-        ) / step_s
+        v[step + 1, n] = (grasp_positions_m[step + 1, row] - grasp_positions_m[step, row]) / step_s
     else:
         gravity = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(-9.81))
-        acceleration = (
-            forces[step, n] / mass_kg + gravity - drag_1_s * v[step, n]
-        )
+        acceleration = forces[step, n] / mass_kg + gravity - drag_1_s * v[step, n]
         speed = v[step, n] + step_s * acceleration
         v[step + 1, n] = speed
         x[step + 1, n] = x[step, n] + step_s * speed
@@ -161,9 +147,7 @@ def add_misfit(
     k = wp.tid()
     sample = k // nodes.shape[0]
     marker = k % nodes.shape[0]
-    residual = (
-        x[first + sample * stride, nodes[marker]] - measured_m[sample, marker]
-    ) * scale
+    residual = (x[first + sample * stride, nodes[marker]] - measured_m[sample, marker]) * scale
     wp.atomic_add(loss, 0, wp.dot(residual, residual))
 
 
@@ -250,9 +234,7 @@ class WarpCylinder:
 
     def positions_m(self) -> Array:
         """Return the node positions (T, n, 3) [m] at the samples of the last simulation."""
-        return np.asarray(self.x.numpy(), dtype=float)[
-            self.settling :: self.stride
-        ]
+        return np.asarray(self.x.numpy(), dtype=float)[self.settling :: self.stride]
 
     def evaluate(self, logarithms: Array) -> LossGradient:
         """Simulate with logarithms of the parameters, and differentiate; NaN where unstable."""

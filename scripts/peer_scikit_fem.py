@@ -22,14 +22,7 @@ from peer_case import (
 )
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import splu
-from skfem import (
-    Basis,
-    BilinearForm,
-    ElementTetP1,
-    ElementVector,
-    LinearForm,
-    MeshTet,
-)
+from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, LinearForm, MeshTet
 
 Array = NDArray[np.float64]
 # Untyped: scikit-fem's annotations exclude what its helpers return.
@@ -55,9 +48,7 @@ class ScikitFemCylinder:
         self.free = np.setdiff1d(np.arange(self.rest_m.size), self.prescribed)
         self.step_s = SAMPLE_S / STEPS_PER_SAMPLE
         count = (SAMPLE_COUNT - 1) * STEPS_PER_SAMPLE + 1
-        grasp_positions_m = grasped_positions(
-            case, self.step_s * np.arange(count)
-        )
+        grasp_positions_m = grasped_positions(case, self.step_s * np.arange(count))
         self.prescribed_m = grasp_positions_m.reshape(count, -1)
         self.order = _node_major_order(self.basis, self.rest_m)
 
@@ -91,19 +82,12 @@ class ScikitFemCylinder:
                 residual = (force - share * weight)[self.free]
                 if np.abs(residual).max() < NEWTON_TOLERANCE_N:
                     break
-                stiffness = self._tangent(
-                    x, 0 * x, lame, damping_s=0.0, position=1.0, velocity=0.0
-                )
+                stiffness = self._tangent(x, 0 * x, lame, damping_s=0.0, position=1.0, velocity=0.0)
                 x[self.free] -= self._solve(stiffness, residual)
         return x
 
     def _midpoint_velocity(
-        self,
-        x: Array,
-        v: Array,
-        end_m: Array,
-        lame: tuple[float, float],
-        damping_s: float,
+        self, x: Array, v: Array, end_m: Array, lame: tuple[float, float], damping_s: float
     ) -> Array:
         """Return the velocity (3 n,) at the middle of a step that ends at prescribed positions."""
         u = v.copy()
@@ -117,12 +101,7 @@ class ScikitFemCylinder:
             if np.abs(residual).max() < NEWTON_TOLERANCE_N:
                 return u
             tangent = self._tangent(
-                middle,
-                u,
-                lame,
-                damping_s,
-                position=0.5 * self.step_s,
-                velocity=1.0,
+                middle, u, lame, damping_s, position=0.5 * self.step_s, velocity=1.0
             ) + diags_array(2 * self.mass_kg / self.step_s)
             u[self.free] -= self._solve(tangent, residual)
         raise RuntimeError("Newton's method did not converge")
@@ -132,18 +111,10 @@ class ScikitFemCylinder:
         free = self.free
         return splu(matrix.tocsc()[free][:, free]).solve(residual)
 
-    def _force(
-        self,
-        x: Array,
-        v: Array,
-        lame: tuple[float, float],
-        damping_s: float,
-    ) -> Array:
+    def _force(self, x: Array, v: Array, lame: tuple[float, float], damping_s: float) -> Array:
         """Return the internal forces (3 n,) [N]."""
         fields = self._fields(x, v)
-        vector = _internal_force().assemble(
-            self.basis, **fields, lame=lame, damping_s=damping_s
-        )
+        vector = _internal_force().assemble(self.basis, **fields, lame=lame, damping_s=damping_s)
         return vector[self.order]
 
     def _tangent(
@@ -199,9 +170,7 @@ def _symmetric(tensor: Array) -> Array:
 
 def _state(w: Any) -> tuple[Array, Array]:
     """Return F and the second Piola–Kirchhoff stress of elasticity and damping."""
-    F = tensors.grad(w["displacement"]) + tensors.identity(
-        tensors.grad(w["displacement"])
-    )
+    F = tensors.grad(w["displacement"]) + tensors.identity(tensors.grad(w["displacement"]))
     rate = tensors.grad(w["speed"])
     strain = 0.5 * (tensors.mul(tensors.transpose(F), F) - tensors.identity(F))
     strain_rate = _symmetric(tensors.mul(tensors.transpose(F), rate))
@@ -235,11 +204,7 @@ def _internal_tangent() -> BilinearForm:
             tensors.mul(tensors.transpose(dF), tensors.grad(w["speed"]))
             + tensors.mul(tensors.transpose(F), d_rate)
         )
-        d_stress = _isotropic(
-            d_strain + w["damping_s"] * d_strain_rate, w["lame"]
-        )
-        return tensors.ddot(
-            tensors.mul(dF, stress) + tensors.mul(F, d_stress), tensors.grad(v)
-        )
+        d_stress = _isotropic(d_strain + w["damping_s"] * d_strain_rate, w["lame"])
+        return tensors.ddot(tensors.mul(dF, stress) + tensors.mul(F, d_stress), tensors.grad(v))
 
     return work

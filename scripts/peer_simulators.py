@@ -115,9 +115,7 @@ def simulate_flex(
 def _has_failed(mujoco: Any, data: Any) -> bool:
     """Return whether MuJoCo has warned of positions, velocities or accelerations."""
     kinds = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
-    return any(
-        data.warning[getattr(mujoco.mjtWarning, kind)].number for kind in kinds
-    )
+    return any(data.warning[getattr(mujoco.mjtWarning, kind)].number for kind in kinds)
 
 
 def _flex_description(mesh: cs.TetMesh, values: Mapping[str, float]) -> str:
@@ -209,11 +207,7 @@ def simulate_with_calculix(
     deck = _calculix_deck(mesh, values, is_damped=is_damped)
     (folder / f"{JOB}.inp").write_text(deck, encoding="ascii")
     process = subprocess.run(
-        ["ccx", "-i", JOB],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
+        ["ccx", "-i", JOB], cwd=folder, capture_output=True, text=True, check=False
     )
     blocks = (folder / f"{JOB}.dat").read_text().split("displacements")[1:]
     if process.returncode or len(blocks) != SAMPLE_COUNT:
@@ -229,9 +223,7 @@ def _displacements(block: str) -> Array:
     return np.array(rows, dtype=float)
 
 
-def _calculix_deck(
-    mesh: cs.TetMesh, values: Mapping[str, float], *, is_damped: bool
-) -> str:
+def _calculix_deck(mesh: cs.TetMesh, values: Mapping[str, float], *, is_damped: bool) -> str:
     """Return CalculiX's input: a static step under gravity, then the motion of the hand."""
     grasped = grasped_nodes(mesh)
     free = np.setdiff1d(np.arange(len(mesh.points_m)), grasped)
@@ -284,9 +276,7 @@ U
 
 
 def _amplitudes(
-    grasped: NDArray[np.intp],
-    times_s: NDArray[np.floating],
-    displacements_m: Array,
+    grasped: NDArray[np.intp], times_s: NDArray[np.floating], displacements_m: Array
 ) -> str:
     """Return CalculiX's tables of the displacements (k, g, 3) [m] of the grasped nodes."""
     tables = []
@@ -310,8 +300,7 @@ def _boundary_conditions(grasped: NDArray[np.intp]) -> str:
 def _rows(rows: Iterable[tuple[int, Any]]) -> str:
     """Return lines of a number and further numbers, of at most 20 characters each."""
     return "\n".join(
-        ",".join([str(number), *(_number(value) for value in values)])
-        for number, values in rows
+        ",".join([str(number), *(_number(value) for value in values)]) for number, values in rows
     )
 
 

@@ -16,20 +16,11 @@ from collocation_sysid.extras.studies import (
     plan_comparison,
     run_all,
 )
-from collocation_sysid.extras.studies.study_rows import (
-    Row,
-    SuccessCriterion,
-    run_row,
-)
+from collocation_sysid.extras.studies.study_rows import Row, SuccessCriterion, run_row
 from collocation_sysid.problem import Problem
 
 # True parameters of the cylinder of the studies.
-TRUTH = {
-    "lambda_pa": 200.0,
-    "mu_pa": 300.0,
-    "gamma_r_s": 0.009,
-    "gamma_m_1_s": 1.0,
-}
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 # Symbols of the parameters, in the order of `TRUTH`.
 PARAMETER_SYMBOLS = ("λ", "μ", "γ_r", "γ_m")
 
@@ -59,13 +50,12 @@ class Variant:
     @property
     def overrides(self) -> list[str]:
         """Arguments of the option --set of the command line."""
-        return [
-            f"solver.{self.method}.{key}={value}"
-            for key, value in self.options.items()
-        ]
+        return [f"solver.{self.method}.{key}={value}" for key, value in self.options.items()]
 
     def limited(self, time_s: float) -> Variant:
-        """Return the variant with a time limit [s], unless it has one or its method has no such option."""
+        """Return the variant with a time limit [s], unless it has one or its method has no such
+        option.
+        """
         if self.method in ("reduced-space", "continuation"):
             return self
         return replace(self, options={"max_time_s": time_s, **self.options})
@@ -105,9 +95,7 @@ def run_variants(
         problem = Problem.read(path, overrides)
         count = max(1, round(starts * variant.share)) + 1 if starts else 1
         guesses = Starts(count, spread, seed)
-        runs = plan_comparison(
-            problem, [variant.method], overrides, guesses, TRUTH
-        )
+        runs = plan_comparison(problem, [variant.method], overrides, guesses, TRUTH)
         planned[variant.name] = runs[1:] if starts else runs
     remaining = [
         run
@@ -117,10 +105,7 @@ def run_variants(
     ]
     names = {run.key: name for name, runs in planned.items() for run in runs}
     run_all(
-        remaining,
-        store,
-        limits,
-        lambda record, _: _print_progress(names[record["key"]], record),
+        remaining, store, limits, lambda record, _: _print_progress(names[record["key"]], record)
     )
     criterion = SuccessCriterion(TRUTH)
     return {
@@ -144,9 +129,7 @@ def worst_error(row: Row) -> float:
 def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table with the first column aligned left and the others right."""
     rule = ("---", *("---:" for _ in heads[1:]))
-    return "\n".join(
-        "| " + " | ".join(line) + " |" for line in (heads, rule, *rows)
-    )
+    return "\n".join("| " + " | ".join(line) + " |" for line in (heads, rule, *rows))
 
 
 def number(value: float | None, scale: float = 1.0, digits: int = 3) -> str:

@@ -4,10 +4,10 @@
     python scripts/study_contact.py --parts poked --twins 20
 
 The meshes have more and more elements per half-width of the contact. The computed force is compared
-with the force that Hertz's theory gives for the computed width of the contact, from the second moment
-of the pressures; this ratio does not depend on the size of the block. For `poked`, a hundred twins of
-problems/poked_block, each with its own noise and onsets of contact, are identified with finite
-elements and with Hertz's formula from the same forces.
+with the force that Hertz's theory gives for the computed width of the contact, from the second
+moment of the pressures; this ratio does not depend on the size of the block. For `poked`, a hundred
+twins of problems/poked_block, each with its own noise and onsets of contact, are identified with
+finite elements and with Hertz's formula from the same forces.
 """
 
 from __future__ import annotations
@@ -49,19 +49,17 @@ UP = np.array([0.0, 0.0, 1.0])
 SIZES_M = (30.0, 90.0)
 
 
-def ticks(
-    cells: int, fine_m: float, size_m: float, growth: float
-) -> np.ndarray:
-    """Return coordinates of nodes: equal cells up to `fine_m`, then growing cells up to `size_m` [m]."""
+def ticks(cells: int, fine_m: float, size_m: float, growth: float) -> np.ndarray:
+    """Return coordinates of nodes: equal cells up to `fine_m`, then growing cells up to `size_m`
+    [m].
+    """
     coordinates_m = list(np.linspace(0, fine_m, cells + 1))
     step = fine_m / cells
     while coordinates_m[-1] < size_m:
         step *= growth
         coordinates_m.append(coordinates_m[-1] + step)
     outer_m = np.array(coordinates_m[cells:])
-    outer_m = fine_m + (outer_m - fine_m) * (size_m - fine_m) / (
-        outer_m[-1] - fine_m
-    )
+    outer_m = fine_m + (outer_m - fine_m) * (size_m - fine_m) / (outer_m[-1] - fine_m)
     return np.concatenate([coordinates_m[:cells], outer_m])
 
 
@@ -78,7 +76,8 @@ def press(
     kappa: float | None,
     delta: float | None,
 ) -> tuple[float, float]:
-    """Return the force [N], and the mean square distance of the pressure from the contact centre [m²].
+    """Return the force [N], and the mean square distance of the pressure from the contact centre
+    [m²].
 
     Parameters
     ----------
@@ -91,15 +90,13 @@ def press(
     edge_m : float
         Edge of the elements at the contact [m].
     kappa : float or None
-        Contact stiffness in units of E over the edge; None for the default, and contact on all faces.
+        Contact stiffness in units of E over the edge; None for the default, and contact on all
+        faces.
     delta : float or None
         Width of the smooth onset of pressure in units of the edge; None for the default.
     """
     low = body.nodes_m.min(axis=0)
-    symmetry_nodes = [
-        np.flatnonzero(np.abs(body.nodes_m[:, k] - low[k]) < 1e-9)
-        for k in range(3)
-    ]
+    symmetry_nodes = [np.flatnonzero(np.abs(body.nodes_m[:, k] - low[k]) < 1e-9) for k in range(3)]
     fixed = cs.PoseSequence.fixed()
     sliding = [
         cs.Grasp(symmetry_nodes[0], fixed, axes="x"),
@@ -111,9 +108,7 @@ def press(
         far_nodes = np.abs(body.nodes_m[:, 1] - body.nodes_m[:, 1].max()) < 1e-9
         sliding.append(cs.Grasp(np.flatnonzero(far_nodes), fixed, axes="y"))
     down = cs.PoseSequence(
-        np.arange(2.0),
-        np.tile(-depth_m * UP, (2, 1)),
-        np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)),
+        np.arange(2.0), np.tile(-depth_m * UP, (2, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
     )
     top = cs.Box((-1.0, -1.0, -1e-9), (3.0, 3.0, 1e-9))
     obstacle = cs.Obstacle(
@@ -143,24 +138,13 @@ def press(
     law = term.law_of_contact
     approach_m = np.maximum(law.widths_m - gap_m, 0)
     penetration_m = np.maximum(-gap_m, 0)
-    forces_n = (
-        law.surface.area_m2
-        * law.data[3]
-        * (approach_m**2 - penetration_m**2)
-        / law.widths_m
-    )
-    x_m, y_m, _ = (
-        points[:3] + term.law_of_contact.body.frame_nodes_m[0][:, None]
-    )
+    forces_n = law.surface.area_m2 * law.data[3] * (approach_m**2 - penetration_m**2) / law.widths_m
+    x_m, y_m, _ = points[:3] + term.law_of_contact.body.frame_nodes_m[0][:, None]
     r2_m2 = x_m**2 + (y_m**2 if isinstance(shape, cs.Sphere) else 0.0)
-    return -float(equilibrium.wrenches[0][0, 2]), float(
-        (forces_n * r2_m2).sum() / forces_n.sum()
-    )
+    return -float(equilibrium.wrenches[0][0, 2]), float((forces_n * r2_m2).sum() / forces_n.sum())
 
 
-def sphere(
-    cells: float, kappa: float = 100.0, delta: float = 0.002
-) -> tuple[float, int]:
+def sphere(cells: float, kappa: float = 100.0, delta: float = 0.002) -> tuple[float, int]:
     """Return the force over that of Hertz for the same contact radius, and the number of nodes.
 
     `cells` is the number of elements per contact radius; for `kappa` and `delta` see `press`.
@@ -173,9 +157,7 @@ def sphere(
     force_n, r2_m2 = press(body, shape, 1 / RADIUS_M, edge_m, kappa, delta)
     # The mean of r² under √(1 − r²/a²) is 2a²/5; a quarter of the sphere is there.
     radius_m = np.sqrt(2.5 * r2_m2)
-    return 4 * force_n / (4 / 3 * CONTACT_PA * radius_m**3 / RADIUS_M), len(
-        body.nodes_m
-    )
+    return 4 * force_n / (4 / 3 * CONTACT_PA * radius_m**3 / RADIUS_M), len(body.nodes_m)
 
 
 def sphere_at_depth(cells: int, size_m: float) -> tuple[float, int]:
@@ -192,9 +174,7 @@ def sphere_at_depth(cells: int, size_m: float) -> tuple[float, int]:
         Edge of the block, in radii of the contact.
     """
     across_m = ticks(round(FINE_M * cells), FINE_M, size_m, 2.0)
-    downward_m = ticks(
-        max(1, round(FINE_M * cells / 2)), FINE_M / 2, size_m, 2.0
-    )
+    downward_m = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, size_m, 2.0)
     body = graded_block(across_m, across_m, -downward_m)
     shape = cs.Sphere(RADIUS_M, RADIUS_M * UP)
     depth_m = 1 / RADIUS_M
@@ -212,9 +192,7 @@ def sphere_on_half_space(cells: int) -> float:
     return (ratio * large - small) / (ratio - 1)
 
 
-def cylinder(
-    cells: float, kappa: float = 100.0, delta: float = 0.002
-) -> tuple[float, int]:
+def cylinder(cells: float, kappa: float = 100.0, delta: float = 0.002) -> tuple[float, int]:
     """Return force ratio and number of nodes, as `sphere` does, for half of a long cylinder."""
     edge_m = 1 / cells
     across_m = ticks(round(FINE_M * cells), FINE_M, 30.0, 2.0)
@@ -253,22 +231,20 @@ def hertz_pa(depths_m: np.ndarray, force_n: np.ndarray) -> float:
 
     def residuals(unknown: np.ndarray) -> np.ndarray:
         indentation_m = np.maximum(depths_m - 1e-3 * unknown[1], 0)
-        stiffness_n_m15 = (
-            4 / 3 * 1e4 * unknown[0] / (1 - poisson**2) * np.sqrt(radius_m)
-        )
+        stiffness_n_m15 = 4 / 3 * 1e4 * unknown[0] / (1 - poisson**2) * np.sqrt(radius_m)
         return (stiffness_n_m15 * indentation_m**1.5 - force_n) / gel.NOISE_N
 
     return 1e4 * float(least_squares(residuals, [1.0, 0.0]).x[0])
 
 
 def twins(count: int) -> Iterator[IndentationEstimates]:
-    """Yield the results of twins of the shipped problem; each solve starts from the previous answer."""
+    """Yield the results of twins of the shipped problem; each solve starts from the previous
+    answer.
+    """
     guess = f"parameters.young_pa.guess={gel.TRUTH['young_pa']}"
     problem = cs.Problem.read(gel.FOLDER / "problem.toml", [guess])
     table_depths_m = np.arange(-5e-4, 2.5e-3, 2e-5)
-    exact_n = CubicSpline(
-        table_depths_m, gel.forces_n(problem.experiments[0], table_depths_m)
-    )
+    exact_n = CubicSpline(table_depths_m, gel.forces_n(problem.experiments[0], table_depths_m))
     spread = student.ppf(0.975, gel.PLACES - 1)
     z = None
     for seed in range(count):
@@ -282,28 +258,18 @@ def twins(count: int) -> Iterator[IndentationEstimates]:
             assert tip.wrench is not None
             values = np.full(tip.wrench.values.shape, np.nan)
             values[:, 2] = -own_n / gel.QUARTERS
-            measured_tip = replace(
-                tip, wrench=replace(tip.wrench, values=values)
-            )
-            measured_experiments.append(
-                replace(experiment, grasps=[*grasps, measured_tip])
-            )
+            measured_tip = replace(tip, wrench=replace(tip.wrench, values=values))
+            measured_experiments.append(replace(experiment, grasps=[*grasps, measured_tip]))
         twin = replace(problem, experiments=measured_experiments).collocation()
         solution = ReducedSpace()(twin, start=z)
         z = solution.z
         uncertainty = uncertainty_at(solution.collocation, solution.z)
-        onsets = [
-            part.phi[0] for part in solution.collocation.iterates(solution.z)
-        ]
+        onsets = [part.phi[0] for part in solution.collocation.iterates(solution.z)]
         onset_errors = np.abs(np.array(onsets) - onset_m / gel.ONSET_M) / list(
             uncertainty.nuisance.values()
         )
-        hertz_estimates_pa = np.array(
-            [hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n]
-        )
-        hertz_interval_pa = (
-            spread * sem(hertz_estimates_pa) * np.array([0, -1, 1])
-        )
+        hertz_estimates_pa = np.array([hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n])
+        hertz_interval_pa = spread * sem(hertz_estimates_pa) * np.array([0, -1, 1])
         estimate = uncertainty.estimates["young_pa"]
         assert estimate.statistical95 is not None
         yield IndentationEstimates(
@@ -314,12 +280,13 @@ def twins(count: int) -> Iterator[IndentationEstimates]:
 
 
 def print_coverage(count: int = 100) -> None:
-    """Print the coverage of the intervals of E, the errors of the estimates, and the coverage of onsets."""
+    """Print the coverage of the intervals of E, the errors of the estimates, and the coverage of
+    onsets.
+    """
     estimates = list(twins(count))
     for name in ("model_pa", "hertz_pa"):
         value, low, high = (
-            np.array([getattr(each, name) for each in estimates]).T
-            / gel.TRUTH["young_pa"]
+            np.array([getattr(each, name) for each in estimates]).T / gel.TRUTH["young_pa"]
         )
         covered = int(((low < 1) & (high > 1)).sum())
         print(
@@ -327,9 +294,7 @@ def print_coverage(count: int = 100) -> None:
             f"{covered} of {count} intervals contain the true E; "
             f"E over its true value {value.mean():.4f} ± {value.std(ddof=1):.4f}",
         )
-        print(
-            f"  mean half-width of an interval over the true E {np.mean(high - low) / 2:.4f}"
-        )
+        print(f"  mean half-width of an interval over the true E {np.mean(high - low) / 2:.4f}")
     print(
         "onsets within two standard errors of the truth: "
         f"{sum(each.covered_onsets for each in estimates)} of {count * gel.PLACES}"
@@ -347,25 +312,16 @@ def print_force_ratios(name: str) -> None:
     for cells in resolutions:
         print(name, cells, law(cells), flush=True)
     if name == "cylinder":
-        for kappa, delta in (
-            (10, 0.02),
-            (30, 0.002),
-            (100, 0.02),
-            (300, 0.002),
-            (1000, 2e-4),
-        ):
+        for kappa, delta in ((10, 0.02), (30, 0.002), (100, 0.02), (300, 0.002), (1000, 2e-4)):
             print(name, 8.0, kappa, delta, law(8.0, kappa, delta), flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parts = ("sphere", "cylinder", "poked")
-    parser.add_argument(
-        "--parts", nargs="+", choices=parts, default=list(parts)
-    )
+    parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
     parser.add_argument("--twins", type=int, default=100, help="of `poked`")
     arguments = parser.parse_args()
     for part in arguments.parts:

@@ -41,38 +41,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=100)
     parser.add_argument("--duration", type=float, default=SWING.duration_s)
-    parser.add_argument(
-        "--limits", type=Path, help="the shipped swing's own by default"
-    )
+    parser.add_argument("--limits", type=Path, help="the shipped swing's own by default")
     parser.add_argument("--evaluations", type=int, default=300)
     parser.add_argument("--substeps", type=int, default=2)
     parser.add_argument("--waves", type=int, default=1)
-    parser.add_argument(
-        "--for", dest="names", default="", help="parameters that count"
-    )
-    parser.add_argument(
-        "--nuisance", choices=("none", "default"), default="none"
-    )
+    parser.add_argument("--for", dest="names", default="", help="parameters that count")
+    parser.add_argument("--nuisance", choices=("none", "default"), default="none")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    problem = cylinder(
-        arguments.duration, arguments.nuisance, arguments.substeps
-    )
+    problem = cylinder(arguments.duration, arguments.nuisance, arguments.substeps)
     limits = Limits.read(arguments.limits) if arguments.limits else own_limits()
     names = tuple(arguments.names.split(",")) if arguments.names else ()
     options = DesignOptions(
-        arguments.evaluations,
-        pairs=0,
-        waves=arguments.waves,
-        seed=arguments.seed,
+        arguments.evaluations, pairs=0, waves=arguments.waves, seed=arguments.seed
     )
     design = design_motion(
-        problem,
-        limits,
-        arguments.duration,
-        DesignCriterion("worst", names),
-        options,
-        say=print,
+        problem, limits, arguments.duration, DesignCriterion("worst", names), options, say=print
     )
     print(table(design), features(design), sep="\n\n", flush=True)
     if arguments.twins:
@@ -84,9 +68,7 @@ def cylinder(duration_s: float, nuisance: str, substeps: int) -> Problem:
 
     `nuisance` is "default" or "none".
     """
-    guesses = [
-        f"parameters.{name}.guess={value}" for name, value in TRUTH.items()
-    ]
+    guesses = [f"parameters.{name}.guess={value}" for name, value in TRUTH.items()]
     overrides = [*guesses, f"transcription.substeps={substeps}"]
     shipped = Problem.read(FOLDER / "problem.toml", overrides)
     (experiment,) = shipped.experiments
@@ -103,10 +85,7 @@ def cylinder(duration_s: float, nuisance: str, substeps: int) -> Problem:
         nuisance=Nuisance() if nuisance == "default" else Nuisance.none(),
     )
     return Problem(
-        [longer_experiment],
-        shipped.parameters,
-        scheme=shipped.scheme,
-        substeps=substeps,
+        [longer_experiment], shipped.parameters, scheme=shipped.scheme, substeps=substeps
     )
 
 
@@ -125,21 +104,16 @@ def own_limits() -> Limits:
         return float(np.degrees(largest(vectors)))
 
     low, high = (
-        tuple(side.tolist())
-        for side in (positions_m.min(axis=0), positions_m.max(axis=0))
+        tuple(side.tolist()) for side in (positions_m.min(axis=0), positions_m.max(axis=0))
     )
     return Limits.model_validate(
         {
             "workspace_m": (low, high),
             "speed_m_s": largest(speed),
             "acceleration_m_s2": largest(np.gradient(speed, FINE_S, axis=0)),
-            "rotation_deg": in_degrees(
-                (rotations * rotations[0].inv()).as_rotvec()
-            ),
+            "rotation_deg": in_degrees((rotations * rotations[0].inv()).as_rotvec()),
             "angular_speed_deg_s": in_degrees(angular),
-            "angular_acceleration_deg_s2": in_degrees(
-                np.gradient(angular, FINE_S, axis=0)
-            ),
+            "angular_acceleration_deg_s2": in_degrees(np.gradient(angular, FINE_S, axis=0)),
         }
     )
 
@@ -153,16 +127,10 @@ def table(design: Design) -> str:
     )
     for name, after in design.after.relative.items():
         before = design.before.relative[name]
-        lines.append(
-            f"| {name} | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |"
-        )
+        lines.append(f"| {name} | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |")
     free = [item.name for item in design.recording.problem.parameters.free]
-    before, after = (
-        max(b.relative[n] for n in free) for b in (design.before, design.after)
-    )
-    lines.append(
-        f"| worst | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |"
-    )
+    before, after = (max(b.relative[n] for n in free) for b in (design.before, design.after))
+    lines.append(f"| worst | {100 * before:.3g} | {100 * after:.3g} | {before / after:.2f} |")
     return "\n".join(lines)
 
 
@@ -174,36 +142,27 @@ def features(design: Design) -> str:
     motion = design.motion
     (rotation, _) = design.recording.start_pose
     place, rate, growth = motion.derivatives(motion.grid_s)
-    lines = [
-        "| motion | RMS | RMS acceleration | mean frequency, Hz |",
-        "|---|---|---|---|",
-    ]
-    for kind, columns, unit in (
-        ("shift", slice(3), "m"),
-        ("turn", slice(3, 6), "rad"),
-    ):
-        body_axes = [
-            each[:, columns] @ rotation for each in (place, rate, growth)
-        ]
+    lines = ["| motion | RMS | RMS acceleration | mean frequency, Hz |", "|---|---|---|---|"]
+    for kind, columns, unit in (("shift", slice(3), "m"), ("turn", slice(3, 6), "rad")):
+        body_axes = [each[:, columns] @ rotation for each in (place, rate, growth)]
         for name, axes in (("along", [2]), ("across", [0, 1])):
             size, speed, acceleration = (
-                float(np.sqrt(np.mean(np.sum(e[:, axes] ** 2, axis=1))))
-                for e in body_axes
+                float(np.sqrt(np.mean(np.sum(e[:, axes] ** 2, axis=1)))) for e in body_axes
             )
             lines.append(
                 f"| {kind} {name} | {size:.4f} {unit} | {acceleration:.3g} {unit}/s² | "
                 f"{acceleration / max(speed, 1e-300) / (2 * np.pi):.2f} |"
             )
-    return "\n".join(
-        [*lines, f"window {motion.active_s:.3g} of {motion.duration_s:.3g} s"]
-    )
+    return "\n".join([*lines, f"window {motion.active_s:.3g} of {motion.duration_s:.3g} s"])
 
 
 # Twins --------------------------------------------------------------------------------------------
 
 
 def spread(design: Design, twins: int, seed: int) -> str:
-    """Return the table of the standard deviations of the estimates of twins over the predicted ones."""
+    """Return the table of the standard deviations of the estimates of twins over the predicted
+    ones.
+    """
     rng = np.random.default_rng(seed)
     answers = [twin(design, rng) for _ in range(twins)]
     converged = [each for each in answers if each is not None]
@@ -224,33 +183,30 @@ def spread(design: Design, twins: int, seed: int) -> str:
 
 
 def twin(design: Design, rng: np.random.Generator) -> dict[str, float] | None:
-    """Return the estimates from one twin of the designed motion; None if the solve does not converge."""
+    """Return the estimates from one twin of the designed motion; None if the solve does not
+    converge.
+    """
     problem = design.recording.problem
     experiment = design.experiment
 
     def collocation_of(recording: Experiment) -> Collocation:
         return Collocation(
-            [recording],
-            problem.parameters,
-            problem.scheme,
-            problem.choose_first_substeps(),
+            [recording], problem.parameters, problem.scheme, problem.choose_first_substeps()
         )
 
-    (segment,) = collocation_of(experiment).transcriptions
-    phi = segment.compute_guess_phi() + rng.normal(size=segment.nuisance.size)
+    (transcription,) = collocation_of(experiment).transcriptions
+    phi = transcription.compute_guess_phi() + rng.normal(size=transcription.nuisance.size)
     values = problem.parameters.guesses
     motion = simulate(
-        segment.corrected_experiment(phi),
+        transcription.corrected_experiment(phi),
         values,
         problem.scheme,
         substeps=problem.choose_first_substeps(),
     )
-    tracks = segment.markers.predict_samples(motion.positions_m, phi)
+    tracks = transcription.markers.predict_samples(motion.positions_m, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)
     noisy_recording = with_markers(experiment, tracks + noise)
-    solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(
-        collocation_of(noisy_recording)
-    )
+    solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation_of(noisy_recording))
     if not solution.status.converged:
         return None
     derived = DerivedModuli.from_bodies(

@@ -1,13 +1,14 @@
-"""Coverage of the 95 % intervals with the errors of a real laboratory, for twins with one error each.
+"""Coverage of the 95 % intervals with the errors of a real laboratory, for twins with one error
+each.
 
-A cylinder hangs from a swung hand, as in study_coverage.py. The tracks are simulated with the scheme
-of the fit and have white noise. Each twin has one error of the recording, a random number of the
-stated size, and is identified with every option at its default: nuisance parameters, noise and
-covariance. The solve starts from the true values. The table has the coverage of the intervals and the
-median standard errors; for twins without errors also the ratio of standard errors with and without
-nuisance parameters. In the rows "assumed", the body deviates from an assumption of the budget by a
-random number with the standard deviation of this assumption; these rows have the coverage of the
-combined interval too, of a budget with this assumption or with all of them.
+A cylinder hangs from a swung hand, as in study_coverage.py. The tracks are simulated with the
+scheme of the fit and have white noise. Each twin has one error of the recording, a random number of
+the stated size, and is identified with every option at its default: nuisance parameters, noise and
+covariance. The solve starts from the true values. The table has the coverage of the intervals and
+the median standard errors; for twins without errors also the ratio of standard errors with and
+without nuisance parameters. In the rows "assumed", the body deviates from an assumption of the
+budget by a random number with the standard deviation of this assumption; these rows have the
+coverage of the combined interval too, of a budget with this assumption or with all of them.
 """
 
 from __future__ import annotations
@@ -27,32 +28,16 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
-from study_coverage import (
-    QUANTITIES,
-    SCHEME,
-    intervals_with_truth,
-    reference,
-    truth,
-)
+from study_coverage import QUANTITIES, SCHEME, intervals_with_truth, reference, truth
 from study_starts import TRUTH, parameters
 
 from collocation_sysid import Problem
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import (
-    Experiment,
-    Grasp,
-    Nuisance,
-    PoseSequence,
-)
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changed_residuals,
-)
-from collocation_sysid.statistics.budget.systematic_effects import (
-    ASSUMPTIONS,
-    Assumption,
-)
+from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
+from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumption
 from collocation_sysid.statistics.budget.uncertainty_budget import (
     BudgetLine,
     VarianceSources,
@@ -111,30 +96,20 @@ class BudgetedFit:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=200, help="of each fault")
-    parser.add_argument(
-        "--only", nargs="*", choices=list(FAULTS), default=list(FAULTS)
-    )
+    parser.add_argument("--only", nargs="*", choices=list(FAULTS), default=list(FAULTS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1, help="processes")
     arguments = parser.parse_args()
     # Worker processes read these variables when they start: one thread each.
-    os.environ |= {
-        "OPENBLAS_NUM_THREADS": "1",
-        "COLLOCATION_SYSID_THREADS": "1",
-    }
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
     start = multiprocessing.get_context("spawn")
     notes = []
     began = time.perf_counter()
     print(header(arguments.twins), table_head(), sep="\n\n", flush=True)
     with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
         for fault in arguments.only:
-            seeds = [
-                (arguments.seed, *fault.encode(), twin)
-                for twin in range(arguments.twins)
-            ]
-            outcomes = list(
-                pool.map(run, [fault] * len(seeds), seeds, chunksize=5)
-            )
+            seeds = [(arguments.seed, *fault.encode(), twin) for twin in range(arguments.twins)]
+            outcomes = list(pool.map(run, [fault] * len(seeds), seeds, chunksize=5))
             print(table_row(fault, outcomes), flush=True)
             if fault == "none":
                 notes.append(loss_of_precision(outcomes))
@@ -145,21 +120,19 @@ def main() -> None:
 
 
 def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
-    """Draw a twin with a fault (a key of `FAULTS`), identify it, and compare the answer with the truth."""
+    """Draw a twin with a fault (a key of `FAULTS`), identify it, and compare the answer with the
+    truth.
+    """
     rng = np.random.default_rng(seed)
     true_recording, described = FAULTS[fault](exact_recording(), rng)
     tracks = true_recording.markers.positions_m
-    tracks = tracks + true_recording.markers.sigma_m[
-        :, None
-    ] * rng.standard_normal(tracks.shape)
+    tracks = tracks + true_recording.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
     uncertainty, combined_contains_truth, converged = identified(
         with_markers(described, tracks), ROWS.get(fault, ())
     )
     errors_without_nuisance = np.full(len(QUANTITIES), np.nan)
     if true_recording is described:
-        ideal = replace(
-            with_markers(described, tracks), nuisance=Nuisance.none()
-        )
+        ideal = replace(with_markers(described, tracks), nuisance=Nuisance.none())
         errors_without_nuisance = relative_errors(identified(ideal)[0])
     return FaultOutcome(
         converged,
@@ -175,9 +148,7 @@ def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
 def exact_recording() -> Experiment:
     """Return the experiment with exact tracks and with the default nuisance parameters."""
     experiment = replace(reference(SIGMA_M)[0], nuisance=Nuisance())
-    return with_markers(
-        experiment, experiment.markers.predict_positions(positions_m())
-    )
+    return with_markers(experiment, experiment.markers.predict_positions(positions_m()))
 
 
 def positions_m() -> Array:
@@ -208,17 +179,13 @@ def identified(
     true = truth()
     lines = fit.lines
     combined_contains_truth = [
-        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1])
-        if n in lines
-        else np.nan
+        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1]) if n in lines else np.nan
         for n in QUANTITIES
     ]
     return fit.uncertainty, np.array(combined_contains_truth), fit.converged
 
 
-def fit_from_truth(
-    experiment: Experiment, assumed: Sequence[Assumption]
-) -> BudgetedFit:
+def fit_from_truth(experiment: Experiment, assumed: Sequence[Assumption]) -> BudgetedFit:
     """Return the fit of an experiment from the truth, with a budget of some assumptions."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
@@ -240,9 +207,7 @@ def relative_errors(uncertainty: Uncertainty) -> Array:
     estimates = {**uncertainty.estimates, **uncertainty.derived}
     true = truth()
     errors = [estimates[name].statistical_std_error for name in QUANTITIES]
-    return np.array([np.nan if e is None else e for e in errors]) / [
-        true[n] for n in QUANTITIES
-    ]
+    return np.array([np.nan if e is None else e for e in errors]) / [true[n] for n in QUANTITIES]
 
 
 # Faults: each returns the true recording, and the recording as the problem describes it -----------
@@ -254,7 +219,9 @@ def without_fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
 
 
 def late(late_s: float) -> Callable[..., TrueAndStated]:
-    """Return a fault by which the marker clock is late by `late_s` [s]; before the start the body rests."""
+    """Return a fault by which the marker clock is late by `late_s` [s]; before the start the body
+    rests.
+    """
 
     def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         tracks = CubicSpline(experiment.t_s, experiment.markers.positions_m)
@@ -264,28 +231,21 @@ def late(late_s: float) -> Callable[..., TrueAndStated]:
     return fault
 
 
-def noisy_poses(
-    size_m: float, degrees: float, is_stated: bool
-) -> Callable[..., TrueAndStated]:
+def noisy_poses(size_m: float, degrees: float, is_stated: bool) -> Callable[..., TrueAndStated]:
     """Return a fault by which poses have independent noise, which the problem states or not."""
     size_rad = np.radians(degrees)
 
     def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         (grasp,) = experiment.grasps
         poses = grasp.poses
-        rotations = Rotation.from_rotvec(
-            size_rad * rng.standard_normal((len(poses.t_s), 3))
-        )
+        rotations = Rotation.from_rotvec(size_rad * rng.standard_normal((len(poses.t_s), 3)))
         noisy = PoseSequence(
             poses.t_s,
-            poses.positions_m
-            + size_m * rng.standard_normal(poses.positions_m.shape),
+            poses.positions_m + size_m * rng.standard_normal(poses.positions_m.shape),
             (rotations * Rotation.from_quat(poses.quaternions_xyzw)).as_quat(),
         )
         sigmas = {"sigma_m": size_m, "sigma_rad": size_rad} if is_stated else {}
-        return experiment, replace(
-            experiment, grasps=(Grasp(grasp.nodes, noisy, **sigmas),)
-        )
+        return experiment, replace(experiment, grasps=(Grasp(grasp.nodes, noisy, **sigmas),))
 
     return fault
 
@@ -295,20 +255,14 @@ def tilted(experiment: Experiment, rng: Generator) -> TrueAndStated:
     angles = np.radians(rng.standard_normal(2))
     down = np.array([*angles, -1.0])
     gravity_m_s2 = 9.81 * down / np.linalg.norm(down)
-    tilted_gravity = replace(
-        experiment, gravity_m_s2=tuple(gravity_m_s2.tolist())
-    )
+    tilted_gravity = replace(experiment, gravity_m_s2=tuple(gravity_m_s2.tolist()))
     return simulated(tilted_gravity), experiment
 
 
-def misplaced_in_gripper(
-    experiment: Experiment, rng: Generator
-) -> TrueAndStated:
+def misplaced_in_gripper(experiment: Experiment, rng: Generator) -> TrueAndStated:
     """Return a recording of a body that is misplaced in the gripper by 1 mm and 0.5° per axis."""
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(
-        np.radians(0.5) * rng.standard_normal(3)
-    ).as_matrix()
+    matrix[:3, :3] = Rotation.from_rotvec(np.radians(0.5) * rng.standard_normal(3)).as_matrix()
     matrix[:3, 3] = 1e-3 * rng.standard_normal(3)
     (grasp,) = experiment.grasps
     shifted_grasp = Grasp(grasp.nodes, grasp.poses.after(matrix))
@@ -317,9 +271,7 @@ def misplaced_in_gripper(
 
 def simulated(experiment: Experiment) -> Experiment:
     """Return the experiment with exact simulated tracks."""
-    return with_markers(
-        experiment, simulate(experiment, TRUTH, SCHEME, substeps=1).markers_m
-    )
+    return with_markers(experiment, simulate(experiment, TRUTH, SCHEME, substeps=1).markers_m)
 
 
 def with_stated_sigma(factor: float) -> Callable[..., TrueAndStated]:
@@ -337,17 +289,13 @@ def with_noisy_marker(experiment: Experiment, rng: Generator) -> TrueAndStated:
     """Return a recording whose first marker has three times the stated noise."""
     sigma_m = experiment.markers.sigma_m.copy()
     sigma_m[0] *= 3
-    return replace(
-        experiment, markers=replace(experiment.markers, sigma_m=sigma_m)
-    ), experiment
+    return replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m)), experiment
 
 
 def misplaced(experiment: Experiment, rng: Generator) -> TrueAndStated:
     """Return a recording whose markers are misplaced on the body by 1 mm per axis."""
     places_m = experiment.markers.predict_positions(experiment.body.nodes_m)
-    with_true_places = at_places(
-        experiment, places_m + 1e-3 * rng.standard_normal(places_m.shape)
-    )
+    with_true_places = at_places(experiment, places_m + 1e-3 * rng.standard_normal(places_m.shape))
     return with_markers(
         experiment, with_true_places.markers.predict_positions(positions_m())
     ), experiment
@@ -362,19 +310,15 @@ def unplaced(experiment: Experiment, rng: Generator) -> TrueAndStated:
 def at_places(experiment: Experiment, places_m: Array) -> Experiment:
     """Return the experiment with markers at other positions (M, 3) on the body [m]; NaN if unknown."""
     markers = replace(
-        experiment.markers,
-        placement=None,
-        located=None,
-        places_m=places_m,
-        attach="embedded",
+        experiment.markers, placement=None, located=None, places_m=places_m, attach="embedded"
     )
     return replace(experiment, markers=markers)
 
 
-def draw_assumption_errors(
-    names: Sequence[str],
-) -> Callable[..., TrueAndStated]:
-    """Return a fault that draws deviations from the named assumptions, each at its standard deviation."""
+def draw_assumption_errors(names: Sequence[str]) -> Callable[..., TrueAndStated]:
+    """Return a fault that draws deviations from the named assumptions, each at its standard
+    deviation.
+    """
 
     def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
         errors = {}
@@ -383,10 +327,7 @@ def draw_assumption_errors(
                 error = (row.sigma or 0.0) * rng.standard_normal()
                 # Coefficients of the air are not negative.
                 errors[name] = max(error, -0.99) if row.name in AIR else error
-        values = {
-            name: truth()[name]
-            for name in ("young_pa", "poisson", *list(TRUTH)[2:])
-        }
+        values = {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
         return with_wrong_assumptions(experiment, values, errors), experiment
 
     return fault
@@ -408,10 +349,7 @@ SINGLE = (
 # Names of the assumptions that are wrong in each fault, and the rows of the budget for them.
 ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE}
 ASSUMED |= {"assumed: air": AIR, "assumed: all of these": SINGLE}
-ROWS = {
-    f: tuple(r for r in ASSUMPTIONS if r.name in names)
-    for f, names in ASSUMED.items()
-}
+ROWS = {f: tuple(r for r in ASSUMPTIONS if r.name in names) for f, names in ASSUMED.items()}
 
 FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
     "none": without_fault,
@@ -464,12 +402,8 @@ def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> str:
             for outcome in converged_outcomes
         ]
     ).T
-    errors = 100 * np.nanmedian(
-        [outcome.relative for outcome in converged_outcomes], axis=0
-    )
-    correlated = 100 * np.mean(
-        [outcome.correlated for outcome in converged_outcomes]
-    )
+    errors = 100 * np.nanmedian([outcome.relative for outcome in converged_outcomes], axis=0)
+    correlated = 100 * np.mean([outcome.correlated for outcome in converged_outcomes])
     failures = len(outcomes) - len(converged_outcomes)
     return _line(
         [
@@ -483,7 +417,8 @@ def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> str:
 
 
 def _coverage_cell(contained: Array) -> str:
-    """Return the coverage in percent, with a star if exact intervals would have it in less than 5 % of cases.
+    """Return the coverage in percent, with a star if exact intervals would have it in less than 5 %
+    of cases.
 
     `contained` has 1, 0 or NaN for each twin; NaN (no interval) does not count.
     """
@@ -496,12 +431,8 @@ def _coverage_cell(contained: Array) -> str:
 
 def loss_of_precision(outcomes: Sequence[FaultOutcome]) -> str:
     """Return the ratios of standard errors with and without nuisance parameters, without errors."""
-    ratios = np.nanmedian(
-        [outcome.relative / outcome.without for outcome in outcomes], axis=0
-    )
-    shown_ratios = ", ".join(
-        f"{c} {ratio:.2f}" for c, ratio in zip(COLUMNS, ratios, strict=True)
-    )
+    ratios = np.nanmedian([outcome.relative / outcome.without for outcome in outcomes], axis=0)
+    shown_ratios = ", ".join(f"{c} {ratio:.2f}" for c, ratio in zip(COLUMNS, ratios, strict=True))
     return f"Without faults: standard errors with nuisance parameters over those without: {shown_ratios}"
 
 

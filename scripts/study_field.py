@@ -27,10 +27,7 @@ import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.spatial_field import Prior
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.statistics.field_estimates import (
-    FieldEstimate,
-    field_estimates,
-)
+from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 Array = NDArray[np.float64]
@@ -100,9 +97,7 @@ class FieldTwin:
         return np.array(CENTRES_M[seed % len(CENTRES_M)])
 
 
-def stiff_cells(
-    kind: str, mesh: cs.TetMesh, centre_m: Array = BALL_M
-) -> NDArray[np.bool_]:
+def stiff_cells(kind: str, mesh: cs.TetMesh, centre_m: Array = BALL_M) -> NDArray[np.bool_]:
     """Return the mask (cells,) of the stiffer cells; `kind` as in the twin."""
     centres = mesh.points_m[mesh.tetrahedra].mean(axis=1)
     if kind == "half":
@@ -116,25 +111,18 @@ def hanging_block(body: Body, count: int, steps: int) -> cs.Experiment:
     """Return a recording of the block without tracks, with `count` markers and `steps` samples."""
     t_s = STEP_S * np.arange(steps)
     upright = Rotation.identity()
-    poses = swing(
-        t_s, (0.02, 0.02, 0.01), (0.3, 0.3, 0.5), (1.7, 2.3, 1.3), 0.2, upright
-    )
+    poses = swing(t_s, (0.02, 0.02, 0.01), (0.3, 0.3, 0.5), (1.7, 2.3, 1.3), 0.2, upright)
     x = body.nodes_m
     high = np.array(SIZE_M)
     surface = np.flatnonzero(
-        ((x < 1e-9) | (x > high - 1e-9)).any(axis=1)
-        & (x[:, 2] < high[2] - 0.01)
+        ((x < 1e-9) | (x > high - 1e-9)).any(axis=1) & (x[:, 2] < high[2] - 0.01)
     )
     chosen = np.random.default_rng(0).permutation(surface)[:count]
     names = [f"m{k}" for k in range(len(chosen))]
     no_tracks = np.zeros((steps, len(chosen), 3))
-    markers = cs.Markers(t_s, no_tracks, SIGMA_M, names, x[chosen]).on_body(
-        body
-    )
+    markers = cs.Markers(t_s, no_tracks, SIGMA_M, names, x[chosen]).on_body(body)
     grasp = cs.Grasp(np.flatnonzero(x[:, 2] > high[2] - 1e-9), poses)
-    return cs.Experiment(
-        body, t_s, [grasp], markers, nuisance=cs.Nuisance.none()
-    )
+    return cs.Experiment(body, t_s, [grasp], markers, nuisance=cs.Nuisance.none())
 
 
 def problem_of(twin: FieldTwin, seed: int) -> tuple[cs.Problem, Array]:
@@ -143,34 +131,19 @@ def problem_of(twin: FieldTwin, seed: int) -> tuple[cs.Problem, Array]:
     stiff = stiff_cells(twin.kind, mesh, twin.centre_m(seed))
     regions = [cs.Region("stiff", stiff)] if stiff.any() else []
     true_body = Body(mesh, density_kg_m3=1000.0, regions=regions)
-    values = {
-        "young_pa": YOUNG_PA,
-        "stiff.young_pa": twin.ratio * YOUNG_PA,
-        **OTHER_TRUTHS,
-    }
-    true_values = {
-        n: v for n, v in values.items() if regions or not n.startswith("stiff")
-    }
+    values = {"young_pa": YOUNG_PA, "stiff.young_pa": twin.ratio * YOUNG_PA, **OTHER_TRUTHS}
+    true_values = {n: v for n, v in values.items() if regions or not n.startswith("stiff")}
     simulation = cs.simulate(
-        hanging_block(true_body, twin.markers, twin.steps),
-        true_values,
-        "midpoint",
-        substeps=1,
+        hanging_block(true_body, twin.markers, twin.steps), true_values, "midpoint", substeps=1
     )
     amplitude = twin.amplitude if twin.prior == "smooth" else None
-    field = cs.Field(
-        twin.length_m, modes=twin.modes, amplitude=amplitude, prior=twin.prior
-    )
+    field = cs.Field(twin.length_m, modes=twin.modes, amplitude=amplitude, prior=twin.prior)
     described = hanging_block(
         Body(mesh, density_kg_m3=1000.0, field=field), twin.markers, twin.steps
     )
     noise = np.random.default_rng(seed).normal(size=simulation.markers_m.shape)
-    experiment = cs.with_markers(
-        described, simulation.markers_m + SIGMA_M * noise
-    )
-    guesses = {
-        n: cs.Unknown(0.7 * values[n]) for n in ("young_pa", "gamma_r_s")
-    }
+    experiment = cs.with_markers(described, simulation.markers_m + SIGMA_M * noise)
+    guesses = {n: cs.Unknown(0.7 * values[n]) for n in ("young_pa", "gamma_r_s")}
     problem = cs.Problem([experiment], {**OTHER_TRUTHS, **guesses}, substeps=1)
     return problem, np.log(YOUNG_PA * np.where(stiff, twin.ratio, 1.0))
 
@@ -181,15 +154,9 @@ TWINS = (
     FieldTwin("the same, 12 markers", "half", 2.0, 0.04, 60, markers=12),
     FieldTwin("stiff ball, twice", "ball", 2.0, 0.03, 80),
     FieldTwin("stiff ball, three times", "ball", 3.0, 0.03, 80),
-    FieldTwin(
-        "half three times, two phases", "half", 3.0, 0.04, 60, prior="two-phase"
-    ),
-    FieldTwin(
-        "ball three times, two phases", "ball", 3.0, 0.03, 80, prior="two-phase"
-    ),
-    FieldTwin(
-        "ball five times, two phases", "ball", 5.0, 0.03, 80, prior="two-phase"
-    ),
+    FieldTwin("half three times, two phases", "half", 3.0, 0.04, 60, prior="two-phase"),
+    FieldTwin("ball three times, two phases", "ball", 3.0, 0.03, 80, prior="two-phase"),
+    FieldTwin("ball five times, two phases", "ball", 5.0, 0.03, 80, prior="two-phase"),
     FieldTwin("even, two phases", "none", 1.0, 0.04, 60, prior="two-phase"),
     FieldTwin("even", "none", 1.0, 0.04, 60),
     FieldTwin("half, amplitude 0.1", "half", 2.0, 0.04, 60, 0.1),
@@ -231,16 +198,10 @@ def identify(twin: FieldTwin, seed: int) -> FieldAnswer:
     processor_time_s = time.process_time() - began
     uncertainty = uncertainty_at(collocation, solution.z)
     body = collocation.transcriptions[0].body
-    (field,) = field_estimates(
-        body, collocation.parameters, solution.q, uncertainty
-    )
+    (field,) = field_estimates(body, collocation.parameters, solution.q, uncertainty)
     estimate = uncertainty.estimates.get("contrast")
     return FieldAnswer(
-        field,
-        truth,
-        body.mesh,
-        processor_time_s,
-        estimate and estimate.statistical95,
+        field, truth, body.mesh, processor_time_s, estimate and estimate.statistical95
     )
 
 
@@ -258,26 +219,16 @@ def table_row(twin: FieldTwin, seeds: range) -> str:
         contains_truth = (low < truth) & (truth < high)
         stiff = stiff_cells(twin.kind, mesh, twin.centre_m(seed))
         log = np.log(field.value)
-        ratio = (
-            np.exp(log[stiff].mean() - log[~stiff].mean())
-            if stiff.any()
-            else np.nan
-        )
+        ratio = np.exp(log[stiff].mean() - log[~stiff].mean()) if stiff.any() else np.nan
         z_m = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2]
-        step_mm = (
-            1e3 * step_height_m(z_m, log) if twin.kind == "half" else np.nan
-        )
+        step_mm = 1e3 * step_height_m(z_m, log) if twin.kind == "half" else np.nan
         determined_share = field.is_informed.mean()
         width = np.median(field.deviation)
         error = np.sqrt(np.mean((log - truth) ** 2))
         determined_coverage = (
-            contains_truth[field.is_informed].mean()
-            if field.is_informed.any()
-            else np.nan
+            contains_truth[field.is_informed].mean() if field.is_informed.any() else np.nan
         )
-        inclusion_coverage = (
-            contains_truth[stiff].mean() if stiff.any() else np.nan
-        )
+        inclusion_coverage = contains_truth[stiff].mean() if stiff.any() else np.nan
         rows.append(
             (
                 determined_share,
@@ -296,11 +247,7 @@ def table_row(twin: FieldTwin, seeds: range) -> str:
             lower, upper = answer.contrast95
             notes |= {f"contrast {lower:.3g} to {upper:.3g}"}
         notes |= {concern.code for concern in field.list_concerns()}
-        notes |= (
-            {f"length {field.modes.length_m:g}"}
-            if isinstance(twin.length_m, tuple)
-            else set()
-        )
+        notes |= {f"length {field.modes.length_m:g}"} if isinstance(twin.length_m, tuple) else set()
     mean = np.mean(rows, axis=0)
     cells = (
         f"{mean[0]:.0%}", f"{mean[1]:.1%}", f"{mean[2]:.1%}", f"{mean[3]:.3f}", f"{mean[4]:.3f}",
@@ -337,28 +284,18 @@ def cost() -> None:
         twin = FieldTwin("", "half", 2.0, 0.04, max(1, modes))
         problem, _ = problem_of(twin, 1)
         if not modes:
-            fixed = {
-                name: 0.0
-                for name in problem.bodies[0].list_field_coefficient_names()
-            }
+            fixed = {name: 0.0 for name in problem.bodies[0].list_field_coefficient_names()}
             problem = cs.Problem(
-                problem.experiments,
-                problem.parameters.with_fixed(fixed),
-                substeps=1,
+                problem.experiments, problem.parameters.with_fixed(fixed), substeps=1
             )
         best = np.inf
         for _ in range(2):
             began = time.process_time()
             solution = ReducedSpace()(problem.collocation())
-            best = min(
-                best, (time.process_time() - began) / solution.iterations
-            )
+            best = min(best, (time.process_time() - began) / solution.iterations)
         without = without or best
         nodes = len(problem.bodies[0].nodes_m)
-        print(
-            f"| {modes} | {nodes} | {best:.2f} | {best / without:.2f} |",
-            flush=True,
-        )
+        print(f"| {modes} | {nodes} | {best:.2f} | {best / without:.2f} |", flush=True)
 
 
 def main() -> None:
@@ -366,9 +303,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=10)
     parser.add_argument("--cost", action="store_true")
-    parser.add_argument(
-        "--only", default="", help="twins whose name contains this text"
-    )
+    parser.add_argument("--only", default="", help="twins whose name contains this text")
     options = parser.parse_args()
     if options.cost:
         cost()

@@ -1,10 +1,10 @@
 """Errors of the description that the residuals do not show: bias of E, intervals and verdicts.
 
 A block of foam is moved at random, as in `twins`. Its tracks are simulated with an effect that the
-described body does not have, or with another body, and are fitted with all options at their default.
-The estimated parameters absorb such errors, so that the residuals look like noise. The table has
-the smallest and the largest estimated E over the true one, how many combined intervals contain the
-true E, and the verdicts.
+described body does not have, or with another body, and are fitted with all options at their
+default. The estimated parameters absorb such errors, so that the residuals look like noise. The
+table has the smallest and the largest estimated E over the true one, how many combined intervals
+contain the true E, and the verdicts.
 
     python scripts/study_hidden_errors.py [--twins 5] [--only markers memory]
 """
@@ -22,12 +22,7 @@ from twins import random_poses
 import collocation_sysid as cs
 from collocation_sysid.statistics.budget.systematic_effects import KnownEffect
 
-TRUTH = {
-    "young_pa": 5e3,
-    "poisson": 0.3,
-    "gamma_r_s": 0.01,
-    "gamma_m_1_s": 2.0,
-}
+TRUTH = {"young_pa": 5e3, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
 UNKNOWN = {name: cs.Unknown() for name in TRUTH}
 # Edges of the block [m], numbers of elements along them, and density.
 SIZE_M = (0.05, 0.05, 0.1)
@@ -84,21 +79,12 @@ def recording(body: cs.Body, seed: int) -> cs.Experiment:
     t_s = STEP_S * np.arange(SAMPLES)
     nodes_m = block().nodes_m
     high = np.flatnonzero(
-        (nodes_m[:, 2] > 0.3 * SIZE_M[2])
-        & (nodes_m[:, 2] < SIZE_M[2] - LACKING_M)
+        (nodes_m[:, 2] > 0.3 * SIZE_M[2]) & (nodes_m[:, 2] < SIZE_M[2] - LACKING_M)
     )
     places_m = nodes_m[rng.choice(high, MARKERS, replace=False)]
-    markers = cs.Markers(
-        t_s, np.zeros((SAMPLES, MARKERS, 3)), NOISE_M, places_m=places_m
-    )
+    markers = cs.Markers(t_s, np.zeros((SAMPLES, MARKERS, 3)), NOISE_M, places_m=places_m)
     held = np.flatnonzero(body.nodes_m[:, 2] < body.nodes_m[:, 2].min() + 1e-9)
-    return cs.Experiment(
-        body,
-        t_s,
-        [cs.Grasp(held, random_poses(t_s, rng))],
-        markers,
-        name="swing",
-    )
+    return cs.Experiment(body, t_s, [cs.Grasp(held, random_poses(t_s, rng))], markers, name="swing")
 
 
 def no_error(seed: int) -> HiddenError:
@@ -113,10 +99,7 @@ def with_heavy_markers(seed: int) -> HiddenError:
     nodes_m = described.body.nodes_m
     places_m = described.markers.predict_positions(nodes_m)
     masses = [
-        cs.PointMass(
-            [int(np.linalg.norm(nodes_m - place_m, axis=1).argmin())],
-            MARKER_MASS_KG,
-        )
+        cs.PointMass([int(np.linalg.norm(nodes_m - place_m, axis=1).argmin())], MARKER_MASS_KG)
         for place_m in places_m
     ]
     return HiddenError(replace(described, masses=masses), described)
@@ -125,10 +108,7 @@ def with_heavy_markers(seed: int) -> HiddenError:
 def with_stated_markers(seed: int) -> HiddenError:
     """Return the same body with the mass of the markers stated in the budget."""
     stated = KnownEffect(mean=MARKER_MASS_KG, deviation=0.1 * MARKER_MASS_KG)
-    return replace(
-        with_heavy_markers(seed),
-        assumptions=cs.Assumptions(marker_mass_kg=stated),
-    )
+    return replace(with_heavy_markers(seed), assumptions=cs.Assumptions(marker_mass_kg=stated))
 
 
 def with_memory(seed: int) -> HiddenError:
@@ -141,9 +121,7 @@ def held_higher(seed: int) -> HiddenError:
     """Return a body that the gripper holds up to a greater height than described."""
     described = recording(block(), seed)
     mesh = cs.box_mesh((*SIZE_M[:2], SIZE_M[2] - HELD_M), DIVISIONS)
-    shorter = cs.TetMesh(
-        mesh.points_m + np.array([0, 0, HELD_M]), mesh.tetrahedra
-    )
+    shorter = cs.TetMesh(mesh.points_m + np.array([0, 0, HELD_M]), mesh.tetrahedra)
     body = cs.Body(shorter, density_kg_m3=DENSITY_KG_M3)
     return HiddenError(recording(body, seed), described)
 
@@ -166,10 +144,7 @@ def with_gradient(seed: int) -> HiddenError:
 ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "none": ("none", no_error),
     "markers": ("8 markers of 0.5 g on the body of 25 g", with_heavy_markers),
-    "stated-markers": (
-        "the same, with `marker_mass_kg` stated",
-        with_stated_markers,
-    ),
+    "stated-markers": ("the same, with `marker_mass_kg` stated", with_stated_markers),
     "memory": ("memory: share 0.3, 0.1 s", with_memory),
     "grasp": ("the gripper holds 1 mm more", held_higher),
     "mesh": ("the mesh lacks 10 mm at the free end", with_lacking_end),
@@ -198,12 +173,8 @@ class Outcome:
 def fit(name: str, seed: int) -> Outcome:
     """Simulate a twin with an error, a key of `ERRORS`, and identify it."""
     error = ERRORS[name][1](seed)
-    tracks_m = cs.simulate(
-        error.actual, TRUTH | dict(error.more_constants), "newmark"
-    ).markers_m
-    noise_m = np.random.default_rng((seed, 1)).normal(
-        scale=NOISE_M, size=tracks_m.shape
-    )
+    tracks_m = cs.simulate(error.actual, TRUTH | dict(error.more_constants), "newmark").markers_m
+    noise_m = np.random.default_rng((seed, 1)).normal(scale=NOISE_M, size=tracks_m.shape)
     problem = cs.Problem(
         [cs.with_markers(error.described, tracks_m + noise_m)],
         UNKNOWN,
@@ -222,13 +193,9 @@ def main() -> None:
     """Run the study with the options of the command line, and print its table."""
     parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=5, help="of each error")
-    parser.add_argument(
-        "--only", nargs="+", choices=tuple(ERRORS), default=tuple(ERRORS)
-    )
+    parser.add_argument("--only", nargs="+", choices=tuple(ERRORS), default=tuple(ERRORS))
     options = parser.parse_args()
-    print(
-        "| error | E over the true E | intervals that contain it | verdicts |"
-    )
+    print("| error | E over the true E | intervals that contain it | verdicts |")
     print("|---|---|---|---|")
     for name in options.only:
         outcomes = [fit(name, seed) for seed in range(options.twins)]

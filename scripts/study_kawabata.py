@@ -56,11 +56,7 @@ class Law:
     @property
     def free_names(self) -> list[str]:
         """Names of the constants that are estimated."""
-        return [
-            name
-            for name, each in self.parameters.items()
-            if isinstance(each, cs.Unknown)
-        ]
+        return [name for name, each in self.parameters.items() if isinstance(each, cs.Unknown)]
 
 
 def ogden_law(terms: int, *, fixes_exponents: bool) -> Law:
@@ -68,34 +64,16 @@ def ogden_law(terms: int, *, fixes_exponents: bool) -> Law:
     parameters: dict[str, cs.Unknown | float] = dict(KAPPA)
     for number, (mu_pa, alpha) in enumerate(OGDEN_TERMS[:terms], start=1):
         parameters[f"mu_{number}_pa"] = cs.Unknown(guess=mu_pa)
-        parameters[f"alpha_{number}"] = (
-            alpha if fixes_exponents else cs.Unknown(guess=alpha)
-        )
+        parameters[f"alpha_{number}"] = alpha if fixes_exponents else cs.Unknown(guess=alpha)
     suffix = ", α fixed" if fixes_exponents else ""
     return Law(f"ogden-{terms}{suffix}", f"ogden-{terms}", parameters)
 
 
 LAWS = (
-    Law(
-        "neo-hookean",
-        "neo-hookean",
-        {"mu_pa": UNKNOWN, "lambda_pa": KAPPA["kappa_pa"]},
-    ),
-    Law(
-        "mooney-rivlin",
-        "mooney-rivlin",
-        {"c10_pa": UNKNOWN, "c01_pa": UNKNOWN, **KAPPA},
-    ),
-    Law(
-        "yeoh",
-        "yeoh",
-        {"c10_pa": UNKNOWN, "c20_pa": UNKNOWN, "c30_pa": UNKNOWN, **KAPPA},
-    ),
-    Law(
-        "gent",
-        "gent",
-        {"mu_pa": UNKNOWN, "gent_limit": cs.Unknown(guess=60.0), **KAPPA},
-    ),
+    Law("neo-hookean", "neo-hookean", {"mu_pa": UNKNOWN, "lambda_pa": KAPPA["kappa_pa"]}),
+    Law("mooney-rivlin", "mooney-rivlin", {"c10_pa": UNKNOWN, "c01_pa": UNKNOWN, **KAPPA}),
+    Law("yeoh", "yeoh", {"c10_pa": UNKNOWN, "c20_pa": UNKNOWN, "c30_pa": UNKNOWN, **KAPPA}),
+    Law("gent", "gent", {"mu_pa": UNKNOWN, "gent_limit": cs.Unknown(guess=60.0), **KAPPA}),
     Law(
         "arruda-boyce",
         "arruda-boyce",
@@ -110,16 +88,11 @@ LAWS = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--laws", nargs="+", help="names of laws; all by default"
-    )
+    parser.add_argument("--laws", nargs="+", help="names of laws; all by default")
     options = parser.parse_args()
-    laws = [
-        law for law in LAWS if options.laws is None or law.name in options.laws
-    ]
+    laws = [law for law in LAWS if options.laws is None or law.name in options.laws]
     heads = (
         "stretch up to",
         "fitted tests",
@@ -128,12 +101,7 @@ def main() -> None:
         "error of the fit, kPa",
         *(f"error of {test}, kPa" for test in ALL_TESTS),
     )
-    rows = [
-        row_of_tests(law, limit, tests)
-        for limit in LIMITS
-        for tests in FITTED
-        for law in laws
-    ]
+    rows = [row_of_tests(law, limit, tests) for limit in LIMITS for tests in FITTED for law in laws]
     print(markdown(heads, rows), flush=True)
     heads = (
         "λ₁ up to",
@@ -147,23 +115,15 @@ def main() -> None:
     print(markdown(heads, rows))
 
 
-def row_of_tests(
-    law: Law, limit: float, fitted: tuple[str, ...]
-) -> tuple[str, ...]:
+def row_of_tests(law: Law, limit: float, fitted: tuple[str, ...]) -> tuple[str, ...]:
     """Return modulus, error of the fit, and error of the prediction of each other test."""
-    experiments = cs.datasets.kawabata_1981(
-        law.material, tests=ALL_TESTS, largest_stretch=limit
-    )
+    experiments = cs.datasets.kawabata_1981(law.material, tests=ALL_TESTS, largest_stretch=limit)
     known = [each for each in experiments if each.name in fitted]
     run = cs.run(cs.Problem(known, {**law.parameters, **UNDAMPED}))
     constants = run.solution.parameters
     errors = {each.name: rms_kpa([each], constants) for each in experiments}
     cells = ["fitted" if name in fitted else errors[name] for name in ALL_TESTS]
-    name = (
-        law.name
-        if run.solution.status.converged
-        else f"{law.name} (not converged)"
-    )
+    name = law.name if run.solution.status.converged else f"{law.name} (not converged)"
     return (
         str(limit),
         "uniaxial" if len(fitted) == 1 else "three tests",
@@ -176,17 +136,11 @@ def row_of_tests(
 
 def row_of_stretches(law: Law, limit: float) -> tuple[str, ...]:
     """Return constants, error of the fit up to a stretch, and error of the prediction beyond."""
-    fitted = cs.datasets.kawabata_1981(
-        law.material, tests=ALL_TESTS, largest_stretch=limit
-    )
+    fitted = cs.datasets.kawabata_1981(law.material, tests=ALL_TESTS, largest_stretch=limit)
     run = cs.run(cs.Problem(fitted, {**law.parameters, **UNDAMPED}))
     constants = run.solution.parameters
     everything = cs.datasets.kawabata_1981(law.material, tests=ALL_TESTS)
-    name = (
-        law.name
-        if run.solution.status.converged
-        else f"{law.name} (not converged)"
-    )
+    name = law.name if run.solution.status.converged else f"{law.name} (not converged)"
     return (
         str(limit),
         name,
@@ -233,13 +187,9 @@ def rms_kpa(
             trajectory = cs.simulate(experiment, constants)
         except cs.SimulationError:
             return "unstable"
-        pairs = zip(
-            trajectory.custom_sensor_values, experiment.readings, strict=True
-        )
+        pairs = zip(trajectory.custom_sensor_values, experiment.readings, strict=True)
         for predicted, gauge in pairs:
-            residuals_pa.append(
-                (predicted - gauge.measured_values)[is_counted(stretch), 0]
-            )
+            residuals_pa.append((predicted - gauge.measured_values)[is_counted(stretch), 0])
     return f"{np.sqrt(np.nanmean(np.concatenate(residuals_pa) ** 2)) / 1e3:.3g}"
 
 

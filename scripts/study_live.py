@@ -1,9 +1,9 @@
 """Coverage of the intervals of live estimates while a recording is made.
 
 Twins of a small block are moved at random and simulated with the scheme of the estimator, so that
-the noise of 0.5 mm is the only error. They are streamed frame by frame, starting from the guess. With
-each frame a fixed number of rows is linearised again, so that the load of the machine changes the
-times only, not the estimates.
+the noise of 0.5 mm is the only error. They are streamed frame by frame, starting from the guess.
+With each frame a fixed number of rows is linearised again, so that the load of the machine changes
+the times only, not the estimates.
 
     python scripts/study_live.py                       # 200 twins
     python scripts/study_live.py --twins 20 --rows 6 --batch 5
@@ -29,7 +29,8 @@ from collocation_sysid.statistics.uncertainty import uncertainty_at
 SAMPLES = 101
 # Times at which intervals and verdicts are counted [s]; the motion rises from 0 s on.
 EVALUATED_S = (0.25, 0.5, 1.0)
-# Time at which the errors of the estimates are counted [s], and the relative error that is small enough.
+# Time at which the errors of the estimates are counted [s], and the relative error that is small
+# enough.
 EARLY_S = 0.3
 CLOSE_SHARE = 0.1
 # Number of twins after which the counts are printed.
@@ -68,14 +69,10 @@ class LiveCounts:
                     self._count(time_s, update)
             if abs(frame.t_s - EARLY_S) < 1e-6:
                 estimates = update.estimates
-                self.errors.append(
-                    [abs(estimates[n].value / SOFT[n] - 1) for n in SOFT]
-                )
+                self.errors.append([abs(estimates[n].value / SOFT[n] - 1) for n in SOFT])
         if batch:
             solution = solve(problem, ReducedSpace())
-            batch_estimates = uncertainty_at(
-                solution.collocation, solution.z
-            ).estimates
+            batch_estimates = uncertainty_at(solution.collocation, solution.z).estimates
             self.batch_differences += [
                 abs(update.estimates[n].value - batch_estimates[n].value)
                 / (batch_estimates[n].statistical_std_error or np.inf)
@@ -107,22 +104,16 @@ class LiveCounts:
                 f"all parameters {covered / max(1, intervals):.3f} of {intervals} intervals"
             )
             verdict_counts = (
-                f"{v} {self.verdicts[time_s, v]}"
-                for v in ("good", "check", "doubtful")
+                f"{v} {self.verdicts[time_s, v]}" for v in ("good", "check", "doubtful")
             )
             print(f"    verdicts: {', '.join(verdict_counts)}")
         close_shares = np.mean(np.array(self.errors) <= CLOSE_SHARE, axis=0)
-        shares = (
-            f"{n} {share:.2f}"
-            for n, share in zip(SOFT, close_shares, strict=True)
-        )
+        shares = (f"{n} {share:.2f}" for n, share in zip(SOFT, close_shares, strict=True))
         print(
             f"share of twins with an error of at most {CLOSE_SHARE:.0%} at {EARLY_S:g} s: {', '.join(shares)}"
         )
         median, upper = 1e3 * np.percentile(self.latency_s, [50, 99])
-        print(
-            f"processor time per frame: median {median:.2f} ms, 99 % below {upper:.2f} ms"
-        )
+        print(f"processor time per frame: median {median:.2f} ms, 99 % below {upper:.2f} ms")
         if self.batch_differences:
             print(
                 "largest difference from the batch solution, in standard errors: "
@@ -134,28 +125,18 @@ def main() -> None:
     """Stream the twins, and print the counts after every ten twins."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--twins", type=int, default=200)
-    parser.add_argument(
-        "--first", type=int, default=0, help="seed of the first twin"
-    )
+    parser.add_argument("--first", type=int, default=0, help="seed of the first twin")
     parser.add_argument("--body", default="block")
     parser.add_argument(
-        "--rows",
-        type=int,
-        default=6,
-        help="rows that are linearised again with each frame",
+        "--rows", type=int, default=6, help="rows that are linearised again with each frame"
     )
     parser.add_argument(
-        "--batch",
-        type=int,
-        default=0,
-        help="number of twins that are also solved as a whole",
+        "--batch", type=int, default=0, help="number of twins that are also solved as a whole"
     )
     arguments = parser.parse_args()
     counts = LiveCounts()
     for number in range(arguments.twins):
-        problem = twin(
-            arguments.body, SOFT, arguments.first + number, SAMPLES, "midpoint"
-        )
+        problem = twin(arguments.body, SOFT, arguments.first + number, SAMPLES, "midpoint")
         counts.stream(problem, arguments.rows, number < arguments.batch)
         if (number + 1) % TWINS_PER_PRINT == 0 or number + 1 == arguments.twins:
             counts.show()

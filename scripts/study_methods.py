@@ -1,9 +1,9 @@
 """Success of each method from distant initial guesses, on a small problem.
 
 A cylinder hangs from a swung hand. Its tracks are simulated with the scheme of the fit, without
-noise. Every method starts from the same guesses, log-uniform within a factor of 10 of the true values
-in all four parameters. A run succeeds if all four estimates are within 1 % of the true values,
-whatever its status.
+noise. Every method starts from the same guesses, log-uniform within a factor of 10 of the true
+values in all four parameters. A run succeeds if all four estimates are within 1 % of the true
+values, whatever its status.
 
     python scripts/study_methods.py                     # all methods, 40 starts
     python scripts/study_methods.py --methods shooting reduced-space --starts 100
@@ -18,15 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from studies import (
-    TRUTH,
-    Variant,
-    markdown,
-    number,
-    run_variants,
-    save,
-    worst_error,
-)
+from studies import TRUTH, Variant, markdown, number, run_variants, save, worst_error
 from synthetic import swing
 
 from collocation_sysid.extras.studies.study_rows import Row, wilson_interval
@@ -43,7 +35,8 @@ HEIGHT_M = 0.16
 
 # Options of methods: inner Levenberg–Marquardt solver.
 LM = {"inner": "levenberg-marquardt"}
-# Initial trajectories are simulated at the guess, not taken from a coarse solution by reduced space.
+# Initial trajectories are simulated at the guess, not taken from a coarse solution by reduced
+# space.
 FROM_SIMULATION = {"initial": "simulation"}
 # A growing horizon whose stages are solved by shooting.
 SHOOTING_STAGES = {"stage.method": "shooting"}
@@ -53,16 +46,9 @@ VARIANTS = (
     Variant("shooting, growing horizon", "continuation", SHOOTING_STAGES),
     Variant("penalty, LM", "penalty", LM),
     Variant(
-        "augmented-lagrangian, LM, first ρ = 1e2",
-        "augmented-lagrangian",
-        {"rho": 1e2},
-        share=0.5,
+        "augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}, share=0.5
     ),
-    Variant(
-        "augmented-lagrangian, LM, first ρ = 1e5",
-        "augmented-lagrangian",
-        share=0.5,
-    ),
+    Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian", share=0.5),
     Variant("interior-point", "interior-point", FROM_SIMULATION, share=0.25),
     Variant("penalty, CG", "penalty", {"max_time_s": 15}, share=0.25),
 )
@@ -131,38 +117,23 @@ class MethodScore:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--starts", type=int, default=40)
     parser.add_argument("--spread", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--layers", type=int, default=7, help="7 (layers + 1) nodes"
-    )
+    parser.add_argument("--layers", type=int, default=7, help="7 (layers + 1) nodes")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--step-s", type=float, default=0.02)
-    parser.add_argument(
-        "--time-s", type=float, default=40.0, help="limit of a run"
-    )
+    parser.add_argument("--time-s", type=float, default=40.0, help="limit of a run")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument(
-        "--methods", nargs="*", choices=[v.name for v in VARIANTS]
-    )
-    parser.add_argument(
-        "--out", type=Path, default=Path("results/study_methods")
-    )
+    parser.add_argument("--methods", nargs="*", choices=[v.name for v in VARIANTS])
+    parser.add_argument("--out", type=Path, default=Path("results/study_methods"))
     arguments = parser.parse_args()
-    path = write_problem(
-        arguments.out, arguments.layers, arguments.steps, arguments.step_s
-    )
+    path = write_problem(arguments.out, arguments.layers, arguments.steps, arguments.step_s)
     rows = run_variants(
         path,
-        [
-            v
-            for v in VARIANTS
-            if not arguments.methods or v.name in arguments.methods
-        ],
+        [v for v in VARIANTS if not arguments.methods or v.name in arguments.methods],
         arguments.out,
         starts=arguments.starts,
         spread=arguments.spread,
@@ -170,15 +141,12 @@ def main() -> None:
         time_s=arguments.time_s,
         workers=arguments.workers,
     )
-    save(
-        arguments.out,
-        "study_methods",
-        table([score(name, each) for name, each in rows.items()]),
-    )
+    save(arguments.out, "study_methods", table([score(name, each) for name, each in rows.items()]))
 
 
 def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
-    """Write the problem of a swung cylinder with exact tracks of the midpoint rule; return its path.
+    """Write the problem of a swung cylinder with exact tracks of the midpoint rule; return its
+    path.
 
     Parameters
     ----------
@@ -203,25 +171,13 @@ def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
     )
     write_poses_csv(folder / "motion.csv", poses)
     on_side = np.linalg.norm(mesh.points_m[:, :2], axis=1) > RADIUS_M / 2
-    marker_places_m = mesh.points_m[
-        on_side & (mesh.points_m[:, 2] > 0.2 * HEIGHT_M)
-    ][::5]
-    places = ", ".join(
-        f"m{k} = {point.tolist()}" for k, point in enumerate(marker_places_m)
-    )
+    marker_places_m = mesh.points_m[on_side & (mesh.points_m[:, 2] > 0.2 * HEIGHT_M)][::5]
+    places = ", ".join(f"m{k} = {point.tolist()}" for k, point in enumerate(marker_places_m))
     path = folder / "problem.toml"
-    path.write_text(
-        PROBLEM.replace("REFERENCES", f"{{ {places} }}"), encoding="utf-8"
-    )
-    truth_overrides = [
-        f"parameters.{name}.guess={value}" for name, value in TRUTH.items()
-    ]
+    path.write_text(PROBLEM.replace("REFERENCES", f"{{ {places} }}"), encoding="utf-8")
+    truth_overrides = [f"parameters.{name}.guess={value}" for name, value in TRUTH.items()]
     (folder / "swing_markers.csv").unlink(missing_ok=True)
-    write_data(
-        Problem.read(path, truth_overrides, simulation=True),
-        folder,
-        Recipe("midpoint"),
-    )
+    write_data(Problem.read(path, truth_overrides, simulation=True), folder, Recipe("midpoint"))
     return path
 
 
@@ -229,20 +185,10 @@ def score(name: str, rows: Sequence[Row]) -> MethodScore:
     """Return the counts and the median time of the runs of one variant of a method."""
     has_succeeded = [worst_error(row) <= SUCCESS_SHARE for row in rows]
     converged = [bool(row["converged"]) for row in rows]
-    times = [
-        row["total_s"] if row["total_s"] is not None else row["wall_s"]
-        for row in rows
-    ]
-    misled = sum(
-        c and not n for c, n in zip(converged, has_succeeded, strict=True)
-    )
+    times = [row["total_s"] if row["total_s"] is not None else row["wall_s"] for row in rows]
+    misled = sum(c and not n for c, n in zip(converged, has_succeeded, strict=True))
     return MethodScore(
-        name,
-        len(rows),
-        sum(has_succeeded),
-        sum(converged),
-        misled,
-        float(np.median(times)),
+        name, len(rows), sum(has_succeeded), sum(converged), misled, float(np.median(times))
     )
 
 

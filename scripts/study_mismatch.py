@@ -1,9 +1,9 @@
 """Effect of the time step of each scheme on the estimates, for data without noise.
 
 A swung cylinder is simulated by Newmark's scheme with a step so fine that its error is negligible,
-sampled every 20 ms, and identified with each scheme at steps of 20, 10 … 1.25 ms. The observed order
-is the slope of log |relative error| against log Δt. A star marks an estimate at a bound; the other
-estimates of that row are then biased, and the row is not used for the order.
+sampled every 20 ms, and identified with each scheme at steps of 20, 10 … 1.25 ms. The observed
+order is the slope of log |relative error| against log Δt. A star marks an estimate at a bound; the
+other estimates of that row are then biased, and the row is not used for the order.
 
     python scripts/study_mismatch.py
 """
@@ -70,37 +70,22 @@ class SchemeFit:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--schemes", nargs="*", choices=SCHEMES, default=list(SCHEMES)
-    )
-    parser.add_argument(
-        "--substeps", nargs="*", type=int, default=[1, 2, 4, 8, 16]
-    )
-    parser.add_argument(
-        "--layers", type=int, default=7, help="7 (layers + 1) nodes"
-    )
+    parser.add_argument("--schemes", nargs="*", choices=SCHEMES, default=list(SCHEMES))
+    parser.add_argument("--substeps", nargs="*", type=int, default=[1, 2, 4, 8, 16])
+    parser.add_argument("--layers", type=int, default=7, help="7 (layers + 1) nodes")
     parser.add_argument("--samples", type=int, default=50)
-    parser.add_argument(
-        "--fine-s", type=float, default=1.25e-4, help="Newmark's step"
-    )
-    parser.add_argument(
-        "--out", type=Path, default=Path("results/study_mismatch")
-    )
+    parser.add_argument("--fine-s", type=float, default=1.25e-4, help="Newmark's step")
+    parser.add_argument("--out", type=Path, default=Path("results/study_mismatch"))
     arguments = parser.parse_args()
-    experiment = exact_recording(
-        arguments.layers, arguments.samples, arguments.fine_s
-    )
+    experiment = exact_recording(arguments.layers, arguments.samples, arguments.fine_s)
     fits = [
         identify(experiment, scheme, substeps)
         for scheme in arguments.schemes
         for substeps in arguments.substeps
     ]
-    save(
-        arguments.out, "study_mismatch", f"{table(fits)}\n\n{order_table(fits)}"
-    )
+    save(arguments.out, "study_mismatch", f"{table(fits)}\n\n{order_table(fits)}")
 
 
 def exact_recording(layers: int, samples: int, fine_s: float) -> Experiment:
@@ -120,23 +105,18 @@ def exact_recording(layers: int, samples: int, fine_s: float) -> Experiment:
     grasp = Grasp(experiment.grasps[0].nodes, motion.poses(fine_s))
     markers = replace(experiment.markers, t_s=t_s)
     experiment = replace(experiment, t_s=t_s, grasps=(grasp,), markers=markers)
-    return with_markers(
-        experiment, simulate(experiment, TRUTH, timestep_s=fine_s).markers_m
-    )
+    return with_markers(experiment, simulate(experiment, TRUTH, timestep_s=fine_s).markers_m)
 
 
 def identify(experiment: Experiment, scheme: str, substeps: int) -> SchemeFit:
     """Identify the parameters with a scheme and a number of time steps per sample."""
     parameters = Parameters(
         tuple(
-            Parameter(name, guess, *BOUNDS[name])
-            for name, guess in zip(TRUTH, GUESS, strict=True)
+            Parameter(name, guess, *BOUNDS[name]) for name, guess in zip(TRUTH, GUESS, strict=True)
         )
     )
     began = time.perf_counter()
-    solution = ReducedSpace()(
-        Collocation([experiment], parameters, scheme, substeps)
-    )
+    solution = ReducedSpace()(Collocation([experiment], parameters, scheme, substeps))
     estimates = solution.theta
     bounds = np.array([BOUNDS[name] for name in TRUTH])
     return SchemeFit(
@@ -155,15 +135,11 @@ def orders(fits: Sequence[SchemeFit]) -> Array:
 
     Fits that did not converge or have an estimate at a bound are not used.
     """
-    usable_fits = [
-        fit for fit in fits if fit.converged and not fit.at_bound.any()
-    ]
+    usable_fits = [fit for fit in fits if fit.converged and not fit.at_bound.any()]
     if len(usable_fits) < 2:
         return np.full(len(TRUTH), np.nan)
     steps = np.log([fit.step_s for fit in usable_fits])
-    return np.polyfit(
-        steps, np.log(np.abs([fit.errors for fit in usable_fits])), 1
-    )[0]
+    return np.polyfit(steps, np.log(np.abs([fit.errors for fit in usable_fits])), 1)[0]
 
 
 def table(fits: Sequence[SchemeFit]) -> str:
@@ -183,13 +159,7 @@ def table(fits: Sequence[SchemeFit]) -> str:
         ]
         name = fit.scheme if fit.converged else f"{fit.scheme} (not converged)"
         lines.append(
-            (
-                name,
-                f"{1e3 * fit.step_s:g}",
-                *cells,
-                f"{1e3 * fit.rms_m:.2g}",
-                f"{fit.time_s:.1f}",
-            )
+            (name, f"{1e3 * fit.step_s:g}", *cells, f"{1e3 * fit.rms_m:.2g}", f"{fit.time_s:.1f}")
         )
     return markdown(heads, lines)
 
@@ -198,13 +168,8 @@ def order_table(fits: Sequence[SchemeFit]) -> str:
     """Return a Markdown table of the orders over all steps, and over the two finest."""
     lines = []
     for scheme in dict.fromkeys(fit.scheme for fit in fits):
-        scheme_fits = sorted(
-            (f for f in fits if f.scheme == scheme), key=lambda fit: fit.step_s
-        )
-        for name, chosen in (
-            ("all steps", scheme_fits),
-            ("two finest", scheme_fits[:2]),
-        ):
+        scheme_fits = sorted((f for f in fits if f.scheme == scheme), key=lambda fit: fit.step_s)
+        for name, chosen in (("all steps", scheme_fits), ("two finest", scheme_fits[:2])):
             cells = ["–" if np.isnan(o) else f"{o:.2f}" for o in orders(chosen)]
             lines.append((f"{scheme}, {name}", *cells))
     return markdown(("observed order", *PARAMETER_SYMBOLS), lines)

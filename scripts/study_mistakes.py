@@ -25,19 +25,12 @@ from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.features.camera_feature import (
-    depth_image_hypotheses,
-    may_be_images,
-)
-from collocation_sysid.features.wrench_causes import (
-    wrench_mistakes,
-)
+from collocation_sysid.features.camera_feature import depth_image_hypotheses, may_be_images
+from collocation_sysid.features.wrench_causes import wrench_mistakes
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
-from collocation_sysid.runs.check import (
-    misspecification_hypotheses,
-)
+from collocation_sysid.runs.check import misspecification_hypotheses
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
     Hypothesis,
     rank,
@@ -112,9 +105,7 @@ class SolveReport:
 def main() -> None:
     options = _options()
     began_s = time.perf_counter()
-    print(
-        _line(["mistake", "`check`", "`solve`"]), _line(["---"] * 3), sep="\n"
-    )
+    print(_line(["mistake", "`check`", "`solve`"]), _line(["---"] * 3), sep="\n")
     rows = []
     for row in table_rows(
         families(options.body, options.samples),
@@ -131,25 +122,17 @@ def main() -> None:
 def _options() -> argparse.Namespace:
     """Return the options of the command line."""
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     groups = ["tracks", "wrench", "depth", "obstacle"]
     parser.add_argument("--groups", nargs="+", choices=groups, default=groups)
     parser.add_argument("--body", choices=list(BODIES), default="bar")
     parser.add_argument("--samples", type=int, default=40)
     parser.add_argument(
-        "--seeds",
-        type=int,
-        default=5,
-        help="number of correct problems of each kind",
+        "--seeds", type=int, default=5, help="number of correct problems of each kind"
     )
-    parser.add_argument(
-        "--only", default="", help="rows whose name contains this"
-    )
-    parser.add_argument(
-        "--check-only", action="store_true", help="do not solve"
-    )
+    parser.add_argument("--only", default="", help="rows whose name contains this")
+    parser.add_argument("--check-only", action="store_true", help="do not solve")
     return parser.parse_args()
 
 
@@ -178,12 +161,7 @@ def families(body: str, samples: int) -> list[ProblemFamily]:
             shear_pa,
         ),
         ProblemFamily(
-            "depth",
-            "one depth image",
-            depth_twins.hanging_twin,
-            DEPTH_FAULTS,
-            "young_pa",
-            bar_pa,
+            "depth", "one depth image", depth_twins.hanging_twin, DEPTH_FAULTS, "young_pa", bar_pa
         ),
         ProblemFamily(
             "depth",
@@ -194,12 +172,7 @@ def families(body: str, samples: int) -> list[ProblemFamily]:
             bar_pa,
         ),
         ProblemFamily(
-            "obstacle",
-            "indentation",
-            contact_twins.poked_twin,
-            POKING_FAULTS,
-            "young_pa",
-            block_pa,
+            "obstacle", "indentation", contact_twins.poked_twin, POKING_FAULTS, "young_pa", block_pa
         ),
         ProblemFamily(
             "obstacle",
@@ -213,12 +186,7 @@ def families(body: str, samples: int) -> list[ProblemFamily]:
 
 
 def table_rows(
-    kinds: Sequence[ProblemFamily],
-    *,
-    groups: Sequence[str],
-    seeds: int,
-    only: str,
-    is_solved: bool,
+    kinds: Sequence[ProblemFamily], *, groups: Sequence[str], seeds: int, only: str, is_solved: bool
 ) -> Iterator[MistakeRow]:
     """Yield the rows of all correct problems, then those of all mistakes.
 
@@ -243,18 +211,11 @@ def table_rows(
     for family in chosen:
         for name, fault in family.faults.items():
             if only in name:
-                yield table_row(
-                    name, family, fault, PROBLEM_SEED, is_solved=is_solved
-                )
+                yield table_row(name, family, fault, PROBLEM_SEED, is_solved=is_solved)
 
 
 def table_row(
-    name: str,
-    family: ProblemFamily,
-    fault: Fault | None,
-    seed: int,
-    *,
-    is_solved: bool,
+    name: str, family: ProblemFamily, fault: Fault | None, seed: int, *, is_solved: bool
 ) -> MistakeRow:
     """Return the row of a problem with a mistake, or without one (None).
 
@@ -274,11 +235,7 @@ def table_row(
     refusal = ""
     try:
         correct = family.make(seed)
-        described = (
-            correct
-            if fault is None
-            else fault(correct, np.random.default_rng(FAULT_SEED))
-        )
+        described = correct if fault is None else fault(correct, np.random.default_rng(FAULT_SEED))
         causes = checked_causes(described)
     except (InputError, SimulationError) as error:
         refusal = f"refused: {error}"
@@ -286,9 +243,7 @@ def table_row(
     if is_solved:
         # A description that cannot be built is refused by a solve too.
         report = (
-            SolveReport(refusal, False)
-            if described is None
-            else solve_report(described, family)
+            SolveReport(refusal, False) if described is None else solve_report(described, family)
         )
     return MistakeRow(
         name,
@@ -309,9 +264,7 @@ def checked_causes(problem: Problem) -> tuple[Hypothesis, ...]:
     collocation = problem.collocation()
     if has_images:
         variables, _ = initial_variables(collocation)
-        mistakes = depth_image_hypotheses(
-            problem, collocation.iterates(variables)
-        )
+        mistakes = depth_image_hypotheses(problem, collocation.iterates(variables))
         causes = rank((*causes, *mistakes))
     return causes or rank(wrench_mistakes(collocation).hypotheses)
 
@@ -330,17 +283,12 @@ def solve_report(problem: Problem, family: ProblemFamily) -> SolveReport:
     if verdict != "good":
         return SolveReport(f"{verdict}: {reason}", False)
     ratio = answer.estimates[family.parameter].value / family.truth
-    return SolveReport(
-        f"{verdict}: {reason}, {family.parameter} {ratio:.3g} of the truth",
-        True,
-    )
+    return SolveReport(f"{verdict}: {reason}, {family.parameter} {ratio:.3g} of the truth", True)
 
 
 def causes_text(causes: Sequence[Hypothesis]) -> str:
     """Return the likeliest causes with the factors by which the misfit falls without them."""
-    shown = (
-        f"{each.code} ({each.strength:.2g})" for each in causes[:SHOWN_CAUSES]
-    )
+    shown = (f"{each.code} ({each.strength:.2g})" for each in causes[:SHOWN_CAUSES])
     return ", ".join(shown) or "nothing"
 
 
@@ -349,11 +297,7 @@ def summary(rows: Sequence[MistakeRow]) -> str:
     counts = Counter(
         (row.is_correct, key)
         for row in rows
-        for key, counted in (
-            ("all", True),
-            ("reported", row.is_reported),
-            ("good", row.is_good),
-        )
+        for key, counted in (("all", True), ("reported", row.is_reported), ("good", row.is_good))
         if counted
     )
     return (

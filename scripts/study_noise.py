@@ -55,10 +55,7 @@ CASES = (
     MethodCase("reduced-space", "reduced-space", {}),
     MethodCase("shooting", "shooting", {}),
     MethodCase(
-        "augmented-lagrangian, LM",
-        "augmented-lagrangian",
-        {"rho": 1e2, "max_time_s": 60.0},
-        0.1,
+        "augmented-lagrangian, LM", "augmented-lagrangian", {"rho": 1e2, "max_time_s": 60.0}, 0.1
     ),
     MethodCase("penalty, LM", "penalty", {**LM, "max_time_s": 60.0}, 0.1),
 )
@@ -75,21 +72,15 @@ class NoiseOutcome:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--sigma-m", type=float, default=1e-3)
-    parser.add_argument(
-        "--workers", type=int, default=os.cpu_count() or 1, help="processes"
-    )
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--out", type=Path, default=Path("results/study_noise"))
     arguments = parser.parse_args()
     # Worker processes read these variables when they start: one thread each.
-    os.environ |= {
-        "OPENBLAS_NUM_THREADS": "1",
-        "COLLOCATION_SYSID_THREADS": "1",
-    }
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
     start = multiprocessing.get_context("spawn")
     outcomes = {}
     with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
@@ -114,21 +105,14 @@ def run(case: MethodCase, sigma_m: float, seed: int) -> NoiseOutcome:
     )
 
 
-def noisy_twin(
-    sigma_m: float, seed: int | None, guess: Sequence[float]
-) -> Collocation:
+def noisy_twin(sigma_m: float, seed: int | None, guess: Sequence[float]) -> Collocation:
     """Return the program of a twin with the noise of a seed; without noise if the seed is None."""
     experiment, x = reference(sigma_m)
     tracks = experiment.markers.predict_positions(x.reshape(len(x), -1, 3))
     if seed is not None:
-        tracks = tracks + sigma_m * np.random.default_rng(seed).standard_normal(
-            tracks.shape
-        )
+        tracks = tracks + sigma_m * np.random.default_rng(seed).standard_normal(tracks.shape)
     parameters = Parameters(
-        tuple(
-            Parameter(n, g, *BOUNDS[n])
-            for n, g in zip(TRUTH, guess, strict=True)
-        )
+        tuple(Parameter(n, g, *BOUNDS[n]) for n, g in zip(TRUTH, guess, strict=True))
     )
     return Collocation([with_markers(experiment, tracks)], parameters, SCHEME)
 
@@ -146,20 +130,14 @@ def predicted(sigma_m: float) -> tuple[float, ...]:
     return tuple(np.sqrt(variances).tolist())
 
 
-def table(
-    outcomes: Mapping[str, Sequence[NoiseOutcome]], expected: Sequence[float]
-) -> str:
+def table(outcomes: Mapping[str, Sequence[NoiseOutcome]], expected: Sequence[float]) -> str:
     """Return a Markdown table of bias and spread of every method.
 
     `expected` are the predicted standard errors (4,) of the logarithms.
     """
     heads = (
         *("method", "number of twins", "converged"),
-        *(
-            f"{name} {what} [%]"
-            for name in PARAMETER_SYMBOLS
-            for what in ("bias", "spread")
-        ),
+        *(f"{name} {what} [%]" for name in PARAMETER_SYMBOLS for what in ("bias", "spread")),
         "median time [s]",
     )
     spreads = [cell for each in expected for cell in ("0", f"{100 * each:.3g}")]
@@ -189,9 +167,7 @@ def bias_and_spread(errors: Sequence[Array]) -> list[str]:
         return ["–"] * (2 * len(PARAMETER_SYMBOLS))
     percent = 100 * np.array(errors)
     cells = []
-    for bias, spread in zip(
-        percent.mean(axis=0), percent.std(axis=0, ddof=1), strict=True
-    ):
+    for bias, spread in zip(percent.mean(axis=0), percent.std(axis=0, ddof=1), strict=True):
         standard_error_bias = spread / np.sqrt(len(percent))
         cells += [f"{bias:+.2g} ± {standard_error_bias:.1g}", f"{spread:.3g}"]
     return cells

@@ -20,15 +20,7 @@ import numpy as np
 from get_pneumatic_arm import FOLDER, ArmShape, arm_mesh
 from numpy.typing import NDArray
 
-from collocation_sysid import (
-    Box,
-    Nuisance,
-    Problem,
-    SimulationError,
-    Solution,
-    simulate,
-    solve,
-)
+from collocation_sysid import Box, Nuisance, Problem, SimulationError, Solution, simulate, solve
 from collocation_sysid.recording import Experiment, PointMass
 from collocation_sysid.runs.warm_start import WarmStart
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
@@ -41,13 +33,12 @@ WALLS_M = {"wall_32": 0.0032, "wall_42": 0.0042}
 KEYS = {
     "poisson_40": ["parameters.poisson.fixed=0.40"],
     "poisson_48": ["parameters.poisson.fixed=0.48"],
-    "poisson_free": [
-        "parameters.poisson={ guess = 0.45, lower = 0.2, upper = 0.49 }"
-    ],
+    "poisson_free": ["parameters.poisson={ guess = 0.45, lower = 0.2, upper = 0.49 }"],
 }
 FACTORS = {"pressure_105": 1.05}
 MASSES_KG = {"mass_5g": 0.005}
-# Modulus of the silicone that the authors state, and one so small that the threads have no effect [Pa].
+# Modulus of the silicone that the authors state, and one so small that the threads have no effect
+# [Pa].
 AUTHORS_YOUNG_PA = 263824.0
 NO_THREADS_PA = 1.0
 # Files of the largest pressure, in place of those of the last recording in the problem.
@@ -80,12 +71,9 @@ class TravelError:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--variants", nargs="+", choices=VARIANTS, default=["shipped"]
-    )
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["shipped"])
     start = None
     for variant in parser.parse_args().variants:
         print(f"\n== {variant} ==\n", flush=True)
@@ -102,15 +90,12 @@ def print_statics() -> None:
         travels = []
         for fibre_pa in (NO_THREADS_PA, 1e6):
             try:
-                travel_m = static_travel_m(
-                    problem, fibre_pa, pressure_mbar(experiment)
-                )
+                travel_m = static_travel_m(problem, fibre_pa, pressure_mbar(experiment))
                 travels.append(f"{1e3 * travel_m:.2f} mm")
             except SimulationError:
                 travels.append("no equilibrium found")
         print(
-            f"{experiment.name:9} without threads {travels[0]}, with 1 MPa {travels[1]}",
-            flush=True,
+            f"{experiment.name:9} without threads {travels[0]}, with 1 MPa {travels[1]}", flush=True
         )
 
 
@@ -127,17 +112,9 @@ def static_travel_m(problem: Problem, fibre_pa: float, mbar: float) -> float:
     assert experiment.markers is not None
     t_s = np.array([0.0, 1.0])
     inflated = replace(
-        pressure,
-        pressure_pa=[0.0, 100 * mbar],
-        t_s=t_s,
-        lag_s=0.0,
-        body_measure=None,
+        pressure, pressure_pa=[0.0, 100 * mbar], t_s=t_s, lag_s=0.0, body_measure=None
     )
-    markers = replace(
-        experiment.markers,
-        t_s=t_s,
-        positions_m=experiment.markers.positions_m[:2],
-    )
+    markers = replace(experiment.markers, t_s=t_s, positions_m=experiment.markers.positions_m[:2])
     static_experiment = replace(
         experiment,
         kind="static",
@@ -147,14 +124,8 @@ def static_travel_m(problem: Problem, fibre_pa: float, mbar: float) -> float:
         nuisance=Nuisance.none(),
     )
     items = problem.parameters.scalars
-    values = {
-        item.name: float(item.guess) for item in items if item.guess is not None
-    }
-    values |= {
-        "young_pa": AUTHORS_YOUNG_PA,
-        "fibre_pa": fibre_pa,
-        "prony_1.share": 0.0,
-    }
+    values = {item.name: float(item.guess) for item in items if item.guess is not None}
+    values |= {"young_pa": AUTHORS_YOUNG_PA, "fibre_pa": fibre_pa, "prony_1.share": 0.0}
     tip_m = tip_motion(simulate(static_experiment, values).markers_m)
     return float(np.linalg.norm(tip_m[-1]))
 
@@ -164,20 +135,11 @@ def print_fit(variant: str, start: WarmStart | None) -> Solution:
     misfits and predictions.
     """
     problem = variant_of_problem(variant)
-    fitted_recordings = [
-        each for each in problem.experiments if not each.validation
-    ]
-    solution = solve(
-        replace(problem, experiments=fitted_recordings), start=start
-    )
-    print(
-        f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s"
-    )
+    fitted_recordings = [each for each in problem.experiments if not each.validation]
+    solution = solve(replace(problem, experiments=fitted_recordings), start=start)
+    print(f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s")
     print_estimates(problem, solution)
-    misfits = (
-        f"{name} {1e3 * rms:.2f}"
-        for name, rms in solution.rms_by_experiment_m.items()
-    )
+    misfits = (f"{name} {1e3 * rms:.2f}" for name, rms in solution.rms_by_experiment_m.items())
     print("RMS [mm]:", ", ".join(misfits))
     delays_s, log_lags = pressure_timing(solution)
     print(
@@ -190,20 +152,12 @@ def print_fit(variant: str, start: WarmStart | None) -> Solution:
     print(f"\n{'[mm]':9}{columns}{'polynomial':>12}")
     for experiment in problem.experiments:
         measured_m = measured_tip(experiment)
-        polynomial_m = polynomial_position(
-            fitted_recordings, pressure_mbar(experiment)
-        )
-        without_model_mm = 1e3 * np.linalg.norm(
-            polynomial_m - final_position(measured_m)
-        )
+        polynomial_m = polynomial_position(fitted_recordings, pressure_mbar(experiment))
+        without_model_mm = 1e3 * np.linalg.norm(polynomial_m - final_position(measured_m))
         try:
-            error = travel_error(
-                experiment, solution, delays_s.mean(), log_lags.mean()
-            )
+            error = travel_error(experiment, solution, delays_s.mean(), log_lags.mean())
         except SimulationError as failure:
-            print(
-                f"{experiment.name:9}{1e3 * final_travel(measured_m):10.2f} fails: {failure}"
-            )
+            print(f"{experiment.name:9}{1e3 * final_travel(measured_m):10.2f} fails: {failure}")
             print(f"{'':9}polynomial {without_model_mm:.2f}", flush=True)
             continue
         print(
@@ -225,21 +179,15 @@ def variant_of_problem(variant: str) -> Problem:
             arm_mesh(ArmShape(wall_m=WALLS_M[variant])).write(mesh)
             keys.append(f"object.mesh={mesh}")
         problem = Problem.read(file, keys, allow_code=True)
-        largest = Problem.read(
-            file, [*keys, *LARGEST], allow_code=True
-        ).experiments[-1]
+        largest = Problem.read(file, [*keys, *LARGEST], allow_code=True).experiments[-1]
     factor = FACTORS.get(variant, 1.0)
     mass_kg = MASSES_KG.get(variant)
     tip = Box((-1, -1, -1), (1, 1, 1e-4))
-    masses = (
-        [] if mass_kg is None else [PointMass(tip, mass_kg / 2)]
-    )  # half of the arm
+    masses = [] if mass_kg is None else [PointMass(tip, mass_kg / 2)]  # half of the arm
     experiments = [
         replace(
             each,
-            pressures=[
-                replace(pressure, factor=factor) for pressure in each.pressures
-            ],
+            pressures=[replace(pressure, factor=factor) for pressure in each.pressures],
             masses=masses,
         )
         for each in (*problem.experiments, replace(largest, name="450mbar"))
@@ -258,24 +206,18 @@ def print_estimates(problem: Problem, solution: Solution) -> None:
             continue
         estimate = uncertainty.estimates[item.name]
         interval = estimate.statistical95
-        text = (
-            "not determined"
-            if interval is None
-            else f"{interval[0]:.4g} to {interval[1]:.4g}"
-        )
+        text = "not determined" if interval is None else f"{interval[0]:.4g} to {interval[1]:.4g}"
         print(f"{item.name:16}{estimate.value:12.5g}   {text}")
 
 
-def pressure_timing(
-    solution: Solution,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def pressure_timing(solution: Solution) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return delay of the markers [s] and logarithm of the lag over the stated lag, one for each
     fitted recording.
     """
     delays_s = []
     log_lags = []
     for part in solution.collocation.iterates(solution.z):
-        for entry, _, value in part.segment.nuisance.iterate_values(part.phi):
+        for entry, _, value in part.transcription.nuisance.iterate_values(part.phi):
             if entry.row.name == "time_shift_s":
                 delays_s.append(value)
             if entry.row.name == "pressure_lag":
@@ -287,9 +229,7 @@ def timing_text(
     fitted_recordings: Sequence[Experiment], log_lags: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the lags of the fitted recordings [ms], rounded."""
-    stated_lags_s = np.array(
-        [each.pressures[0].lag_s for each in fitted_recordings]
-    )
+    stated_lags_s = np.array([each.pressures[0].lag_s for each in fitted_recordings])
     return np.round(1e3 * stated_lags_s * np.exp(log_lags), 1)
 
 
@@ -315,25 +255,16 @@ def travel_error(
         body_measure=None,
     )
     single_recording = replace(
-        experiment,
-        pressures=[shifted_pressure],
-        nuisance=Nuisance.none(),
-        validation=False,
+        experiment, pressures=[shifted_pressure], nuisance=Nuisance.none(), validation=False
     )
-    simulated = simulate(
-        single_recording, solution.parameters, "midpoint", substeps=1
-    ).markers_m
+    simulated = simulate(single_recording, solution.parameters, "midpoint", substeps=1).markers_m
     predicted_m = tip_motion(simulated)
     measured_m = measured_tip(experiment)
     distance_m = np.linalg.norm(predicted_m - measured_m, axis=1)
     return TravelError(
         measured_m=final_travel(measured_m),
         predicted_m=final_travel(predicted_m),
-        final_m=float(
-            np.linalg.norm(
-                final_position(predicted_m) - final_position(measured_m)
-            )
-        ),
+        final_m=float(np.linalg.norm(final_position(predicted_m) - final_position(measured_m))),
         rms_m=float(np.sqrt(np.mean(distance_m**2))),
     )
 
@@ -373,9 +304,7 @@ def polynomial_position(
     """Return the final position (2,) by a polynomial of the pressure, zero at zero, through the
     fitted recordings: a prediction without a model.
     """
-    known_m = np.array(
-        [final_position(measured_tip(each)) for each in fitted_recordings]
-    )
+    known_m = np.array([final_position(measured_tip(each)) for each in fitted_recordings])
     powers = np.arange(1, len(fitted_recordings) + 1)
     known_mbar = np.array([pressure_mbar(each) for each in fitted_recordings])
     coefficients = np.linalg.solve(known_mbar[:, None] ** powers, known_m)

@@ -4,8 +4,8 @@
 
 A block of linear and a bar of quadratic elements are moved at random. Their markers are simulated
 with random parameters, with every tetrahedron divided into 64 and a quarter of the time step, and
-with noise. The twins are fitted on the coarse mesh and refined once. The output has the share of 95 %
-intervals that contain the truth: for independent noise alone, and with the numerical error.
+with noise. The twins are fitted on the coarse mesh and refined once. The output has the share of 95
+% intervals that contain the truth: for independent noise alone, and with the numerical error.
 """
 
 from __future__ import annotations
@@ -33,10 +33,7 @@ NOISE_M = 5e-5
 SAMPLES = 20
 STEP_S = 0.01
 # Edges [m] and numbers of elements of the bodies; their elements and typical stiffnesses [Pa].
-BODIES = {
-    "block": ((0.06, 0.06, 0.09), (2, 2, 2)),
-    "bar": ((0.04, 0.04, 0.06), (1, 1, 1)),
-}
+BODIES = {"block": ((0.06, 0.06, 0.09), (2, 2, 2)), "bar": ((0.04, 0.04, 0.06), (1, 1, 1))}
 ELEMENTS = {"block": "tet4", "bar": "tet10"}
 YOUNG_PA = {"block": 1e3, "bar": 500.0}
 NAMES = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
@@ -45,36 +42,21 @@ NAMES = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
 def random_truth(name: str, rng: np.random.Generator) -> dict[str, float]:
     """Return true parameters of a body, drawn at random around its typical values."""
     young_pa = YOUNG_PA[name] * float(np.exp(rng.uniform(-0.5, 0.5)))
-    damping = {
-        "gamma_r_s": 0.004 * np.exp(rng.uniform(-0.5, 0.5)),
-        "gamma_m_1_s": 1.0,
-    }
-    return {
-        "young_pa": young_pa,
-        "poisson": float(rng.uniform(0.15, 0.4)),
-        **damping,
-    }
+    damping = {"gamma_r_s": 0.004 * np.exp(rng.uniform(-0.5, 0.5)), "gamma_m_1_s": 1.0}
+    return {"young_pa": young_pa, "poisson": float(rng.uniform(0.15, 0.4)), **damping}
 
 
-def unmeasured_problem(
-    name: str, rng: np.random.Generator
-) -> tuple[Problem, dict[str, float]]:
+def unmeasured_problem(name: str, rng: np.random.Generator) -> tuple[Problem, dict[str, float]]:
     """Return a problem without measurements, and its true parameters."""
     size_m, divisions = BODIES[name]
-    body = Body(
-        box_mesh(size_m, divisions), density_kg_m3=30.0, element=ELEMENTS[name]
-    )
+    body = Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=ELEMENTS[name])
     t_s = STEP_S * np.arange(SAMPLES)
     grasped_nodes = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
     free_nodes = np.setdiff1d(np.arange(len(body.nodes_m)), grasped_nodes)
     places_m = body.nodes_m[rng.choice(free_nodes, 6, replace=False)]
-    markers = Markers(
-        t_s, np.zeros((SAMPLES, 6, 3)), NOISE_M, places_m=places_m
-    )
+    markers = Markers(t_s, np.zeros((SAMPLES, 6, 3)), NOISE_M, places_m=places_m)
     grasp = Grasp(grasped_nodes, random_poses(t_s, rng))
-    experiment = Experiment(
-        body, t_s, [grasp], markers, name=name, nuisance=Nuisance.none()
-    )
+    experiment = Experiment(body, t_s, [grasp], markers, name=name, nuisance=Nuisance.none())
     truth = random_truth(name, rng)
     guess = {
         "young_pa": Unknown(truth["young_pa"], 10.0, 1e6),
@@ -92,10 +74,7 @@ def twin(name: str, seed: int) -> tuple[Problem, dict[str, float]]:
     (fine,) = finer_mesh(finer_mesh(coarse)).experiments
     tracks = simulate(fine, truth, "midpoint", substeps=4).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks.shape)
-    return replace(
-        coarse,
-        experiments=[with_markers(coarse.experiments[0], tracks + noise)],
-    ), truth
+    return replace(coarse, experiments=[with_markers(coarse.experiments[0], tracks + noise)]), truth
 
 
 def main(twins: int = 20, first: int = 0) -> None:
@@ -103,29 +82,19 @@ def main(twins: int = 20, first: int = 0) -> None:
 
     `twins` is the number of twins of each body, `first` the first seed.
     """
-    covered: dict[str, list[tuple[bool, bool]]] = {
-        name: [] for name in NAMES[:3]
-    }
+    covered: dict[str, list[tuple[bool, bool]]] = {name: [] for name in NAMES[:3]}
     for seed in range(first, first + twins):
         for name in BODIES:
             problem, truth = twin(name, seed)
             solution = solve(problem)
             uncertainty = uncertainty_at(
-                solution.collocation,
-                solution.z,
-                ErrorModel(errors="independent"),
+                solution.collocation, solution.z, ErrorModel(errors="independent")
             )
-            refined = solve_refined(
-                problem, WarmStart.of(solution), uncertainty.estimates
-            )
+            refined = solve_refined(problem, WarmStart.of(solution), uncertainty.estimates)
             for key in covered:
                 estimate = uncertainty.estimates[key]
                 error = refined.errors.get(key)
-                if (
-                    estimate.statistical95 is None
-                    or error is None
-                    or error.interval95 is None
-                ):
+                if estimate.statistical95 is None or error is None or error.interval95 is None:
                     print(name, seed, key, estimate.reason, flush=True)
                     continue
                 contains_truth = tuple(
@@ -137,10 +106,7 @@ def main(twins: int = 20, first: int = 0) -> None:
                     [f"{v:.5g}" for v in pair]
                     for pair in (estimate.statistical95, error.interval95)
                 ]
-                changes = [
-                    f"{change:+.3g}"
-                    for change in (error.step or 0.0, error.mesh or 0.0)
-                ]
+                changes = [f"{change:+.3g}" for change in (error.step or 0.0, error.mesh or 0.0)]
                 print(
                     f"{name}, seed {seed}, {key}: truth {truth[key]:.5g}, "
                     f"estimate {estimate.value:.5g}, "
@@ -157,9 +123,7 @@ def main(twins: int = 20, first: int = 0) -> None:
             f"{key}: coverage of the interval for noise {shares[0]:.0%}, "
             f"with numerical error {shares[1]:.0%}; {len(counted)} intervals"
         )
-    shares = np.mean(
-        [each for counted in covered.values() for each in counted], axis=0
-    )
+    shares = np.mean([each for counted in covered.values() for each in counted], axis=0)
     print(
         f"all: coverage of the interval for noise {shares[0]:.0%}, "
         f"with numerical error {shares[1]:.0%}"

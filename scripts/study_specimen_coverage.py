@@ -94,37 +94,21 @@ CASES = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--twins", type=int, default=200)
-    parser.add_argument(
-        "--case", type=int, choices=range(len(CASES)), help="one of the cases"
-    )
+    parser.add_argument("--case", type=int, choices=range(len(CASES)), help="one of the cases")
     options = parser.parse_args()
     rows = []
-    for case in (
-        CASES
-        if options.case is None
-        else CASES[options.case : options.case + 1]
-    ):
+    for case in CASES if options.case is None else CASES[options.case : options.case + 1]:
         start = time.perf_counter()
-        outcomes = [
-            intervals_with_truth(case, seed) for seed in range(options.twins)
-        ]
+        outcomes = [intervals_with_truth(case, seed) for seed in range(options.twins)]
         elapsed = time.perf_counter() - start
         for name in case.free:
             contains_truth = np.array([outcome[name] for outcome in outcomes])
             share = f"{contains_truth.sum()} of {len(contains_truth)}, {contains_truth.mean():.1%}"
-            rows.append(
-                (case.name, name, share, f"{elapsed / len(contains_truth):.2g}")
-            )
-    heads = (
-        "twins",
-        "constant",
-        "intervals that contain the truth",
-        "time per twin [s]",
-    )
+            rows.append((case.name, name, share, f"{elapsed / len(contains_truth):.2g}"))
+    heads = ("twins", "constant", "intervals that contain the truth", "time per twin [s]")
     print(markdown(heads, rows))
 
 
@@ -132,18 +116,13 @@ def intervals_with_truth(case: SpecimenCase, seed: int) -> dict[str, bool]:
     """Return for each estimated constant whether its statistical 95 % interval contains the truth."""
     rng = np.random.default_rng(seed)
     experiments = [twin(case, test, rng) for test in case.tests]
-    free = {
-        name: cs.Unknown(guess=GUESS_SHARE * case.truth[name])
-        for name in case.free
-    }
+    free = {name: cs.Unknown(guess=GUESS_SHARE * case.truth[name]) for name in case.free}
     problem = cs.Problem(experiments, {**case.truth, **UNDAMPED, **free})
     solution = cs.solve(problem)
     assert solution.status.converged, seed
     fit = linearise_fit(solution.collocation, solution.z)
     parameters = solution.collocation.parameters
-    uncertainty = uncertainty_from_fit(
-        fit, parameters, solution.q, problem.uncertainty
-    )
+    uncertainty = uncertainty_from_fit(fit, parameters, solution.q, problem.uncertainty)
     contains_truth = {}
     for name in case.free:
         interval = uncertainty.estimates[name].statistical95
@@ -152,37 +131,25 @@ def intervals_with_truth(case: SpecimenCase, seed: int) -> dict[str, bool]:
     return contains_truth
 
 
-def twin(
-    case: SpecimenCase, test: str, rng: np.random.Generator
-) -> cs.Experiment:
+def twin(case: SpecimenCase, test: str, rng: np.random.Generator) -> cs.Experiment:
     """Return a test with noise, a random zero of the strain and a random error of the area."""
     strain = np.linspace(*case.strains, SAMPLES)
     zeros = np.zeros(SAMPLES)
     lateral: Any = 1 + zeros if case.has_lateral else None
     described = cs.Specimen(
-        test,
-        strain,
-        zeros,
-        SIGMA_PA,
-        lateral_stretch=lateral,
-        lateral_sigma=LATERAL_SIGMA,
+        test, strain, zeros, SIGMA_PA, lateral_stretch=lateral, lateral_sigma=LATERAL_SIGMA
     )
     true_strain = strain + described.strain_zero * rng.normal()
-    true_specimen = cs.Specimen(
-        test, true_strain, zeros, SIGMA_PA, lateral_stretch=lateral
-    )
+    true_specimen = cs.Specimen(test, true_strain, zeros, SIGMA_PA, lateral_stretch=lateral)
     trajectory = cs.simulate(
-        true_specimen.experiment(case.material, test),
-        {**case.truth, **UNDAMPED},
+        true_specimen.experiment(case.material, test), {**case.truth, **UNDAMPED}
     )
     area_factor = 1 + described.area_error * rng.normal()
     experiment = described.experiment(case.material, test)
     values = [
         (area_factor if gauge.unit == "Pa" else 1.0) * reading
         + gauge.sigma * rng.normal(size=reading.shape)
-        for gauge, reading in zip(
-            experiment.readings, trajectory.custom_sensor_values, strict=True
-        )
+        for gauge, reading in zip(experiment.readings, trajectory.custom_sensor_values, strict=True)
     ]
     return with_readings(experiment, values)
 

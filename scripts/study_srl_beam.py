@@ -26,17 +26,10 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import FieldCoefficients
 from collocation_sysid.program.collocation import ExperimentIterate
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.identifiability import (
-    identifiability_sentences,
-)
+from collocation_sysid.statistics.identifiability import identifiability_sentences
 from collocation_sysid.statistics.linearised import LinearisedFit, linearise_fit
-from collocation_sysid.statistics.residuals.residual_diagnostics import (
-    diagnose_markers,
-)
-from collocation_sysid.statistics.uncertainty import (
-    Uncertainty,
-    uncertainty_from_fit,
-)
+from collocation_sysid.statistics.residuals.residual_diagnostics import diagnose_markers
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 TRIALS = ("gravity", "load52", "load101")
 # Element and bricks along x, y and z.
@@ -60,9 +53,7 @@ class Beam:
 
     def load(self, *overrides: str) -> Problem:
         """Return the problem with these recordings, and with other values of some keys."""
-        markers = (
-            self.recordings / f"beam_{trial}_V2_a.c3d" for trial in TRIALS
-        )
+        markers = (self.recordings / f"beam_{trial}_V2_a.c3d" for trial in TRIALS)
         files = [
             f"experiment.{trial}.markers.file={file}"
             for trial, file in zip(TRIALS, markers, strict=True)
@@ -87,22 +78,11 @@ def main() -> None:
         "poisson": print_poisson,
     }
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--from",
-        dest="source",
-        type=Path,
-        default=FOLDER,
-        help="the recordings",
-    )
-    parser.add_argument(
-        "--problem", default="problem.toml", help="a file of problems/srl_beam"
-    )
-    parser.add_argument(
-        "--parts", nargs="+", choices=parts, default=list(parts)
-    )
+    parser.add_argument("--from", dest="source", type=Path, default=FOLDER, help="the recordings")
+    parser.add_argument("--problem", default="problem.toml", help="a file of problems/srl_beam")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
     arguments = parser.parse_args()
     for part in arguments.parts:
         print(f"\n== {part} ==\n", flush=True)
@@ -122,9 +102,7 @@ def fit(problem: Problem, solution: Solution | None = None) -> BeamFit:
         print(f"NOT CONVERGED: {solution.message}")
     linearised = linearise_fit(solution.collocation, solution.z)
     return BeamFit(
-        solution,
-        linearised,
-        uncertainty_from_fit(linearised, problem.parameters, solution.q),
+        solution, linearised, uncertainty_from_fit(linearised, problem.parameters, solution.q)
     )
 
 
@@ -136,56 +114,34 @@ def print_joint_fit(beam: Beam) -> None:
     joint_fit = fit(beam.load(), shipped(beam))
     solution = joint_fit.solution
     uncertainty = joint_fit.uncertainty
-    print(
-        f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s"
-    )
-    print(
-        f"\n{'parameter':14}{'value':>12}   95 % interval ({uncertainty.errors} errors)"
-    )
+    print(f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s")
+    print(f"\n{'parameter':14}{'value':>12}   95 % interval ({uncertainty.errors} errors)")
     for name, estimate in uncertainty.estimates.items():
         print(f"{name:14}{estimate.value:12.5g}   {interval(estimate)}")
-    print(
-        "\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation)
-    )
+    print("\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation))
     print("\nnuisance parameters, and their standard deviations")
     for part in solution.collocation.iterates(solution.z):
-        nuisance = part.segment.nuisance
-        for name, value, scale in zip(
-            nuisance.names, part.phi, nuisance.scales, strict=True
-        ):
+        nuisance = part.transcription.nuisance
+        for name, value, scale in zip(nuisance.names, part.phi, nuisance.scales, strict=True):
             deviation = uncertainty.nuisance[name] * scale
-            print(
-                f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3"
-            )
+            print(f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3")
     print(f"\nRMS distance [mm]: {rms_line(solution)}")
     notes = dict.fromkeys(
-        (
-            *solution.notes,
-            *uncertainty.notes,
-            *identifiability_sentences(uncertainty),
-        )
+        (*solution.notes, *uncertainty.notes, *identifiability_sentences(uncertainty))
     )
-    sentences = [
-        diagnosis.sentence
-        for diagnosis in diagnose_markers(joint_fit.linearised)
-    ]
-    print(
-        "\n" + "\n".join(f"- {sentence}" for sentence in (*notes, *sentences))
-    )
+    sentences = [diagnosis.sentence for diagnosis in diagnose_markers(joint_fit.linearised)]
+    print("\n" + "\n".join(f"- {sentence}" for sentence in (*notes, *sentences)))
 
 
 def print_refinement(beam: Beam) -> None:
     """Print the joint fit on other meshes, with other time steps, and with other schemes."""
-    print(
-        f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]"
-    )
+    print(f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]")
     shipped_answer = shipped(beam)
     for substeps in SUBSTEPS:
         for scheme in SCHEMES:
             steps = f"transcription.substeps={substeps}"
             problem = with_guesses_from(
-                beam.load(f"transcription.scheme={scheme}", steps),
-                shipped_answer,
+                beam.load(f"transcription.scheme={scheme}", steps), shipped_answer
             )
             print_row(f"{scheme}, {10 / substeps:g} ms", fit(problem))
     with tempfile.TemporaryDirectory() as folder:
@@ -193,14 +149,10 @@ def print_refinement(beam: Beam) -> None:
             mesh = Path(folder) / "beam.vtu"
             box_mesh(SIZE_M, divisions, ORIGIN_M).write(mesh)
             problem = with_guesses_from(
-                beam.load(f"object.mesh={mesh}", f"object.element={element}"),
-                shipped_answer,
+                beam.load(f"object.mesh={mesh}", f"object.element={element}"), shipped_answer
             )
             bricks = " x ".join(map(str, divisions))
-            print_row(
-                f"{element} {bricks}, {len(problem.bodies[0].nodes_m)} nodes",
-                fit(problem),
-            )
+            print_row(f"{element} {bricks}, {len(problem.bodies[0].nodes_m)} nodes", fit(problem))
 
 
 def print_validation(beam: Beam) -> None:
@@ -208,22 +160,15 @@ def print_validation(beam: Beam) -> None:
     joint_answer = shipped(beam)
     free = [item.name for item in joint_answer.collocation.parameters.free]
     print(f"{'predicted':12}" + "".join(f"{name:>15}" for name in free), end="")
-    print(
-        f"{'RMS [mm] with its nuisance':>30}{'without':>10}{'in joint fit':>14}"
-    )
+    print(f"{'RMS [mm] with its nuisance':>30}{'without':>10}{'in joint fit':>14}")
     joint_rms_mm = dict(zip(TRIALS, rms_mm(joint_answer), strict=True))
     for trial in TRIALS:
-        problem = with_guesses_from(
-            beam.load(f"experiment.{trial}.validation=true"), joint_answer
-        )
+        problem = with_guesses_from(beam.load(f"experiment.{trial}.validation=true"), joint_answer)
         solution = solve(problem)
         with_nuisance, without = predicted_rms_mm(problem, trial, solution)
         values = "".join(f"{solution.parameters[name]:15.5g}" for name in free)
         print(f"{trial:12}{values}", end="")
-        print(
-            f"{with_nuisance:30.3f}{without:10.3f}{joint_rms_mm[trial]:14.3f}",
-            flush=True,
-        )
+        print(f"{with_nuisance:30.3f}{without:10.3f}{joint_rms_mm[trial]:14.3f}", flush=True)
 
 
 def print_poisson(beam: Beam) -> None:
@@ -235,23 +180,17 @@ def print_poisson(beam: Beam) -> None:
     ratio = free_fit.uncertainty.estimates["poisson"]
     print(f"ν = {ratio.value:.3f}, {interval(ratio)}")
     notes = dict.fromkeys(
-        (
-            *free_fit.uncertainty.notes,
-            *identifiability_sentences(free_fit.uncertainty),
-        )
+        (*free_fit.uncertainty.notes, *identifiability_sentences(free_fit.uncertainty))
     )
     print("\n".join(f"- {sentence}" for sentence in notes))
     for value in (0.3, 0.4, 0.45, 0.48, 0.49):
         problem = with_guesses_from(
-            beam.load(f"parameters.poisson={{ fixed = {value} }}"),
-            shipped_answer,
+            beam.load(f"parameters.poisson={{ fixed = {value} }}"), shipped_answer
         )
         print_row(f"fixed at {value}", fit(problem))
 
 
-def predicted_rms_mm(
-    problem: Problem, trial: str, solution: Solution
-) -> tuple[float, float]:
+def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[float, float]:
     """Return the RMS distances [mm] of a trial at the material of a solution.
 
     The first is with fitted nuisance parameters of the trial, the second with all of them zero.
@@ -301,9 +240,7 @@ def matrix(names: Sequence[str], values: NDArray[np.float64]) -> str:
         f"{name:14}" + "".join(f"{value:13.3f}" for value in row)
         for name, row in zip(names, values, strict=True)
     )
-    return "\n".join(
-        [" " * 14 + "".join(f"{name:>13}" for name in names), *rows]
-    )
+    return "\n".join([" " * 14 + "".join(f"{name:>13}" for name in names), *rows])
 
 
 def with_guesses_from(problem: Problem, solution: Solution) -> Problem:
@@ -311,9 +248,7 @@ def with_guesses_from(problem: Problem, solution: Solution) -> Problem:
     values = solution.parameters
     items = tuple(
         item
-        if isinstance(item, FieldCoefficients)
-        or item.is_fixed
-        or item.name not in values
+        if isinstance(item, FieldCoefficients) or item.is_fixed or item.name not in values
         else replace(item, guess=values[item.name])
         for item in problem.parameters.items
     )
@@ -327,7 +262,7 @@ def rms_mm(solution: Solution) -> list[float]:
 
 def rms_of(part: ExperimentIterate) -> float:
     """Return the RMS marker distance of one experiment [mm]."""
-    squares = part.segment.markers.squared_distances_m2(part.x, part.phi)
+    squares = part.transcription.markers.squared_distances_m2(part.x, part.phi)
     return 1e3 * float(np.sqrt(squares.mean()))
 
 

@@ -1,14 +1,14 @@
 """Convergence from distant initial guesses, and without any, for three bodies.
 
 The guess of every parameter is log-uniform within a factor of the true value, or there is no guess.
-The bodies are the paper's cylinder, which hangs; a soft bar, which sags by as much as its length; and
-a block of silicone, so stiff that it moves almost as the hand does. A start succeeds if every
+The bodies are the paper's cylinder, which hangs; a soft bar, which sags by as much as its length;
+and a block of silicone, so stiff that it moves almost as the hand does. A start succeeds if every
 parameter is within 1 %, or within three standard errors, of the best answer of all starts. It also
 succeeds with an equal fit, as where the data do not determine a parameter: the likelihood ratio of
-both answers is within three standard deviations; the number of these successes is printed. Without a
-guess every run has its own noise, and an answer succeeds if its misfit is not larger than that of the
-true values. The cost is counted in sweeps, that is in factorisations of the blocks of all time steps,
-including those of simulations and of the initial equilibrium.
+both answers is within three standard deviations; the number of these successes is printed. Without
+a guess every run has its own noise, and an answer succeeds if its misfit is not larger than that of
+the true values. The cost is counted in sweeps, that is in factorisations of the blocks of all time
+steps, including those of simulations and of the initial equilibrium.
 """
 
 from __future__ import annotations
@@ -33,24 +33,13 @@ from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
 from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.linear_algebra.factorisation import (
-    Factor,
-    Factoriser,
-)
+from collocation_sysid.program.linear_algebra.factorisation import Factor, Factoriser
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import (
-    ErrorModel,
-    uncertainty_from_fit,
-)
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
-TRUTH = {
-    "lambda_pa": 200.0,
-    "mu_pa": 300.0,
-    "gamma_r_s": 0.009,
-    "gamma_m_1_s": 1.0,
-}
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 BOUNDS = {
     "lambda_pa": (10.0, 1e5),
     "mu_pa": (10.0, 1e5),
@@ -139,9 +128,7 @@ class StartOutcome:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--bodies", nargs="*", default=list(CASES), choices=list(CASES)
-    )
+    parser.add_argument("--bodies", nargs="*", default=list(CASES), choices=list(CASES))
     parser.add_argument("--starts", type=int, default=100)
     parser.add_argument("--factor", type=float, default=30.0)
     parser.add_argument(
@@ -150,53 +137,35 @@ def main() -> None:
         help="start without a guess, each start with other noise",
     )
     parser.add_argument(
-        "--unplaced",
-        action="store_true",
-        help="the places of the markers are unknown",
+        "--unplaced", action="store_true", help="the places of the markers are unknown"
     )
-    parser.add_argument(
-        "--ideal", action="store_true", help="no nuisance parameters"
-    )
+    parser.add_argument("--ideal", action="store_true", help="no nuisance parameters")
     parser.add_argument("--method", default="reduced-space")
     parser.add_argument(
-        "--noise-m",
-        type=float,
-        help="standard deviation of the noise, if not that of the body",
+        "--noise-m", type=float, help="standard deviation of the noise, if not that of the body"
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--only", type=int, nargs="*", help="numbers of the starts to run"
-    )
+    parser.add_argument("--only", type=int, nargs="*", help="numbers of the starts to run")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     outcomes_by_body = {}
     for body in arguments.bodies:
-        case = with_description(
-            CASES[body](), arguments.unplaced, arguments.ideal
-        )
-        noise_m = (
-            case.noise_m if arguments.noise_m is None else arguments.noise_m
-        )
-        starts = guesses(
-            arguments.starts, arguments.factor, arguments.seed, case.truth
-        )
+        case = with_description(CASES[body](), arguments.unplaced, arguments.ideal)
+        noise_m = case.noise_m if arguments.noise_m is None else arguments.noise_m
+        starts = guesses(arguments.starts, arguments.factor, arguments.seed, case.truth)
         if arguments.unguessed:
             seeds = arguments.only or range(arguments.starts)
             outcomes_by_body[body] = [
-                solve_without_guess(case, noise_m, seed, arguments.method)
-                for seed in seeds
+                solve_without_guess(case, noise_m, seed, arguments.method) for seed in seeds
             ]
         else:
             noisy_body = with_noise(case, noise_m, arguments.seed)
-            outcomes_by_body[body] = study(
-                noisy_body, starts, arguments.method, arguments.only
-            )
+            outcomes_by_body[body] = study(noisy_body, starts, arguments.method, arguments.only)
         if not arguments.json:
             print(f"{body}: {summary(outcomes_by_body[body])}", flush=True)
     if arguments.json:
         records = {
-            body: [asdict(each) for each in outcomes]
-            for body, outcomes in outcomes_by_body.items()
+            body: [asdict(each) for each in outcomes] for body, outcomes in outcomes_by_body.items()
         }
         print(json.dumps(records, indent=1))
 
@@ -206,18 +175,12 @@ def main() -> None:
 
 def cylinder() -> SwungBody:
     """Return the cylinder of the paper: 171 nodes of foam, 100 steps of 10 ms."""
-    return SwungBody(
-        hanging_cylinder(layers=8, steps=100, scheme="midpoint", rings=2), TRUTH
-    )
+    return SwungBody(hanging_cylinder(layers=8, steps=100, scheme="midpoint", rings=2), TRUTH)
 
 
 def soft_bar() -> SwungBody:
     """Return a clamped bar of 220 × 35 × 50 mm with E = 2 kPa and 95 kg/m³, whose tip hangs down."""
-    body = Body(
-        box_mesh((0.22, 0.035, 0.05), (11, 2, 3)),
-        density_kg_m3=95.0,
-        damping="rayleigh",
-    )
+    body = Body(box_mesh((0.22, 0.035, 0.05), (11, 2, 3)), density_kg_m3=95.0, damping="rayleigh")
     motion = Swing(
         duration_s=1.0,
         amplitude_m=(0.03, 0.04, 0.03),
@@ -228,10 +191,7 @@ def soft_bar() -> SwungBody:
     )
     clamped_nodes = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
     return swung_body(
-        body,
-        clamped_nodes,
-        motion,
-        moduli(2e3, 0.3) | {"gamma_r_s": 0.01, "gamma_m_1_s": 0.5},
+        body, clamped_nodes, motion, moduli(2e3, 0.3) | {"gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
     )
 
 
@@ -241,11 +201,7 @@ def silicone_block() -> SwungBody:
     The block deforms by some tenths of a millimetre. The noise of its markers is therefore 0.1 mm:
     with 1 mm the data would not determine the damping.
     """
-    body = Body(
-        box_mesh((0.06, 0.06, 0.1), (3, 3, 5)),
-        density_kg_m3=1100.0,
-        damping="rayleigh",
-    )
+    body = Body(box_mesh((0.06, 0.06, 0.1), (3, 3, 5)), density_kg_m3=1100.0, damping="rayleigh")
     motion = Swing(
         duration_s=1.0,
         amplitude_m=(0.05, 0.04, 0.03),
@@ -262,10 +218,7 @@ def silicone_block() -> SwungBody:
 def moduli(young_pa: float, poisson: float) -> dict[str, float]:
     """Return λ and μ [Pa]."""
     shear = young_pa / (2 * (1 + poisson))
-    return {
-        "lambda_pa": 2 * shear * poisson / (1 - 2 * poisson),
-        "mu_pa": shear,
-    }
+    return {"lambda_pa": 2 * shear * poisson / (1 - 2 * poisson), "mu_pa": shear}
 
 
 def swung_body(
@@ -282,18 +235,12 @@ def swung_body(
     poses = motion.poses(STEP_S)
     nodes = body.nodes_m
     at_side = (nodes == nodes.min(axis=0)) | (nodes == nodes.max(axis=0))
-    marked_nodes = np.setdiff1d(
-        np.flatnonzero(at_side.any(axis=1)), clamped_nodes
-    )[::5]
+    marked_nodes = np.setdiff1d(np.flatnonzero(at_side.any(axis=1)), clamped_nodes)[::5]
     no_tracks = np.zeros((len(poses.t_s), len(marked_nodes), 3))
-    markers = Markers(
-        poses.t_s, no_tracks, noise_m, places_m=body.nodes_m[marked_nodes]
-    )
+    markers = Markers(poses.t_s, no_tracks, noise_m, places_m=body.nodes_m[marked_nodes])
     grasp = Grasp(clamped_nodes, poses)
     ideal = Nuisance.none()
-    experiment = Experiment(
-        body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal
-    )
+    experiment = Experiment(body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal)
     tracks = simulate(experiment, truth, "midpoint", substeps=1).markers_m
     return SwungBody(with_markers(experiment, tracks), truth, noise_m=noise_m)
 
@@ -301,15 +248,13 @@ def swung_body(
 def with_description(case: SwungBody, unplaced: bool, ideal: bool) -> SwungBody:
     """Return the body as a problem describes it.
 
-    If `ideal`, no nuisance parameters are estimated, else the default ones; if `unplaced`, the places
-    of the markers are unknown.
+    If `ideal`, no nuisance parameters are estimated, else the default ones; if `unplaced`, the
+    places of the markers are unknown.
     """
     experiment = case.experiment
     if unplaced:
         markers = experiment.markers
-        unknown = Markers(
-            markers.t_s, markers.positions_m, markers.sigma_m, markers.names
-        )
+        unknown = Markers(markers.t_s, markers.positions_m, markers.sigma_m, markers.names)
         experiment = replace(experiment, markers=unknown)
     nuisance = Nuisance.none() if ideal else Nuisance()
     return replace(case, experiment=replace(experiment, nuisance=nuisance))
@@ -319,9 +264,7 @@ def with_noise(case: SwungBody, noise_m: float, seed: int) -> SwungBody:
     """Return the recording with noise of a standard deviation [m] on its tracks."""
     tracks = case.experiment.markers.positions_m
     noise = np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
-    return replace(
-        case, experiment=with_markers(case.experiment, tracks + noise)
-    )
+    return replace(case, experiment=with_markers(case.experiment, tracks + noise))
 
 
 CASES: dict[str, Callable[[], SwungBody]] = {
@@ -331,9 +274,7 @@ CASES: dict[str, Callable[[], SwungBody]] = {
 }
 
 
-def hanging_cylinder(
-    layers: int, steps: int, scheme: str, rings: int = 1
-) -> Experiment:
+def hanging_cylinder(layers: int, steps: int, scheme: str, rings: int = 1) -> Experiment:
     """Return the recording of a hanging, swung cylinder with exact tracks of a scheme.
 
     `layers` and `rings` are numbers of elements, `steps` is the number of samples.
@@ -353,17 +294,11 @@ def hanging_cylinder(
     on_side = np.linalg.norm(body.nodes_m[:, :2], axis=1) > RADIUS_M / 2
     marked_nodes = np.flatnonzero(on_side & (heights > 0.2 * HEIGHT_M))[::5]
     no_tracks = np.zeros((steps, len(marked_nodes), 3))
-    markers = Markers(
-        t_s, no_tracks, SIGMA_M, places_m=body.nodes_m[marked_nodes]
-    )
+    markers = Markers(t_s, no_tracks, SIGMA_M, places_m=body.nodes_m[marked_nodes])
     grasp = Grasp(np.flatnonzero(heights < 1e-9), poses)
     ideal = Nuisance.none()
-    experiment = Experiment(
-        body, t_s, [grasp], markers, name="swing", nuisance=ideal
-    )
-    return with_markers(
-        experiment, simulate(experiment, TRUTH, scheme, substeps=1).markers_m
-    )
+    experiment = Experiment(body, t_s, [grasp], markers, name="swing", nuisance=ideal)
+    return with_markers(experiment, simulate(experiment, TRUTH, scheme, substeps=1).markers_m)
 
 
 # Starts -------------------------------------------------------------------------------------------
@@ -405,14 +340,10 @@ def study(
         raise SystemExit(f"from the truth: {best.message}")
     fit = linearise_fit(best.collocation, best.z)
     uncertainty = uncertainty_from_fit(
-        fit,
-        best.collocation.parameters,
-        best.q,
-        ErrorModel("given", "independent"),
+        fit, best.collocation.parameters, best.q, ErrorModel("given", "independent")
     )
     std_errors = [
-        uncertainty.estimates[name].statistical_std_error or np.nan
-        for name in case.truth
+        uncertainty.estimates[name].statistical_std_error or np.nan for name in case.truth
     ]
     outcomes = []
     for number, guess in enumerate(starts):
@@ -428,23 +359,18 @@ def study(
     best_index = min(np.flatnonzero(has_ended), key=lambda k: losses[k])
     smallest_loss = losses[best_index]
     reference = np.array(answers[best_index])
-    return [
-        with_success(each, reference, smallest_loss, np.array(std_errors))
-        for each in outcomes
-    ]
+    return [with_success(each, reference, smallest_loss, np.array(std_errors)) for each in outcomes]
 
 
-def solve_without_guess(
-    case: SwungBody, noise_m: float, seed: int, method: str
-) -> StartOutcome:
-    """Solve a recording with the noise of a seed without a guess, and compare with the loss of the truth."""
+def solve_without_guess(case: SwungBody, noise_m: float, seed: int, method: str) -> StartOutcome:
+    """Solve a recording with the noise of a seed without a guess, and compare with the loss of the
+    truth.
+    """
     noisy = with_noise(case, noise_m, seed)
     outcome = attempt(noisy, seed, np.full(len(case.truth), np.nan), method)
     print(end=".", file=sys.stderr, flush=True)
     excess = outcome.loss - loss_of_truth(noisy, case)
-    ratios = np.abs(
-        np.log(np.array(outcome.estimates) / list(case.truth.values()))
-    )
+    ratios = np.abs(np.log(np.array(outcome.estimates) / list(case.truth.values())))
     return replace(
         outcome,
         success=excess < 0 and outcome.status in SOLVED_STATUSES,
@@ -460,18 +386,12 @@ def loss_of_truth(noisy: SwungBody, clean: SwungBody) -> float:
     true_positions_m = clean.experiment.markers.positions_m
     return float(
         (
-            (
-                (noisy_markers.positions_m - true_positions_m)
-                / noisy_markers.sigma_m[:, None]
-            )
-            ** 2
+            ((noisy_markers.positions_m - true_positions_m) / noisy_markers.sigma_m[:, None]) ** 2
         ).sum()
     )
 
 
-def attempt(
-    case: SwungBody, number: int, guess: NDArray[np.float64], method: str
-) -> StartOutcome:
+def attempt(case: SwungBody, number: int, guess: NDArray[np.float64], method: str) -> StartOutcome:
     """Solve from one initial guess (p,); success and errors are set later, by `with_success`."""
     guess_values = tuple(guess.tolist())
     no_estimates = (np.nan,) * len(guess)
@@ -502,8 +422,7 @@ def attempt(
         False,
         False,
         count[0] / len(case.experiment.t_s),
-        solution.timing.total
-        + (solution.scan.time_s if solution.scan else 0.0),
+        solution.timing.total + (solution.scan.time_s if solution.scan else 0.0),
         solution.history[-1].loss if solution.history else np.inf,
         np.inf,
         solution.rms_m,
@@ -524,22 +443,20 @@ def with_success(
 ) -> StartOutcome:
     """Return the outcome with its success, by comparison with the best answer.
 
-    `best` (p,) are the estimates of the best answer, `smallest_loss` is its loss, and `std_errors` (p,)
-    are their standard errors.
+    `best` (p,) are the estimates of the best answer, `smallest_loss` is its loss, and `std_errors`
+    (p,) are their standard errors.
     """
     estimates = np.array(outcome.estimates)
     excess = outcome.loss - smallest_loss
     ratios = np.abs(np.log(estimates / best))
     errors = np.abs(estimates - best) / std_errors
-    is_close = bool(
-        ((ratios < SUCCESS_SHARE) | (errors < STANDARD_ERRORS)).all()
-    )
-    # The loss follows a χ² distribution, so that this difference is that of as many standard deviations.
+    is_close = bool(((ratios < SUCCESS_SHARE) | (errors < STANDARD_ERRORS)).all())
+    # The loss follows a χ² distribution, so that this difference is that of as many standard
+    # deviations.
     fits_equally = excess < STANDARD_ERRORS**2
     return replace(
         outcome,
-        success=(is_close or fits_equally)
-        and outcome.status in SOLVED_STATUSES,
+        success=(is_close or fits_equally) and outcome.status in SOLVED_STATUSES,
         same_fit=fits_equally and not is_close,
         excess=excess,
         worst_ratio=float(np.exp(ratios.max())),
@@ -568,7 +485,9 @@ def parameters(values: NDArray[np.float64]) -> Parameters:
 
 @contextmanager
 def counted_factorisations() -> Iterator[list[int]]:
-    """Count the factorised matrices in the body of a with statement; the list has the current number."""
+    """Count the factorised matrices in the body of a with statement; the list has the current
+    number.
+    """
     count = [0]
     original = Factoriser.factorise
 
@@ -590,9 +509,7 @@ def summary(outcomes: list[StartOutcome]) -> str:
     lines = [
         f"success: {len(sweeps)} of {len(outcomes)}, of which by an equal fit only: "
         f"{sum(outcome.success and outcome.same_fit for outcome in outcomes)}",
-        f"sweeps: median {np.median(sweeps):.1f}, max {np.max(sweeps):.1f}"
-        if sweeps
-        else "",
+        f"sweeps: median {np.median(sweeps):.1f}, max {np.max(sweeps):.1f}" if sweeps else "",
         f"time: {sum(outcome.time_s for outcome in outcomes):.1f} s",
         f"failures: {dict(Counter(outcome.status for outcome in failures)) or 'none'}",
     ]

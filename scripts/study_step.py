@@ -1,4 +1,5 @@
-"""Coverage of intervals for noise and time step, with one step per sample and with the chosen number.
+"""Coverage of intervals for noise and time step, with one step per sample and with the chosen
+number.
 
     python scripts/study_step.py [--twins 20] [--first 0]
 
@@ -24,22 +25,15 @@ from collocation_sysid.runs.result_content import ReportedEstimate
 NOISES_M = (5e-5, 2e-4, 1e-3)
 
 
-def twin(
-    name: str, noise_m: float, seed: int
-) -> tuple[Problem, dict[str, float]]:
+def twin(name: str, noise_m: float, seed: int) -> tuple[Problem, dict[str, float]]:
     """Return a problem with tracks of a much finer time step, and its true parameters."""
     rng = np.random.default_rng(seed)
     problem, truth = unmeasured_problem(name, rng)
     (experiment,) = problem.experiments
-    markers = replace(
-        experiment.markers,
-        sigma_m=np.full(len(experiment.markers.names), noise_m),
-    )
+    markers = replace(experiment.markers, sigma_m=np.full(len(experiment.markers.names), noise_m))
     tracks = simulate(experiment, truth, timestep_s=STEP_S / 16).markers_m
     noise = rng.normal(scale=noise_m, size=tracks.shape)
-    recording = with_markers(
-        replace(experiment, markers=markers), tracks + noise
-    )
+    recording = with_markers(replace(experiment, markers=markers), tracks + noise)
     return replace(problem, experiments=[recording]), truth
 
 
@@ -55,16 +49,12 @@ def main(twins: int = 20, first: int = 0) -> None:
         for name in BODIES:
             for seed in range(first, first + twins):
                 problem, truth = twin(name, noise_m, seed)
-                one_step_answer = run(
-                    replace(problem, substeps=1), seek_causes=False
-                )
+                one_step_answer = run(replace(problem, substeps=1), seek_causes=False)
                 chosen_step_answer = run(problem, seek_causes=False)
                 steps[chosen_step_answer.solution.collocation.substeps] += 1
                 for key in NAMES[:3]:
                     intervals = {
-                        "one step, noise": one_step_answer.optimum[
-                            key
-                        ].statistical95,
+                        "one step, noise": one_step_answer.optimum[key].statistical95,
                         "one step, noise, estimate corrected": one_step_answer.estimates[
                             key
                         ].statistical95,
@@ -78,26 +68,17 @@ def main(twins: int = 20, first: int = 0) -> None:
                     if all(intervals.values()):
                         count += 1
                         covered.update(
-                            k
-                            for k, e in intervals.items()
-                            if e and e[0] <= truth[key] <= e[1]
+                            k for k, e in intervals.items() if e and e[0] <= truth[key] <= e[1]
                         )
-        shares = ", ".join(
-            f"{kind} {100 * n / count:.0f} %" for kind, n in covered.items()
-        )
-        print(
-            f"noise {1e3 * noise_m:g} mm, coverage of {count} intervals: {shares}",
-            flush=True,
-        )
+        shares = ", ".join(f"{kind} {100 * n / count:.0f} %" for kind, n in covered.items())
+        print(f"noise {1e3 * noise_m:g} mm, coverage of {count} intervals: {shares}", flush=True)
         print(
             f"    number of twins by chosen steps per sample: {dict(sorted(steps.items()))}",
             flush=True,
         )
 
 
-def _interval_with_step(
-    estimate: ReportedEstimate,
-) -> tuple[float, float] | None:
+def _interval_with_step(estimate: ReportedEstimate) -> tuple[float, float] | None:
     """Return the interval for noise and time step; that for noise if the step changes nothing."""
     error = estimate.numerical_error
     return estimate.statistical95 if error is None else error.interval95
@@ -105,9 +86,7 @@ def _interval_with_step(
 
 if __name__ == "__main__":
     parser = make_parser(__doc__)
-    parser.add_argument(
-        "--twins", type=int, default=20, help="of each body and noise"
-    )
+    parser.add_argument("--twins", type=int, default=20, help="of each body and noise")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     options = parser.parse_args()
     main(options.twins, options.first)

@@ -14,46 +14,29 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from studies import (
-    PARAMETER_SYMBOLS,
-    TRUTH,
-    Variant,
-    markdown,
-    number,
-    run_variants,
-    save,
-)
+from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, number, run_variants, save
 
 from collocation_sysid.extras.studies.study_rows import Row
 
-PROBLEM = (
-    Path(__file__).parents[1] / "problems" / "table1" / "problem_scheme.toml"
-)
+PROBLEM = Path(__file__).parents[1] / "problems" / "table1" / "problem_scheme.toml"
 # Options of methods: inner Levenberg–Marquardt solver.
 LM = {"inner": "levenberg-marquardt"}
 VARIANTS = (
     Variant("reduced-space", "reduced-space"),
     Variant("shooting", "shooting"),
     Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian"),
-    Variant(
-        "augmented-lagrangian, LM, first ρ = 1e2",
-        "augmented-lagrangian",
-        {"rho": 1e2},
-    ),
+    Variant("augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}),
     Variant("penalty, CG", "penalty"),
     # Constant weights: that of the first stage of the schedule, and a large one.
-    Variant(
-        "penalty, CG, ρ = 1e2",
-        "penalty",
-        {"schedule": "constant", "inner_iterations": 10000},
-    ),
+    Variant("penalty, CG, ρ = 1e2", "penalty", {"schedule": "constant", "inner_iterations": 10000}),
     Variant(
         "penalty, CG, ρ = 1e6",
         "penalty",
         {"schedule": "constant", "rho": 1e6, "inner_iterations": 10000},
     ),
     Variant("penalty, LM", "penalty", LM),
-    # Initial trajectories are simulated at the guess, not taken from a coarse solution by reduced space.
+    # Initial trajectories are simulated at the guess, not taken from a coarse solution by reduced
+    # space.
     Variant("interior-point", "interior-point", {"initial": "simulation"}),
 )
 # Row of the paper, with the heads of `table`.
@@ -65,20 +48,13 @@ PAPER_ROW = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     names = [variant.name for variant in VARIANTS]
-    parser.add_argument(
-        "--methods", nargs="*", choices=names, default=names[:-1]
-    )
-    parser.add_argument(
-        "--time-s", type=float, default=180.0, help="time limit of a run [s]"
-    )
+    parser.add_argument("--methods", nargs="*", choices=names, default=names[:-1])
+    parser.add_argument("--time-s", type=float, default=180.0, help="time limit of a run [s]")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument(
-        "--out", type=Path, default=Path("results/study_table1")
-    )
+    parser.add_argument("--out", type=Path, default=Path("results/study_table1"))
     arguments = parser.parse_args()
     rows = run_variants(
         PROBLEM,
@@ -103,12 +79,7 @@ def table(rows: Mapping[str, Sequence[Row]]) -> str:
         ),
         *("iterations", "time [s]", "status"),
     )
-    truth = (
-        "truth",
-        *(f"{value:g}" for value in TRUTH.values()),
-        *("0",) * 4,
-        *"–––",
-    )
+    truth = ("truth", *(f"{value:g}" for value in TRUTH.values()), *("0",) * 4, *"–––")
     lines = [truth, PAPER_ROW]
     for name, (row, *_) in rows.items():
         lines.append(

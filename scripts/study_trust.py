@@ -36,12 +36,10 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
-from collocation_sysid.statistics.misspecification.plausibility import (
-    size_and_density_hypotheses,
-)
+from collocation_sysid.statistics.misspecification.plausibility import size_and_density_hypotheses
 
-# Samples, sampling interval [s] and time steps per sample; with fewer steps the verdict would report
-# the error of the scheme instead of the fault.
+# Samples, sampling interval [s] and time steps per sample; with fewer steps the verdict would
+# report the error of the scheme instead of the fault.
 SAMPLES = 60
 STEP_S = 0.01
 SUBSTEPS = 3
@@ -81,30 +79,16 @@ class VerdictOutcome:
     @property
     def is_right(self) -> bool:
         """Whether all parameters are within `RIGHT_STANDARD_ERRORS` of the truth."""
-        return (
-            self.worst_errors is not None
-            and self.worst_errors < RIGHT_STANDARD_ERRORS
-        )
+        return self.worst_errors is not None and self.worst_errors < RIGHT_STANDARD_ERRORS
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--twins", type=int, default=200, help="number of twins without a fault"
-    )
-    parser.add_argument(
-        "--faulty", type=int, default=9, help="number of twins with each fault"
-    )
-    parser.add_argument(
-        "--only",
-        nargs="*",
-        choices=["none", *FAULTS],
-        default=["none", *FAULTS],
-    )
+    parser.add_argument("--twins", type=int, default=200, help="number of twins without a fault")
+    parser.add_argument("--faulty", type=int, default=9, help="number of twins with each fault")
+    parser.add_argument("--only", nargs="*", choices=["none", *FAULTS], default=["none", *FAULTS])
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument(
-        "--json", type=Path, help="file to which one line per twin is appended"
-    )
+    parser.add_argument("--json", type=Path, help="file to which one line per twin is appended")
     arguments = parser.parse_args()
     rows = []
     faulty_outcomes = []
@@ -136,15 +120,9 @@ def main() -> None:
 def row(name: str, outcomes: Sequence[VerdictOutcome]) -> tuple[str, ...]:
     """Return a row of the table: numbers of twins with each verdict, and the most frequent reasons."""
     verdicts = Counter(each.verdict for each in outcomes)
-    counts = [
-        str(verdicts[word]) for word in ("refused", "doubtful", "check", "good")
-    ]
-    right_count = sum(
-        each.verdict == "good" and each.is_right for each in outcomes
-    )
-    reasons = Counter(
-        subject(each.reasons[0]) for each in outcomes if each.reasons
-    )
+    counts = [str(verdicts[word]) for word in ("refused", "doubtful", "check", "good")]
+    right_count = sum(each.verdict == "good" and each.is_right for each in outcomes)
+    reasons = Counter(subject(each.reasons[0]) for each in outcomes if each.reasons)
     return (
         name,
         *counts,
@@ -155,35 +133,26 @@ def row(name: str, outcomes: Sequence[VerdictOutcome]) -> tuple[str, ...]:
 
 def subject(reason: str) -> str:
     """Return the subject of a reason, without its numbers."""
-    return re.split(
-        r"[:;,(]| by | that | as if | is | are ",
-        re.sub("likely: '.*?':", "", reason),
-    )[0].strip()
+    return re.split(r"[:;,(]| by | that | as if | is | are ", re.sub("likely: '.*?':", "", reason))[
+        0
+    ].strip()
 
 
 def judge_twin(fault: str, seed: int) -> VerdictOutcome:
     """Return the verdict on the twin of a seed with a fault; "refused" if the problem is rejected."""
     problem, truth = swung_twin(seed)
     # The stated fault is the only error: the twin has no systematic effects.
-    problem = replace(
-        problem, uncertainty=UncertaintyOptions(assumptions=Assumptions.exact())
-    )
+    problem = replace(problem, uncertainty=UncertaintyOptions(assumptions=Assumptions.exact()))
     try:
         if fault != "none":
-            problem = FAULTS[fault](
-                problem, np.random.default_rng((seed, *fault.encode()))
-            )
+            problem = FAULTS[fault](problem, np.random.default_rng((seed, *fault.encode())))
         for body in problem.bodies:
             size_and_density_hypotheses(body)
         for experiment in problem.experiments:
-            require_plausible_markers(
-                experiment, typical_constants(problem.parameters)
-            )
+            require_plausible_markers(experiment, typical_constants(problem.parameters))
         answer = run(problem, seek_causes=False)
         if answer.trust.verdict == "good":
-            answer = replace(
-                answer, causes=find_misspecifications(answer.solution)
-            )
+            answer = replace(answer, causes=find_misspecifications(answer.solution))
     except (InputError, SimulationError) as error:
         return VerdictOutcome(fault, seed, "refused", (str(error),), None, None)
     errors = errors_of(answer, truth)
@@ -227,32 +196,21 @@ def swung_twin(seed: int) -> tuple[Problem, dict[str, float]]:
     """
     rng = np.random.default_rng(seed)
     body, young_pa = bodies()[seed % 2]
-    truth = {
-        "young_pa": young_pa * (1, 1.5)[seed // 2 % 2],
-        "poisson": 0.3,
-    } | DAMPING
+    truth = {"young_pa": young_pa * (1, 1.5)[seed // 2 % 2], "poisson": 0.3} | DAMPING
     t_s = STEP_S * np.arange(SAMPLES)
     nodes = body.nodes_m
     length_m = np.ptp(body.nodes_m[:, 2])
     clamped_nodes = np.flatnonzero(nodes[:, 2] < 1e-9)
     marker_candidates = np.setdiff1d(
-        np.unique(body.mesh.surface),
-        np.flatnonzero(nodes[:, 2] < 0.3 * length_m),
+        np.unique(body.mesh.surface), np.flatnonzero(nodes[:, 2] < 0.3 * length_m)
     )
     places_m = nodes[rng.choice(marker_candidates, 8, replace=False)]
-    markers = Markers(
-        t_s, np.zeros((SAMPLES, 8, 3)), SIGMA_M, places_m=places_m
-    )
+    markers = Markers(t_s, np.zeros((SAMPLES, 8, 3)), SIGMA_M, places_m=places_m)
     grasp = Grasp(clamped_nodes, random_poses(t_s, rng))
     experiment = Experiment(body, t_s, [grasp], markers, name="swing")
     tracks = simulate(experiment, truth).markers_m
-    recording = with_markers(
-        experiment, tracks + rng.normal(scale=SIGMA_M, size=tracks.shape)
-    )
-    guesses = {
-        name: Unknown(float(value * rng.uniform(0.3, 3)))
-        for name, value in truth.items()
-    }
+    recording = with_markers(experiment, tracks + rng.normal(scale=SIGMA_M, size=tracks.shape))
+    guesses = {name: Unknown(float(value * rng.uniform(0.3, 3))) for name, value in truth.items()}
     guesses["poisson"] = Unknown(float(rng.uniform(0.2, 0.45)))
     return Problem([recording], guesses, substeps=SUBSTEPS), truth
 

@@ -23,12 +23,7 @@ from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.methods.solution import pooled_wrench_rms
 from collocation_sysid.runs.result_content import ReportedEstimate
 
-FILE = (
-    Path(__file__).parents[1]
-    / "problems"
-    / "phantom_compression"
-    / "whole_stroke.toml"
-)
+FILE = Path(__file__).parents[1] / "problems" / "phantom_compression" / "whole_stroke.toml"
 PLATEN = "experiment.A1.obstacle.platen"
 # Keys of the problem file that differ in each row.
 ASSUMPTIONS = {
@@ -44,9 +39,7 @@ ASSUMPTIONS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--only", nargs="*", choices=("specimens", "assumed", "meshes")
-    )
+    parser.add_argument("--only", nargs="*", choices=("specimens", "assumed", "meshes"))
     only = parser.parse_args().only or ("specimens", "assumed", "meshes")
     print(
         "| specimen or assumption | E, kPa | statistical interval of E | combined interval of E "
@@ -59,9 +52,7 @@ def main() -> None:
             print(_line(name, specimen, changes), flush=True)
 
 
-def _variants(
-    only: Sequence[str], folder: Path
-) -> Iterator[tuple[str, str, Sequence[str]]]:
+def _variants(only: Sequence[str], folder: Path) -> Iterator[tuple[str, str, Sequence[str]]]:
     if "specimens" in only:
         for k in range(1, 6):
             yield f"A{k}", f"A{k}", ()
@@ -76,32 +67,22 @@ def _variants(
 
 def _line(name: str, specimen: str, changes: Sequence[str]) -> str:
     problem = Problem.read(FILE, list(changes))
-    (experiment,) = (
-        each for each in problem.experiments if each.name == specimen
-    )
+    (experiment,) = (each for each in problem.experiments if each.name == specimen)
     try:
-        answer = run(
-            replace(problem, experiments=[experiment]), seek_causes=False
-        )
+        answer = run(replace(problem, experiments=[experiment]), seek_causes=False)
     except (InputError, SimulationError) as error:
         return f"| {name} | {error} | | | | | | | |"
-    (wrench,) = (
-        each.wrench for each in experiment.obstacles if each.wrench is not None
-    )
+    (wrench,) = (each.wrench for each in experiment.obstacles if each.wrench is not None)
     largest_n = wrench.symmetry * np.nanmax(np.abs(wrench.values))
     misfit_n = pooled_wrench_rms(answer.solution)[0]
     assert misfit_n is not None
     young = _value_and_intervals(answer.estimates["young_pa"], 1e-3, "{:.1f}")
-    friction = _value_and_intervals(
-        answer.estimates["platen_friction"], 1.0, "{:.2f}"
-    )
+    friction = _value_and_intervals(answer.estimates["platen_friction"], 1.0, "{:.2f}")
     misfit = f"{misfit_n:.2f} | {100 * misfit_n / largest_n:.2f}"
     return f"| {name} | {young} | {friction} | {misfit} |"
 
 
-def _value_and_intervals(
-    estimate: ReportedEstimate, factor: float, form: str
-) -> str:
+def _value_and_intervals(estimate: ReportedEstimate, factor: float, form: str) -> str:
     """Return three cells: value, statistical interval and combined interval, times a factor."""
     cells = [form.format(factor * estimate.value)]
     for interval in (estimate.statistical95, estimate.combined95):

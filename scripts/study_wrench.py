@@ -1,8 +1,8 @@
 """Coverage of the 95 % intervals of E, ρ and ν with a force sensor, for twins with different noise.
 
-A block projects from a hand that swings it. The tracks and the wrench of the hand are simulated with
-the scheme of the fit and have white noise of 1 mm and 0.05 N. Without the sensor, the data determine
-only the ratio of E to ρ.
+A block projects from a hand that swings it. The tracks and the wrench of the hand are simulated
+with the scheme of the fit and have white noise of 1 mm and 0.05 N. Without the sensor, the data
+determine only the ratio of E to ρ.
 
     nice -n 15 python scripts/study_wrench.py --twins 200
 """
@@ -45,21 +45,13 @@ NOISE_NM = 0.005
 STEPS = 60
 STEP_S = 0.01
 DENSITY = "density_kg_m3"
-TRUTH = {
-    "young_pa": 6e4,
-    "poisson": 0.3,
-    "gamma_r_s": 0.004,
-    "gamma_m_1_s": 0.5,
-    DENSITY: 300.0,
-}
+TRUTH = {"young_pa": 6e4, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5, DENSITY: 300.0}
 # Parameters whose coverage is counted.
 COUNTED_NAMES = ("young_pa", "poisson", DENSITY)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description="Coverage of intervals with a force sensor."
-    )
+    parser = argparse.ArgumentParser(description="Coverage of intervals with a force sensor.")
     parser.add_argument("--twins", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -73,19 +65,13 @@ def main() -> None:
             estimate = uncertainty.estimates[name]
             assert estimate.statistical95 is not None
             assert estimate.statistical_std_error is not None
-            covered[name] += (
-                estimate.statistical95[0]
-                <= TRUTH[name]
-                <= estimate.statistical95[1]
-            )
+            covered[name] += estimate.statistical95[0] <= TRUTH[name] <= estimate.statistical95[1]
             errors[name].append(estimate.statistical_std_error / TRUTH[name])
         if twin % 20 == 0 or twin == arguments.twins:
             print_coverage(covered, errors, twin)
 
 
-def print_coverage(
-    covered: dict[str, int], errors: dict[str, list[float]], twins: int
-) -> None:
+def print_coverage(covered: dict[str, int], errors: dict[str, list[float]], twins: int) -> None:
     """Print the coverage of the intervals and the median standard error of each parameter."""
     low, high = binom.interval(0.95, twins, 0.95)
     print(
@@ -102,26 +88,20 @@ def print_coverage(
 
 def uncertainty_of_fit(experiment: Experiment):
     """Return the uncertainties of a fit of all parameters, from guesses 10 % above the truth."""
-    unknown = {
-        name: Unknown(guess=1.1 * value) for name, value in TRUTH.items()
-    }
+    unknown = {name: Unknown(guess=1.1 * value) for name, value in TRUTH.items()}
     problem = Problem([experiment], unknown)
     solution = ReducedSpace()(problem.collocation())
     fit = linearise_fit(solution.collocation, solution.z)
     return uncertainty_from_fit(fit, problem.parameters, solution.q)
 
 
-def noisy_recording(
-    exact_recording: Experiment, rng: np.random.Generator
-) -> Experiment:
+def noisy_recording(exact_recording: Experiment, rng: np.random.Generator) -> Experiment:
     """Return the recording with noise on tracks and wrench."""
     tracks = exact_recording.markers.positions_m
     (grasp,) = exact_recording.grasps
     assert grasp.wrench is not None
     deviations = np.repeat([NOISE_N, NOISE_NM], 3)
-    wrench = grasp.wrench.values + deviations * rng.normal(
-        size=grasp.wrench.values.shape
-    )
+    wrench = grasp.wrench.values + deviations * rng.normal(size=grasp.wrench.values.shape)
     with_noisy_tracks = with_markers(
         exact_recording, tracks + rng.normal(scale=NOISE_M, size=tracks.shape)
     )
@@ -135,12 +115,8 @@ def recording() -> Experiment:
     t_s = np.asarray(STEP_S * np.arange(STEPS + 1), dtype=np.float64)
     motion_share = 1 - np.cos(2 * np.pi * t_s / 0.3)
     half_axis = np.outer(motion_share, [0.15, 0.1, 0.2])
-    quaternions = np.column_stack(
-        [half_axis, np.sqrt(1 - np.sum(half_axis**2, axis=1))]
-    )
-    poses = PoseSequence(
-        t_s, np.outer(motion_share, [0.01, 0.02, 0.03]), quaternions
-    )
+    quaternions = np.column_stack([half_axis, np.sqrt(1 - np.sum(half_axis**2, axis=1))])
+    poses = PoseSequence(t_s, np.outer(motion_share, [0.01, 0.02, 0.03]), quaternions)
     clamped_nodes = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
     marked_nodes = np.flatnonzero(body.nodes_m[:, 0] > 0.09)
     markers = Markers(
@@ -149,23 +125,15 @@ def recording() -> Experiment:
         NOISE_M,
         places_m=body.nodes_m[marked_nodes],
     )
-    sensor = Wrench(
-        t_s, np.zeros((len(t_s), 6)), NOISE_N, NOISE_NM, frame="grasp"
-    )
-    grasp = Grasp(
-        clamped_nodes, poses, sigma_m=0.0, sigma_rad=0.0, wrench=sensor
-    )
+    sensor = Wrench(t_s, np.zeros((len(t_s), 6)), NOISE_N, NOISE_NM, frame="grasp")
+    grasp = Grasp(clamped_nodes, poses, sigma_m=0.0, sigma_rad=0.0, wrench=sensor)
     nuisance = Nuisance.none(tare=10.0)
-    experiment = Experiment(
-        body, t_s, [grasp], markers, name="block", nuisance=nuisance
-    )
-    values = {
-        name: value for name, value in TRUTH.items() if name in body.constants
-    } | {name: TRUTH[name] for name in ("young_pa", "poisson")}
+    experiment = Experiment(body, t_s, [grasp], markers, name="block", nuisance=nuisance)
+    values = {name: value for name, value in TRUTH.items() if name in body.constants} | {
+        name: TRUTH[name] for name in ("young_pa", "poisson")
+    }
     simulation = simulate(experiment, values, "midpoint", substeps=1)
-    return with_wrenches(
-        with_markers(experiment, simulation.markers_m), simulation.wrenches
-    )
+    return with_wrenches(with_markers(experiment, simulation.markers_m), simulation.wrenches)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Synthetic problems of a body that a robot swings and cameras observe; shared by the makers of problems."""
+"""Synthetic problems of a body that a robot swings and cameras observe; shared by the makers of
+problems.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.recording import (
-    Experiment,
-    Grasp,
-    PoseSequence,
-    write_poses_csv,
-)
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence, write_poses_csv
 
 # Rotation by 180° about x: the body hangs below the gripper.
 HANGING = Rotation.from_rotvec([np.pi, 0, 0])
@@ -64,22 +61,17 @@ def swing(
     rise = t**2 / (t**2 + rise_s**2)
     angular = 2 * np.pi * np.array(frequency_hz)
     phase = np.outer(t, angular)
-    positions = (
-        rise[:, None] * amplitude_m * np.sin(phase + np.array([0.0, 0.7, 1.4]))
-    )
+    positions = rise[:, None] * amplitude_m * np.sin(phase + np.array([0.0, 0.7, 1.4]))
     rotation_vectors_rad = (
-        rise[:, None]
-        * amplitude_rad
-        * np.sin(1.2 * phase + np.array([0.3, 1.0, 1.7]))
+        rise[:, None] * amplitude_rad * np.sin(1.2 * phase + np.array([0.3, 1.0, 1.7]))
     )
     rotations = Rotation.from_rotvec(rotation_vectors_rad) * start
     return PoseSequence(np.asarray(t_s), positions, rotations.as_quat())
 
 
-def prepare_experiment(
-    problem: Path, poses: str, logged: PoseSequence
-) -> Experiment:
-    """Write the poses, delete old marker tracks, and return the experiment at the times of the poses.
+def prepare_experiment(problem: Path, poses: str, logged: PoseSequence) -> Experiment:
+    """Write the poses, delete old marker tracks, and return the experiment at the times of the
+    poses.
 
     Parameters
     ----------
@@ -103,19 +95,17 @@ def simulate_tracks(
     noise_m: float,
     seed: int,
 ) -> np.ndarray:
-    """Return noisy tracks (T, M, 3) [m] of a Newmark simulation with the time step of the poses `fine`."""
+    """Return noisy tracks (T, M, 3) [m] of a Newmark simulation with the time step of the poses
+    `fine`.
+    """
     grasp = experiment.grasps[0]
     on_fine_grid = replace(experiment, grasps=(Grasp(grasp.nodes, fine),))
     step_s = float(fine.t_s[1] - fine.t_s[0])
     tracks = simulate(on_fine_grid, truth, timestep_s=step_s).markers_m
-    return (
-        tracks + np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
-    )
+    return tracks + np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
 
 
-def exchanged(
-    tracks: np.ndarray, pair: Sequence[int], frames: slice
-) -> np.ndarray:
+def exchanged(tracks: np.ndarray, pair: Sequence[int], frames: slice) -> np.ndarray:
     """Return the tracks with the labels of two markers exchanged in some frames."""
     swapped = tracks.copy()
     swapped[frames, list(pair)] = tracks[frames, list(pair)[::-1]]
@@ -123,12 +113,11 @@ def exchanged(
 
 
 def occluded(
-    tracks: np.ndarray,
-    blocks: Sequence[tuple[int, slice]],
-    share: float,
-    seed: int,
+    tracks: np.ndarray, blocks: Sequence[tuple[int, slice]], share: float, seed: int
 ) -> np.ndarray:
-    """Return the tracks with NaN in blocks of (marker, frames), and in a random share of all samples."""
+    """Return the tracks with NaN in blocks of (marker, frames), and in a random share of all
+    samples.
+    """
     is_missing = np.random.default_rng(seed).random(tracks.shape[:2]) < share
     for marker, frames in blocks:
         is_missing[frames, marker] = True

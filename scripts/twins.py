@@ -14,13 +14,7 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import (
-    Experiment,
-    Grasp,
-    Markers,
-    PoseSequence,
-    Wrench,
-)
+from collocation_sysid.recording import Experiment, Grasp, Markers, PoseSequence, Wrench
 
 # Standard deviation of each marker coordinate [m], typical of cameras in a room.
 NOISE_M = 5e-4
@@ -28,17 +22,9 @@ NOISE_M = 5e-4
 SAMPLES = 60
 STEP_S = 0.01
 # Edges [m] and numbers of elements along x, y and z; the nodes of the upper face are grasped.
-BODIES = {
-    "block": ((0.06, 0.06, 0.09), (2, 2, 3)),
-    "bar": ((0.03, 0.03, 0.12), (1, 1, 4)),
-}
+BODIES = {"block": ((0.06, 0.06, 0.09), (2, 2, 3)), "bar": ((0.03, 0.03, 0.12), (1, 1, 4))}
 # True constants of the soft and of the stiff body, and initial guesses with bounds.
-SOFT = {
-    "lambda_pa": 800.0,
-    "mu_pa": 600.0,
-    "gamma_r_s": 0.006,
-    "gamma_m_1_s": 1.5,
-}
+SOFT = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
 GUESS = {
     "lambda_pa": Unknown(400.0, 10.0, 1e5),
     "mu_pa": Unknown(150.0, 10.0, 1e5),
@@ -54,13 +40,13 @@ def block(size_m: tuple[float, ...], divisions: tuple[int, ...]) -> Body:
 
     The cached body is shared by all twins, so that its kernels compile once.
     """
-    return Body(
-        box_mesh(size_m, divisions), density_kg_m3=30.0, damping="rayleigh"
-    )
+    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0, damping="rayleigh")
 
 
 def random_poses(t_s: np.ndarray, rng: np.random.Generator) -> PoseSequence:
-    """Return poses at `t_s` [s] of a motion from rest, from a random pose, in all six degrees of freedom."""
+    """Return poses at `t_s` [s] of a motion from rest, from a random pose, in all six degrees of
+    freedom.
+    """
     start = Rotation.from_quat(rng.normal(size=4))
     place_m = rng.uniform(-0.5, 0.5, 3)
     rise = (t_s - t_s[0]) ** 2 / ((t_s - t_s[0]) ** 2 + 0.1**2)
@@ -107,19 +93,11 @@ def twin(
     grasped_nodes = np.flatnonzero(body.nodes_m[:, 2] > size_m[2] - 1e-6)
     free_nodes = np.setdiff1d(np.arange(len(body.nodes_m)), grasped_nodes)
     places_m = body.nodes_m[rng.choice(free_nodes, 6, replace=False)]
-    markers = Markers(
-        t_s, np.zeros((samples, 6, 3)), NOISE_M, places_m=places_m
-    )
+    markers = Markers(t_s, np.zeros((samples, 6, 3)), NOISE_M, places_m=places_m)
     experiment = Experiment(
-        body,
-        t_s,
-        [Grasp(grasped_nodes, random_poses(t_s, rng))],
-        markers,
-        name="swing",
+        body, t_s, [Grasp(grasped_nodes, random_poses(t_s, rng))], markers, name="swing"
     )
-    tracks_m = simulate(
-        experiment, truth, integrator, substeps=substeps
-    ).markers_m
+    tracks_m = simulate(experiment, truth, integrator, substeps=substeps).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks_m.shape)
     return Problem([with_markers(experiment, tracks_m + noise)], GUESS)
 
@@ -129,9 +107,7 @@ WRENCH_N = 5e-4
 WRENCH_NM = 5e-5
 
 
-def sensing_twin(
-    name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES
-) -> Problem:
+def sensing_twin(name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES) -> Problem:
     """Return a `twin` with a force–torque sensor at the grasp.
 
     The wrench is expressed in the frame of the grasp, about a point above the body.
@@ -141,14 +117,7 @@ def sensing_twin(
     (grasp,) = experiment.grasps
     point_m = (0.01, 0.02, BODIES[name][0][2] + 0.03)
     zero = np.zeros((samples, 6))
-    sensor = Wrench(
-        experiment.t_s,
-        zero,
-        WRENCH_N,
-        WRENCH_NM,
-        frame="grasp",
-        point_m=point_m,
-    )
+    sensor = Wrench(experiment.t_s, zero, WRENCH_N, WRENCH_NM, frame="grasp", point_m=point_m)
     sensed = replace(experiment, grasps=[replace(grasp, wrench=sensor)])
     (values,) = simulate(sensed, truth, "newmark").wrenches
     noise = np.random.default_rng(seed).normal(
@@ -156,8 +125,5 @@ def sensing_twin(
     )
     noisy_sensor = replace(sensor, values=values + noise)
     return replace(
-        unsensed,
-        experiments=[
-            replace(experiment, grasps=[replace(grasp, wrench=noisy_sensor)])
-        ],
+        unsensed, experiments=[replace(experiment, grasps=[replace(grasp, wrench=noisy_sensor)])]
     )

@@ -21,12 +21,7 @@ from collocation_sysid.recording import Depth, DepthCamera, Experiment
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # A camera frame with x forward, y to the left and z up, as of robots, in the columns.
 FORWARD_LEFT_UP = np.array(
-    [
-        [0.0, -1.0, 0.0, 0.0],
-        [0.0, 0.0, -1.0, 0.0],
-        [1.0, 0.0, 0.0, 0.0],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 # Factor of depths in millimetres that are stated as metres.
 MILLIMETRES_PER_METRE = 1e3
@@ -50,8 +45,7 @@ def described(
         depth.name,
         np.array(depth.images_m) if images_m is None else images_m,
         DepthCamera(
-            camera.matrix if matrix is None else matrix,
-            pose=camera.pose if pose is None else pose,
+            camera.matrix if matrix is None else matrix, pose=camera.pose if pose is None else pose
         ),
         depth.sigma_m,
         depth.sample_times_s,
@@ -64,9 +58,7 @@ def depths(change: Callable[[Depth], Depth]) -> ExperimentChange:
     """Return the change of every depth camera of an experiment."""
 
     def changed(experiment: Experiment, rng: Rng) -> Experiment:
-        return replace(
-            experiment, depths=[change(each) for each in experiment.depths]
-        )
+        return replace(experiment, depths=[change(each) for each in experiment.depths])
 
     return changed
 
@@ -74,25 +66,19 @@ def depths(change: Callable[[Depth], Depth]) -> ExperimentChange:
 def images(change: Callable[[Array], Array]) -> ExperimentChange:
     """Return the change of the images (S, rows, columns) of every depth camera."""
     return depths(
-        lambda depth: described(
-            depth, images_m=change(np.array(depth.images_m, dtype=float))
-        )
+        lambda depth: described(depth, images_m=change(np.array(depth.images_m, dtype=float)))
     )
 
 
 def poses(change: Callable[[Array], Array]) -> ExperimentChange:
     """Return the change of the stated pose (4, 4) of every depth camera."""
-    return depths(
-        lambda depth: described(depth, pose=change(depth.camera.pose))
-    )
+    return depths(lambda depth: described(depth, pose=change(depth.camera.pose)))
 
 
 def with_focal_lengths_times(factor: float) -> ExperimentChange:
     """Return the change of both focal lengths, as of an image that was scaled after calibration."""
     scale = np.array([[factor, 1.0, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]])
-    return depths(
-        lambda depth: described(depth, matrix=scale * depth.camera.matrix)
-    )
+    return depths(lambda depth: described(depth, matrix=scale * depth.camera.matrix))
 
 
 def with_mirrored_principal_point(depth: Depth) -> Depth:
@@ -139,9 +125,7 @@ def with_transposed_rotation(pose: Array) -> Array:
 def with_turned_camera(pose: Array) -> Array:
     """Return the pose of a camera that was bumped: turned by 15 degrees about its optical axis."""
     turned = pose.copy()
-    turned[:3, :3] = (
-        pose[:3, :3] @ Rotation.from_rotvec([0, 0, np.radians(15)]).as_matrix()
-    )
+    turned[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0, 0, np.radians(15)]).as_matrix()
     return turned
 
 
@@ -170,43 +154,24 @@ DEPTH_FAULTS = {
     "depth: millimetres as metres": Fault(
         images(lambda each: MILLIMETRES_PER_METRE * each), ("camera",)
     ),
-    "depth: focal length doubled": Fault(
-        with_focal_lengths_times(2.0), ("camera",)
-    ),
-    "depth: principal point mirrored": Fault(
-        depths(with_mirrored_principal_point), ("camera",)
-    ),
-    "depth: image rows flipped": Fault(
-        images(lambda each: each[:, ::-1]), ("camera",)
-    ),
+    "depth: focal length doubled": Fault(with_focal_lengths_times(2.0), ("camera",)),
+    "depth: principal point mirrored": Fault(depths(with_mirrored_principal_point), ("camera",)),
+    "depth: image rows flipped": Fault(images(lambda each: each[:, ::-1]), ("camera",)),
     "depth: image mirrored left to right": Fault(
         images(lambda each: each[:, :, ::-1]), ("camera",)
     ),
     "depth: pose inverted": Fault(poses(with_inverse_pose), ("camera",)),
-    "depth: pose of an OpenGL frame": Fault(
-        poses(lambda pose: pose @ OPENGL), ("camera",)
-    ),
-    "depth: pose of a frame with x forward": Fault(
-        poses(with_axes_of_robot), ("camera",)
-    ),
-    "depth: rotation transposed": Fault(
-        poses(with_transposed_rotation), ("camera",)
-    ),
-    "depth: camera turned by 15 deg": Fault(
-        poses(with_turned_camera), ("camera",)
-    ),
-    "depth: distance along the ray": Fault(
-        depths(with_ray_lengths), ("camera",)
-    ),
+    "depth: pose of an OpenGL frame": Fault(poses(lambda pose: pose @ OPENGL), ("camera",)),
+    "depth: pose of a frame with x forward": Fault(poses(with_axes_of_robot), ("camera",)),
+    "depth: rotation transposed": Fault(poses(with_transposed_rotation), ("camera",)),
+    "depth: camera turned by 15 deg": Fault(poses(with_turned_camera), ("camera",)),
+    "depth: distance along the ray": Fault(depths(with_ray_lengths), ("camera",)),
     "depth: background not removed": Fault(images(with_wall), ()),
 }
 MOVING_FAULTS = {
     "depth: camera 0.1 s late": Fault(late, ("camera-clock",)),
-    "depth: images in reverse order": Fault(
-        images(lambda each: each[::-1]), ("camera-clock",)
-    ),
+    "depth: images in reverse order": Fault(images(lambda each: each[::-1]), ("camera-clock",)),
     "depth: image of the start throughout": Fault(
-        images(lambda each: np.repeat(each[:1], len(each), axis=0)),
-        ("camera-clock",),
+        images(lambda each: np.repeat(each[:1], len(each), axis=0)), ("camera-clock",)
     ),
 }

@@ -10,14 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from wrong_twins import (
-    GRAM_FORCE_N,
-    Fault,
-    obstacles,
-    reversed_normal,
-    wrench_times,
-    wrenches,
-)
+from wrong_twins import GRAM_FORCE_N, Fault, obstacles, reversed_normal, wrench_times, wrenches
 
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.recording import Obstacle, PoseSequence, Sphere, Wrench
@@ -33,24 +26,17 @@ TARED_SAMPLE = 3
 PARTS = 4
 
 
-def with_ways(
-    change: Callable[[Array], Array],
-) -> Callable[[Obstacle], Obstacle]:
+def with_ways(change: Callable[[Array], Array]) -> Callable[[Obstacle], Obstacle]:
     """Return the change of the shifts (T, 3) [m] of an obstacle."""
 
     def changed(obstacle: Obstacle) -> Obstacle:
         poses: PoseSequence = obstacle.poses
-        return replace(
-            obstacle,
-            poses=replace(poses, positions_m=change(poses.positions_m)),
-        )
+        return replace(obstacle, poses=replace(poses, positions_m=change(poses.positions_m)))
 
     return changed
 
 
-def with_ball(
-    radius_factor: float = 1.0, shift_m: float = 0.0
-) -> Callable[[Obstacle], Obstacle]:
+def with_ball(radius_factor: float = 1.0, shift_m: float = 0.0) -> Callable[[Obstacle], Obstacle]:
     """Return the change of a ball that touches the body from above: its radius, about its lowest
     point, and its height [m].
     """
@@ -73,22 +59,13 @@ def zeroed_in_contact(wrench: Wrench) -> Wrench:
 
 POKING_FAULTS = {
     "obstacle: load reversed": Fault(wrench_times(-1, -1), ("sign",)),
-    "obstacle: load in gram-force": Fault(
-        wrench_times(1 / GRAM_FORCE_N, 1), ()
-    ),
-    "obstacle: load of the whole for a quarter": Fault(
-        wrench_times(PARTS, 1), ()
-    ),
-    "obstacle: load zeroed in contact": Fault(
-        wrenches(zeroed_in_contact), ("obstacle-pull",)
-    ),
+    "obstacle: load in gram-force": Fault(wrench_times(1 / GRAM_FORCE_N, 1), ()),
+    "obstacle: load of the whole for a quarter": Fault(wrench_times(PARTS, 1), ()),
+    "obstacle: load zeroed in contact": Fault(wrenches(zeroed_in_contact), ("obstacle-pull",)),
     "obstacle: displacement in mm": Fault(
-        obstacles(with_ways(lambda ways: MILLIMETRES_PER_METRE * ways)),
-        ("obstacle-stroke",),
+        obstacles(with_ways(lambda ways: MILLIMETRES_PER_METRE * ways)), ("obstacle-stroke",)
     ),
-    "obstacle: diameter for radius": Fault(
-        obstacles(with_ball(radius_factor=2.0)), ()
-    ),
+    "obstacle: diameter for radius": Fault(obstacles(with_ball(radius_factor=2.0)), ()),
     "obstacle: 5 mm into the body": Fault(
         obstacles(with_ball(shift_m=-MISPLACED_M)), ("obstacle-load",)
     ),
@@ -96,29 +73,19 @@ POKING_FAULTS = {
         obstacles(with_ball(shift_m=MISPLACED_M)), ("obstacle-load",)
     ),
     "obstacle: stroke begins 0.5 mm late": Fault(
-        obstacles(
-            with_ways(lambda ways: ways + STROKE_OFFSET_M * np.eye(3)[2])
-        ),
-        (),
+        obstacles(with_ways(lambda ways: ways + STROKE_OFFSET_M * np.eye(3)[2])), ()
     ),
     "obstacle: fixed while it moves": Fault(
-        obstacles(with_ways(lambda ways: np.zeros_like(ways))),
-        ("obstacle-fixed",),
+        obstacles(with_ways(lambda ways: np.zeros_like(ways))), ("obstacle-fixed",)
     ),
     "obstacle: moves along x in place of z": Fault(
-        obstacles(with_ways(lambda ways: -ways[:, [2, 1, 0]])),
-        ("obstacle-load",),
+        obstacles(with_ways(lambda ways: -ways[:, [2, 1, 0]])), ("obstacle-load",)
     ),
 }
 PLATE_FAULTS = {
-    "obstacle: normal reversed": Fault(
-        obstacles(reversed_normal), ("obstacle-normal",)
-    ),
+    "obstacle: normal reversed": Fault(obstacles(reversed_normal), ("obstacle-normal",)),
     "obstacle: friction 0 in place of 0.5": Fault(
-        obstacles(lambda each: replace(each, friction=0.0)),
-        ("obstacle-friction",),
+        obstacles(lambda each: replace(each, friction=0.0)), ("obstacle-friction",)
     ),
-    "obstacle: load of a plate reversed": Fault(
-        wrench_times(-1, -1), ("obstacle-pull", "sign")
-    ),
+    "obstacle: load of a plate reversed": Fault(wrench_times(-1, -1), ("obstacle-pull", "sign")),
 }

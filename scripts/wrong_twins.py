@@ -1,7 +1,7 @@
 """Problems whose description is wrong in one known way.
 
-Each fault is a function of a correct `Problem` and a random generator, which returns the problem with
-this error in its description. `FAULTS` states the hypotheses that name each error correctly.
+Each fault is a function of a correct `Problem` and a random generator, which returns the problem
+with this error in its description. `FAULTS` states the hypotheses that name each error correctly.
 """
 
 from __future__ import annotations
@@ -16,14 +16,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.recording import (
-    Experiment,
-    Grasp,
-    Obstacle,
-    Plane,
-    PoseSequence,
-    Wrench,
-)
+from collocation_sysid.recording import Experiment, Grasp, Obstacle, Plane, PoseSequence, Wrench
 
 Rng = np.random.Generator
 ExperimentChange = Callable[[Experiment, Rng], Experiment]
@@ -49,25 +42,17 @@ class Fault:
 
     def __call__(self, problem: Problem, rng: Rng) -> Problem:
         """Return the problem with this error in every experiment."""
-        return replace(
-            problem,
-            experiments=[self.change(e, rng) for e in problem.experiments],
-        )
+        return replace(problem, experiments=[self.change(e, rng) for e in problem.experiments])
 
 
 def _with_poses(
     experiment: Experiment, change: Callable[[PoseSequence], PoseSequence]
 ) -> Experiment:
-    grasps = [
-        Grasp(g.nodes, change(g.poses), g.from_s, g.until_s)
-        for g in experiment.grasps
-    ]
+    grasps = [Grasp(g.nodes, change(g.poses), g.from_s, g.until_s) for g in experiment.grasps]
     return replace(experiment, grasps=grasps)
 
 
-def _with_body(
-    experiment: Experiment, points_m: np.ndarray, density: float = 1.0
-) -> Experiment:
+def _with_body(experiment: Experiment, points_m: np.ndarray, density: float = 1.0) -> Experiment:
     """Return the experiment with other positions of the mesh points (n, 3) [m].
 
     Grasps and markers keep their nodes. The density is multiplied by the factor `density`.
@@ -103,7 +88,9 @@ def markers_times(factor: float) -> ExperimentChange:
 
 
 def mesh_times(factor: float) -> ExperimentChange:
-    """Return a change that multiplies the mesh by a factor, with all places on it, as of another unit."""
+    """Return a change that multiplies the mesh by a factor, with all places on it, as of another
+    unit.
+    """
     return lambda e, rng: _with_body(e, factor * e.body.mesh.points_m)
 
 
@@ -126,43 +113,34 @@ def inverted(poses: PoseSequence) -> PoseSequence:
 
 
 def reordered(places: int) -> Callable[[PoseSequence], PoseSequence]:
-    """Return a change that rotates the components of quaternions: by 1 from wxyz, by −1 the reverse."""
+    """Return a change that rotates the components of quaternions: by 1 from wxyz, by −1 the
+    reverse.
+    """
 
     def change(poses: PoseSequence) -> PoseSequence:
-        return replace(
-            poses,
-            quaternions_xyzw=np.roll(poses.quaternions_xyzw, places, axis=1),
-        )
+        return replace(poses, quaternions_xyzw=np.roll(poses.quaternions_xyzw, places, axis=1))
 
     return change
 
 
 def late(lag_s: float) -> ExperimentChange:
-    """Return a change by which the marker clock is late: positions at t were measured at t − `lag_s`."""
+    """Return a change by which the marker clock is late: positions at t were measured at t −
+    `lag_s`.
+    """
 
     def change(experiment: Experiment, rng: Rng) -> Experiment:
         end_s = experiment.t_s[-1] - max(lag_s, 0.0)
         begin_s = experiment.t_s[0] - min(lag_s, 0.0)
         slack = 1e-9
-        is_recorded = (experiment.t_s >= begin_s - slack) & (
-            experiment.t_s <= end_s + slack
-        )
+        is_recorded = (experiment.t_s >= begin_s - slack) & (experiment.t_s <= end_s + slack)
         markers = experiment.markers
         tracks = replace(
-            markers,
-            t_s=markers.t_s[is_recorded],
-            positions_m=markers.positions_m[is_recorded],
+            markers, t_s=markers.t_s[is_recorded], positions_m=markers.positions_m[is_recorded]
         )
         shifted = [
-            replace(g, poses=replace(g.poses, t_s=g.poses.t_s - lag_s))
-            for g in experiment.grasps
+            replace(g, poses=replace(g.poses, t_s=g.poses.t_s - lag_s)) for g in experiment.grasps
         ]
-        return replace(
-            experiment,
-            t_s=experiment.t_s[is_recorded],
-            grasps=shifted,
-            markers=tracks,
-        )
+        return replace(experiment, t_s=experiment.t_s[is_recorded], grasps=shifted, markers=tracks)
 
     return change
 
@@ -170,9 +148,7 @@ def late(lag_s: float) -> ExperimentChange:
 def jumping(experiment: Experiment, rng: Rng) -> Experiment:
     """Return the experiment with poses that are shifted from a random sample on."""
     shift = _direction(rng) * rng.uniform(*JUMP_M)
-    from_s = rng.choice(
-        experiment.t_s[len(experiment.t_s) // 4 : -len(experiment.t_s) // 4]
-    )
+    from_s = rng.choice(experiment.t_s[len(experiment.t_s) // 4 : -len(experiment.t_s) // 4])
 
     def change(poses: PoseSequence) -> PoseSequence:
         after = (poses.t_s >= from_s - 1e-9)[:, None]
@@ -190,7 +166,9 @@ def _frame(rng: Rng) -> tuple[Rotation, np.ndarray]:
 
 
 def in_grippers_frame(experiment: Experiment, rng: Rng) -> Experiment:
-    """Return the experiment with the poses of the gripper's own frame in place of those of the mesh."""
+    """Return the experiment with the poses of the gripper's own frame in place of those of the
+    mesh.
+    """
     turn, shift_m = _frame(rng)
 
     def change(poses: PoseSequence) -> PoseSequence:
@@ -205,12 +183,11 @@ def in_grippers_frame(experiment: Experiment, rng: Rng) -> Experiment:
 
 
 def in_meshs_frame(experiment: Experiment, rng: Rng) -> Experiment:
-    """Return the experiment with a rotated and shifted mesh, which the poses do not map to the body."""
+    """Return the experiment with a rotated and shifted mesh, which the poses do not map to the
+    body.
+    """
     turn, shift_m = _frame(rng)
-    return _with_body(
-        experiment,
-        turn.apply(np.array(experiment.body.mesh.points_m)) + shift_m,
-    )
+    return _with_body(experiment, turn.apply(np.array(experiment.body.mesh.points_m)) + shift_m)
 
 
 def in_cameras_frame(experiment: Experiment, rng: Rng) -> Experiment:
@@ -258,9 +235,7 @@ def with_deeper_grasp(experiment: Experiment, rng: Rng) -> Experiment:
     grasps = []
     for grasp in experiment.grasps:
         is_adjacent = np.isin(experiment.body.cells, grasp.nodes).any(axis=1)
-        grasps.append(
-            replace(grasp, nodes=np.unique(experiment.body.cells[is_adjacent]))
-        )
+        grasps.append(replace(grasp, nodes=np.unique(experiment.body.cells[is_adjacent])))
     return replace(experiment, grasps=grasps)
 
 
@@ -277,15 +252,9 @@ FAULTS = {
     "markers in km": Fault(markers_times(1e-3), ("length-unit",)),
     "mesh in mm": Fault(mesh_times(1e3), ("length-unit",)),
     "mesh in km": Fault(mesh_times(1e-3), ("length-unit",)),
-    "poses inverted": Fault(
-        lambda e, rng: _with_poses(e, inverted), ("poses-inverted",)
-    ),
-    "wxyz as xyzw": Fault(
-        lambda e, rng: _with_poses(e, reordered(1)), ("quaternion-order",)
-    ),
-    "xyzw as wxyz": Fault(
-        lambda e, rng: _with_poses(e, reordered(-1)), ("quaternion-order",)
-    ),
+    "poses inverted": Fault(lambda e, rng: _with_poses(e, inverted), ("poses-inverted",)),
+    "wxyz as xyzw": Fault(lambda e, rng: _with_poses(e, reordered(1)), ("quaternion-order",)),
+    "xyzw as wxyz": Fault(lambda e, rng: _with_poses(e, reordered(-1)), ("quaternion-order",)),
     "clock 10 ms late": Fault(late(0.01), ("clock",)),
     "clock 30 ms late": Fault(late(0.03), ("clock",)),
     "clock 100 ms late": Fault(late(0.1), ("clock",)),
@@ -306,13 +275,9 @@ FAULTS = {
 # Tracks and meshes that no grasped body can have --------------------------------------------------
 
 
-def with_track_axes(
-    order: tuple[int, ...], signs: tuple[int, ...] = (1, 1, 1)
-) -> ExperimentChange:
+def with_track_axes(order: tuple[int, ...], signs: tuple[int, ...] = (1, 1, 1)) -> ExperimentChange:
     """Return a change that takes the axes of tracks in another order, with signs."""
-    return lambda e, rng: with_markers(
-        e, np.array(signs) * e.markers.positions_m[..., list(order)]
-    )
+    return lambda e, rng: with_markers(e, np.array(signs) * e.markers.positions_m[..., list(order)])
 
 
 def constant(poses: PoseSequence) -> PoseSequence:
@@ -321,9 +286,7 @@ def constant(poses: PoseSequence) -> PoseSequence:
     return replace(
         poses,
         positions_m=np.repeat(poses.positions_m[first], len(poses.t_s), axis=0),
-        quaternions_xyzw=np.repeat(
-            poses.quaternions_xyzw[first], len(poses.t_s), axis=0
-        ),
+        quaternions_xyzw=np.repeat(poses.quaternions_xyzw[first], len(poses.t_s), axis=0),
     )
 
 
@@ -332,9 +295,7 @@ def restarting(experiment: Experiment, rng: Rng) -> Experiment:
     tracks = np.array(experiment.markers.positions_m)
     k = int(rng.integers(len(tracks) // 2, 3 * len(tracks) // 4))
     growth = 0.002 * 2.0 ** np.arange(6)
-    tracks[k : k + 6] += (
-        growth[:, None, None] * np.where(np.arange(6) % 2, 1, -1)[:, None, None]
-    )
+    tracks[k : k + 6] += growth[:, None, None] * np.where(np.arange(6) % 2, 1, -1)[:, None, None]
     tracks[k + 6 : k + 8] = np.nan
     tracks[k + 8 :] = tracks[: len(tracks) - k - 8]
     return with_markers(experiment, tracks)
@@ -361,28 +322,18 @@ def torn(experiment: Experiment, rng: Rng) -> Experiment:
     )
     places_m = experiment.markers.predict_positions(body.nodes_m)
     markers = replace(
-        experiment.markers,
-        placement=None,
-        located=None,
-        places_m=places_m,
-        attach="embedded",
+        experiment.markers, placement=None, located=None, places_m=places_m, attach="embedded"
     )
     return replace(experiment, body=other, markers=markers)
 
 
 TRACK_FAULTS = {
-    "markers: y and z exchanged": Fault(
-        with_track_axes((0, 2, 1)), ("markers-axes",)
-    ),
-    "markers: mirrored in x": Fault(
-        with_track_axes((0, 1, 2), (-1, 1, 1)), ("markers-axes",)
-    ),
+    "markers: y and z exchanged": Fault(with_track_axes((0, 2, 1)), ("markers-axes",)),
+    "markers: mirrored in x": Fault(with_track_axes((0, 1, 2), (-1, 1, 1)), ("markers-axes",)),
     "markers: turned by 90 deg": Fault(
         with_track_axes((1, 0, 2), (-1, 1, 1)), ("markers-axes", "camera-frame")
     ),
-    "poses constant": Fault(
-        lambda e, rng: _with_poses(e, constant), ("poses-constant",)
-    ),
+    "poses constant": Fault(lambda e, rng: _with_poses(e, constant), ("poses-constant",)),
     "simulation reset after NaN": Fault(restarting, ("markers-jump", "unlike")),
     "mesh in two parts": Fault(torn, ("mesh-parts",)),
 }
@@ -396,9 +347,7 @@ def wrenches(change: Callable[[Wrench], Wrench]) -> ExperimentChange:
 
     def changed(experiment: Experiment, rng: Rng) -> Experiment:
         grasps = [
-            grasp
-            if grasp.wrench is None
-            else replace(grasp, wrench=change(grasp.wrench))
+            grasp if grasp.wrench is None else replace(grasp, wrench=change(grasp.wrench))
             for grasp in experiment.grasps
         ]
         return replace(experiment, grasps=grasps)
@@ -414,43 +363,28 @@ def wrench_times(force: float, torque: float) -> ExperimentChange:
 
 def tared(wrench: Wrench) -> Wrench:
     """Return a wrench that was zeroed while the gripper held the body."""
-    return replace(
-        wrench, values=wrench.values - np.nanmean(wrench.values[:5], axis=0)
-    )
+    return replace(wrench, values=wrench.values - np.nanmean(wrench.values[:5], axis=0))
 
 
 def in_other_frame(wrench: Wrench) -> Wrench:
     """Return the wrench with the other frame stated: world in place of grasp, or the reverse."""
-    return replace(
-        wrench, frame="world" if wrench.frame == "grasp" else "grasp"
-    )
+    return replace(wrench, frame="world" if wrench.frame == "grasp" else "grasp")
 
 
 GRAM_FORCE_N = 9.80665e-3
 WRENCH_FAULTS = {
     "wrench: sign": Fault(wrench_times(-1, -1), ("wrench-sign",)),
-    "wrench: force alone reversed": Fault(
-        wrench_times(-1, 1), ("wrench-sign",)
-    ),
+    "wrench: force alone reversed": Fault(wrench_times(-1, 1), ("wrench-sign",)),
     "wrench: y and z exchanged": Fault(
-        wrenches(lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]])),
-        ("wrench-axes",),
+        wrenches(lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]])), ("wrench-axes",)
     ),
     "wrench: torques in N mm": Fault(wrench_times(1, 1e3), ("wrench-unit",)),
-    "wrench: forces in gram-force": Fault(
-        wrench_times(1 / GRAM_FORCE_N, 1), ("wrench-unit",)
-    ),
-    "wrench: gain 20 % too large": Fault(
-        wrench_times(1.2, 1.2), ("wrench-gain",)
-    ),
-    "wrench: 0.1 s late": Fault(
-        wrenches(lambda w: replace(w, t_s=w.t_s + 0.1)), ("wrench-clock",)
-    ),
+    "wrench: forces in gram-force": Fault(wrench_times(1 / GRAM_FORCE_N, 1), ("wrench-unit",)),
+    "wrench: gain 20 % too large": Fault(wrench_times(1.2, 1.2), ("wrench-gain",)),
+    "wrench: 0.1 s late": Fault(wrenches(lambda w: replace(w, t_s=w.t_s + 0.1)), ("wrench-clock",)),
     "wrench: other frame": Fault(wrenches(in_other_frame), ("wrench-frame",)),
     "wrench: point off by 50 mm": Fault(
-        wrenches(
-            lambda w: replace(w, point_m=w.point_m + np.array([0.05, 0, 0]))
-        ),
+        wrenches(lambda w: replace(w, point_m=w.point_m + np.array([0.05, 0, 0]))),
         ("wrench-point",),
     ),
     "wrench: tared with the body": Fault(wrenches(tared), ("wrench-tare",)),
@@ -462,14 +396,10 @@ WRENCH_FAULTS = {
 
 def obstacles(change: Callable[[Obstacle], Obstacle]) -> ExperimentChange:
     """Return a change that applies a function to every obstacle."""
-    return lambda e, rng: e.with_obstacles(
-        [change(each) for each in e.obstacles]
-    )
+    return lambda e, rng: e.with_obstacles([change(each) for each in e.obstacles])
 
 
 def reversed_normal(obstacle: Obstacle) -> Obstacle:
     """Return a plane with its normal reversed, so that the body is on the wrong side."""
     assert isinstance(obstacle.shape, Plane)
-    return replace(
-        obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal)
-    )
+    return replace(obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal))

@@ -62,9 +62,7 @@ def make_body(small_mesh: TetMesh) -> BodyFactory:
 
     @cache
     def make(material: str = "neo-hookean", evaluator: str = "auto") -> Body:
-        return Body(
-            small_mesh, material, 30.0, damping="rayleigh", evaluator=evaluator
-        )
+        return Body(small_mesh, material, 30.0, damping="rayleigh", evaluator=evaluator)
 
     return make
 
@@ -78,9 +76,7 @@ def tiny_problem(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def tiny(
-    tiny_problem: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Path:
+def tiny(tiny_problem: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the tiny problem's folder, which is the working directory."""
     folder = tmp_path / "tiny"
     shutil.copytree(tiny_problem, folder)

@@ -30,12 +30,7 @@ from typer.main import get_command, get_command_from_info
 
 from ..common.signal_handling import heed_interrupts, leave
 from ..errors import InputError, SimulationError, hint_at
-from .common import (
-    EXIT_BAD_INPUT,
-    EXIT_INTERRUPTED,
-    EXIT_NOT_CONVERGED,
-    error_console,
-)
+from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
 
 FAMILIES = (
     "problem_commands",
@@ -49,30 +44,11 @@ FAMILIES = (
 )
 # Groups of commands in the help, in the order in which a user needs them.
 COMMAND_GROUPS = {
-    "Identify parameters": (
-        "new",
-        "check",
-        "solve",
-        "refine",
-        "live",
-        "replay",
-    ),
+    "Identify parameters": ("new", "check", "solve", "refine", "live", "replay"),
     "Inspect a run": ("report", "plot", "animate", "view"),
-    "Extend a study": (
-        "simulate",
-        "compare-models",
-        "compare-methods",
-        "sweep",
-        "design",
-    ),
+    "Extend a study": ("simulate", "compare-models", "compare-methods", "sweep", "design"),
     "Exchange data": ("log", "export", "benchmark"),
-    "Reference and installation": (
-        "explain",
-        "methods",
-        "schema",
-        "doctor",
-        "completion",
-    ),
+    "Reference and installation": ("explain", "methods", "schema", "doctor", "completion"),
 }
 # Commands that were replaced, with the message to who types their old name.
 REPLACED_COMMANDS = {
@@ -89,16 +65,11 @@ def command_sources() -> dict[str, tuple[str, str]]:
     """
     commands = {}
     for family in FAMILIES:
-        text = (
-            Path(__file__).with_name(f"{family}.py").read_text(encoding="utf-8")
-        )
+        text = Path(__file__).with_name(f"{family}.py").read_text(encoding="utf-8")
         for each in ast.parse(text).body:
             if isinstance(each, ast.FunctionDef) and each.decorator_list:
                 summary = (ast.get_docstring(each) or "").partition("\n")[0]
-                commands[_command_name(each.name)] = (
-                    f"{__name__}.{family}",
-                    summary,
-                )
+                commands[_command_name(each.name)] = (f"{__name__}.{family}", summary)
     return commands
 
 
@@ -127,17 +98,9 @@ class LazyCommands(TyperGroup):
         """
         if cmd_name not in command_sources():
             return None
-        with error_console.status(
-            "starting"
-        ):  # on a terminal only; it takes a second
-            family = import_module(
-                command_sources()[cmd_name][0]
-            ).commands.registered_commands
-        info = next(
-            each
-            for each in family
-            if _command_name(each.callback.__name__) == cmd_name
-        )
+        with error_console.status("starting"):  # on a terminal only; it takes a second
+            family = import_module(command_sources()[cmd_name][0]).commands.registered_commands
+        info = next(each for each in family if _command_name(each.callback.__name__) == cmd_name)
         how = {"pretty_exceptions_short": False, "rich_markup_mode": None}
         return get_command_from_info(info, **how)
 
@@ -154,14 +117,8 @@ class LazyCommands(TyperGroup):
         """
         if args and (replacement := REPLACED_COMMANDS.get(args[0])):
             ctx.fail(f"No such command {args[0]!r}: {replacement}.")
-        if (
-            args
-            and args[0] not in command_sources()
-            and not ctx.resilient_parsing
-        ):
-            ctx.fail(
-                f"No such command {args[0]!r}{hint_at(args[0], command_sources()) or '.'}"
-            )
+        if args and args[0] not in command_sources() and not ctx.resilient_parsing:
+            ctx.fail(f"No such command {args[0]!r}{hint_at(args[0], command_sources()) or '.'}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -204,10 +161,7 @@ def _root(
     version: Annotated[
         bool,
         typer.Option(
-            "--version",
-            callback=_print_version,
-            is_eager=True,
-            help="Print the version.",
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
         ),
     ] = False,
 ) -> None:
@@ -234,16 +188,7 @@ def main() -> None:
 
 
 def _run_command() -> None:
-    """Run the command of the arguments; the function ends with an exception in any case.
-
-    Raises
-    ------
-    SystemExit
-        With the exit code of the command; after a message, 2 for bad input and files that cannot be
-        used, 1 for a failed simulation.
-    KeyboardInterrupt
-        After an interrupt that the command does not handle.
-    """
+    """Run the command of the arguments; the function ends with an exception in any case."""
     restore = heed_interrupts()
     # That it builds its cache of fonts, or where, is no news to who solves a problem.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
@@ -254,9 +199,7 @@ def _run_command() -> None:
     except OSError as error:
         where = error.filename or "standard output, or a temporary file"
         _exit_with_error(
-            "error",
-            InputError(error.strerror or str(error), where),
-            code=EXIT_BAD_INPUT,
+            "error", InputError(error.strerror or str(error), where), code=EXIT_BAD_INPUT
         )
     except SimulationError as error:
         _exit_with_error("simulation failed", error, code=EXIT_NOT_CONVERGED)
@@ -267,7 +210,6 @@ def _run_command() -> None:
 def _exit_with_error(kind: str, error: Exception, code: int) -> NoReturn:
     """Print an error on stderr after the word `kind`, and raise `SystemExit` with `code`."""
     error_console.print(
-        Text(f"{kind}: ", style="red").append(str(error), style="default"),
-        soft_wrap=True,
+        Text(f"{kind}: ", style="red").append(str(error), style="default"), soft_wrap=True
     )
     sys.exit(code)

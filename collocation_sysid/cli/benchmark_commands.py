@@ -73,9 +73,7 @@ def benchmark(options: BenchmarkCommand) -> None:
     elif options.write:
         _write_bodies(options, options.folder)
     else:
-        with SolveProgress(
-            error_console, quiet=options.quiet, activity="computing the scores"
-        ):
+        with SolveProgress(error_console, quiet=options.quiet, activity="computing the scores"):
             scores = score_benchmark(options.folder, options.body)
         if options.as_json:
             typer.echo(as_json([asdict(each) for each in scores]))
@@ -91,9 +89,7 @@ def _list_bodies(options: BenchmarkCommand) -> None:
     if options.write or options.body is not None:
         where = "--write" if options.write else "--body"
         raise InputError(
-            f"this option needs a folder; expected benchmark FOLDER {where}",
-            None,
-            where=where,
+            f"this option needs a folder; expected benchmark FOLDER {where}", None, where=where
         )
     listed: list[dict[str, Any]] = []
     for body in BODIES.values():
@@ -144,11 +140,7 @@ def _write_bodies(options: BenchmarkCommand, folder: Path) -> None:
         error_console, quiet=options.quiet, activity="simulating the bodies"
     ) as progress:
         write_benchmark(chosen, folder, progress=progress.share)
-    left_out = [
-        body
-        for body in BODIES.values()
-        if options.body is None and body not in chosen
-    ]
+    left_out = [body for body in BODIES.values() if options.body is None and body not in chosen]
     if options.as_json:
         report = {
             "folder": str(folder),
@@ -198,9 +190,7 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
         if own[0].rms_without_offsets is None:
             heads = heads[:-1]
             rows = tuple(row[:-1] for row in rows)
-        tables.append(
-            Table(f"{title[0]}, {title[1]} ({role})", heads, rows=rows)
-        )
+        tables.append(Table(f"{title[0]}, {title[1]} ({role})", heads, rows=rows))
     return tables
 
 
@@ -213,14 +203,11 @@ def score_warnings(scores: Sequence[Score]) -> list[str]:
     from ..extras.benchmark.scores import PREDICTION, UNDEFORMED
 
     trivial = {
-        (each.body, each.recording): each.rms
-        for each in scores
-        if each.source == UNDEFORMED
+        (each.body, each.recording): each.rms for each in scores if each.source == UNDEFORMED
     }
     return [
         f"warning: the prediction of {each.body}, {each.recording}, is worse than the undeformed "
         "body; check units (m, N, Pa), frame, signs and the order of the columns"
         for each in scores
-        if each.source == PREDICTION
-        and each.rms > trivial[each.body, each.recording]
+        if each.source == PREDICTION and each.rms > trivial[each.body, each.recording]
     ]

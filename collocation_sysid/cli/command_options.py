@@ -44,9 +44,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-ProblemPath = Annotated[
-    Path, typer.Argument(metavar="PROBLEM.toml", help="The problem file.")
-]
+ProblemPath = Annotated[Path, typer.Argument(metavar="PROBLEM.toml", help="The problem file.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
@@ -58,32 +56,21 @@ Overrides = Annotated[
 AllowCode = Annotated[
     bool,
     typer.Option(
-        "--allow-code",
-        help="Allow the Python files named in the problem file to be executed.",
+        "--allow-code", help="Allow the Python files named in the problem file to be executed."
     ),
 ]
 OneExperiment = Annotated[
     str | None,
     typer.Option(
-        "--experiment",
-        metavar="NAME",
-        help="Name of the experiment; by default the first one.",
+        "--experiment", metavar="NAME", help="Name of the experiment; by default the first one."
     ),
 ]
-OutputFolder = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Output folder.")
-]
-AsJson = Annotated[
-    bool, typer.Option("--json", help="Print the result as JSON.")
-]
-Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Do not show progress.")
-]
+OutputFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Output folder.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Do not show progress.")]
 
 
-def command(
-    group: typer.Typer, *examples: str
-) -> Callable[[Callable[[Any], None]], Any]:
+def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], None]], Any]:
     """Return a decorator that registers a function of a dataclass of options as a command, and
     returns the function unchanged.
 
@@ -104,11 +91,7 @@ def command(
         """Register the function, whose only argument is annotated with its dataclass of options, in
         `group`, and return it unchanged.
         """
-        (kind,) = (
-            each
-            for name, each in get_type_hints(function).items()
-            if name != "return"
-        )
+        (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
         parameters = [*_typer_parameters(kind)]
 
         def called(**values: Any) -> None:
@@ -118,13 +101,9 @@ def command(
         called.__name__ = function.__name__
         called.__doc__ = function.__doc__
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        called.__annotations__ = {
-            each.name: each.annotation for each in parameters
-        }
+        called.__annotations__ = {each.name: each.annotation for each in parameters}
         lines = "".join(f"\n  collocation-sysid {each}" for each in examples)
-        group.command(epilog=f"\b\nExamples:{lines}")(
-            called
-        )  # kept as they are
+        group.command(epilog=f"\b\nExamples:{lines}")(called)  # kept as they are
         return function
 
     return registered
@@ -142,24 +121,15 @@ def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
         if is_dataclass(hint):
             yield from _typer_parameters(hint)  # type: ignore[arg-type]
             continue
-        infos = (
-            copy(mark) for mark in marks if isinstance(mark, ParameterInfo)
-        )
+        infos = (copy(mark) for mark in marks if isinstance(mark, ParameterInfo))
         info = next(infos, None) or typer.Option()
         if info.help is None:
             written, info.help = documented[name]
             info.metavar = next(
-                (
-                    w
-                    for w in written.split()
-                    if w[0].isupper() or w[0].isdigit()
-                ),
-                None,
+                (w for w in written.split() if w[0].isupper() or w[0].isdigit()), None
             )
             if isinstance(info, OptionInfo):
-                info.param_decls = _option_names(
-                    name, default, type_text=written
-                )
+                info.param_decls = _option_names(name, default, type_text=written)
         yield inspect.Parameter(
             name,
             inspect.Parameter.KEYWORD_ONLY,
@@ -171,16 +141,6 @@ def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
 def _option_names(field: str, default: Any, type_text: str) -> list[str]:
     """Return the names of an option on the command line: those in `type_text`, and unless a long
     one is among them the name of the field before them, with hyphens.
-
-    Parameters
-    ----------
-    field : str
-        Name of the field; underscores at its ends are left out, as of `set_`.
-    default : object
-        Default value; an option that is on by default gets a name to switch it off, as in
-        "--film/--no-film".
-    type_text : str
-        Type of the field in the docstring, which may contain names that begin with "-".
     """
     option = field.strip("_").replace("_", "-")
     names = [word for word in type_text.split() if word.startswith("-")]
@@ -190,20 +150,7 @@ def _option_names(field: str, default: Any, type_text: str) -> list[str]:
 
 
 def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
-    """Return the options of a command from their values by name.
-
-    Parameters
-    ----------
-    kind : type
-        Dataclass of options; fields that are dataclasses of options are made from the same values.
-    values : mapping of name to value
-        A value for every field; values of other names are ignored.
-
-    Raises
-    ------
-    InputError
-        For a value that `kind` refuses, naming the option as it is written on the command line.
-    """
+    """Return the options of a command from their values by name."""
     content = {
         name: _options_from_values(hint, values)  # type: ignore[arg-type]
         if is_dataclass(hint)
@@ -217,9 +164,7 @@ def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
         if error.where not in fields_:
             raise
         written = attributes(kind).get(error.where, ("", ""))[0]
-        names = _option_names(
-            error.where, fields_[error.where], type_text=written
-        )
+        names = _option_names(error.where, fields_[error.where], type_text=written)
         raise InputError(error.message, None, where=names[0]) from error
 
 
@@ -233,20 +178,14 @@ def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
     """
     hints = get_type_hints(kind, include_extras=True)
     defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
-    order = (
-        name for base in kind.__mro__ for name in inspect.get_annotations(base)
-    )
+    order = (name for base in kind.__mro__ for name in inspect.get_annotations(base))
     listed = []
     for name in dict.fromkeys(name for name in order if name in defaults):
         annotated = get_origin(hints[name]) is Annotated
         hint, *marks = get_args(hints[name]) if annotated else (hints[name],)
-        if get_origin(hint) in (
-            Union,
-            UnionType,
-        ):  # for instance a type or None
+        if get_origin(hint) in (Union, UnionType):  # for instance a type or None
             kinds = (
-                get_args(one)[0] if get_origin(one) is Annotated else one
-                for one in get_args(hint)
+                get_args(one)[0] if get_origin(one) is Annotated else one for one in get_args(hint)
             )
             hint = reduce(or_, kinds)
         listed.append((name, defaults[name], hint, tuple(marks)))
@@ -280,9 +219,7 @@ class ProblemOptions:
         from ..result.solve_progress import SolveProgress
 
         with SolveProgress(
-            error_console,
-            quiet=getattr(self, "quiet", False),
-            activity=f"reading {self.problem}",
+            error_console, quiet=getattr(self, "quiet", False), activity=f"reading {self.problem}"
         ) as progress:
             return Problem.read(
                 self.problem,
@@ -319,9 +256,7 @@ class OutputOptions:
     as_json: AsJson = False
     quiet: Quiet = False
 
-    def print_result(
-        self, answer: Any, content: Shown | Iterable[Shown]
-    ) -> None:
+    def print_result(self, answer: Any, content: Shown | Iterable[Shown]) -> None:
         """Print the result on stdout: `answer` as JSON if requested, or else its tables and lines
         `content`.
         """

@@ -25,17 +25,14 @@ UNBROKEN_WIDTH = 100_000
 EXIT_DOUBTFUL = EXIT_NOT_CONVERGED
 
 
-def interruption_exit(
-    saved_results: str, *, continues: bool = True
-) -> typer.Exit:
+def interruption_exit(saved_results: str, *, continues: bool = True) -> typer.Exit:
     """Print on stderr what is kept after an interrupt (`saved_results`) and, if that is continued
     (`continues`), the command for it; return the exit to raise, with `EXIT_INTERRUPTED`.
     """
     again = shlex.join(["collocation-sysid", *sys.argv[1:]])
     text = f"interrupted: {saved_results}"
     error_console.print(
-        Text(f"{text}; continue with: {again}" if continues else text),
-        soft_wrap=True,
+        Text(f"{text}; continue with: {again}" if continues else text), soft_wrap=True
     )
     return typer.Exit(EXIT_INTERRUPTED)
 

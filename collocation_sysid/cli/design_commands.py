@@ -14,13 +14,7 @@ from ..extras.design import DesignCriterion, DesignOptions, Limits
 from ..extras.design import design_motion as designed
 from ..extras.design.predicted_information import Kind, Over
 from ..result.run_writers import require_replaceable
-from .command_options import (
-    OneExperiment,
-    OutputFolder,
-    OutputOptions,
-    ProblemOptions,
-    command,
-)
+from .command_options import OneExperiment, OutputFolder, OutputOptions, ProblemOptions, command
 from .common import EXIT_INTERRUPTED, error_console
 
 commands = typer.Typer()
@@ -76,20 +70,12 @@ def design(options: DesignCommand) -> None:
     and after, pictures, a film and a problem file that simulates the motion. Ctrl-C stops the
     search and keeps the best motion so far; the exit code is then 130.
     """
-    from ..extras.design.design_folder import (
-        DESIGN_FILE,
-        design_json,
-        write_design,
-    )
+    from ..extras.design.design_folder import DESIGN_FILE, design_json, write_design
     from ..extras.design.design_page import design_summary
     from ..extras.studies.study_progress import DesignProgress
 
     folder = options.out or Path("runs") / f"{run_name(options.problem)}-design"
-    names = (
-        ()
-        if options.for_ is None
-        else tuple(n.strip() for n in options.for_.split(","))
-    )
+    names = () if options.for_ is None else tuple(n.strip() for n in options.for_.split(","))
     criterion = DesignCriterion(
         cast("Kind", options.criterion), names, over=cast("Over", options.over)
     )
@@ -97,9 +83,7 @@ def design(options: DesignCommand) -> None:
     problem = options.read_problem(simulation=not options.add)
     require_possible(folder)
     require_replaceable(folder, marker_file=DESIGN_FILE, content_word="design")
-    with DesignProgress(
-        error_console, options.search.evaluations, quiet=options.quiet
-    ) as progress:
+    with DesignProgress(error_console, options.search.evaluations, quiet=options.quiet) as progress:
         try:
             answer = designed(
                 problem,
@@ -115,8 +99,6 @@ def design(options: DesignCommand) -> None:
         except InputError as error:
             key = error.where in Limits.model_fields and error.source is None
             raise (error.located(options.limits) if key else error) from error
-        write_design(
-            answer, folder, with_film=options.film, say=progress.show_activity
-        )
+        write_design(answer, folder, with_film=options.film, say=progress.show_activity)
     options.print_result(design_json(answer), design_summary(answer, folder))
     raise typer.Exit(EXIT_INTERRUPTED if answer.best.is_interrupted else 0)

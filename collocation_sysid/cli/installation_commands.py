@@ -10,11 +10,7 @@ import typer
 
 from ..common.display import Line, Shown, Table, labelled, number
 from ..common.validated_classes import validated
-from ..installation_check import (
-    Dependency,
-    InstallationReport,
-    check_installation,
-)
+from ..installation_check import Dependency, InstallationReport, check_installation
 from .command_options import OutputOptions, command
 from .common import EXIT_BAD_INPUT, error_console
 
@@ -106,11 +102,7 @@ def installation_sections(report: InstallationReport) -> list[Shown]:
             "Required packages",
             (),
             rows=tuple(
-                (
-                    f"  {each.name} ",
-                    each.installed or "missing",
-                    _requirement_text(each),
-                )
+                (f"  {each.name} ", each.installed or "missing", _requirement_text(each))
                 for each in report.dependencies
             ),
             names=2,
@@ -146,11 +138,7 @@ def _solver_rows(report: InstallationReport) -> dict[str, str]:
     if report.solvers is None:
         return {"solvers": "unknown, because CasADi cannot be imported"}
     linear = ", ".join(report.solvers.ipopt_linear) or "none that works"
-    mkl = (
-        "available"
-        if report.solvers.supernodal
-        else "not available (extra: large)"
-    )
+    mkl = "available" if report.solvers.supernodal else "not available (extra: large)"
     return {
         "nonlinear solvers": ", ".join(report.solvers.nonlinear) or "none",
         "IPOPT's linear solvers": linear,
@@ -169,9 +157,7 @@ def _kernel_rows(report: InstallationReport) -> dict[str, str]:
             "which is slower"
         }
     stored = f"{kernels.count} kernels, {number(kernels.size_mb, 3)} MB"
-    state = (
-        "writable" if kernels.fault is None else f"not used: {kernels.fault}"
-    )
+    state = "writable" if kernels.fault is None else f"not used: {kernels.fault}"
     return {
         "compiler": kernels.compiler,
         "C compiler": f"{kernels.c_compiler or 'none'} (not needed)",
@@ -200,8 +186,6 @@ def _conclusion(report: InstallationReport) -> Line:
     text = f"Self test {outcome} in {test.time_s:.1f} s: {test.message}."
     if report.is_working:
         return Line(f"{text} The installation works.", "good")
-    unsuitable = [
-        each.name for each in report.dependencies if not each.is_suitable
-    ]
+    unsuitable = [each.name for each in report.dependencies if not each.is_suitable]
     remedy = f" Install {', '.join(unsuitable)}." if unsuitable else ""
     return Line(f"{text} The installation does not work.{remedy}", "doubtful")

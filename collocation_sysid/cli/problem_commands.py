@@ -24,12 +24,7 @@ from ..result.run_writers import require_replaceable
 from ..result.synthesis import Recipe, write_data
 from ..runs.check import check_problem, quick_check
 from ..runs.result_content import Result
-from .command_options import (
-    OutputFolder,
-    OutputOptions,
-    ProblemOptions,
-    command,
-)
+from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
 from .common import (
     EXIT_DOUBTFUL,
     EXIT_INTERRUPTED,
@@ -126,8 +121,7 @@ def solve(options: SolveCommand) -> None:
                 )
             except KeyboardInterrupt:
                 raise interruption_exit(
-                    f"no result could be kept; nothing was written to {folder}",
-                    continues=False,
+                    f"no result could be kept; nothing was written to {folder}", continues=False
                 ) from None
             until_shown.enter_context(INTERRUPTS.deferred())
         if not options.as_json:
@@ -144,9 +138,7 @@ def solve(options: SolveCommand) -> None:
         if not options.as_json:
             print_result(f"written to {folder}")
     result = (
-        _draw_pictures(finished, folder, options=options)
-        if options.pictures
-        else finished.result
+        _draw_pictures(finished, folder, options=options) if options.pictures else finished.result
     )
     if options.as_json:
         typer.echo(as_json(result))
@@ -162,9 +154,7 @@ def solve(options: SolveCommand) -> None:
     raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
 
 
-def _draw_pictures(
-    finished: Run, folder: Path, options: SolveCommand
-) -> Result:
+def _draw_pictures(finished: Run, folder: Path, options: SolveCommand) -> Result:
     """Draw the pictures of a finished run into its folder, and return its result with the time that
     they took.
 
@@ -174,16 +164,12 @@ def _draw_pictures(
     from ..result.solve_progress import SolveProgress
 
     try:
-        with SolveProgress(
-            error_console, verbose=options.verbose, quiet=options.quiet
-        ) as progress:
+        with SolveProgress(error_console, verbose=options.verbose, quiet=options.quiet) as progress:
             return draw_run(finished, folder, report=progress.say)
     except KeyboardInterrupt:
         again = shlex.join(["collocation-sysid", "plot", str(folder)])
         message = f"interrupted: the result is kept in {folder}, but some pictures are missing"
-        error_console.print(
-            Text(f"{message}; draw them with: {again}"), soft_wrap=True
-        )
+        error_console.print(Text(f"{message}; draw them with: {again}"), soft_wrap=True)
         return finished.result
 
 
@@ -226,10 +212,7 @@ def simulate(options: SimulateCommand) -> None:
     ) as progress:
         try:
             written = write_data(
-                problem,
-                options.out,
-                recipe=options.recipe,
-                progress=progress.share,
+                problem, options.out, recipe=options.recipe, progress=progress.share
             )
         except SimulationError as error:
             if error.stability_loss is not None:
@@ -254,9 +237,7 @@ def _draw_instability(error: SimulationError, folder: Path) -> None:
     file = folder / "instability.png"
     folder.mkdir(parents=True, exist_ok=True)
     with replaced_file(file) as draft:
-        instability_picture(error.stability_loss).savefig(
-            draft, dpi=RESOLUTION_DPI
-        )
+        instability_picture(error.stability_loss).savefig(draft, dpi=RESOLUTION_DPI)
     error_console.print(f"the mode is drawn in {file}")
 
 
@@ -302,9 +283,7 @@ def check(options: CheckCommand) -> None:
     problem = options.read_problem()
     if not options.as_json:
         with SolveProgress(
-            error_console,
-            quiet=options.quiet,
-            activity="checking bodies, recordings and grasps",
+            error_console, quiet=options.quiet, activity="checking bodies, recordings and grasps"
         ):
             findings_at_once = quick_check(problem)
         print_result(quick_check_tables(findings_at_once))
@@ -314,9 +293,7 @@ def check(options: CheckCommand) -> None:
             quiet=options.quiet,
         )
     with SolveProgress(
-        error_console,
-        quiet=options.quiet,
-        activity="preparing the complete program",
+        error_console, quiet=options.quiet, activity="preparing the complete program"
     ) as progress:
         findings = check_problem(problem, progress.say, full=options.full)
     options.print_result(findings.as_dict(), full_check_tables(findings))
@@ -329,11 +306,6 @@ def _write_camera_overlays(problem: Problem, folder: Path, quiet: bool) -> None:
     print the names of the files. Progress is shown unless `quiet`.
 
     The folder is made if necessary. Nothing is written or printed without cameras.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be made or written in.
     """
     if not any(each.camera_names for each in problem.experiments):
         return
@@ -342,9 +314,7 @@ def _write_camera_overlays(problem: Problem, folder: Path, quiet: bool) -> None:
 
     require_possible(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with SolveProgress(
-        error_console, quiet=quiet, activity="drawing the views of the cameras"
-    ):
+    with SolveProgress(error_console, quiet=quiet, activity="drawing the views of the cameras"):
         files = save_overlays(problem.experiments, folder)
     for file in files:
         typer.echo(f"{OVERLAY_TEXT}: {file}")

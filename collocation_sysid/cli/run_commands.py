@@ -25,9 +25,7 @@ from .command_options import (
 from .common import error_console, interruption_exit, print_result
 
 if TYPE_CHECKING:
-    from ..extras.export import (
-        ExportDestination,
-    )  # which takes a second to import
+    from ..extras.export import ExportDestination  # which takes a second to import
 
 commands = typer.Typer()
 
@@ -61,9 +59,7 @@ def refine(options: RefineCommand) -> None:
 
     try:
         with SolveProgress(
-            error_console,
-            quiet=options.quiet,
-            activity=f"reading {options.run_folder}",
+            error_console, quiet=options.quiet, activity=f"reading {options.run_folder}"
         ) as progress:
             refinement, result = refine_run(
                 options.run_folder,
@@ -77,9 +73,7 @@ def refine(options: RefineCommand) -> None:
             f"the solves that were completed are kept in {options.run_folder}"
         ) from None
     report = {**content(refinement), "trust": result.trust}
-    options.print_result(
-        report, [refinement_table(result), verdict_section(result.trust)]
-    )
+    options.print_result(report, [refinement_table(result), verdict_section(result.trust)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,16 +130,9 @@ def export(options: ExportCommand) -> None:
         _export_body(options, destination)
 
 
-def _export_body(
-    options: ExportCommand, destination: ExportDestination
-) -> None:
+def _export_body(options: ExportCommand, destination: ExportDestination) -> None:
     """Write the body of a run for a simulator, and print warnings, what the simulator cannot
     express, the comparison if the export is verified, and the destination; or all of this as JSON.
-
-    Raises
-    ------
-    InputError
-        If run, experiment or destination are not usable.
     """
     from ..extras.export import (
         TARGETS,
@@ -161,14 +148,10 @@ def _export_body(
     destination.require_possible()
     compared = []
     with SolveProgress(
-        error_console,
-        quiet=options.quiet,
-        activity=f"reading {options.run_folder}",
+        error_console, quiet=options.quiet, activity=f"reading {options.run_folder}"
     ) as progress:
         body = IdentifiedBody.read(
-            options.run_folder,
-            options.experiment,
-            allow_code=options.allow_code,
+            options.run_folder, options.experiment, allow_code=options.allow_code
         )
         progress.say(f"writing the body for {target.name}")
         with destination.export_folder() as folder:
@@ -194,21 +177,12 @@ def _export_body(
     print_result(f"not expressed: {each}" for each in exported.limitations)
     if options.verify:
         print_result(comparison_table(target.name, compared))
-    typer.echo(
-        destination.folder if destination.is_folder else destination.main_file
-    )
+    typer.echo(destination.folder if destination.is_folder else destination.main_file)
 
 
-def _export_recording(
-    options: ExportCommand, destination: ExportDestination
-) -> None:
+def _export_recording(options: ExportCommand, destination: ExportDestination) -> None:
     """Write the recording of a run for the Rerun viewer, and print what is missing in it and the
     file; or both as JSON.
-
-    Raises
-    ------
-    InputError
-        With the option --verify, because a recording predicts nothing, and as `write_rerun`.
     """
     from ..extras.export.rerun_recording import RECORDING_FILE, write_rerun
     from ..result.solve_progress import SolveProgress
@@ -221,16 +195,10 @@ def _export_recording(
         )
     destination.require_possible()
     with (
-        SolveProgress(
-            error_console,
-            quiet=options.quiet,
-            activity="writing the recording",
-        ),
+        SolveProgress(error_console, quiet=options.quiet, activity="writing the recording"),
         destination.export_folder() as folder,
     ):
-        missing = write_rerun(
-            options.run_folder, folder, experiment=options.experiment
-        )
+        missing = write_rerun(options.run_folder, folder, experiment=options.experiment)
         destination.place_files(folder, RECORDING_FILE)
     if options.as_json:
         report = {
@@ -287,9 +255,7 @@ class ReportCommand:
     quiet: Quiet = False
 
 
-@command(
-    commands, "report runs/swing", "report runs/swing-sweep --to sweep.html"
-)
+@command(commands, "report runs/swing", "report runs/swing-sweep --to sweep.html")
 def report(options: ReportCommand) -> None:
     """Write a report of a run or a study as one HTML page or a Markdown file.
 
@@ -302,9 +268,7 @@ def report(options: ReportCommand) -> None:
     folder = options.folder
     file = options.to or options.folder / "report.html"
     study = (folder / "summary.json").is_file()
-    with SolveProgress(
-        error_console, quiet=options.quiet, activity="writing the report"
-    ):
+    with SolveProgress(error_console, quiet=options.quiet, activity="writing the report"):
         page = comparison_report(folder) if study else run_report(folder)
         require_possible(file.parent)
         write_text_file(file, report_text(page, file))
@@ -332,20 +296,14 @@ class AnimateCommand(RunFolderOptions):
     quiet: Quiet = False
 
 
-@command(
-    commands, "animate runs/swing --to swing.mp4", "animate runs/swing --slow 4"
-)
+@command(commands, "animate runs/swing --to swing.mp4", "animate runs/swing --slow 4")
 def animate(options: AnimateCommand) -> None:
     """Make a film of a run: the fitted body beside its forward simulation."""
     from ..result.animation import animate as film
     from ..result.solve_progress import SolveProgress
 
-    require_possible(
-        options.run_folder if options.to is None else options.to.parent
-    )
-    with SolveProgress(
-        error_console, quiet=options.quiet, activity="making the film"
-    ):
+    require_possible(options.run_folder if options.to is None else options.to.parent)
+    with SolveProgress(error_console, quiet=options.quiet, activity="making the film"):
         file = film(
             options.run_folder,
             options.to,
@@ -392,7 +350,5 @@ def view(options: ViewCommand) -> None:
         return
     require_possible(html.parent)
     with SolveProgress(error_console, activity="writing the page"):
-        page = export_page(
-            run, html, experiment=options.experiment, field=field
-        )
+        page = export_page(run, html, experiment=options.experiment, field=field)
     typer.echo(page)

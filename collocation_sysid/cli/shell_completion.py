@@ -70,11 +70,7 @@ def completion_script(shell: str, root: Any) -> str:
     context = root.make_context(PROGRAM, ["schema"], resilient_parsing=True)
     values = named_values()
     commands = [
-        _completed_command(
-            root.get_command(context, name),
-            context,
-            values=values.get(name, {}),
-        )
+        _completed_command(root.get_command(context, name), context, values=values.get(name, {}))
         for name in root.list_commands(context)
     ]
     return SCRIPTS[shell](commands, _options(root, context, values={}))
@@ -99,24 +95,9 @@ def named_values() -> dict[str, dict[str, tuple[str, ...]]]:
 def _completed_command(
     command: Any, context: Any, values: Mapping[str, tuple[str, ...]]
 ) -> CompletedCommand:
-    """Return a command of typer with its options.
-
-    Parameters
-    ----------
-    command : Command
-    context : Context
-        Context of the group of commands.
-    values : mapping of str to tuple of str
-        Known values by name of the parameter; for others see `_values`.
-    """
-    arguments = [
-        p
-        for p in command.get_params(context)
-        if p.param_type_name == "argument"
-    ]
-    known = (
-        _values(argument, context, values=values) for argument in arguments
-    )
+    """Return a command of typer with its options."""
+    arguments = [p for p in command.get_params(context) if p.param_type_name == "argument"]
+    known = (_values(argument, context, values=values) for argument in arguments)
     return CompletedCommand(
         name=command.name,
         description=_summary(command.help or ""),
@@ -130,24 +111,12 @@ def _options(
 ) -> tuple[CompletedOption, ...]:
     """Return the options of a command that help shows; one with a negation, such as --no-pictures,
     yields two.
-
-    Parameters
-    ----------
-    command : Command
-    context : Context
-        Context of the group of commands.
-    values : mapping of str to tuple of str
-        Known values by name of the parameter; for others see `_values`.
     """
     options = []
     for parameter in command.get_params(context):
         if parameter.param_type_name != "option" or parameter.hidden:
             continue
-        known = (
-            ()
-            if parameter.is_flag
-            else _values(parameter, context, values=values)
-        )
+        known = () if parameter.is_flag else _values(parameter, context, values=values)
         for names in filter(None, (parameter.opts, parameter.secondary_opts)):
             options.append(
                 CompletedOption(
@@ -160,18 +129,14 @@ def _options(
     return tuple(options)
 
 
-def _values(
-    parameter: Any, context: Any, values: Mapping[str, tuple[str, ...]]
-) -> tuple[str, ...]:
+def _values(parameter: Any, context: Any, values: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     """Return the possible values of a parameter: those in `values`, else those that its type lists;
     empty for files and free text.
     """
     if parameter.name in values:
         return values[parameter.name]
     items = parameter.shell_complete(context, "")
-    return tuple(
-        str(each.value) for each in items if each.type == "plain" and each.value
-    )
+    return tuple(str(each.value) for each in items if each.type == "plain" and each.value)
 
 
 def _summary(text: str) -> str:
@@ -185,9 +150,7 @@ def _summary(text: str) -> str:
     return line[: LONGEST_DESCRIPTION - 1].rsplit(" ", 1)[0].rstrip(",;:") + "…"
 
 
-def bash_script(
-    commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
-) -> str:
+def bash_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]) -> str:
     """Return the script for bash, which defines the completion when it is sourced; values that are
     not known are completed as files.
 
@@ -213,14 +176,10 @@ def bash_script(
     for command in commands:
         for option in command.options:
             if option.takes_value:
-                patterns = "|".join(
-                    f'"{command.name} {name}"' for name in option.names
-                )
+                patterns = "|".join(f'"{command.name} {name}"' for name in option.names)
                 words = shlex.quote(" ".join(option.values))
                 reply = (
-                    f'COMPREPLY=($(compgen -W {words} -- "$current")); '
-                    if option.values
-                    else ""
+                    f'COMPREPLY=($(compgen -W {words} -- "$current")); ' if option.values else ""
                 )
                 lines.append(f"            {patterns}) {reply}return ;;")
     lines += ["        esac", '        case "$command" in']
@@ -242,9 +201,7 @@ def bash_script(
     return "\n".join(lines)
 
 
-def zsh_script(
-    commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
-) -> str:
+def zsh_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]) -> str:
     """Return the script for zsh, to be evaluated, or put into a folder of ``fpath``; arguments as
     of `bash_script`.
     """
@@ -254,10 +211,7 @@ def zsh_script(
         "    local -a known",
         "    if (( CURRENT == 2 )); then",
         "        known=(",
-        *(
-            f"            {_described(each.name, each.description)}"
-            for each in commands
-        ),
+        *(f"            {_described(each.name, each.description)}" for each in commands),
         *(f"            {_described(o.names[0], o.description)}" for o in root),
         "        )",
         "        _describe command known",
@@ -275,11 +229,7 @@ def zsh_script(
             for option in command.options
             for name in option.names
         ]
-        action = (
-            f"({' '.join(command.arguments)})"
-            if command.arguments
-            else "_files"
-        )
+        action = f"({' '.join(command.arguments)})" if command.arguments else "_files"
         lines.append(f"            {shlex.quote(f'*:argument:{action}')} ;;")
     lines += [
         "    esac",
@@ -305,15 +255,11 @@ def _zsh_option(name: str, option: CompletedOption) -> str:
     text = re.sub(r"([\[\]\\:])", r"\\\1", option.description)
     value = ""
     if option.takes_value:
-        value = ":value:" + (
-            f"({' '.join(option.values)})" if option.values else "_files"
-        )
+        value = ":value:" + (f"({' '.join(option.values)})" if option.values else "_files")
     return shlex.quote(f"*{name}[{text}]{value}")
 
 
-def fish_script(
-    commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]
-) -> str:
+def fish_script(commands: Sequence[CompletedCommand], root: Sequence[CompletedOption]) -> str:
     """Return the script for fish, which defines the completion when it is sourced; arguments as of
     `bash_script`.
     """
@@ -323,19 +269,12 @@ def fish_script(
         lines.append(f"{begin} -n __fish_use_subcommand {_fish_option(option)}")
     for command in commands:
         text = _fish_quote(command.description)
-        lines.append(
-            f"{begin} -n __fish_use_subcommand -f -a {command.name} -d {text}"
-        )
-        condition = (
-            f"-n {_fish_quote(f'__fish_seen_subcommand_from {command.name}')}"
-        )
+        lines.append(f"{begin} -n __fish_use_subcommand -f -a {command.name} -d {text}")
+        condition = f"-n {_fish_quote(f'__fish_seen_subcommand_from {command.name}')}"
         if command.arguments:
             values = _fish_quote(" ".join(command.arguments))
             lines.append(f"{begin} {condition} -f -a {values}")
-        lines += [
-            f"{begin} {condition} {_fish_option(option)}"
-            for option in command.options
-        ]
+        lines += [f"{begin} {condition} {_fish_option(option)}" for option in command.options]
     return "\n".join(lines)
 
 
@@ -343,17 +282,10 @@ def _fish_option(option: CompletedOption) -> str:
     """Return the arguments of fish's `complete` for an option: its names, its values (files if
     these are not known) and its description.
     """
-    names = [
-        f"-l {n[2:]}" if n.startswith("--") else f"-s {n[1:]}"
-        for n in option.names
-    ]
+    names = [f"-l {n[2:]}" if n.startswith("--") else f"-s {n[1:]}" for n in option.names]
     value = ""
     if option.takes_value:
-        value = (
-            f" -x -a {_fish_quote(' '.join(option.values))}"
-            if option.values
-            else " -r -F"
-        )
+        value = f" -x -a {_fish_quote(' '.join(option.values))}" if option.values else " -r -F"
     return f"{' '.join(names)}{value} -d {_fish_quote(option.description)}"
 
 
@@ -368,9 +300,7 @@ def _names(options: Sequence[CompletedOption]) -> list[str]:
     return [name for option in options for name in option.names]
 
 
-SCRIPTS: dict[
-    str, Callable[[Sequence[CompletedCommand], Sequence[CompletedOption]], str]
-] = {
+SCRIPTS: dict[str, Callable[[Sequence[CompletedCommand], Sequence[CompletedOption]], str]] = {
     "bash": bash_script,
     "zsh": zsh_script,
     "fish": fish_script,

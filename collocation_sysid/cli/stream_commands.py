@@ -17,13 +17,7 @@ from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
 from ..extras.live import LiveEstimator, LiveOptions, LiveUpdate
 from ..extras.live.sources import read_problem
-from .command_options import (
-    AllowCode,
-    OutputOptions,
-    Overrides,
-    ProblemPath,
-    command,
-)
+from .command_options import AllowCode, OutputOptions, Overrides, ProblemPath, command
 from .common import EXIT_BAD_INPUT, error_console, print_result
 
 if TYPE_CHECKING:
@@ -71,20 +65,14 @@ class LiveEstimationOptions:
 
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
         with SolveProgress(
-            error_console,
-            quiet=getattr(self, "quiet", False),
-            activity=f"reading {recording}",
+            error_console, quiet=getattr(self, "quiet", False), activity=f"reading {recording}"
         ) as progress:
-            problem = read_problem(
-                recording, self.set_ or (), allow_code=self.allow_code
-            )
+            problem = read_problem(recording, self.set_ or (), allow_code=self.allow_code)
             progress.say("preparing the estimator")
             return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
 
     @contextmanager
-    def open_recording(
-        self, estimator: LiveEstimator
-    ) -> Iterator[LiveRecording | None]:
+    def open_recording(self, estimator: LiveEstimator) -> Iterator[LiveRecording | None]:
         """Give the recording of --rerun, which is closed at the end; None without the option."""
         if self.rerun is None:
             yield None
@@ -108,9 +96,7 @@ def processed(
     return update
 
 
-def settled_update(
-    estimator: LiveEstimator, recording: LiveRecording | None
-) -> LiveUpdate | None:
+def settled_update(estimator: LiveEstimator, recording: LiveRecording | None) -> LiveUpdate | None:
     """Return the final update, None without frames, and add it to the recording if there is one."""
     settled = estimator.finish()
     if recording is not None and settled is not None:
@@ -155,9 +141,7 @@ def live(options: LiveCommand) -> None:
         without_garbage_of_startup,
     )
 
-    if (
-        options.udp is None and sys.stdin is None
-    ):  # closed by whoever started the process
+    if options.udp is None and sys.stdin is None:  # closed by whoever started the process
         raise InputError(
             "is closed; expected frames, as in live problem.toml < frames.jsonl, or --udp PORT",
             "standard input",
@@ -174,9 +158,7 @@ def live(options: LiveCommand) -> None:
     else:
         lines = receive_datagrams(options.udp, opened)
         source = f"UDP port {options.udp}"
-    reader = FrameReader.from_model(
-        estimator.model, estimator.problem, source=source
-    )
+    reader = FrameReader.from_model(estimator.model, estimator.problem, source=source)
     bad = 0
     with options.open_recording(estimator) as recording:
         with without_garbage_of_startup():
@@ -228,11 +210,7 @@ def replay(options: ReplayCommand) -> None:
 
     from ..common.display import on_terminal
     from ..extras.live import live_display
-    from ..extras.live.sources import (
-        frames_of_recording,
-        paced_frames,
-        without_garbage_of_startup,
-    )
+    from ..extras.live.sources import frames_of_recording, paced_frames, without_garbage_of_startup
     from ..extras.live.sources import update_as_json as json_line
     from ..result.solve_progress import SolveProgress
 
@@ -246,9 +224,7 @@ def replay(options: ReplayCommand) -> None:
     frames = frames_of_recording(experiment, estimator.model)
     pace = 1.0 / experiment.timestep_s if rate is None else rate
     updates = []
-    watched = (
-        error_console.is_terminal and not options.quiet and not options.as_json
-    )
+    watched = error_console.is_terminal and not options.quiet and not options.as_json
     shown = Live(console=error_console, refresh_per_second=10)
     with options.open_recording(estimator) as recording:
         with without_garbage_of_startup(), shown if watched else nullcontext():
@@ -264,8 +240,6 @@ def replay(options: ReplayCommand) -> None:
     else:
         print_result(live_display.final_display(updates, settled))
     if film is not None:
-        with SolveProgress(
-            error_console, quiet=options.quiet, activity="making the film"
-        ):
+        with SolveProgress(error_console, quiet=options.quiet, activity="making the film"):
             live_display.write_film(updates, film)
         typer.echo(film)

@@ -24,31 +24,12 @@ from ..extras.studies import (
     plan_sweep,
     run_all,
 )
-from ..extras.studies.model_variants import (
-    models,
-    parse_branches,
-    parse_dampings,
-    parse_materials,
-)
-from ..extras.studies.study_arguments import (
-    parse_methods,
-    parse_varied_keys,
-    read_truth,
-)
-from ..extras.studies.study_kinds import (
-    METHOD_STUDY,
-    MODEL_STUDY,
-    STUDY_TITLES,
-    SWEEP_STUDY,
-)
+from ..extras.studies.model_variants import models, parse_branches, parse_dampings, parse_materials
+from ..extras.studies.study_arguments import parse_methods, parse_varied_keys, read_truth
+from ..extras.studies.study_kinds import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
 from ..extras.studies.study_rows import SuccessCriterion
 from ..problem import Problem
-from .command_options import (
-    OutputFolder,
-    OutputOptions,
-    ProblemOptions,
-    command,
-)
+from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
 from .common import error_console, interruption_exit, print_result
 
 commands = typer.Typer()
@@ -105,9 +86,7 @@ def compare_methods(options: CompareMethodsCommand) -> None:
     methods = parse_methods(options.methods)
     problem = options.read_problem()
     free = [item.name for item in problem.parameters.free]
-    truth = read_truth(
-        options.truth or (), problem.parameters.names, needed=free
-    )
+    truth = read_truth(options.truth or (), problem.parameters.names, needed=free)
     planned = plan_comparison(
         problem,
         methods,
@@ -117,10 +96,7 @@ def compare_methods(options: CompareMethodsCommand) -> None:
         allow_code=options.allow_code,
     )
     _run_study(
-        METHOD_STUDY,
-        options,
-        planned=planned,
-        yardstick=SuccessCriterion(truth, options.within),
+        METHOD_STUDY, options, planned=planned, yardstick=SuccessCriterion(truth, options.within)
     )
 
 
@@ -170,50 +146,29 @@ def compare_models(options: CompareModelsCommand) -> None:
 
     Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
-    if not options.with_ and {
-        options.materials,
-        options.damping,
-        options.prony,
-    } == {None}:
-        raise InputError(
-            "no models to compare; expected --materials, --damping, --prony or --with"
-        )
+    if not options.with_ and {options.materials, options.damping, options.prony} == {None}:
+        raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
     from ..result.solve_progress import SolveProgress
 
     method = _single_method(options.method)
     problem = options.read_problem()
-    others = [
-        replace(options, problem=file).read_problem()
-        for file in options.with_ or ()
-    ]
+    others = [replace(options, problem=file).read_problem() for file in options.with_ or ()]
     variants = models(
         [problem, *others],
         options.set_ or (),
-        materials=parse_materials(options.materials)
-        if options.materials is not None
-        else (),
-        branches=parse_branches(options.prony)
-        if options.prony is not None
-        else (),
+        materials=parse_materials(options.materials) if options.materials is not None else (),
+        branches=parse_branches(options.prony) if options.prony is not None else (),
         region=options.region,
-        dampings=parse_dampings(options.damping)
-        if options.damping is not None
-        else (),
+        dampings=parse_dampings(options.damping) if options.damping is not None else (),
     )
     with (
-        SolveProgress(
-            error_console, quiet=options.quiet, activity="reading the models"
-        ),
+        SolveProgress(error_console, quiet=options.quiet, activity="reading the models"),
         counted_phase(StepUnit.PROBLEM, len(variants)),
     ):
         for variant in variants:  # an impossible model would fail every run
-            Problem.read(
-                variant.path, variant.overrides, allow_code=options.allow_code
-            )
+            Problem.read(variant.path, variant.overrides, allow_code=options.allow_code)
             complete_steps(StepUnit.PROBLEM)
-    planned = plan_models(
-        problem, variants, method=method, allow_code=options.allow_code
-    )
+    planned = plan_models(problem, variants, method=method, allow_code=options.allow_code)
     _run_study(MODEL_STUDY, options, planned=planned)
 
 
@@ -249,41 +204,21 @@ def sweep(options: SweepCommand) -> None:
     over = parse_varied_keys(options.over)
     overrides = options.set_ or ()
     planned = plan_sweep(
-        options.problem,
-        over,
-        overrides=overrides,
-        method=method,
-        allow_code=options.allow_code,
+        options.problem, over, overrides=overrides, method=method, allow_code=options.allow_code
     )
     # A missing file would fail every run.
-    with SolveProgress(
-        error_console,
-        quiet=options.quiet,
-        activity=f"reading {options.problem}",
-    ):
-        Problem.read(
-            options.problem,
-            planned[0].overrides,
-            allow_code=options.allow_code,
-        )
+    with SolveProgress(error_console, quiet=options.quiet, activity=f"reading {options.problem}"):
+        Problem.read(options.problem, planned[0].overrides, allow_code=options.allow_code)
     _run_study(SWEEP_STUDY, options, planned=planned)
 
 
 def _single_method(text: str | None) -> str | None:
-    """Return the method named by --method, or None if the option is not used (`text` is None).
-
-    Raises
-    ------
-    InputError
-        For an unknown method, or more than one.
-    """
+    """Return the method named by --method, or None if the option is not used (`text` is None)."""
     if text is None:
         return None
     method, *others = parse_methods(text, "--method")
     if others:
-        raise InputError(
-            f"found {text}; expected one method", None, where="--method"
-        )
+        raise InputError(f"found {text}; expected one method", None, where="--method")
     return method
 
 
@@ -299,22 +234,6 @@ def _run_study(
     are only listed, with those that are finished marked, and nothing is written. Runs that fail do
     not end the study: they are in the tables. Without any record no tables are
     written.
-
-    Parameters
-    ----------
-    kind : {METHOD_STUDY, MODEL_STUDY, SWEEP_STUDY}
-        Kind of study, which is the name of its command and part of its folder's name.
-    options : StudyOptions
-    planned : sequence of PlannedRun
-    yardstick : SuccessCriterion, optional
-        True parameters and tolerance for the success of a run.
-
-    Raises
-    ------
-    typer.Exit
-        After an interrupt, with a message; finished runs are kept.
-    InputError
-        If the folder cannot be made or written in.
     """
     from ..extras.studies.study_page import (
         load_report,
@@ -329,17 +248,10 @@ def _run_study(
     folder = options.out or Path("runs") / f"{name}-{kind}"
     store = RunStore(folder / "runs")
     limits = options.limits
-    finished = [
-        run.key
-        for run in planned
-        if store.load_finished(run.key, limits.time_limit_s)
-    ]
+    finished = [run.key for run in planned if store.load_finished(run.key, limits.time_limit_s)]
     if options.dry_run:
         if options.as_json:
-            listed = [
-                {**run.as_dict(), "finished": run.key in finished}
-                for run in planned
-            ]
+            listed = [{**run.as_dict(), "finished": run.key in finished} for run in planned]
             typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
         else:
             print_result(plan_table(planned, finished))
@@ -351,17 +263,11 @@ def _run_study(
         with StudyProgress(
             error_console, remaining, total=len(planned), quiet=options.quiet
         ) as progress:
-            run_all(
-                remaining, store, options=limits, on_record=progress.count_run
-            )
+            run_all(remaining, store, options=limits, on_record=progress.count_run)
     except KeyboardInterrupt:
         is_complete = False
     report = load_report(
-        f"{STUDY_TITLES[kind]}: {name}",
-        kind,
-        planned=planned,
-        store=store,
-        yardstick=yardstick,
+        f"{STUDY_TITLES[kind]}: {name}", kind, planned=planned, store=store, yardstick=yardstick
     )
     if report.records:
         write_report(report, folder)

@@ -22,12 +22,7 @@ from .common import error_console, print_result
 
 commands = typer.Typer()
 
-TYPE_WORDS = {
-    "number": "number",
-    "integer": "whole number",
-    "string": "text",
-    "object": "table",
-}
+TYPE_WORDS = {"number": "number", "integer": "whole number", "string": "text", "object": "table"}
 
 
 class NewProblemKind(StrEnum):
@@ -56,12 +51,7 @@ class MethodsCommand:
 @command(commands, "methods", "methods interior-point")
 def methods(options: MethodsCommand) -> None:
     """List the methods, or the options of one method: defaults, allowed values and meaning."""
-    from ..methods import (
-        METHODS,
-        method_options_schema,
-        method_summary,
-        require_method,
-    )
+    from ..methods import METHODS, method_options_schema, method_summary, require_method
 
     name = options.name
     if name is not None:
@@ -132,9 +122,7 @@ def explain(options: ExplainCommand) -> None:
         elif console.is_terminal:
             from .markdown import TerminalPage
 
-            console.print(
-                TerminalPage(page_text(topic), hyperlinks=False), crop=False
-            )
+            console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)
         else:
             typer.echo(page_text(topic))
 
@@ -160,10 +148,7 @@ def _key_table(name: str) -> Table:
     """
     from ..problem.key_descriptions import find_keys
 
-    rows = tuple(
-        (each.path, each.form, each.default, each.description)
-        for each in find_keys(name)
-    )
+    rows = tuple((each.path, each.form, each.default, each.description) for each in find_keys(name))
     heads = ("key", "values", "default", "meaning")
     return Table("", heads, rows=rows, names=3, texts=1)
 
@@ -188,10 +173,7 @@ def log(options: LogCommand) -> None:
     from ..recording.formats.topics import list_topics
     from ..result.solve_progress import SolveProgress
 
-    with (
-        SolveProgress(error_console, activity=f"reading {options.log}"),
-        located(options.log),
-    ):
+    with SolveProgress(error_console, activity=f"reading {options.log}"), located(options.log):
         listed = list_topics(options.log)
     if options.as_json:
         typer.echo(as_json(listed))
@@ -211,13 +193,9 @@ def log(options: LogCommand) -> None:
     # Several topics of points have their joint address in common.
     addresses = [
         f"  {address}"
-        for address in dict.fromkeys(
-            address for each in listed for address in each.write
-        )
+        for address in dict.fromkeys(address for each in listed for address in each.write)
     ]
-    what = (
-        ["", "In place of a file name write:", *addresses] if addresses else []
-    )
+    what = ["", "In place of a file name write:", *addresses] if addresses else []
     print_result([Table("", heads, rows=rows, names=2, texts=2), *what])
 
 
@@ -262,9 +240,7 @@ def new(options: NewCommand) -> None:
     kind = options.kind
     if kind is not None and options.dataset is not None:
         raise InputError(
-            "found --kind and --dataset; expected one of them",
-            None,
-            where="--dataset",
+            "found --kind and --dataset; expected one of them", None, where="--dataset"
         )
     if options.dataset is not None:
         file, *data = copy_dataset(options.dataset, folder)
@@ -281,14 +257,9 @@ def new(options: NewCommand) -> None:
     is_empty = kind is None and options.dataset is None
     if options.dataset is not None:
         example = "the problem runs as it is; its comments state the source of the data"
-    error_console.print(
-        f"Next: {yours if is_empty else example}.", soft_wrap=True
-    )
+    error_console.print(f"Next: {yours if is_empty else example}.", soft_wrap=True)
     for next_ in ("check", "solve"):
-        error_console.print(
-            f"  collocation-sysid {next_} {shlex.quote(str(file))}",
-            soft_wrap=True,
-        )
+        error_console.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)
 
 
 def _methods_table() -> Table:
@@ -296,10 +267,7 @@ def _methods_table() -> Table:
     from ..methods import METHODS, method_summary
 
     return Table(
-        "",
-        ("method", ""),
-        rows=tuple((name, method_summary(name)) for name in METHODS),
-        texts=1,
+        "", ("method", ""), rows=tuple((name, method_summary(name)) for name in METHODS), texts=1
     )
 
 
@@ -319,9 +287,7 @@ def _options_table(method: str) -> list[Shown]:
                 f"{_allowed_values_text(option)}\n{option['description']}",
             )
         )
-    table = Table(
-        "", ("option", "default", ""), rows=tuple(rows), names=2, texts=1
-    )
+    table = Table("", ("option", "default", ""), rows=tuple(rows), names=2, texts=1)
     return [
         method_summary(method),
         "",
@@ -335,9 +301,7 @@ def _default_text(option: Mapping[str, Any]) -> str:
     """Return the default of an option as text, from its JSON schema; a tuple in brackets."""
     default = option["default"]
     items = default if isinstance(default, tuple) else [default]
-    text = ", ".join(
-        f"{item:g}" if isinstance(item, float) else str(item) for item in items
-    )
+    text = ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in items)
     return f"[{text}]" if isinstance(default, tuple) else text
 
 
@@ -347,15 +311,10 @@ def _allowed_values_text(option: Mapping[str, Any]) -> str:
     """
     if "enum" in option:
         return ", ".join(
-            each if isinstance(each, str) else json.dumps(each)
-            for each in option["enum"]
+            each if isinstance(each, str) else json.dumps(each) for each in option["enum"]
         )
     if option["type"] == "array":
         return f"list, each a {_allowed_values_text(option['items'])}"
     limits = {"exclusiveMinimum": "above", "minimum": "of at least"}
-    ranges = [
-        f" {word} {option[key]:g}"
-        for key, word in limits.items()
-        if key in option
-    ]
+    ranges = [f" {word} {option[key]:g}" for key, word in limits.items() if key in option]
     return TYPE_WORDS[option["type"]] + "".join(ranges)

@@ -23,9 +23,7 @@ LARGEST_COMPRESSION = 250
 # Part of the memory that one array may take; what is made of it takes several times as much.
 MEMORY_SHARE = 0.25
 
-_HEADERS: dict[
-    tuple[int, int], Callable[[Any], tuple[tuple[int, ...], bool, np.dtype]]
-] = {
+_HEADERS: dict[tuple[int, int], Callable[[Any], tuple[tuple[int, ...], bool, np.dtype]]] = {
     (1, 0): npy.read_array_header_1_0,
     (2, 0): npy.read_array_header_2_0,
 }
@@ -49,10 +47,7 @@ def load_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
                 with archive.open(member) as content:
                     name = member.filename.removesuffix(".npy")
                     _require_size(
-                        content,
-                        member.file_size,
-                        compressed=member.compress_size,
-                        name=name,
+                        content, member.file_size, compressed=member.compress_size, name=name
                     )
     with np.load(path, allow_pickle=False) as stored:
         return {name: np.asarray(stored[name]) for name in stored.files}
@@ -74,41 +69,19 @@ def load_array(path: str | Path) -> NDArray[Any]:
     return np.load(path, allow_pickle=False)
 
 
-def _require_size(
-    content: IO[bytes], size: int, compressed: int, name: str
-) -> None:
+def _require_size(content: IO[bytes], size: int, compressed: int, name: str) -> None:
     """Refuse an array if its header states more than is plausible.
 
     It is refused if it is larger than its content; and, above `SMALL_BYTES`, if it is compressed
     more than `LARGEST_COMPRESSION`-fold or takes more than `MEMORY_SHARE` of this machine's memory
     (if known). An array in version 3 of the format is not checked.
-
-    Parameters
-    ----------
-    content : binary file
-        Positioned at the beginning of the array; its header is consumed.
-    size : int
-        Bytes of the array's content, decompressed, including the header.
-    compressed : int
-        Bytes that it takes in the file.
-    name : str
-        Name for the message; "" for the only array of a file.
-
-    Raises
-    ------
-    InputError
-        If the array is refused.
-    ValueError
-        If the content does not begin with the header of an array.
     """
     version = npy.read_magic(content)
     if version not in _HEADERS:  # for names of columns that are not Latin
         return
     shape, _, dtype = _HEADERS[version](content)
     stored_bytes = math.prod(shape) * dtype.itemsize
-    array = (
-        f"the array {name or 'in it'} {shape} takes {stored_bytes / 1e9:.3g} GB"
-    )
+    array = f"the array {name or 'in it'} {shape} takes {stored_bytes / 1e9:.3g} GB"
     if stored_bytes > size:
         raise InputError(
             f"{array} according to its header, but the file has only {size:,} bytes of it; "

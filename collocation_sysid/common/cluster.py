@@ -35,9 +35,7 @@ def connected(scheduler: Any) -> Iterator[Any]:
     """
     dask = distributed()
     try:
-        client = dask.Client(
-            scheduler, timeout=CONNECT_WITHIN_S, set_as_default=False
-        )
+        client = dask.Client(scheduler, timeout=CONNECT_WITHIN_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
             f"found {scheduler!r}, where no scheduler answers ({error}); expected an "
@@ -50,9 +48,7 @@ def connected(scheduler: Any) -> Iterator[Any]:
     try:
         yield client
     except BaseException:
-        with suppress(
-            Exception
-        ):  # of a scheduler that was lost, which is not the reason
+        with suppress(Exception):  # of a scheduler that was lost, which is not the reason
             client.close()
         raise
     client.close()

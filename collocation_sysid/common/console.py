@@ -33,11 +33,7 @@ class PlainConsole(Console):
         control segments are unchanged.
         """
         for segment in super().render(renderable, options):
-            yield (
-                segment
-                if segment.control
-                else segment._replace(text=printable(segment.text))
-            )
+            yield (segment if segment.control else segment._replace(text=printable(segment.text)))
 
 
 class Watched:
@@ -60,17 +56,11 @@ class Watched:
         If false, do not update in place, also on a terminal.
     """
 
-    def __init__(
-        self, console: Console, quiet: bool = False, live: bool = True
-    ) -> None:
+    def __init__(self, console: Console, quiet: bool = False, live: bool = True) -> None:
         self.console = console
         self.quiet = quiet
         shown = console.is_terminal and live and not quiet
-        self._live = (
-            Live(console=console, refresh_per_second=8, transient=True)
-            if shown
-            else None
-        )
+        self._live = Live(console=console, refresh_per_second=8, transient=True) if shown else None
 
     def __enter__(self) -> Self:
         if self._live is not None:

@@ -89,9 +89,7 @@ def key(
     return field(metadata={**own, **(metadata or {})}, **field_options)
 
 
-@dataclass_transform(
-    frozen_default=True, eq_default=False, field_specifiers=(key, field)
-)
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(key, field))
 def declaration(kind: type[T]) -> type[T]:
     """Return the class as a frozen dataclass, compared by identity, whose fields are converted and
     validated before ``__post_init__``.
@@ -127,18 +125,13 @@ def _accepted_type(field: Field[Any]) -> Any:
     """
     if (converter := field.metadata.get("converter")) is not None:
         return Annotated[
-            Any,
-            PlainValidator(
-                lambda value: value if value is None else converter(value)
-            ),
+            Any, PlainValidator(lambda value: value if value is None else converter(value))
         ]
     form = field.metadata.get("form")
     if form is None:
         return Any
 
-    def unless_default(
-        value: Any, validated: ValidatorFunctionWrapHandler
-    ) -> Any:
+    def unless_default(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
         """Return None and the default value unchanged, other values validated."""
         is_default = isinstance(value, type(field.default))
         if value is None or (is_default and value == field.default):
@@ -152,9 +145,7 @@ def _refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
     """Return the error of a converter or of ``__post_init__``; or an `InputError` that names the
     object and the invalid field. See `validated_classes.Refusal` for the arguments.
     """
-    field = (
-        fault["loc"] and type(instance).__dataclass_fields__[fault["loc"][0]]
-    )
+    field = fault["loc"] and type(instance).__dataclass_fields__[fault["loc"][0]]
     if not field or field.metadata.get("converter") is not None:
         error = fault["ctx"]["error"]
     else:
@@ -165,18 +156,12 @@ def _refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
     return error.located(where=where).with_traceback(error.__traceback__)
 
 
-def _form_refusal(
-    instance: Any, fault: Mapping[str, Any], form: Any
-) -> InputError:
+def _form_refusal(instance: Any, fault: Mapping[str, Any], form: Any) -> InputError:
     """Return the error for a value that does not have the form of its field."""
     called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
     word = getattr(instance, "description_name", called)
     what, value = faulty_entry(instance, fault)
-    whose = (
-        f"the {word} {instance.name!r}"
-        if hasattr(instance, "name")
-        else f"a {word}"
-    )
+    whose = f"the {word} {instance.name!r}" if hasattr(instance, "name") else f"a {word}"
     of = what if hasattr(instance, "description") else f"{what} of {whose}"
     shown = f"{value:g}" if isinstance(value, float) else repr(value)
     choices = fault["type"] == "literal_error" and get_args(form)

@@ -18,13 +18,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from rich.cells import cell_len
-from rich.console import (
-    Console,
-    ConsoleOptions,
-    Group,
-    RenderableType,
-    RenderResult,
-)
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -33,17 +27,9 @@ from .console import PlainConsole
 from .files import is_own
 from .serialisation import optional
 
-COLOURS = {
-    "good": "green",
-    "check": "yellow",
-    "doubtful": "red",
-    "strong": "bold",
-    "quiet": "dim",
-}
+COLOURS = {"good": "green", "check": "yellow", "doubtful": "red", "strong": "bold", "quiet": "dim"}
 # Markup of Markdown: anywhere in a text, at its beginning, and as the number of a list item.
-MARKUP = re.compile(
-    r"[\\`*\[\]|~]|<(?=[A-Za-z/!?])|&(?=#?\w+;)|(?<![^\W_])_|_(?![^\W_])"
-)
+MARKUP = re.compile(r"[\\`*\[\]|~]|<(?=[A-Za-z/!?])|&(?=#?\w+;)|(?<![^\W_])_|_(?![^\W_])")
 MARKUP_AT_START = re.compile(r"^(?:#(?=#*(?:\s|$))|[-+](?=[-\s]|$)|[=>])")
 NUMBER_AT_START = re.compile(r"^(\d{1,9})(?=[.)](?:\s|$))")
 BACKTICKS = re.compile(r"`+")
@@ -125,13 +111,9 @@ class Table:
     note_column: int | None = optional()
 
     def __post_init__(self) -> None:
-        columns = {len(row) for row in self.rows} | (
-            {len(self.heads)} if self.heads else set()
-        )
+        columns = {len(row) for row in self.rows} | ({len(self.heads)} if self.heads else set())
         if len(columns) > 1:
-            raise ValueError(
-                f"the table {self.title!r} has rows of another length"
-            )
+            raise ValueError(f"the table {self.title!r} has rows of another length")
 
     def is_number(self, column: int) -> bool:
         """Return whether the column with this index contains numbers: neither one of the `names`
@@ -192,11 +174,7 @@ Shown = str | Line | Items | Table | Cards | Picture | Listing | TitledParts
 def flattened_parts(parts: Iterable[Shown]) -> Iterator[Shown]:
     """Yield the parts of all sections, also nested ones, without their titles."""
     for part in parts:
-        yield from (
-            flattened_parts(part.parts)
-            if isinstance(part, TitledParts)
-            else (part,)
-        )
+        yield from (flattened_parts(part.parts) if isinstance(part, TitledParts) else (part,))
 
 
 def own_pictures(folder: Path) -> list[Path]:
@@ -224,11 +202,7 @@ def millimetres(metres: float | None) -> str:
     """Return a length [m] in millimetres with three significant digits and its unit; a dash for
     None, NaN and infinity.
     """
-    return (
-        "–"
-        if metres is None or not isfinite(metres)
-        else f"{1e3 * metres:.3g} mm"
-    )
+    return "–" if metres is None or not isfinite(metres) else f"{1e3 * metres:.3g} mm"
 
 
 def duration(time_s: float | None) -> str:
@@ -248,10 +222,7 @@ def labelled(title: str, rows: dict[str, str]) -> Table:
     spaces.
     """
     return Table(
-        title,
-        (),
-        rows=tuple((f"  {name} ", text) for name, text in rows.items()),
-        texts=1,
+        title, (), rows=tuple((f"  {name} ", text) for name, text in rows.items()), texts=1
     )
 
 
@@ -277,11 +248,7 @@ def plain_text(parts: Shown | Iterable[Shown], width: int = WIDE) -> str:
     # Without these options rich would display the text in a Jupyter notebook, instead of writing
     # it to the file, and FORCE_COLOR would add colours.
     console = PlainConsole(
-        file=file,
-        width=width,
-        force_jupyter=False,
-        force_terminal=False,
-        color_system=None,
+        file=file, width=width, force_jupyter=False, force_terminal=False, color_system=None
     )
     console.print(on_terminal(parts), crop=False)
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
@@ -293,20 +260,14 @@ def _on_terminal(part: Shown) -> RenderableType:
         case str():
             return _text(part)
         case Line():
-            pieces = (
-                (span.text, _colour(span.style)) for span in part.to_spans()
-            )
-            return UnbrokenWords(
-                Text.assemble(*pieces, style=_colour(part.style))
-            )
+            pieces = ((span.text, _colour(span.style)) for span in part.to_spans())
+            return UnbrokenWords(Text.assemble(*pieces, style=_colour(part.style)))
         case Items():
             return _text("\n".join(f"- {text}" for text in part.texts))
         case Table():
             return _titled(part.title, TerminalTable(part))
         case Cards():
-            rows = tuple(
-                (what, f"{value} ({note})") for what, value, note in part.items
-            )
+            rows = tuple((what, f"{value} ({note})") for what, value, note in part.items)
             return TerminalTable(Table("", (), rows=rows, texts=1))
         case Picture():
             return _text(f"{part.caption} {part.file}")
@@ -332,9 +293,7 @@ class UnbrokenWords:
 
     text: Text
 
-    def __rich_console__(
-        self, console: Console, options: ConsoleOptions
-    ) -> RenderResult:
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the lines of the text, wrapped between words to the
         width of the console, for rich.
         """
@@ -365,63 +324,32 @@ class TerminalTable:
 
     table: Table
 
-    def __rich_console__(
-        self, console: Console, options: ConsoleOptions
-    ) -> RenderResult:
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the table as one of rich, in the form that suits the console."""
         yield _rich_table(self.table, parted=console.is_terminal)
 
 
 def _rich_table(table: Table, *, parted: bool) -> RichTable:
-    """Return a table as rich's, without its last `note_column` columns.
-
-    Parameters
-    ----------
-    table : Table
-        The table; its title is not shown.
-    parted : bool
-        If true, headings may be broken: those of numbers at hyphens if there are more than `MANY`
-        columns, other ones at their first dot. If false, line feeds in cells become "; ".
-    """
+    """Return a table as rich's, without its last `note_column` columns."""
     # Without headings, names are set close to their texts.
-    shown = (
-        RichTable(box=None, pad_edge=False)
-        if table.heads
-        else RichTable.grid(padding=(0, 1))
-    )
-    columns = (len(table.heads) or max(map(len, table.rows), default=0)) - (
-        table.note_column or 0
-    )
+    shown = RichTable(box=None, pad_edge=False) if table.heads else RichTable.grid(padding=(0, 1))
+    columns = (len(table.heads) or max(map(len, table.rows), default=0)) - (table.note_column or 0)
     for place, head in enumerate((table.heads or ("",) * columns)[:columns]):
         number = table.is_number(place)
         cells = [row[place] for row in table.rows if place < len(row)]
         if not parted:
             pass
-        elif (
-            number and columns > MANY
-        ):  # names of materials are parted where they have a hyphen
+        elif number and columns > MANY:  # names of materials are parted where they have a hyphen
             head = head.replace("-", "-\n")
         elif not number:  # dotted keys may take two lines
             head = head.replace(".", ".\n", 1)
-        fills_width = place == 0 and (table.texts or 0) > (
-            table.note_column or 0
-        )
+        fills_width = place == 0 and (table.texts or 0) > (table.note_column or 0)
         side = "right" if number else "left"
-        longest_word = max(
-            map(cell_len, " ".join((head, *cells)).split()), default=0
-        )
-        shown.add_column(
-            head, justify=side, min_width=longest_word, no_wrap=fills_width
-        )
+        longest_word = max(map(cell_len, " ".join((head, *cells)).split()), default=0)
+        shown.add_column(head, justify=side, min_width=longest_word, no_wrap=fills_width)
     for row in table.rows:
-        cells = (
-            row[:columns]
-            if parted
-            else (cell.replace("\n", "; ") for cell in row[:columns])
-        )
-        shown.add_row(
-            *(Text(cell, style=_colour(table.style or "")) for cell in cells)
-        )
+        cells = row[:columns] if parted else (cell.replace("\n", "; ") for cell in row[:columns])
+        shown.add_row(*(Text(cell, style=_colour(table.style or "")) for cell in cells))
     return shown
 
 
@@ -458,9 +386,7 @@ def as_html(part: Shown) -> str:
         case Picture():
             content = part.file.read_bytes()
             caption = escape(part.caption)
-            wide = _class(
-                "wide" if int.from_bytes(content[16:20]) > WIDE_PX else ""
-            )  # its header
+            wide = _class("wide" if int.from_bytes(content[16:20]) > WIDE_PX else "")  # its header
             data = f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}"
             return (
                 f'<figure><div class="scroll"><img{wide} src="{data}" alt="{caption}"></div>\n'
@@ -474,9 +400,7 @@ def as_html(part: Shown) -> str:
             inner = "".join(map(as_html, part.parts))
             if part.style:
                 return f"<div{_class(part.style)}>\n{inner}</div>\n"
-            return (
-                f"<h{part.level}>{escape(part.title)}</h{part.level}>\n{inner}"
-            )
+            return f"<h{part.level}>{escape(part.title)}</h{part.level}>\n{inner}"
 
 
 def escape(text: str) -> str:
@@ -540,46 +464,26 @@ def _markdown(part: Shown) -> str:
         case Line():
             return "".join(map(_markdown_span, part.to_spans()))
         case Items():
-            return "\n".join(
-                f"- {escape_markdown(text)}" for text in part.texts
-            )
+            return "\n".join(f"- {escape_markdown(text)}" for text in part.texts)
         case Table():
-            columns = range(
-                len(part.heads) or max(map(len, part.rows), default=0)
-            )
+            columns = range(len(part.heads) or max(map(len, part.rows), default=0))
             heads = part.heads or ("",) * len(columns)
-            rule = tuple(
-                "---:" if part.is_number(k) else "---" for k in columns
-            )
-            head, *rows = (
-                map(escape_markdown, line) for line in (heads, *part.rows)
-            )
-            table = "\n".join(
-                f"| {' | '.join(line)} |" for line in (head, rule, *rows)
-            )
-            return (
-                f"## {escape_markdown(part.title)}\n\n{table}"
-                if part.title
-                else table
-            )
+            rule = tuple("---:" if part.is_number(k) else "---" for k in columns)
+            head, *rows = (map(escape_markdown, line) for line in (heads, *part.rows))
+            table = "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *rows))
+            return f"## {escape_markdown(part.title)}\n\n{table}" if part.title else table
         case Cards():
-            cards = (
-                f"{what}: {value} ({note})" for what, value, note in part.items
-            )
+            cards = (f"{what}: {value} ({note})" for what, value, note in part.items)
             return "\n".join(f"- {escape_markdown(card)}" for card in cards)
         case Picture():
-            return (
-                f"![{escape_markdown(part.caption)}]({quote(part.file.name)})"
-            )
+            return f"![{escape_markdown(part.caption)}]({quote(part.file.name)})"
         case Listing():
             fence = _longer_than_any("```", part.text)
             return f"{escape_markdown(part.title)}:\n\n{fence}\n{printable(part.text)}\n{fence}"
         case TitledParts():
             heading = f"{'#' * part.level} {escape_markdown(part.title)}"
             title = heading if part.title else ""
-            return "\n\n".join(
-                filter(None, (title, *map(_markdown, part.parts)))
-            )
+            return "\n\n".join(filter(None, (title, *map(_markdown, part.parts))))
 
 
 def escape_markdown(text: str) -> str:

@@ -16,15 +16,11 @@ def attributes(kind: type) -> dict[str, tuple[str, str]]:
     descriptions: dict[str, tuple[str, str]] = {}
     for base in reversed(kind.__mro__):
         text = inspect.cleandoc(base.__doc__ or "")
-        section = re.split(
-            "^(?:Attributes|Parameters)\n-+\n", text, maxsplit=1, flags=re.M
-        )[-1]
+        section = re.split("^(?:Attributes|Parameters)\n-+\n", text, maxsplit=1, flags=re.M)[-1]
         for names, form, text in re.findall(
             r"^(\w[\w, ]*) : (.*)\n((?: +.*(?:\n|$))+)", section, re.M
         ):
-            descriptions |= dict.fromkeys(
-                names.split(", "), (form, " ".join(text.split()))
-            )
+            descriptions |= dict.fromkeys(names.split(", "), (form, " ".join(text.split())))
     return descriptions
 
 
@@ -34,7 +30,5 @@ def documented(kind: type) -> dict[str, str]:
     """
     descriptions = attributes(kind)
     return {
-        each.name: descriptions[each.name][1]
-        for each in fields(kind)
-        if each.name in descriptions
+        each.name: descriptions[each.name][1] for each in fields(kind) if each.name in descriptions
     }

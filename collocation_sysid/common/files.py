@@ -67,9 +67,7 @@ def require_regular(path: str | Path, where: str | None = None) -> None:
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         kind = "a pipe" if stat.S_ISFIFO(mode) else "a device or socket"
-        raise InputError(
-            f"this is {kind}; expected a regular file", path, where=where
-        )
+        raise InputError(f"this is {kind}; expected a regular file", path, where=where)
 
 
 def is_own(folder: Path, file: Path) -> bool:
@@ -77,9 +75,7 @@ def is_own(folder: Path, file: Path) -> bool:
     it does not exist, or is a link to a file elsewhere.
     """
     try:
-        return file.is_file() and file.resolve().is_relative_to(
-            folder.resolve()
-        )
+        return file.is_file() and file.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError):  # links in a circle
         return False
 
@@ -112,14 +108,10 @@ def require_run_folder(path: Path) -> None:
         Naming the folder of the file if that is a run folder.
     """
     if path.is_file():
-        raise _file_instead_of_folder(
-            path, "a run folder", expected_file=RESULT_FILE
-        )
+        raise _file_instead_of_folder(path, "a run folder", expected_file=RESULT_FILE)
 
 
-def _file_instead_of_folder(
-    path: Path, what: str, expected_file: str
-) -> InputError:
+def _file_instead_of_folder(path: Path, what: str, expected_file: str) -> InputError:
     """Return the error for a file where `what` is expected; it suggests the folder of the file if
     that has a file `expected_file`.
     """
@@ -148,22 +140,13 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except NotADirectoryError:
-        raise _file_instead_of_folder(
-            file.parent, what, expected_file=file.name
-        ) from None
+        raise _file_instead_of_folder(file.parent, what, expected_file=file.name) from None
     except FileNotFoundError:
-        raise InputError(
-            f"this is not {what}: it has no {file.name}", file.parent
-        ) from None
+        raise InputError(f"this is not {what}: it has no {file.name}", file.parent) from None
     except (OSError, ValueError, RecursionError, MemoryError) as error:
-        raise InputError(
-            f"{file.name} is damaged ({reason(error)}){AGAIN}", file.parent
-        ) from error
+        raise InputError(f"{file.name} is damaged ({reason(error)}){AGAIN}", file.parent) from error
     if not isinstance(content, dict):
-        raise InputError(
-            f"{file.name} is damaged: it contains no JSON object{AGAIN}",
-            file.parent,
-        )
+        raise InputError(f"{file.name} is damaged: it contains no JSON object{AGAIN}", file.parent)
     if (schema := content.get("schema")) != SCHEMA:
         message = (
             f"{file.name} has schema {str(schema)[:20]}; expected {SCHEMA}, which this version "
@@ -198,9 +181,7 @@ def damage_refused(folder: Path, files: str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except DAMAGE as error:
-        raise InputError(
-            f"{files} is damaged ({reason(error)}); {remedy}", folder
-        ) from error
+        raise InputError(f"{files} is damaged ({reason(error)}); {remedy}", folder) from error
 
 
 def safe_name(text: str) -> str:
@@ -228,9 +209,7 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
         the block.
     """
     target = Path(path)
-    draft = target.with_name(
-        f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}"
-    )
+    draft = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}")
     try:
         with naming(target, draft):
             if target.exists() and not target.is_file():
@@ -277,22 +256,14 @@ def naming(target: Path, draft: Path) -> Iterator[None]:
 def reason(error: BaseException) -> str:
     """Return type and message of an error on one line of at most `LONGEST_REASON` characters."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
-    return (
-        text
-        if len(text) <= LONGEST_REASON
-        else f"{text[: LONGEST_REASON - 1]}…"
-    )
+    return text if len(text) <= LONGEST_REASON else f"{text[: LONGEST_REASON - 1]}…"
 
 
 def run_name(problem: Path) -> str:
     """Return the name of a problem file's runs: that of its folder if the file is called
     problem.toml, else the file's without its ending.
     """
-    return (
-        problem.resolve().parent.name
-        if problem.stem == "problem"
-        else problem.stem
-    )
+    return problem.resolve().parent.name if problem.stem == "problem" else problem.stem
 
 
 def require_possible(folder: Path) -> None:
@@ -308,11 +279,8 @@ def require_possible(folder: Path) -> None:
         if place.is_dir():
             if not os.access(place, os.W_OK):
                 raise InputError(
-                    "this folder is not writable; expected one that is: choose another",
-                    place,
+                    "this folder is not writable; expected one that is: choose another", place
                 )
             return
         if place.exists():
-            raise InputError(
-                "this is a file; expected a folder: choose another path", place
-            )
+            raise InputError("this is a file; expected a folder: choose another path", place)

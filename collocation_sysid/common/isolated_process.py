@@ -93,10 +93,7 @@ READING_MB_PER_MB = 60.0
 
 
 def run_isolated(
-    code: str,
-    *words: str,
-    limits: ProcessLimits | None = None,
-    **arrays: ArrayLike,
+    code: str, *words: str, limits: ProcessLimits | None = None, **arrays: ArrayLike
 ) -> dict[str, NDArray]:
     """Run Python code in another process, in a temporary folder, and return the arrays that it
     makes.
@@ -127,8 +124,7 @@ def run_isolated(
         ""
         if limits is None
         else _LIMIT.format(
-            memory_bytes=int(1e6 * limits.memory_mb),
-            time_s=math.ceil(limits.time_s),
+            memory_bytes=int(1e6 * limits.memory_mb), time_s=math.ceil(limits.time_s)
         )
     )
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
@@ -136,28 +132,17 @@ def run_isolated(
         np.savez(folder / "given.npz", allow_pickle=False, **arrays)
         try:
             done = subprocess.run(
-                [
-                    sys.executable,
-                    "-c",
-                    _WRAPPER.format(limit=limit, code=code),
-                    *words,
-                ],
+                [sys.executable, "-c", _WRAPPER.format(limit=limit, code=code), *words],
                 cwd=folder,
                 capture_output=True,
                 text=True,
                 errors="replace",
-                timeout=None
-                if limits is None
-                else (WAITING_FACTOR * limits.time_s),
+                timeout=None if limits is None else (WAITING_FACTOR * limits.time_s),
             )
         except subprocess.TimeoutExpired as late:
-            raise Failed(
-                f"the process was not finished after {late.timeout:.3g} s"
-            ) from None
+            raise Failed(f"the process was not finished after {late.timeout:.3g} s") from None
         if done.returncode:
-            if limits is not None and done.returncode == -getattr(
-                signal, "SIGXCPU", 0
-            ):
+            if limits is not None and done.returncode == -getattr(signal, "SIGXCPU", 0):
                 raise Failed(
                     f"the process was not finished after {limits.time_s:.3g} s of processor time"
                 )

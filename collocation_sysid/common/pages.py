@@ -14,9 +14,7 @@ _IN_CHECKOUT = Path(__file__).parents[2] / "docs"
 # Pages that Sphinx alone can show: lists of links and of names.
 _FOR_SPHINX = ("index", "api")
 # Label and topic of a link; the topic is empty where the link is to a section of the same page.
-_LINK_TO_PAGE = re.compile(
-    r"\[([^\]]*)\]\((?:(?:[\w.-]+/)*(\w+)\.md(?:#[\w-]*)?|#[\w-]+)\)"
-)
+_LINK_TO_PAGE = re.compile(r"\[([^\]]*)\]\((?:(?:[\w.-]+/)*(\w+)\.md(?:#[\w-]*)?|#[\w-]+)\)")
 
 
 def documentation_folder() -> Path:
@@ -34,14 +32,9 @@ def page_files() -> dict[str, Path]:
     Pages for Sphinx alone (`_FOR_SPHINX`) are left out. The dictionary is empty where neither a
     wheel nor a checkout is installed.
     """
-    files = (
-        *documentation_folder().glob("howto/*.md"),
-        *documentation_folder().glob("*.md"),
-    )
+    files = (*documentation_folder().glob("howto/*.md"), *documentation_folder().glob("*.md"))
     return {
-        file.stem: file
-        for file in sorted(files, key=_topic)
-        if _topic(file) not in _FOR_SPHINX
+        file.stem: file for file in sorted(files, key=_topic) if _topic(file) not in _FOR_SPHINX
     }
 
 
@@ -84,9 +77,7 @@ def page_text(topic: str) -> str:
             return f"{label or page_title(other)} (`explain {other}`)"
         return label if other in (None, topic) else link[0]
 
-    return _LINK_TO_PAGE.sub(
-        named, page_files()[topic].read_text(encoding="utf-8")
-    )
+    return _LINK_TO_PAGE.sub(named, page_files()[topic].read_text(encoding="utf-8"))
 
 
 def explain_command(*topics: str) -> str:
@@ -108,11 +99,7 @@ def page_url(topic: str) -> str | None:
     base = documentation_url()
     if base is None:
         return None
-    page = (
-        page_files()[topic]
-        .relative_to(documentation_folder())
-        .with_suffix(".html")
-    )
+    page = page_files()[topic].relative_to(documentation_folder()).with_suffix(".html")
     return f"{base}/{page.as_posix()}"
 
 
@@ -123,12 +110,8 @@ def documentation_url() -> str | None:
     from importlib.metadata import PackageNotFoundError, metadata  # slow
 
     try:
-        project_urls = (
-            metadata("collocation-sysid").get_all("Project-URL") or []
-        )
+        project_urls = metadata("collocation-sysid").get_all("Project-URL") or []
     except PackageNotFoundError:
         return None
     urls = dict(each.split(", ", 1) for each in project_urls)
-    return (
-        urls["Documentation"].rstrip("/") if "Documentation" in urls else None
-    )
+    return urls["Documentation"].rstrip("/") if "Documentation" in urls else None

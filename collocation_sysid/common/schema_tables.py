@@ -6,13 +6,7 @@ import inspect
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Discriminator,
-    GetCoreSchemaHandler,
-    Tag,
-)
+from pydantic import BaseModel, ConfigDict, Discriminator, GetCoreSchemaHandler, Tag
 
 from ..errors import located
 from .declarations import keys_of
@@ -35,16 +29,12 @@ class ByForm:
 
     first: type | tuple[type, ...]
 
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> Any:
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
         first, second = get_args(source)
         forms = Union[  # noqa: UP007
             Annotated[first, Tag("<first>")], Annotated[second, Tag("<second>")]
         ]
-        return handler.generate_schema(
-            Annotated[forms, Discriminator(self._tag)]
-        )
+        return handler.generate_schema(Annotated[forms, Discriminator(self._tag)])
 
     def _tag(self, value: Any) -> str:
         """Return the tag of the form that a value has."""
@@ -57,9 +47,7 @@ class Among:
 
     words: tuple[str, ...]
 
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> Any:
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
         return handler.generate_schema(Literal[self.words])
 
 
@@ -76,9 +64,7 @@ class Section(BaseModel):
         for name, (_, description) in attributes(cls).items():
             if name in cls.model_fields:
                 cls.model_fields[name].description = description
-        text = inspect.cleandoc(cls.__doc__ or "").partition(
-            "\n\nAttributes\n"
-        )[0]
+        text = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
         summary, gap, details = text.partition("\n\n")
         cls.__doc__ = " ".join(summary.split("\n")) + gap + details
 
@@ -127,6 +113,4 @@ def require_one(section: Section, *names: str) -> None:
     there = used_keys(section, *names)
     if len(there) != 1:
         which = " and ".join(there) or f"no {' or '.join(names)}"
-        raise ValueError(
-            f"found {which}; expected exactly one of {', '.join(names)}"
-        )
+        raise ValueError(f"found {which}; expected exactly one of {', '.join(names)}")

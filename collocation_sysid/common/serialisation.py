@@ -14,15 +14,7 @@ from dataclasses import Field, field, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from math import isfinite, nan
-from typing import (
-    Any,
-    Literal,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -46,20 +38,9 @@ def content(value: Any) -> Any:
     """
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: getattr(value, f.name) for f in fields(value)}
-        own |= {
-            name: getattr(value, name)
-            for name in getattr(value, "SERIALISED_PROPERTIES", ())
-        }
-        omitted = {
-            f.name
-            for f in fields(value)
-            if _is_optional(f) and own[f.name] is None
-        }
-        return {
-            name: content(each)
-            for name, each in own.items()
-            if name not in omitted
-        }
+        own |= {name: getattr(value, name) for name in getattr(value, "SERIALISED_PROPERTIES", ())}
+        omitted = {f.name for f in fields(value) if _is_optional(f) and own[f.name] is None}
+        return {name: content(each) for name, each in own.items() if name not in omitted}
     if isinstance(value, Mapping):
         return {key: content(each) for key, each in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
@@ -120,12 +101,8 @@ def read(kind: Any, content: Any) -> Any:
     """
     if is_dataclass(kind):
         hints = _hints(kind)
-        there = (
-            f for f in fields(kind) if not _is_optional(f) or f.name in content
-        )
-        return kind(
-            **{f.name: read(hints[f.name], content[f.name]) for f in there}
-        )  # type: ignore
+        there = (f for f in fields(kind) if not _is_optional(f) or f.name in content)
+        return kind(**{f.name: read(hints[f.name], content[f.name]) for f in there})  # type: ignore
     origin = get_origin(kind)
     inner = get_args(kind)
     if origin in (Union, types.UnionType):
@@ -135,9 +112,7 @@ def read(kind: Any, content: Any) -> Any:
         return np.array(content, dtype=float)
     if origin is tuple:
         kinds = [inner[0]] * len(content) if inner[-1] is ... else inner
-        return tuple(
-            read(one, each) for one, each in zip(kinds, content, strict=True)
-        )
+        return tuple(read(one, each) for one, each in zip(kinds, content, strict=True))
     if origin in (dict, Mapping):
         return {key: read(inner[1], each) for key, each in content.items()}
     if origin is Sequence:
@@ -146,9 +121,7 @@ def read(kind: Any, content: Any) -> Any:
     wrong |= kind in (str, bool, int) and type(content) is not kind
     if kind is float:
         content = nan if content is None else content
-        wrong = type(content) not in (int, float) or abs(content) == float(
-            "inf"
-        )
+        wrong = type(content) not in (int, float) or abs(content) == float("inf")
     if wrong:
         raise TypeError(f"found {str(content)[:40]!r}; expected {kind}")
     return float(content) if kind is float else content

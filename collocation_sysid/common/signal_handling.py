@@ -41,13 +41,6 @@ class Interrupts:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise `KeyboardInterrupt`, or defer the signal if `frame`, which it interrupted, is
         within an import or a `deferred` block.
-
-        Parameters
-        ----------
-        number : int
-            Number of the signal.
-        frame : frame or None
-            Frame that was interrupted; None if there is none.
         """
         is_second = self._timer is not None and not self._tries_again
         self._tries_again = False
@@ -137,9 +130,7 @@ def leave(code: object) -> NoReturn:
     If a thread with the name `ABANDONED_THREAD` is still inside library code that would crash at
     exit, streams are flushed and the process ends without cleaning up; otherwise by `SystemExit`.
     """
-    if not any(
-        thread.name == ABANDONED_THREAD for thread in threading.enumerate()
-    ):
+    if not any(thread.name == ABANDONED_THREAD for thread in threading.enumerate()):
         sys.exit(code if isinstance(code, int) else 1)
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):

@@ -56,12 +56,8 @@ class _Phase:
     completed: float = 0.0
 
 
-_listener: ContextVar[ShareListener | None] = ContextVar(
-    "share_listener", default=None
-)
-_state_listener: ContextVar[StateListener | None] = ContextVar(
-    "state_listener", default=None
-)
+_listener: ContextVar[ShareListener | None] = ContextVar("share_listener", default=None)
+_state_listener: ContextVar[StateListener | None] = ContextVar("state_listener", default=None)
 _activity_listener: ContextVar[ActivityListener | None] = ContextVar(
     "activity_listener", default=None
 )

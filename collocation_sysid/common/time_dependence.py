@@ -1,7 +1,7 @@
 """Fields of dataclasses that depend on time: selection of times, interpolation, scaling of loads.
 
-Mark the fields of a class by their metadata, `over_time()`, `LOAD` or `PARTS_OVER_TIME`; `at_times`,
-`interpolate_in_time`, `scale_loads` and `values_over_time` then work for its instances.
+Mark the fields of a class by their metadata, `over_time()`, `LOAD` or `PARTS_OVER_TIME`;
+`at_times`, `interpolate_in_time`, `scale_loads` and `values_over_time` then work for its instances.
 """
 
 from __future__ import annotations
@@ -40,9 +40,7 @@ class TimeDependence:
     has_parts: bool = False
 
 
-def over_time(
-    axis: int = 0, *, is_load: bool = False
-) -> Mapping[str, TimeDependence]:
+def over_time(axis: int = 0, *, is_load: bool = False) -> Mapping[str, TimeDependence]:
     """Return the metadata of a field whose value is an array with one entry for each time along an
     axis, or None.
 
@@ -111,9 +109,7 @@ def interpolate_in_time(before: T, after: T, share: float) -> T:
     def interpolate(value: Any, start: Any, mark: TimeDependence) -> Any:
         if mark.has_parts:
             return _map_parts(
-                lambda part, first: interpolate_in_time(first, part, share),
-                value,
-                start,
+                lambda part, first: interpolate_in_time(first, part, share), value, start
             )
         if mark.axis is None:
             return value
@@ -134,13 +130,6 @@ def values_over_time(instance: Any) -> dict[str, Any]:
 def _changed(instance: T, function: Callable[..., Any], *others: T) -> T:
     """Return an object with a function applied to its marked fields other than None; itself if no
     value changes.
-
-    Parameters
-    ----------
-    instance : dataclass with marked fields
-    function : callable (value, *values of others, TimeDependence) -> value
-    *others
-        Objects of the same type, whose values of the field follow that of the instance.
     """
     changes = {}
     for name, mark in _marks(type(instance)).items():
@@ -166,8 +155,4 @@ def _map_parts(function: Callable[..., Any], value: Any, *others: Any) -> Any:
 @cache
 def _marks(kind: type) -> dict[str, TimeDependence]:
     """Return the marks of a dataclass by the names of the fields, cached; empty without marks."""
-    return {
-        each.name: each.metadata[MARK]
-        for each in fields(kind)
-        if MARK in each.metadata
-    }
+    return {each.name: each.metadata[MARK] for each in fields(kind) if MARK in each.metadata}

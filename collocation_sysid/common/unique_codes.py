@@ -17,8 +17,8 @@ def unique_codes(groups: Iterable[Index]) -> Index:
     """Return all codes of some groups in ascending order, each once; empty without groups.
 
     Groups that consist of few ascending runs take linear time: they are merged. `numpy.unique`
-    would insert every code into a hash table, which takes some hundred times as long for ten million
-    codes.
+    would insert every code into a hash table, which takes some hundred times as long for ten
+    million codes.
 
     Parameters
     ----------

@@ -28,9 +28,7 @@ T = TypeVar("T")
 # arguments, and of the first entry of pydantic's `ValidationError.errors()`. Its location begins
 # with the name of a field; it is empty for an error of `__post_init__`, which the entry contains.
 Refusal = Callable[[Any, Mapping[str, Any]], Exception]
-_CONFIGURATION = ConfigDict(
-    extra="forbid", arbitrary_types_allowed=True, validate_default=True
-)
+_CONFIGURATION = ConfigDict(extra="forbid", arbitrary_types_allowed=True, validate_default=True)
 
 
 @overload
@@ -82,9 +80,7 @@ def _describe_fields(kind: Any) -> None:
     for each in fields(kind):
         if each.name in descriptions:
             _, text = descriptions[each.name]
-            each.metadata = MappingProxyType(
-                {**each.metadata, "description": text}
-            )
+            each.metadata = MappingProxyType({**each.metadata, "description": text})
 
 
 def validate_arguments(kind: Any, refusal: Refusal) -> None:
@@ -106,9 +102,7 @@ def validate_arguments(kind: Any, refusal: Refusal) -> None:
     def construct(self: Any, *arguments: Any, **by_name: Any) -> None:
         """Validate the arguments, assign them, and call ``__post_init__``."""
         try:
-            _validator(kind).validate_python(
-                ArgsKwargs(arguments, by_name), self_instance=self
-            )
+            _validator(kind).validate_python(ArgsKwargs(arguments, by_name), self_instance=self)
             return
         except ValidationError as error:
             fault = error.errors(include_url=False)[0]
@@ -127,14 +121,7 @@ def validate_arguments(kind: Any, refusal: Refusal) -> None:
 def _bind_arguments(
     kind: Any, arguments: tuple[Any, ...], by_name: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the arguments of the constructor of a class by the names of its fields.
-
-    Raises
-    ------
-    TypeError
-        If the arguments are others than those of the constructor; the message names the class, and
-        its other constructors (class methods from_…) if there are any.
-    """
+    """Return the arguments of the constructor of a class by the names of its fields."""
     try:
         return inspect.signature(kind).bind(*arguments, **by_name).arguments
     except TypeError as error:
@@ -142,8 +129,7 @@ def _bind_arguments(
     others = [
         f"{kind.__name__}.{name}"
         for name in dir(kind)
-        if name.startswith("from_")
-        and isinstance(inspect.getattr_static(kind, name), classmethod)
+        if name.startswith("from_") and isinstance(inspect.getattr_static(kind, name), classmethod)
     ]
     hint = f"; other constructors: {', '.join(others)}" if others else ""
     raise TypeError(f"{kind.__name__}: {message}{hint}")
@@ -164,11 +150,6 @@ def _key_refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
     where, value = faulty_entry(instance, fault)
     if fault["type"] == "value_error":
         return InputError(str(fault["ctx"]["error"]), None, where=where)
-    choices = re.findall(
-        "'(.*?)'",
-        fault["ctx"]["expected"] if "literal" in fault["type"] else "",
-    )
+    choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
     hint = hint_at(str(value), choices)
-    return InputError(
-        f"found {value!r}; expected {expected(fault)}{hint}", None, where=where
-    )
+    return InputError(f"found {value!r}; expected {expected(fault)}{hint}", None, where=where)

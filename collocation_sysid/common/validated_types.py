@@ -18,13 +18,7 @@ LARGEST = 1e100
 
 
 def _of_usual_size(value: float) -> float:
-    """Return the value if it is zero or its magnitude lies between `SMALLEST` and `LARGEST`.
-
-    Raises
-    ------
-    ValueError
-        If it does not.
-    """
+    """Return the value if it is zero or its magnitude lies between `SMALLEST` and `LARGEST`."""
     if value and not SMALLEST <= abs(value) <= LARGEST:
         sizes = f"zero, or a size from {SMALLEST:g} to {LARGEST:g}"
         raise ValueError(f"found {value:g}; expected {sizes}")
@@ -33,18 +27,10 @@ def _of_usual_size(value: float) -> float:
 
 _Usual = AfterValidator(_of_usual_size)
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), _Usual]
-Positive = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual
-]
-NotNegative = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual
-]
-AboveOne = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual
-]
-OneOrMore = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual
-]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual]
+AboveOne = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual]
+OneOrMore = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual]
 Boundless = Annotated[float, Field(strict=True)]
 StrictInteger = Annotated[int, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]

@@ -18,9 +18,7 @@ from typing import Any
 LIST_FILE = ".collocation-sysid.json"
 # Nobody's data: drafts of a process that was killed, see `files.replaced_file`, and what file
 # managers leave in folders that they show.
-IGNORED_NAME = re.compile(
-    r"\..+\.[0-9a-f]{8}\.partial(\.\w+)?|\.DS_Store|Thumbs\.db|desktop\.ini"
-)
+IGNORED_NAME = re.compile(r"\..+\.[0-9a-f]{8}\.partial(\.\w+)?|\.DS_Store|Thumbs\.db|desktop\.ini")
 
 
 def list_files(folder: Path) -> None:
@@ -58,12 +56,8 @@ def add_to_list(file: Path, content: Path) -> None:
         hashes = listed_hashes(file.parent)
         hash_now = _hash(content)
         if hashes.get(file.name) != hash_now:
-            draft = listing.with_name(
-                f"{LIST_FILE}.{secrets.token_hex(4)}.partial"
-            )
-            draft.write_text(
-                list_as_text({**hashes, file.name: hash_now}), encoding="utf-8"
-            )
+            draft = listing.with_name(f"{LIST_FILE}.{secrets.token_hex(4)}.partial")
+            draft.write_text(list_as_text({**hashes, file.name: hash_now}), encoding="utf-8")
             os.replace(draft, listing)
 
 
@@ -74,9 +68,7 @@ def hashes_of(contents: Mapping[str, Path]) -> dict[str, str]:
 
 def list_as_text(hashes: Mapping[str, str]) -> str:
     """Return the content of a list file (JSON, names in alphabetical order) from hashes by name."""
-    return (
-        json.dumps({"written": dict(sorted(hashes.items()))}, indent=1) + "\n"
-    )
+    return json.dumps({"written": dict(sorted(hashes.items()))}, indent=1) + "\n"
 
 
 def listed_hashes(folder: Path) -> dict[str, str]:
@@ -84,20 +76,9 @@ def listed_hashes(folder: Path) -> dict[str, str]:
     dictionary if there is no valid list.
     """
     try:
-        content: Any = json.loads(
-            (folder / LIST_FILE).read_text(encoding="utf-8")
-        )
-        return {
-            str(name): str(value) for name, value in content["written"].items()
-        }
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ):
+        content: Any = json.loads((folder / LIST_FILE).read_text(encoding="utf-8"))
+        return {str(name): str(value) for name, value in content["written"].items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return {}
 
 
@@ -138,12 +119,7 @@ def foreign_files(folder: Path) -> Iterator[Path]:
         if home not in lists:
             lists[home] = listed_hashes(home)
         known = lists[home].get(file.relative_to(home).as_posix())
-        if (
-            file.is_symlink()
-            or not file.is_file()
-            or known is None
-            or known != _hash(file)
-        ):
+        if file.is_symlink() or not file.is_file() or known is None or known != _hash(file):
             yield file
 
 

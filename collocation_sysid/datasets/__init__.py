@@ -223,39 +223,12 @@ def _rubber(
     largest_stretch: float | None = None,
     is_exact: bool = False,
 ) -> Experiment:
-    """Return the experiment of a table of stretches and stresses of the package.
-
-    Parameters
-    ----------
-    dataset : str
-        Name in `DATASETS`.
-    name : str
-        Name of the table without ending, and of the experiment.
-    material : str, Material or callable
-        Material law.
-    test : str
-        Kind of the test.
-    sigma_pa : float
-        Standard deviation of the stresses.
-    largest_stretch : float, optional
-        Samples with a larger stretch along either axis are left out; None for all samples.
-    is_exact : bool
-        Whether the zero of the strain and the area count as exact; otherwise they have the default
-        uncertainties of `Specimen`.
-
-    Raises
-    ------
-    InputError
-        If there is no such table, the material or test is unknown, or no sample is within
-        `largest_stretch`.
-    """
+    """Return the experiment of a table of stretches and stresses of the package."""
     file = dataset_file(dataset, f"{name}.csv")
     table = read_specimen(file, SpecimenLayout(test=test, columns={}))
     limit = float("inf") if largest_stretch is None else largest_stretch
     largest = (
-        table.strain
-        if table.second_strain is None
-        else table.strain.clip(min=table.second_strain)
+        table.strain if table.second_strain is None else table.strain.clip(min=table.second_strain)
     )
     if not (1 + largest <= limit).any():
         raise InputError(
@@ -264,9 +237,6 @@ def _rubber(
         )
     exact = {"strain_zero": 0.0, "area_error": 0.0} if is_exact else {}
     specimen = Specimen(
-        test,
-        **values_over_time(at_times(table, 1 + largest <= limit)),
-        sigma_pa=sigma_pa,
-        **exact,
+        test, **values_over_time(at_times(table, 1 + largest <= limit)), sigma_pa=sigma_pa, **exact
     )
     return specimen.experiment(material, name)

@@ -12,12 +12,7 @@ from pathlib import Path
 from ..common.files import replaced_file, require_possible, write_text_file
 from ..errors import InputError, hint_at
 from ..problem import Problem
-from ..problem.editor_schema import (
-    SCHEMA_FILE,
-    schema_text,
-    schema_url,
-    with_schema_reference,
-)
+from ..problem.editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
 
 # Problem file of each dataset.
 DATASETS = {
@@ -42,8 +37,8 @@ _IN_CHECKOUT = Path(__file__).parents[2] / "problems"
 
 
 def dataset_folder(name: str) -> Path:
-    """Return the folder of a dataset, which contains its problem file: that of the package, else that
-    of the repository.
+    """Return the folder of a dataset, which contains its problem file: that of the package, else
+    that of the repository.
 
     Raises
     ------
@@ -110,11 +105,7 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
     """
     source = dataset_folder(name)
     problem_file = source / DATASETS[name]
-    others = sorted(
-        file
-        for file in source.iterdir()
-        if file.is_file() and file != problem_file
-    )
+    others = sorted(file for file in source.iterdir() if file.is_file() and file != problem_file)
     if name in THIRD_PARTY_LICENCES:
         others.append(_IN_PACKAGE / THIRD_PARTY_LICENCES[name])
     require_possible(folder)

@@ -21,10 +21,7 @@ from ..program.depth.camera_alignment import thinned
 from ..program.depth.depth_comparison import camera_residuals
 from ..program.depth.depth_residual import DepthResidual
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from ..statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    HypothesisTest,
-)
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES_OF_TIMES = {
@@ -78,16 +75,14 @@ def camera_clock_hypotheses(part: ExperimentIterate) -> Iterator[Hypothesis]:
     """Yield hypotheses about the times of each depth camera's images, for an experiment at a
     simulated or fitted motion; none for cameras with few images.
     """
-    name = part.segment.experiment.name
-    for reading in camera_residuals(part.segment):
+    name = part.transcription.experiment.name
+    for reading in camera_residuals(part.transcription):
         times_s = reading.correspondences.camera.depth.sample_times_s
         within = times_s <= reading.observable_s[-1] + 1e-9
         if np.count_nonzero(within) < FEWEST_IMAGES:
             continue
         positions_m = part.x.reshape(len(part.x), -1, 3)
-        comparison = _MotionComparison(
-            reading, positions_m, is_simulated=within
-        )
+        comparison = _MotionComparison(reading, positions_m, is_simulated=within)
         yield from comparison.hypotheses(name)
 
 
@@ -124,25 +119,16 @@ class _MotionComparison:
     """
 
     def __init__(
-        self,
-        reading: DepthResidual,
-        positions_m: Array,
-        is_simulated: NDArray[np.bool_],
+        self, reading: DepthResidual, positions_m: Array, is_simulated: NDArray[np.bool_]
     ) -> None:
         self.camera = reading.correspondences.camera
         surface = reading.correspondences.surface
         depth = self.camera.depth
         self.at_s = reading.observable_s
         images = np.array(
-            [
-                k
-                for k in np.flatnonzero(is_simulated).tolist()
-                if len(depth.clouds[k])
-            ]
+            [k for k in np.flatnonzero(is_simulated).tolist() if len(depth.clouds[k])]
         )
-        spread = np.linspace(
-            0, len(images) - 1, min(len(images), MOST_IMAGES)
-        ).astype(int)
+        spread = np.linspace(0, len(images) - 1, min(len(images), MOST_IMAGES)).astype(int)
         images = images[np.unique(spread)]
         self.stated = ImageTimes(images, depth.sample_times_s[images])
         self.trees = {k: KDTree(thinned(depth.points_m[k])) for k in images}
@@ -151,8 +137,7 @@ class _MotionComparison:
         faces = rng.choice(selected, SAMPLES)
         barycentric = rng.dirichlet(np.ones(3), SAMPLES)
         evaluated = [
-            surface.evaluate(x[surface.nodes], faces, barycentric=barycentric)
-            for x in positions_m
+            surface.evaluate(x[surface.nodes], faces, barycentric=barycentric) for x in positions_m
         ]
         self.places_m = np.array([each[1] for each in evaluated])
         self.normals = np.array([each[2] for each in evaluated])
@@ -179,9 +164,7 @@ class _MotionComparison:
         """Yield each common mistake, about the subject, with the times that correct it."""
         stated = self.stated
         reversed_order = ImageTimes(stated.images[::-1], stated.times_s)
-        yield Hypothesis(
-            "camera-order", subject, data={}, corrected=reversed_order
-        )
+        yield Hypothesis("camera-order", subject, data={}, corrected=reversed_order)
         moved_m = np.linalg.norm(self.places_m - self.places_m[0], axis=2)
         if moved_m.max() > MOVING * self.camera.size_m:
             same = np.full(len(stated.images), stated.times_s[0])
@@ -220,33 +203,25 @@ class _MotionComparison:
             aligned = self._align(described.images, shapes, start=aligned)
         return aligned.misfit_m
 
-    def _shapes_in_camera(
-        self, described: ImageTimes
-    ) -> list[tuple[Array, Array]]:
+    def _shapes_in_camera(self, described: ImageTimes) -> list[tuple[Array, Array]]:
         """Return for each image the visible points of the surface [m] and their unit normals,
         (P, 3) each, in the camera's stated frame.
         """
-        rows = np.interp(
-            described.times_s, self.at_s, np.arange(len(self.at_s))
-        )
+        rows = np.interp(described.times_s, self.at_s, np.arange(len(self.at_s)))
         rotations, translations_m = self.camera.poses
         shapes = []
         for image, row in zip(described.images, rows, strict=True):
             before = min(int(row), len(self.at_s) - 1)
             after = min(before + 1, len(self.at_s) - 1)
             share = row - before
-            places_m = (1 - share) * self.places_m[before] + (
-                share * self.places_m[after]
-            )
+            places_m = (1 - share) * self.places_m[before] + (share * self.places_m[after])
             normals = self.normals[before if share < 0.5 else after]
             in_camera_m = (places_m - translations_m[image]) @ rotations[image]
             turned = normals @ rotations[image]
             is_facing = np.ones(len(turned), dtype=bool)
             if self.camera.depth.camera.matrix is not None:
                 lengths_m = np.linalg.norm(in_camera_m, axis=1)
-                is_facing = (
-                    -np.sum(turned * in_camera_m, axis=1) > GRAZING * lengths_m
-                )
+                is_facing = -np.sum(turned * in_camera_m, axis=1) > GRAZING * lengths_m
             shapes.append((in_camera_m[is_facing], turned[is_facing]))
         return shapes
 
@@ -256,18 +231,7 @@ class _MotionComparison:
         shapes: list[tuple[Array, Array]],
         start: _AlignedPoints,
     ) -> _AlignedPoints:
-        """Return the rotation and shift of the points after one more Gauss–Newton step.
-
-        Parameters
-        ----------
-        images : sequence of int
-            Indices of the compared images.
-        shapes : list of pairs of (P, 3) arrays
-            Visible points of the surface [m] and their normals at each of these images, in the
-            camera's stated frame.
-        start : _AlignedPoints
-            Rotation and shift before the step; not modified.
-        """
+        """Return the rotation and shift of the points after one more Gauss–Newton step."""
         turn_rad = start.turn_rad
         shift_m = start.shift_m
         pivot_m = self.camera.pivot_m
@@ -287,17 +251,11 @@ class _MotionComparison:
             rows.append(np.hstack([by_turn, normals])[near] / self.rough_m)
             right.append(along_m[near] / self.rough_m)
         prior = np.concatenate(
-            [
-                self.camera.prior_weights(DEPTH_TURN),
-                self.camera.prior_weights(DEPTH_SHIFT),
-            ]
+            [self.camera.prior_weights(DEPTH_TURN), self.camera.prior_weights(DEPTH_SHIFT)]
         )
         estimate = np.concatenate([turn_rad, shift_m])
         step = np.linalg.lstsq(
-            np.vstack([*rows, np.diag(prior)]),
-            -np.concatenate([*right, prior * estimate]),
+            np.vstack([*rows, np.diag(prior)]), -np.concatenate([*right, prior * estimate])
         )[0]
         misfit_m = float(np.sqrt(np.mean(np.concatenate(distances_m) ** 2)))
-        return _AlignedPoints(
-            turn_rad + step[:3], shift_m + step[3:], misfit_m=misfit_m
-        )
+        return _AlignedPoints(turn_rad + step[:3], shift_m + step[3:], misfit_m=misfit_m)

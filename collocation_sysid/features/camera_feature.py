@@ -27,23 +27,10 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..statistics.assessment import forward_simulation_concerns
 from ..statistics.concerns import Concern, concern_if
-from ..statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    rank,
-)
-from .camera_clock_misspecifications import (
-    MESSAGES_OF_TIMES,
-    camera_clock_hypotheses,
-)
-from .camera_image_misspecifications import (
-    MESSAGES_OF_IMAGES,
-    camera_image_hypotheses,
-)
-from .camera_misspecifications import (
-    MESSAGES_OF_POSES,
-    camera_hypotheses,
-    require_depth_units,
-)
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
+from .camera_clock_misspecifications import MESSAGES_OF_TIMES, camera_clock_hypotheses
+from .camera_image_misspecifications import MESSAGES_OF_IMAGES, camera_image_hypotheses
+from .camera_misspecifications import MESSAGES_OF_POSES, camera_hypotheses, require_depth_units
 from .feature import Feature, SimulatedCheck, Units
 from .measurement_results import (
     FittedExperiment,
@@ -95,24 +82,18 @@ NODES = 2000
 def instruments(experiment: Experiment) -> list[str]:
     """Return the number of points of each camera."""
     return [
-        f"{sum(map(len, depth.clouds)):,} points of '{depth.name}'"
-        for depth in experiment.depths
+        f"{sum(map(len, depth.clouds)):,} points of '{depth.name}'" for depth in experiment.depths
     ]
 
 
-def predict(
-    segment: Transcription, trajectory: Trajectory, phi: Array
-) -> dict[str, Any]:
+def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
     """Return the comparison of each camera with the simulated surface, by name."""
     return {
         "surfaces": {
             reading.correspondences.camera.depth.name: SurfaceComparison.from_motion(
-                reading,
-                trajectory.t_s,
-                positions_m=trajectory.positions_m,
-                phi=phi,
+                reading, trajectory.t_s, positions_m=trajectory.positions_m, phi=phi
             )
-            for reading in camera_residuals(segment)
+            for reading in camera_residuals(transcription)
         }
     }
 
@@ -120,9 +101,7 @@ def predict(
 def reason_against_copy(experiment: Experiment, _: Experiment) -> str:
     """Return that points cannot be compared if nothing else is measured; else ""."""
     is_compared = (
-        experiment.markers.count_samples()
-        or experiment.sensors_by_grasp
-        or experiment.readings
+        experiment.markers.count_samples() or experiment.sensors_by_grasp or experiment.readings
     )
     if is_compared:
         return ""
@@ -131,15 +110,11 @@ def reason_against_copy(experiment: Experiment, _: Experiment) -> str:
 
 def errors(_: Experiment, predicted: InstrumentPrediction) -> dict[str, Any]:
     """Return the distances of each camera's points from the surface; None without cameras."""
-    by_camera = {
-        name: surface.error for name, surface in predicted.surfaces.items()
-    }
+    by_camera = {name: surface.error for name, surface in predicted.surfaces.items()}
     return {"depth": by_camera or None}
 
 
-def misfits(
-    _: Experiment, predicted: InstrumentPrediction
-) -> Iterator[InstrumentMisfit]:
+def misfits(_: Experiment, predicted: InstrumentPrediction) -> Iterator[InstrumentMisfit]:
     """Yield the distances of each camera with a point near the body, over its σ."""
     for name, surface in predicted.surfaces.items():
         error = surface.error
@@ -155,29 +130,22 @@ def misfits(
 
 
 def step_differences(
-    part: ExperimentIterate,
-    trajectory: Trajectory,
-    _: InstrumentPrediction,
-    share: float,
+    part: ExperimentIterate, trajectory: Trajectory, _: InstrumentPrediction, share: float
 ) -> list[Array]:
     """Return the changes (S, M, 3) of the residuals of each camera and outline, at the
     correspondences of the fit.
     """
     if not (residuals := surface_residuals(part)):
         return []
-    known_s = part.segment.experiment.t_s
-    rows_s = part.segment.dynamics.t_s
-    fitted = part.x[part.segment.markers.observable.rows]
+    known_s = part.transcription.experiment.t_s
+    rows_s = part.transcription.dynamics.t_s
+    fitted = part.x[part.transcription.markers.observable.rows]
     way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
-    way_rows_m = np.array(
-        [np.interp(rows_s, known_s, each) for each in way_m.T]
-    )
+    way_rows_m = np.array([np.interp(rows_s, known_s, each) for each in way_m.T])
     displacements_m = way_rows_m.T.reshape(len(rows_s), -1, 3, 1)
     return [
         reading.residual_changes(
-            observation,
-            displacements_m[:, reading.correspondences.surface.nodes],
-            phi=part.phi,
+            observation, displacements_m[:, reading.correspondences.surface.nodes], phi=part.phi
         )[..., 0]
         for reading, observation in residuals
     ]
@@ -186,9 +154,7 @@ def step_differences(
 # Likely errors ------------------------------------------------------------------------------------
 
 
-def simulated_hypotheses(
-    check: SimulatedCheck,
-) -> tuple[Sequence[Hypothesis], Sequence[str]]:
+def simulated_hypotheses(check: SimulatedCheck) -> tuple[Sequence[Hypothesis], Sequence[str]]:
     """Return likely errors of images, and a note if equilibria of large bodies were left out;
     nothing without cameras, or if another error explains a recording.
     """
@@ -218,9 +184,7 @@ def may_be_images(causes: Sequence[Hypothesis]) -> bool:
 
 
 def depth_image_hypotheses(
-    problem: Problem,
-    parts: Sequence[ExperimentIterate],
-    most_nodes: int | None = NODES,
+    problem: Problem, parts: Sequence[ExperimentIterate], most_nodes: int | None = NODES
 ) -> tuple[Hypothesis, ...]:
     """Return likely errors of times, order, orientation and matrices of depth images.
 
@@ -233,9 +197,7 @@ def depth_image_hypotheses(
         Largest bodies whose equilibria for many stiffnesses are computed; None for any size.
     """
     constants = typical_constants(problem.parameters)
-    clocks = (
-        cause for part in parts for cause in camera_clock_hypotheses(part)
-    )
+    clocks = (cause for part in parts for cause in camera_clock_hypotheses(part))
     shapes = (
         cause
         for e in problem.experiments
@@ -256,7 +218,7 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
             for reading, observation in depth_residuals(part)
         ):
             continue
-        experiment = part.segment.experiment
+        experiment = part.transcription.experiment
         yield from camera_hypotheses(experiment)
         yield from camera_clock_hypotheses(part)
         yield from camera_image_hypotheses(experiment, solution.parameters)
@@ -275,25 +237,17 @@ def _misses_surface(distances: Array) -> bool:
 
 def part_concerns(part: ExperimentIterate) -> Iterator[Concern]:
     """Yield concerns about the estimated poses of the cameras, and about outlines."""
-    experiment = part.segment.experiment
-    nuisance = part.segment.nuisance
+    experiment = part.transcription.experiment
+    nuisance = part.transcription.nuisance
     for camera in range(len(experiment.depths)):
-        pose = nuisance.indices_of_rows(
-            DEPTH_TURN, DEPTH_SHIFT, component=camera
-        )
-        yield from camera_pose_concerns(
-            [nuisance.names[k] for k in pose], part.phi[pose].tolist()
-        )
+        pose = nuisance.indices_of_rows(DEPTH_TURN, DEPTH_SHIFT, component=camera)
+        yield from camera_pose_concerns([nuisance.names[k] for k in pose], part.phi[pose].tolist())
     for reading, distance_px in outline_distances_px(part):
         name = reading.correspondences.camera.depth.name
-        yield from outline_concerns(
-            f"'{name}' of '{experiment.name}'", distance_px
-        )
+        yield from outline_concerns(f"'{name}' of '{experiment.name}'", distance_px)
 
 
-def camera_pose_concerns(
-    names: Sequence[str], deviations: Sequence[float]
-) -> list[Concern]:
+def camera_pose_concerns(names: Sequence[str], deviations: Sequence[float]) -> list[Concern]:
     """Return one concern, as a list, if a component of a depth camera's pose error exceeds
     `LARGEST_CAMERA_OFFSET` standard deviations, about the largest component; else empty, also
     without components.
@@ -347,27 +301,21 @@ def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
     )
 
 
-def simulation_concerns(
-    name: str, error: PredictionErrors
-) -> Iterator[Concern]:
+def simulation_concerns(name: str, error: PredictionErrors) -> Iterator[Concern]:
     """Yield a concern for each camera of the experiment `name` without a point within its gate of
     the simulated surface.
     """
     for camera, distances in (error.depth or {}).items():
         if not distances.points:
-            data = {
-                "experiment": name,
-                "camera": camera,
-                "seen": distances.compared_points,
-            }
+            data = {"experiment": name, "camera": camera, "seen": distances.compared_points}
             yield Concern("prediction/unseen", "doubtful", data=data)
 
 
 def validation_concerns(
     name: str, error: PredictionErrors, solution: Solution
 ) -> Iterator[Concern]:
-    """Yield concerns about the predicted distances, in stated σ without outliers, against the larger
-    of the fitted residuals of all cameras and the noise.
+    """Yield concerns about the predicted distances, in stated σ without outliers, against the
+    larger of the fitted residuals of all cameras and the noise.
     """
     fitted = [
         distances.tame_sigmas
@@ -385,16 +333,10 @@ def validation_concerns(
         )
 
 
-def live_limitations(
-    experiment: Experiment,
-) -> list[tuple[str, object, str]]:
+def live_limitations(experiment: Experiment) -> list[tuple[str, object, str]]:
     """Return that frames of a live recording contain no images."""
     return [
-        (
-            "depth cameras, because frames do not contain their images",
-            experiment.depths,
-            "none",
-        )
+        ("depth cameras, because frames do not contain their images", experiment.depths, "none")
     ]
 
 
@@ -413,9 +355,7 @@ def fitted_surfaces(part: ExperimentIterate) -> dict[str, SurfaceComparison]:
 
 def fitted_errors(part: ExperimentIterate) -> dict[str, DepthError]:
     """Return the distances of each camera's points from the fitted surface, by name."""
-    return {
-        name: surface.error for name, surface in fitted_surfaces(part).items()
-    }
+    return {name: surface.error for name, surface in fitted_surfaces(part).items()}
 
 
 def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
@@ -425,16 +365,14 @@ def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
 
 def excluded_loss(part: ExperimentIterate) -> float:
     """Return the loss of the points beyond the gate, each counted like one at the gate."""
-    return sum(
-        reading.loss_of_distant_points for reading, _ in depth_residuals(part)
-    )
+    return sum(reading.loss_of_distant_points for reading, _ in depth_residuals(part))
 
 
 def notes(part: ExperimentIterate) -> Iterator[str]:
     """Yield notes on the distances of points and outlines from the fitted surface, per camera;
     first on all points, then on all outlines.
     """
-    name = part.segment.experiment.name
+    name = part.transcription.experiment.name
     for reading, observation in depth_residuals(part):
         distance_m = reading.signed_distances_m(observation, part.phi)
         correspondences = reading.correspondences
@@ -499,12 +437,7 @@ def _distance_text(error: DepthError) -> str:
 
 CAMERAS = Feature(
     "depth",
-    messages={
-        **MESSAGES,
-        **MESSAGES_OF_POSES,
-        **MESSAGES_OF_IMAGES,
-        **MESSAGES_OF_TIMES,
-    },
+    messages={**MESSAGES, **MESSAGES_OF_POSES, **MESSAGES_OF_IMAGES, **MESSAGES_OF_TIMES},
     picture_kinds=[
         PictureKind(
             "depth",

@@ -19,12 +19,7 @@ from ..errors import SimulationError
 from ..fem.laws.constants import is_modulus
 from ..fem.laws.moduli import engineering_constants
 from ..model.nuisance_map import NuisanceMap
-from ..program.depth.camera_alignment import (
-    AlignedPose,
-    ExactCloud,
-    iterate_alignments,
-    thinned,
-)
+from ..program.depth.camera_alignment import AlignedPose, ExactCloud, iterate_alignments, thinned
 from ..program.depth.depth_camera_model import DepthCameraModel
 from ..program.depth.visible_surface import VisibleSurface
 from ..program.forward.initial_equilibrium import equilibrium
@@ -33,10 +28,7 @@ from ..recording.depth_camera import DepthCamera
 from ..recording.experiment import Experiment
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..recording.sample_times import TIME_TOLERANCE_S
-from ..statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    HypothesisTest,
-)
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES_OF_IMAGES = {
@@ -128,9 +120,7 @@ class MeasuredPixels:
     def with_depths_of_ray_lengths(self) -> MeasuredPixels:
         """Return the image with its depths taken as distances along the rays."""
         rays = self.camera.points_at_unit_depth(self.pixels)
-        return replace(
-            self, depth_m=self.depth_m / np.linalg.norm(rays, axis=1)
-        )
+        return replace(self, depth_m=self.depth_m / np.linalg.norm(rays, axis=1))
 
 
 def camera_image_hypotheses(
@@ -217,8 +207,7 @@ def equilibrium_shapes_m(
         count = int(moved_m / (SHAPE_STEP * size_m))
         last_m = shapes_m[-1]
         shapes_m += [
-            last_m + share * (shape_m - last_m)
-            for share in np.arange(1, count + 1) / max(1, count)
+            last_m + share * (shape_m - last_m) for share in np.arange(1, count + 1) / max(1, count)
         ]
     return shapes_m
 
@@ -264,11 +253,7 @@ class _ImageComparison:
     stated: MeasuredPixels
 
     def __init__(
-        self,
-        experiment: Experiment,
-        camera: DepthCameraModel,
-        first: int,
-        shapes_m: list[Array],
+        self, experiment: Experiment, camera: DepthCameraModel, first: int, shapes_m: list[Array]
     ) -> None:
         depth = camera.depth
         image_m = next(each for each in depth.images_m if each is not None)
@@ -292,12 +277,8 @@ class _ImageComparison:
         barycentric = rng.dirichlet(np.ones(3), SAMPLES)
         self.surfaces = []
         for shape_m in shapes_m:
-            nodes_m = (
-                shape_m[surface.nodes] - translations_m[first]
-            ) @ rotations[first]
-            _, places_m, normals = surface.evaluate(
-                nodes_m, faces, barycentric=barycentric
-            )
+            nodes_m = (shape_m[surface.nodes] - translations_m[first]) @ rotations[first]
+            _, places_m, normals = surface.evaluate(nodes_m, faces, barycentric=barycentric)
             self.surfaces.append((places_m, normals))
         self.known: dict[MeasuredPixels, _Fit] = {}
 
@@ -317,8 +298,7 @@ class _ImageComparison:
         accepted = [
             each
             for each in test.accepted(self._mistakes())
-            if each.strength > CERTAIN
-            or self.fit(each.corrected).misfit < EXPLAINED
+            if each.strength > CERTAIN or self.fit(each.corrected).misfit < EXPLAINED
         ]
         yield from accepted
         if accepted or stated.distance_m > ALIGNED * self.rough_m:
@@ -331,9 +311,7 @@ class _ImageComparison:
                 "deviations": deviation,
             }
             strength = deviation / LARGEST_POSE_DEVIATION
-            yield Hypothesis(
-                "camera-pose", self.subject, data=data, strength=strength
-            )
+            yield Hypothesis("camera-pose", self.subject, data=data, strength=strength)
 
     def fit(self, image: MeasuredPixels) -> _Fit:
         """Return the best fit of a description of the image among all shapes; cached."""
@@ -345,31 +323,13 @@ class _ImageComparison:
             for index in range(0, len(self.surfaces), STRIDE)
         }
         best = min(rough, key=lambda index: rough[index].misfit)
-        neighbours = range(
-            max(0, best - STRIDE + 1),
-            min(len(self.surfaces), best + STRIDE),
-        )
-        fits = [
-            self._fit_shape(cloud, index, iterations=ITERATIONS)
-            for index in neighbours
-        ]
+        neighbours = range(max(0, best - STRIDE + 1), min(len(self.surfaces), best + STRIDE))
+        fits = [self._fit_shape(cloud, index, iterations=ITERATIONS) for index in neighbours]
         self.known[image] = min(fits, key=lambda each: each.misfit)
         return self.known[image]
 
-    def _fit_shape(
-        self, cloud: ExactCloud, index: int, iterations: int
-    ) -> _Fit:
-        """Return the fit of points to one shape.
-
-        Parameters
-        ----------
-        cloud : ExactCloud
-            Measured points in the camera's frame [m].
-        index : int
-            Index of the shape.
-        iterations : int
-            Of the alignment.
-        """
+    def _fit_shape(self, cloud: ExactCloud, index: int, iterations: int) -> _Fit:
+        """Return the fit of points to one shape."""
         places_m, normals = self.surfaces[index]
         gate_m = self.camera.depth.gate_m
         size_m = self.camera.size_m
@@ -405,10 +365,7 @@ class _ImageComparison:
         """Return the pose error (6,) of a fit in standard deviations of its prior."""
         errors = np.concatenate([fit.turn_rad, fit.shift_m])
         weights = np.concatenate(
-            [
-                self.camera.prior_weights(DEPTH_TURN),
-                self.camera.prior_weights(DEPTH_SHIFT),
-            ]
+            [self.camera.prior_weights(DEPTH_TURN), self.camera.prior_weights(DEPTH_SHIFT)]
         )
         return weights * errors
 
@@ -423,27 +380,18 @@ class _ImageComparison:
             "upside down (rotated by 180°)": size - image.pixels,
         }
         for order, pixels in flips.items():
-            yield self._hypothesis(
-                "camera-image", image.with_pixels(pixels), order=order
-            )
+            yield self._hypothesis("camera-image", image.with_pixels(pixels), order=order)
         for ratio in SIZE_RATIOS:
             factor = 1 / ratio
             zoomed = np.array(image.camera.matrix)
             zoomed[[0, 1], [0, 1]] *= factor
-            yield self._hypothesis(
-                "camera-matrix/focal",
-                image.with_matrix(zoomed),
-                factor=factor,
-            )
+            yield self._hypothesis("camera-matrix/focal", image.with_matrix(zoomed), factor=factor)
             resized = np.array(image.camera.matrix)
             resized[:2] *= factor
-            yield self._hypothesis(
-                "camera-matrix/size", image.with_matrix(resized), factor=factor
-            )
+            yield self._hypothesis("camera-matrix/size", image.with_matrix(resized), factor=factor)
         matrix = image.camera.require_matrix()
         centres = {
-            "counted from the opposite corner of the image": size
-            - matrix[:2, 2],
+            "counted from the opposite corner of the image": size - matrix[:2, 2],
             "exchanged": matrix[[1, 0], [2, 2]],
         }
         for how, centre in centres.items():
@@ -455,18 +403,8 @@ class _ImageComparison:
                 how=how,
                 centre=str(np.round(centre, 1).tolist()),
             )
-        yield self._hypothesis(
-            "camera-rays", image.with_depths_of_ray_lengths()
-        )
+        yield self._hypothesis("camera-rays", image.with_depths_of_ray_lengths())
 
-    def _hypothesis(
-        self, code: str, corrected: MeasuredPixels, **data: object
-    ) -> Hypothesis:
+    def _hypothesis(self, code: str, corrected: MeasuredPixels, **data: object) -> Hypothesis:
         """Return a hypothesis with the image that corrects it, and data of its message."""
-        return Hypothesis(
-            code,
-            self.subject,
-            data=data,
-            corrected=corrected,
-            handicap=ONE_OF_MANY,
-        )
+        return Hypothesis(code, self.subject, data=data, corrected=corrected, handicap=ONE_OF_MANY)

@@ -85,9 +85,7 @@ def _scaled(seeing: CameraDescription, factor: float) -> CameraDescription:
     return replace(seeing, pose=pose)
 
 
-def _rotated(
-    seeing: CameraDescription, rotation: list[list[int]]
-) -> CameraDescription:
+def _rotated(seeing: CameraDescription, rotation: list[list[int]]) -> CameraDescription:
     """Return a copy of the description with the camera's frame rotated by a matrix (3, 3), about
     its own axes: the rotation of the pose is multiplied by it on the right.
     """
@@ -115,16 +113,14 @@ MISTAKES: tuple[dict[str, Undo], ...] = (
     {
         "camera.pose were inverted (state the transform from the camera's frame to the world)": (
             lambda s: replace(s, pose=np.linalg.inv(s.pose))
-        ),
+        )
     },
     {
         "camera.poses were inverted (state the transforms from the camera's carrier to the "
-        "world)": (lambda s: replace(s, carrier=np.linalg.inv(s.carrier))),
+        "world)": (lambda s: replace(s, carrier=np.linalg.inv(s.carrier)))
     },
     {
-        f"camera.pose were of a frame with {axes} ({EXPECTED})": partial(
-            _rotated, rotation=turn
-        )
+        f"camera.pose were of a frame with {axes} ({EXPECTED})": partial(_rotated, rotation=turn)
         for axes, turn in FRAMES.items()
     },
     {
@@ -138,7 +134,7 @@ MISTAKES: tuple[dict[str, Undo], ...] = (
     {
         "camera.pose had a transposed rotation (state its rotation row by row)": (
             _with_transposed_rotation
-        ),
+        )
     },
     {"camera.pose were in mm (state it in m)": partial(_scaled, factor=MILLI)},
 )
@@ -169,12 +165,9 @@ def require_depth_units(experiment: Experiment) -> None:
         view = _CameraTrial(experiment, depth)
         if view.visible_share(view.declared) >= HARDLY:
             continue
-        factors = [
-            10.0**k for k in range(-LARGEST_POWER, LARGEST_POWER + 1) if k
-        ]
+        factors = [10.0**k for k in range(-LARGEST_POWER, LARGEST_POWER + 1) if k]
         shares = {
-            factor: view.visible_share(_with_factor(view.declared, factor))
-            for factor in factors
+            factor: view.visible_share(_with_factor(view.declared, factor)) for factor in factors
         }
         factor = max(factors, key=lambda each: shares[each])
         if shares[factor] < (HARDLY if view.collapsed else WELL):
@@ -247,9 +240,7 @@ class _CameraTrial:
         self.shape_m = self.skin.initial_positions_m(experiment, depth)
         points_m = depth.points_m[depth.find_first_sample_with_points()]
         image_m = (
-            depth.images_m[depth.find_first_sample_with_points()]
-            if len(depth.images_m)
-            else None
+            depth.images_m[depth.find_first_sample_with_points()] if len(depth.images_m) else None
         )
         if len(points_m) < COLLAPSED and image_m is not None:
             points_m = points_from_image(image_m, camera)
@@ -266,9 +257,7 @@ class _CameraTrial:
         self.within_m = initial_gate_m(self.shape_m)
         eye_m = (carrier @ camera.pose)[:3, 3]
         self.points_m = float(np.median(np.linalg.norm(points_m, axis=1)))
-        self.body_m = float(
-            np.median(np.linalg.norm(self.shape_m - eye_m, axis=1))
-        )
+        self.body_m = float(np.median(np.linalg.norm(self.shape_m - eye_m, axis=1)))
 
     def visible_share(self, seeing: CameraDescription) -> float:
         """Return the share, from 0 to 1, of the surface facing the camera that has points of the
@@ -278,18 +267,12 @@ class _CameraTrial:
         motion = seeing.carrier @ seeing.pose
         turn = motion[:3, :3]
         eye_m = motion[:3, 3]
-        is_facing = self.skin.is_facing(
-            self.shape_m, eye_m if self.pinhole else None
-        )
+        is_facing = self.skin.is_facing(self.shape_m, eye_m if self.pinhole else None)
         if not is_facing.any():
             return 0.0
-        middles_m = self.shape_m[self.skin.plane_triangles[is_facing]].mean(
-            axis=1
-        )
+        middles_m = self.shape_m[self.skin.plane_triangles[is_facing]].mean(axis=1)
         in_camera = (middles_m - eye_m) @ turn / seeing.factor
-        nearest, _ = self.tree.query(
-            in_camera, distance_upper_bound=self.within_m / seeing.factor
-        )
+        nearest, _ = self.tree.query(in_camera, distance_upper_bound=self.within_m / seeing.factor)
         return float(np.isfinite(nearest).mean())
 
     def best_corrections(self) -> list[tuple[str, ...]]:
@@ -316,9 +299,5 @@ class _CameraTrial:
         """Return the stated description with some mistakes, keys of `MISTAKES` or `POWERS`,
         corrected one after the other.
         """
-        undo = dict(
-            chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS))
-        )
-        return reduce(
-            lambda seeing, name: undo[name](seeing), mistakes, self.declared
-        )
+        undo = dict(chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS)))
+        return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.declared)

@@ -24,17 +24,10 @@ from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.concerns import Concern, Topic, concern_if
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
-from ..statistics.misspecification.obstacle_misspecifications import (
-    MESSAGES,
-    obstacle_hypotheses,
-)
+from ..statistics.misspecification.obstacle_misspecifications import MESSAGES, obstacle_hypotheses
 from ..statistics.misspecification.placement_causes import placement_mistakes
 from .feature import Feature
-from .measurement_results import (
-    FittedExperiment,
-    InstrumentPrediction,
-    PictureKind,
-)
+from .measurement_results import FittedExperiment, InstrumentPrediction, PictureKind
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
@@ -62,37 +55,29 @@ TOPICS = {
             "if it remained in contact, check the motion of the obstacle and the guess, or "
             "end window_s before",
         },
-    ),
+    )
 }
 
 
 def hypotheses(experiment: Experiment) -> tuple[Hypothesis, ...]:
     """Return likely errors in the placement of a body, or else in its obstacles and their loads."""
-    return tuple(placement_mistakes(experiment)) or tuple(
-        obstacle_hypotheses(experiment)
-    )
+    return tuple(placement_mistakes(experiment)) or tuple(obstacle_hypotheses(experiment))
 
 
 def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
     """Yield likely errors in the obstacles of the fitted experiments and their loads."""
-    for segment in solution.collocation.transcriptions:
-        yield from obstacle_hypotheses(segment.experiment)
+    for transcription in solution.collocation.transcriptions:
+        yield from obstacle_hypotheses(transcription.experiment)
 
 
-def guess_concerns(
-    parts: Sequence[ExperimentIterate], is_complete: bool
-) -> list[Concern]:
+def guess_concerns(parts: Sequence[ExperimentIterate], is_complete: bool) -> list[Concern]:
     """Return concerns about contact in a simulation at the guess.
 
     `is_complete` is false if only the first samples were simulated: then there are only concerns
     about penetration at the start.
     """
     concerns = contact_concerns(summaries_of_parts(parts), AT_THE_GUESS)
-    return [
-        each
-        for each in concerns
-        if is_complete or each.code == "contact/pressed"
-    ]
+    return [each for each in concerns if is_complete or each.code == "contact/pressed"]
 
 
 def concerns(parts: Sequence[ExperimentIterate]) -> list[Concern]:
@@ -100,20 +85,16 @@ def concerns(parts: Sequence[ExperimentIterate]) -> list[Concern]:
     return contact_concerns(summaries_of_parts(parts))
 
 
-def summaries_of_parts(
-    parts: Iterable[ExperimentIterate],
-) -> Iterator[ContactSummary]:
+def summaries_of_parts(parts: Iterable[ExperimentIterate]) -> Iterator[ContactSummary]:
     """Yield the contact summaries of each obstacle of each experiment, experiment by experiment, at
     the positions of its iterate.
     """
     for part in parts:
         t_s = part.equations.dynamics.t_s[: len(part.x)]
-        yield from contact_summaries(part.segment.experiment, part.x, t_s=t_s)
+        yield from contact_summaries(part.transcription.experiment, part.x, t_s=t_s)
 
 
-def contact_concerns(
-    summaries: Iterable[ContactSummary], guess: str = ""
-) -> list[Concern]:
+def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> list[Concern]:
     """Return concerns about obstacles that are never touched, or by too few faces to resolve the
     contact.
 
@@ -136,27 +117,16 @@ def contact_concerns(
     """
     concerns: dict[tuple[str, str], list[Concern]] = {}
     for each in sorted(summaries, key=lambda touch: touch.face_count):
-        data = {
-            "experiment": each.experiment,
-            "obstacle": each.obstacle,
-            "guess": guess,
-        }
+        data = {"experiment": each.experiment, "obstacle": each.obstacle, "guess": guess}
         coarse = 0 < each.face_count < FEWEST_FACES
         sizes = {"faces": each.face_count, "face_mm": each.face_mm}
         for one in (
             *concern_if(
-                not each.face_count,
-                not guess,
-                code="contact/never",
-                mm=1e3 * each.gap_m,
-                **data,
+                not each.face_count, not guess, code="contact/never", mm=1e3 * each.gap_m, **data
             ),
             *concern_if(coarse, False, code="contact/coarse", **sizes, **data),
             *concern_if(
-                bool(guess) and each.is_initially_in_contact,
-                False,
-                code="contact/pressed",
-                **data,
+                bool(guess) and each.is_initially_in_contact, False, code="contact/pressed", **data
             ),
             *concern_if(
                 bool(guess and each.separation_s),
@@ -168,22 +138,13 @@ def contact_concerns(
         ):
             concerns.setdefault((one.code, each.obstacle), []).append(one)
     return [
-        replace(
-            first,
-            data={
-                **first.data,
-                "more": f" and {len(others)} more" if others else "",
-            },
-        )
+        replace(first, data={**first.data, "more": f" and {len(others)} more" if others else ""})
         for first, *others in concerns.values()
     ]
 
 
 def recorded(
-    experiment: Experiment,
-    solution: Solution,
-    _: InstrumentPrediction | None,
-    positions_m: Array,
+    experiment: Experiment, solution: Solution, _: InstrumentPrediction | None, positions_m: Array
 ) -> dict[str, Any]:
     """Return gap [m] and pressure [Pa] on the boundary triangles at the estimates, (T, F) each;
     nothing without obstacles.
@@ -193,7 +154,7 @@ def recorded(
     if not experiment.obstacles:
         return {}
     if (part := solution.part_of(experiment.name)) is not None:
-        experiment = part.segment.corrected_experiment(part.phi)
+        experiment = part.transcription.corrected_experiment(part.phi)
     theta = experiment.body.theta_from_values(solution.parameters)
     gaps_m, pressures_pa = surface_gaps_and_pressures(
         experiment, np.array(theta), x=positions_m.reshape(len(positions_m), -1)
@@ -205,24 +166,17 @@ def largest_difference_step(experiment: Experiment) -> float:
     """Return a small share of the narrowest gap range over which a pressure rises; infinity without
     obstacles.
     """
-    widths_m = (
-        term.law_of_contact.largest_width_m
-        for term in contact_terms(experiment)
-    )
+    widths_m = (term.law_of_contact.largest_width_m for term in contact_terms(experiment))
     return STEP_PER_WIDTH * min(widths_m, default=inf)
 
 
 def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
     """Return the friction with each obstacle; None without friction."""
-    friction = friction_summaries(
-        part.segment.experiment, part.equations.dynamics, x=part.x
-    )
+    friction = friction_summaries(part.transcription.experiment, part.equations.dynamics, x=part.x)
     return {"friction": friction or None}
 
 
-def fit_lines(
-    name: str, fitted: FittedExperiment, is_symmetric: bool
-) -> Iterator[str]:
+def fit_lines(name: str, fitted: FittedExperiment, is_symmetric: bool) -> Iterator[str]:
     """Yield the friction with each obstacle; its energy is that of the modelled part."""
     unit = "J in the modelled part" if is_symmetric else "J"
     for obstacle, friction in (fitted.friction or {}).items():
@@ -236,14 +190,8 @@ def fit_lines(
 CONTACT = Feature(
     "contact",
     picture_kinds=[
-        PictureKind(
-            "pressure", "Pressure of obstacles on the body.", before="tracks"
-        ),
-        PictureKind(
-            "gap",
-            "Gap between the body's surface and obstacles.",
-            before="tracks",
-        ),
+        PictureKind("pressure", "Pressure of obstacles on the body.", before="tracks"),
+        PictureKind("gap", "Gap between the body's surface and obstacles.", before="tracks"),
     ],
     topics=TOPICS,
     messages=MESSAGES,

@@ -37,13 +37,11 @@ def instruments(experiment: Experiment) -> list[str]:
     return [gauge.name for gauge in experiment.readings]
 
 
-def predict(
-    segment: Transcription, trajectory: Trajectory, phi: Array
-) -> dict[str, Any]:
+def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
     """Return the predicted values (S, m) by name."""
     positions_m = trajectory.positions_m
     predicted = _predict_sensors(
-        segment,
+        transcription,
         positions_m.reshape(len(positions_m), -1),
         reactions=trajectory.reactions,
         phi=phi,
@@ -51,30 +49,20 @@ def predict(
     return {
         "readings": {
             gauge.sensor.name: gauge.without_padding(values)
-            for gauge, values in zip(
-                segment.custom_sensors, predicted, strict=True
-            )
+            for gauge, values in zip(transcription.custom_sensors, predicted, strict=True)
         }
     }
 
 
 def copied(_: Experiment, other: Experiment) -> dict[str, Any]:
     """Return the measured values of another recording by name."""
-    return {
-        "readings": {
-            gauge.name: gauge.measured_values for gauge in other.readings
-        }
-    }
+    return {"readings": {gauge.name: gauge.measured_values for gauge in other.readings}}
 
 
-def copied_times_s(
-    experiment: Experiment, other: Experiment
-) -> Iterable[tuple[Array, Array]]:
+def copied_times_s(experiment: Experiment, other: Experiment) -> Iterable[tuple[Array, Array]]:
     """Return the sample times of each sensor in both recordings."""
     pairs = zip(experiment.readings, other.readings, strict=True)
-    return [
-        (own.sample_times_s, theirs.sample_times_s) for own, theirs in pairs
-    ]
+    return [(own.sample_times_s, theirs.sample_times_s) for own, theirs in pairs]
 
 
 def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
@@ -84,17 +72,13 @@ def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     return "other sensor readings" if own != theirs else ""
 
 
-def errors(
-    experiment: Experiment, predicted: InstrumentPrediction
-) -> dict[str, Any]:
+def errors(experiment: Experiment, predicted: InstrumentPrediction) -> dict[str, Any]:
     """Return the RMS differences by name, in the units of the sensors; None without sensors."""
     rms = custom_sensor_rms(experiment, predicted.readings)
     return {"reading_rms": rms or None}
 
 
-def misfits(
-    experiment: Experiment, predicted: InstrumentPrediction
-) -> Iterator[InstrumentMisfit]:
+def misfits(experiment: Experiment, predicted: InstrumentPrediction) -> Iterator[InstrumentMisfit]:
     """Yield the differences of each sensor over its σ."""
     for gauge in experiment.readings:
         difference = predicted.readings[gauge.name] - gauge.measured_values
@@ -102,71 +86,52 @@ def misfits(
 
 
 def step_differences(
-    part: ExperimentIterate,
-    trajectory: Trajectory,
-    _: InstrumentPrediction,
-    share: float,
+    part: ExperimentIterate, trajectory: Trajectory, _: InstrumentPrediction, share: float
 ) -> Iterator[Array]:
     """Yield the changes (S, G, 3) of the residuals of each sensor; zero where not predicted."""
-    if not (segment := part.segment).custom_sensors:
+    if not (transcription := part.transcription).custom_sensors:
         return
-    fitted_x = part.x[segment.markers.observable.rows]
+    fitted_x = part.x[transcription.markers.observable.rows]
     fitted = _predict_sensors(
-        segment,
+        transcription,
         fitted_x,
-        reactions=(
-            ReactionGrid.from_dynamics(segment.dynamics),
-            part.reactions,
-        ),
+        reactions=(ReactionGrid.from_dynamics(transcription.dynamics), part.reactions),
         phi=part.phi,
     )
     simulated = _predict_sensors(
-        segment,
+        transcription,
         trajectory.positions_m.reshape(len(fitted_x), -1),
         reactions=trajectory.reactions,
         phi=part.phi,
     )
-    rows = zip(segment.custom_sensors, fitted, simulated, strict=True)
+    rows = zip(transcription.custom_sensors, fitted, simulated, strict=True)
     for gauge, of_fit, of_simulation in rows:
         change = share * np.nan_to_num(of_simulation - of_fit)
         yield change / gauge.sigmas[:, None]
 
 
 def _predict_sensors(
-    segment: Transcription,
+    transcription: Transcription,
     x: Array,
     reactions: tuple[ReactionGrid, ReactionForces],
     phi: Array,
 ) -> list[Array]:
     """Return the predictions of custom sensors, for each (S, G, 3) at S samples of G points, or
     forces and torques.
-
-    Parameters
-    ----------
-    segment : Transcription
-    x : (T, 3n) array
-        Positions at the samples [m].
-    reactions : (ReactionGrid, ReactionForces)
-        Grid and values of the reactions of grasps, for sensors of forces.
-    phi : (k,) array
-        Nuisance parameters of the recording.
     """
     grid, reaction_forces = reactions
     motion = ObservedMotion(x, reaction_forces)
     gauges = custom_sensor_residuals(
-        segment.experiment,
-        segment.experiment.t_s,
+        transcription.experiment,
+        transcription.experiment.t_s,
         grid=grid,
-        nuisance=segment.nuisance,
+        nuisance=transcription.nuisance,
     )
     return [gauge.predict_motion(motion, phi) for gauge in gauges]
 
 
 def recorded(
-    experiment: Experiment,
-    solution: Solution,
-    predicted: InstrumentPrediction | None,
-    _: Array,
+    experiment: Experiment, solution: Solution, predicted: InstrumentPrediction | None, _: Array
 ) -> dict[str, Any]:
     """Return an array (S, 1 + 3m) for each sensor, by name.
 
@@ -193,10 +158,7 @@ def simulated_series(
     """Yield the measured and simulated numbers of each sensor, without units."""
     for k, gauge in enumerate(experiment.readings, 1):
         columns = comparison_columns(
-            gauge.sample_times_s,
-            gauge.measured_values,
-            None,
-            predicted.readings[gauge.name],
+            gauge.sample_times_s, gauge.measured_values, None, predicted.readings[gauge.name]
         )
         count = gauge.measured_values.shape[1]
         names = [f"{gauge.name} {j + 1}" for j in range(count)]
@@ -218,10 +180,10 @@ def fit_rms(solution: Solution) -> dict[str, float | None]:
     """Return the RMS residual of the stresses of all fitted specimens [Pa]; None without any."""
     residuals_pa = [
         _stress_residuals(
-            segment.experiment, solution.readings[segment.experiment.name]
+            transcription.experiment, solution.readings[transcription.experiment.name]
         ).values
-        for segment in solution.collocation.transcriptions
-        if segment.experiment.specimen is not None
+        for transcription in solution.collocation.transcriptions
+        if transcription.experiment.specimen is not None
     ]
     if not residuals_pa:
         return {STRESS_UNIT: None}
@@ -232,40 +194,23 @@ def fit_rms(solution: Solution) -> dict[str, float | None]:
 def _stress_residuals(
     experiment: Experiment, predicted: Mapping[str, Array]
 ) -> PredictionResiduals:
-    """Return the differences of the stresses of a specimen, the custom sensors with the unit Pa.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Test of a specimen, with at least one measured stress.
-    predicted : mapping of str to (S, 1) array
-        Prediction at the samples of each stress [Pa], by the name of the custom sensor.
-    """
-    stresses = [
-        gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT
-    ]
+    """Return the differences of the stresses of a specimen, the custom sensors with the unit Pa."""
+    stresses = [gauge for gauge in experiment.readings if gauge.unit == STRESS_UNIT]
     return PredictionResiduals.in_order_of_time(
         np.concatenate([gauge.sample_times_s for gauge in stresses]),
-        np.concatenate(
-            [
-                predicted[gauge.name] - gauge.measured_values
-                for gauge in stresses
-            ]
-        ),
+        np.concatenate([predicted[gauge.name] - gauge.measured_values for gauge in stresses]),
         unit=STRESS_UNIT,
     )
 
 
 def units_by_name(experiment: Experiment) -> dict[str, str] | None:
     """Return the units of the custom sensors that state one, by name; None if none does."""
-    return {
-        gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit
-    } or None
+    return {gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit} or None
 
 
 def fit_fields(part: ExperimentIterate, solution: Solution) -> dict[str, Any]:
     """Return RMS residuals, stated σ and units by name; None without sensors."""
-    experiment = part.segment.experiment
+    experiment = part.transcription.experiment
     rms = custom_sensor_rms(experiment, solution.readings[experiment.name])
     sigma = {gauge.name: gauge.sigma for gauge in experiment.readings}
     return {
@@ -280,9 +225,7 @@ def fit_lines(name: str, fitted: FittedExperiment, _: bool) -> Iterator[str]:
     for reading, rms in (fitted.reading_rms or {}).items():
         unit = _unit_text(fitted.reading_unit, reading)
         sigma = short((fitted.reading_sigma or {})[reading])
-        yield (
-            f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})"
-        )
+        yield (f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})")
 
 
 def error_texts(error: PredictionErrors, units: Units) -> Iterator[str]:

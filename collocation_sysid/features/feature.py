@@ -119,8 +119,8 @@ class Feature:
     require_valid : callable
         ``require_valid(experiment)`` raises an `InputError` for data that cannot be fitted.
     predict : callable
-        ``predict(segment, trajectory, phi)``: fields of `InstrumentPrediction` for a simulated
-        motion and nuisance parameters φ (k,).
+        ``predict(transcription, trajectory, phi)``: fields of `InstrumentPrediction` for a
+        simulated motion and nuisance parameters φ (k,).
     copied : callable
         ``copied(experiment, other)``: the same fields from the measurements of another recording.
     copied_times_s : callable
@@ -210,52 +210,36 @@ class Feature:
     require_valid: Callable[[Experiment], object] = _nothing
     predict: Callable[[Transcription, Trajectory, Array], Fields] = _no_fields
     copied: Callable[[Experiment, Experiment], Fields] = _no_fields
-    copied_times_s: Callable[
-        [Experiment, Experiment], Iterable[tuple[Array, Array]]
-    ] = _nothing
+    copied_times_s: Callable[[Experiment, Experiment], Iterable[tuple[Array, Array]]] = _nothing
     reason_against_copy: Callable[[Experiment, Experiment], str] = _no_reason
     for_simulation: Callable[[Experiment], Experiment] = identity
     largest_difference_step: Callable[[Experiment], float] = lambda _: inf
-    recorded: Callable[
-        [Experiment, Solution, InstrumentPrediction | None, Array], Fields
-    ] = _no_fields
-    simulated_series: Callable[
-        [Experiment, InstrumentPrediction], Iterable[SensorSeries]
-    ] = _nothing
-    errors: Callable[[Experiment, InstrumentPrediction], Fields] = _no_fields
-    misfits: Callable[
-        [Experiment, InstrumentPrediction], Iterable[InstrumentMisfit]
-    ] = _nothing
-    step_differences: Callable[
-        [ExperimentIterate, Trajectory, InstrumentPrediction, float],
-        Iterable[Array],
-    ] = _nothing
-    hypotheses: Callable[[Experiment], Iterable[Hypothesis]] = _nothing
-    simulated_hypotheses: Callable[
-        [SimulatedCheck], tuple[Sequence[Hypothesis], Sequence[str]]
-    ] = lambda _: ((), ())
-    fit_hypotheses: Callable[[Solution], Iterable[Hypothesis]] = _nothing
-    guess_concerns: Callable[
-        [Sequence[ExperimentIterate], bool], Iterable[Concern]
-    ] = _nothing
-    part_concerns: Callable[[ExperimentIterate], Iterable[Concern]] = _nothing
-    concerns: Callable[[Sequence[ExperimentIterate]], Iterable[Concern]] = (
+    recorded: Callable[[Experiment, Solution, InstrumentPrediction | None, Array], Fields] = (
+        _no_fields
+    )
+    simulated_series: Callable[[Experiment, InstrumentPrediction], Iterable[SensorSeries]] = (
         _nothing
     )
-    simulation_concerns: Callable[
-        [str, PredictionErrors], Iterable[Concern]
+    errors: Callable[[Experiment, InstrumentPrediction], Fields] = _no_fields
+    misfits: Callable[[Experiment, InstrumentPrediction], Iterable[InstrumentMisfit]] = _nothing
+    step_differences: Callable[
+        [ExperimentIterate, Trajectory, InstrumentPrediction, float], Iterable[Array]
     ] = _nothing
-    validation_concerns: Callable[
-        [str, PredictionErrors, Solution], Iterable[Concern]
-    ] = _nothing
-    live_limitations: Callable[
-        [Experiment], Iterable[tuple[str, object, str]]
-    ] = _nothing
+    hypotheses: Callable[[Experiment], Iterable[Hypothesis]] = _nothing
+    simulated_hypotheses: Callable[[SimulatedCheck], tuple[Sequence[Hypothesis], Sequence[str]]] = (
+        lambda _: ((), ())
+    )
+    fit_hypotheses: Callable[[Solution], Iterable[Hypothesis]] = _nothing
+    guess_concerns: Callable[[Sequence[ExperimentIterate], bool], Iterable[Concern]] = _nothing
+    part_concerns: Callable[[ExperimentIterate], Iterable[Concern]] = _nothing
+    concerns: Callable[[Sequence[ExperimentIterate]], Iterable[Concern]] = _nothing
+    simulation_concerns: Callable[[str, PredictionErrors], Iterable[Concern]] = _nothing
+    validation_concerns: Callable[[str, PredictionErrors, Solution], Iterable[Concern]] = _nothing
+    live_limitations: Callable[[Experiment], Iterable[tuple[str, object, str]]] = _nothing
     write_predicted: Callable[[Experiment, Trajectory, Path], object] = _nothing
     read_predicted: Callable[[dict[str, Any]], object] = _nothing
     prediction_residuals: Callable[
-        [Experiment, Trajectory, InstrumentPrediction],
-        PredictionResiduals | None,
+        [Experiment, Trajectory, InstrumentPrediction], PredictionResiduals | None
     ] = _no_residuals
     fit_rms: Callable[[Solution], Mapping[str, float | None]] = _no_fields
     notes: Callable[[ExperimentIterate], Iterable[str]] = _nothing

@@ -39,15 +39,9 @@ KEYS_OF_FILE = (
 )
 
 
-def predict(
-    segment: Transcription, trajectory: Trajectory, phi: Array
-) -> dict[str, Any]:
+def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
     """Return the predicted marker positions (T, M, 3) [m]."""
-    return {
-        "markers_m": segment.markers.predict_samples(
-            trajectory.positions_m, phi
-        )
-    }
+    return {"markers_m": transcription.markers.predict_samples(trajectory.positions_m, phi)}
 
 
 def copied(experiment: Experiment, other: Experiment) -> dict[str, Any]:
@@ -56,15 +50,11 @@ def copied(experiment: Experiment, other: Experiment) -> dict[str, Any]:
     """
     markers = other.markers
     order = [markers.names.index(name) for name in experiment.markers.names]
-    known_m = np.where(
-        markers.is_present[..., None], markers.positions_m, np.nan
-    )
+    known_m = np.where(markers.is_present[..., None], markers.positions_m, np.nan)
     return {"markers_m": known_m[:, order]}
 
 
-def copied_times_s(
-    experiment: Experiment, other: Experiment
-) -> Iterable[tuple[Array, Array]]:
+def copied_times_s(experiment: Experiment, other: Experiment) -> Iterable[tuple[Array, Array]]:
     """Return the times of both recordings if the experiment has a marker sample."""
     if experiment.markers.count_samples():
         return ((experiment.t_s, other.t_s),)
@@ -77,14 +67,10 @@ def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     return "other markers" if own != set(other.markers.names) else ""
 
 
-def errors(
-    experiment: Experiment, predicted: InstrumentPrediction
-) -> dict[str, Any]:
+def errors(experiment: Experiment, predicted: InstrumentPrediction) -> dict[str, Any]:
     """Return RMS and largest distance of the markers [m]; None without any."""
     markers = experiment.markers
-    distance_m = np.linalg.norm(
-        predicted.markers_m - markers.positions_m, axis=2
-    )
+    distance_m = np.linalg.norm(predicted.markers_m - markers.positions_m, axis=2)
     present_m = distance_m[markers.is_present & np.isfinite(distance_m)]
     return {
         "rms_m": root_mean(present_m**2) if present_m.size else None,
@@ -92,19 +78,13 @@ def errors(
     }
 
 
-def misfits(
-    experiment: Experiment, predicted: InstrumentPrediction
-) -> Iterator[InstrumentMisfit]:
+def misfits(experiment: Experiment, predicted: InstrumentPrediction) -> Iterator[InstrumentMisfit]:
     """Yield the differences of all markers together, over their σ; nothing without a sample."""
     markers = experiment.markers
     if not markers.is_present.any():
         return
-    difference_m = (predicted.markers_m - markers.positions_m)[
-        markers.is_present
-    ]
-    sigma_m = np.broadcast_to(markers.sigma_m, markers.is_present.shape)[
-        markers.is_present
-    ]
+    difference_m = (predicted.markers_m - markers.positions_m)[markers.is_present]
+    sigma_m = np.broadcast_to(markers.sigma_m, markers.is_present.shape)[markers.is_present]
     rms_m = root_mean(np.sum(difference_m**2, axis=1))
     yield misfit(
         "the markers",
@@ -115,21 +95,16 @@ def misfits(
 
 
 def step_differences(
-    part: ExperimentIterate,
-    trajectory: Trajectory,
-    _: InstrumentPrediction,
-    share: float,
+    part: ExperimentIterate, trajectory: Trajectory, _: InstrumentPrediction, share: float
 ) -> Iterator[Array]:
     """Yield the changes (T, M, 3) of the residuals of the markers; zero where not predicted."""
-    segment = part.segment
-    fitted_m = segment.markers.predict_positions(part.x, part.phi)
+    transcription = part.transcription
+    fitted_m = transcription.markers.predict_positions(part.x, part.phi)
     way_m = share * (trajectory.markers_m - fitted_m)
-    yield np.nan_to_num(way_m / segment.experiment.markers.sigma_m[:, None])
+    yield np.nan_to_num(way_m / transcription.experiment.markers.sigma_m[:, None])
 
 
-def write_predicted(
-    experiment: Experiment, trajectory: Trajectory, folder: Path
-) -> None:
+def write_predicted(experiment: Experiment, trajectory: Trajectory, folder: Path) -> None:
     """Write the predicted tracks of the markers into a folder."""
     write_markers_csv(
         folder / PREDICTED_FILE,
@@ -170,10 +145,7 @@ def fit_rms(solution: Solution) -> dict[str, float | None]:
 def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
     """Yield RMS and largest distance in words; nothing without markers."""
     if error.rms_m:
-        yield (
-            f"{1e3 * error.rms_m:.3f} mm RMS, at most "
-            f"{1e3 * (error.max_m or 0.0):.2f} mm"
-        )
+        yield (f"{1e3 * error.rms_m:.3f} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm")
 
 
 MARKERS = Feature(

@@ -299,9 +299,7 @@ class SeriesKind:
 
     def series(self, number: int, columns: Array) -> SensorSeries:
         """Return the series of one sensor; number and columns are those of `SensorSeries`."""
-        return SensorSeries(
-            self.name, number, columns, self.number_names, units=self.units
-        )
+        return SensorSeries(self.name, number, columns, self.number_names, units=self.units)
 
 
 @dataclass(frozen=True)
@@ -328,7 +326,8 @@ class PictureKind:
 
 @dataclass(frozen=True, eq=False)
 class PredictionResiduals:
-    """Differences by which a prediction of held-out measurements is judged, predicted less measured.
+    """Differences by which a prediction of held-out measurements is judged, predicted less
+    measured.
 
     Attributes
     ----------
@@ -348,9 +347,7 @@ class PredictionResiduals:
     unit: str
 
     @classmethod
-    def in_order_of_time(
-        cls, t_s: Array, values: Array, unit: str
-    ) -> PredictionResiduals:
+    def in_order_of_time(cls, t_s: Array, values: Array, unit: str) -> PredictionResiduals:
         """Return the differences (S, d) of several sensors together, at times (S,) in any order; a
         sample counts if any of its numbers is finite.
         """
@@ -364,9 +361,7 @@ class PredictionResiduals:
         )
 
 
-def misfit(
-    what: str, declared_size: str, ratio: Array, size: str = ""
-) -> InstrumentMisfit:
+def misfit(what: str, declared_size: str, ratio: Array, size: str = "") -> InstrumentMisfit:
     """Return the misfit of one instrument; its RMS is that of the values that are finite.
 
     Parameters
@@ -383,12 +378,7 @@ def misfit(
     known = ratio[np.isfinite(ratio)]
     sigmas = root_mean(known**2)
     return InstrumentMisfit(
-        what,
-        declared_size,
-        sigmas=sigmas,
-        robust_sigmas=sigmas,
-        count=known.size,
-        size=size,
+        what, declared_size, sigmas=sigmas, robust_sigmas=sigmas, count=known.size, size=size
     )
 
 
@@ -399,17 +389,12 @@ def main_error(error: PredictionErrors) -> float:
     return error.rms_m or error.wrench_rms_n or float("inf")
 
 
-def comparison_columns(
-    t_s: Array, measured: Array, *models: Array | None
-) -> Array:
+def comparison_columns(t_s: Array, measured: Array, *models: Array | None) -> Array:
     """Return the columns time, measured values and the values of each model, as one array (S, 1 + m
     (1 + number of models)).
 
     `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
     NaN.
     """
-    columns = (
-        np.full_like(measured, np.nan) if each is None else each
-        for each in models
-    )
+    columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
     return np.column_stack([t_s, measured, *columns])

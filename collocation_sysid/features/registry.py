@@ -17,22 +17,14 @@ from .measurement_results import InstrumentPrediction, PredictionResiduals
 from .wrench_feature import WRENCH
 
 # In the order of the residuals of an experiment, see `Transcription.residuals`.
-FEATURES: tuple[Feature, ...] = (
-    MARKERS,
-    WRENCH,
-    CUSTOM_SENSORS,
-    CONTACT,
-    CAMERAS,
-)
+FEATURES: tuple[Feature, ...] = (MARKERS, WRENCH, CUSTOM_SENSORS, CONTACT, CAMERAS)
 for _feature in FEATURES:
     declare_topics(_feature.topics)
     declare_messages(_feature.messages)
 
 
 def prediction_residuals(
-    experiment: Experiment,
-    trajectory: Trajectory,
-    predicted: InstrumentPrediction,
+    experiment: Experiment, trajectory: Trajectory, predicted: InstrumentPrediction
 ) -> PredictionResiduals:
     """Return the differences by which a prediction of an experiment is judged: those of the first
     feature that has some.
@@ -43,8 +35,7 @@ def prediction_residuals(
         If nothing is measured by which it could be judged.
     """
     of_features = (
-        each.prediction_residuals(experiment, trajectory, predicted)
-        for each in FEATURES
+        each.prediction_residuals(experiment, trajectory, predicted) for each in FEATURES
     )
     for residuals in of_features:
         if residuals is not None:

@@ -21,13 +21,14 @@ from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..statistics.axes import OTHER_AXES
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 
-# Message of the offset by the code of its concern; those of other hypotheses are in `wrench_causes`.
+# Message of the offset by the code of its concern; those of other hypotheses are in
+# `wrench_causes`.
 MESSAGE_OF_OFFSET = {
     "description/wrench-offset": "most of its deviation from the simulation at the guess{after} is an "
     "offset, in {component} {offset} ({deviations:.3g} standard deviations of its noise): zero the "
     "sensor before the grasp or subtract a reading without the body; or state "
     "nuisance.tare = {{ prior_sigmas = {prior} }}, and nuisance.tool if a gripper hangs "
-    "between sensor and body",
+    "between sensor and body"
 }
 # RMS deviation in standard deviations of the noise below which nothing is tested: guesses err.
 SMALLEST_MISFIT = 5.0
@@ -92,16 +93,10 @@ class WrenchDeviation:
         """Return a sentence with the deviation and its mean."""
         mean = ", ".join(
             f"{name} {value:+.3g} {unit}"
-            for name, value, unit in zip(
-                COMPONENTS, self.compute_offset(), UNITS, strict=True
-            )
+            for name, value, unit in zip(COMPONENTS, self.compute_offset(), UNITS, strict=True)
             if np.isfinite(value)
         )
-        force = (
-            f"{self.compute_rms_n():.3g} N RMS, "
-            if np.isfinite(self.compute_rms_n())
-            else ""
-        )
+        force = f"{self.compute_rms_n():.3g} N RMS, " if np.isfinite(self.compute_rms_n()) else ""
         return (
             f"{self.subject} deviates from the simulation at the guess by {force}"
             f"{self.compute_rms_sigmas():.3g} standard deviations of its noise; mean of measured minus "
@@ -127,27 +122,17 @@ class WrenchDeviation:
         the wrench (S, 6) so corrected; None if the stated description is about as good.
         """
         stated = self._explained_share(self.measured)
-        trials = [
-            (Hypothesis("wrench-sign", self.subject), -self.measured, 0.0)
-        ]
+        trials = [(Hypothesis("wrench-sign", self.subject), -self.measured, 0.0)]
         for axes, (order, signs) in OTHER_AXES.items():
             if order == (0, 1, 2) and len({*signs}) == 1:
                 continue  # the sign of all components
             columns = [*order, *(3 + k for k in order)]
             turned = np.tile(signs, 2) * self.measured[:, columns]
-            hypothesis = Hypothesis(
-                "wrench-axes", self.subject, data={"axes": axes}
-            )
+            hypothesis = Hypothesis("wrench-axes", self.subject, data={"axes": axes})
             trials.append((hypothesis, turned, ONE_OF_MANY_SHARE))
-        shares = [
-            self._explained_share(values) - handicap
-            for _, values, handicap in trials
-        ]
+        shares = [self._explained_share(values) - handicap for _, values, handicap in trials]
         best = int(np.argmax(shares))
-        if (
-            shares[best] < EXPLAINED_SHARE
-            or stated > LARGEST_STATED_SHARE * shares[best]
-        ):
+        if shares[best] < EXPLAINED_SHARE or stated > LARGEST_STATED_SHARE * shares[best]:
             return None
         strength = shares[best] / max(stated, SMALLEST_STATED_SHARE)
         return replace(trials[best][0], strength=strength), trials[best][1]
@@ -157,9 +142,7 @@ class WrenchDeviation:
         explains with the best gain that is not negative.
         """
         measured = _centred(values)
-        simulated = np.where(
-            np.isfinite(measured), _centred(self.simulated), np.nan
-        )
+        simulated = np.where(np.isfinite(measured), _centred(self.simulated), np.nan)
         products = np.nansum(measured * simulated)
         squares = np.nansum(measured**2) * np.nansum(simulated**2)
         return float(products**2 / squares) if products > 0 and squares else 0.0
@@ -198,9 +181,7 @@ class WrenchDeviation:
         )
 
 
-def wrench_deviations(
-    parts: Sequence[ExperimentIterate],
-) -> list[WrenchDeviation]:
+def wrench_deviations(parts: Sequence[ExperimentIterate]) -> list[WrenchDeviation]:
     """Return the deviations of all wrenches of simulated experiments, without nuisance parameters;
     those without a common sample are left out.
 
@@ -211,23 +192,23 @@ def wrench_deviations(
     """
     deviations = []
     for part in parts:
-        segment = part.segment
-        for sensor in segment.sensors:
+        transcription = part.transcription
+        for sensor in transcription.sensors:
             wrench = sensor.wrench
             predicted = sensor.predict_reactions(
-                part.reactions, np.zeros(segment.nuisance.size)
+                part.reactions, np.zeros(transcription.nuisance.size)
             )
             simulated = np.where(wrench.is_measured, predicted, np.nan)
             measured = np.where(np.isfinite(simulated), wrench.values, np.nan)
             if np.isfinite(measured).any():
                 deviations.append(
                     WrenchDeviation(
-                        segment.experiment.name,
+                        transcription.experiment.name,
                         measured / wrench.stack_sigmas(),
                         simulated=simulated / wrench.stack_sigmas(),
                         sigmas=wrench.stack_sigmas(),
-                        tare=segment.experiment.nuisance.tare or 0.0,
-                        is_inertial=has_inertial_wrenches(segment.experiment),
+                        tare=transcription.experiment.nuisance.tare or 0.0,
+                        is_inertial=has_inertial_wrenches(transcription.experiment),
                     )
                 )
     return deviations

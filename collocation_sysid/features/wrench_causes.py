@@ -24,18 +24,12 @@ from ..methods.solution import Solution
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.observables import ReactionForces
 from ..program.transcription import Transcription
-from ..program.wrench_residual import (
-    WrenchResidual,
-    without_grasp_sensors,
-)
+from ..program.wrench_residual import WrenchResidual, without_grasp_sensors
 from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ..recording.poses import Frame
 from ..statistics.axes import OTHER_AXES
-from ..statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    HypothesisTest,
-)
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES = {
@@ -101,11 +95,7 @@ UNITS = (
         },
         FORCES,
     ),
-    (
-        "torques",
-        {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665},
-        TORQUES,
-    ),
+    ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, TORQUES),
 )
 # Offset over the standard deviation of the tare's prior from which on the sensor was not zeroed.
 LARGEST_TARE = 3.0
@@ -144,21 +134,14 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
     if not any(map(_misses, solution.parts)):
         return []
     with_markers = [
-        s
-        for s in solution.collocation.transcriptions
-        if s.experiment.markers.count_samples()
+        s for s in solution.collocation.transcriptions if s.experiment.markers.count_samples()
     ]
-    estimated = {part.segment.experiment.name: part for part in solution.parts}
+    estimated = {part.transcription.experiment.name: part for part in solution.parts}
     parts = _from_markers(
-        solution.collocation,
-        with_markers,
-        method=ReducedSpace(max_iterations=MOST_SWEEPS),
+        solution.collocation, with_markers, method=ReducedSpace(max_iterations=MOST_SWEEPS)
     )
     return _of_parts(
-        [
-            _with_tools(part, estimated[part.segment.experiment.name])
-            for part in parts
-        ]
+        [_with_tools(part, estimated[part.transcription.experiment.name]) for part in parts]
     )
 
 
@@ -196,16 +179,11 @@ def wrench_mistakes(collocation: Collocation) -> WrenchComparison:
     if not shorter:
         return WrenchComparison([], [])
     beginning = replace(collocation, experiments=shorter)
-    method = ReducedSpace(
-        max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE
-    )
+    method = ReducedSpace(max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE)
     parts = _from_markers(beginning, beginning.transcriptions, method=method)
-    explained = [
-        part for part in parts if _markers_misfit(part) < MARKERS_MISFIT
-    ]
+    explained = [part for part in parts if _markers_misfit(part) < MARKERS_MISFIT]
     return WrenchComparison(
-        _of_parts(explained),
-        [part.segment.experiment.name for part in explained],
+        _of_parts(explained), [part.transcription.experiment.name for part in explained]
     )
 
 
@@ -214,7 +192,7 @@ def _misses(part: ExperimentIterate) -> bool:
     `MISFIT` standard deviations; false without sensors.
     """
     # They are behind the markers.
-    pairs = zip(part.segment.sensors, part.observables[1:], strict=False)
+    pairs = zip(part.transcription.sensors, part.observables[1:], strict=False)
     return any(
         float(np.sum(sensor.residuals(observation, part.phi) ** 2))
         > MISFIT**2 * sensor.is_compared.reshape(-1, 6).sum()
@@ -226,40 +204,24 @@ def _markers_misfit(part: ExperimentIterate) -> float:
     """Return the root mean square of the markers' residuals in standard deviations; 0 without
     samples.
     """
-    residuals = part.segment.markers.residuals(part.observables[0], part.phi)
+    residuals = part.transcription.markers.residuals(part.observables[0], part.phi)
     return float(
         np.sqrt(
-            np.sum(residuals**2)
-            / max(1, 3 * part.segment.experiment.markers.count_samples())
+            np.sum(residuals**2) / max(1, 3 * part.transcription.experiment.markers.count_samples())
         )
     )
 
 
 def _from_markers(
-    collocation: Collocation,
-    transcriptions: Sequence[Transcription],
-    method: ReducedSpace,
+    collocation: Collocation, transcriptions: Sequence[Transcription], method: ReducedSpace
 ) -> list[ExperimentIterate]:
     """Return experiments fitted together to their markers alone, with the nuisance parameters of
     the wrenches at zero.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Program of the parameters and options.
-    transcriptions : sequence of Transcription
-        Transcriptions of the experiments to be fitted.
-    method : ReducedSpace
-
-    Returns
-    -------
-    list of ExperimentIterate
-        One for each transcription, with its sensors; empty if there are none or the fit fails.
     """
     if not transcriptions:
         return []
     without_wrenches = [
-        without_grasp_sensors(segment.experiment) for segment in transcriptions
+        without_grasp_sensors(transcription.experiment) for transcription in transcriptions
     ]
     try:
         solution = method(replace(collocation, experiments=without_wrenches))
@@ -267,20 +229,16 @@ def _from_markers(
         return []
     solution.unless_interrupted()
     parts = []
-    for segment, part in zip(transcriptions, solution.parts, strict=True):
-        values = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
-        phi = np.array(
-            [values.get(name, 0.0) for name in segment.nuisance.names]
-        )
-        parts.append(ExperimentIterate(segment, part.q, phi=phi, x=part.x))
+    for transcription, part in zip(transcriptions, solution.parts, strict=True):
+        values = dict(zip(part.transcription.nuisance.names, part.phi, strict=True))
+        phi = np.array([values.get(name, 0.0) for name in transcription.nuisance.names])
+        parts.append(ExperimentIterate(transcription, part.q, phi=phi, x=part.x))
     return parts
 
 
-def _with_tools(
-    part: ExperimentIterate, estimated: ExperimentIterate
-) -> ExperimentIterate:
+def _with_tools(part: ExperimentIterate, estimated: ExperimentIterate) -> ExperimentIterate:
     """Return an experiment with the masses and centres of the tools of another iterate of it."""
-    tools = part.segment.nuisance.indices_of_rows(*TOOL)
+    tools = part.transcription.nuisance.indices_of_rows(*TOOL)
     phi = np.array(part.phi)
     phi[tools] = estimated.phi[tools]
     return replace(part, phi=phi)
@@ -293,7 +251,7 @@ def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
     hypotheses: list[Hypothesis] = []
     for part in parts:
         forced = part.reactions
-        for sensor in part.segment.sensors:
+        for sensor in part.transcription.sensors:
             hypotheses += _OneSensor(part, sensor, forced=forced).causes()
     return hypotheses
 
@@ -319,22 +277,17 @@ class _OneSensor:
     scale_known: bool
 
     def __init__(
-        self,
-        part: ExperimentIterate,
-        sensor: WrenchResidual,
-        forced: ReactionForces,
+        self, part: ExperimentIterate, sensor: WrenchResidual, forced: ReactionForces
     ) -> None:
-        segment = part.segment
+        transcription = part.transcription
         self.part = part
         self.sensor = sensor
         self.forced = forced
-        blind = without_grasp_sensors(segment.experiment)
-        self.scale_known = (
-            not segment.body.mass_derivatives or blind.has_known_force()
-        )
+        blind = without_grasp_sensors(transcription.experiment)
+        self.scale_known = not transcription.body.mass_derivatives or blind.has_known_force()
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
         self.declared = DescribedWrench(
-            sensor.wrench, segment.experiment.nuisance.tare or 0.0
+            sensor.wrench, transcription.experiment.nuisance.tare or 0.0
         )
 
     def causes(self) -> Iterator[Hypothesis]:
@@ -344,9 +297,7 @@ class _OneSensor:
         accepted: list[Hypothesis] = []
         misfit = self.misfit(self.declared)
         if misfit > MISFIT:
-            test = HypothesisTest(
-                misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0
-            )
+            test = HypothesisTest(misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0)
             accepted = list(test.accepted(self._mistakes()))
         yield from accepted or self._large_tare()
 
@@ -357,9 +308,7 @@ class _OneSensor:
         tare = self.declared.tare
         if not tare:
             return
-        measured, predicted = self._scaled_by_sigma(
-            DescribedWrench(self.declared.wrench, 0.0)
-        )
+        measured, predicted = self._scaled_by_sigma(DescribedWrench(self.declared.wrench, 0.0))
         factor = 1.0 if self.scale_known else _slope(measured, predicted)
         differences = measured - factor * predicted
         is_measured = np.isfinite(differences).any(axis=0)
@@ -369,10 +318,8 @@ class _OneSensor:
             else 0.0
         )
         if largest > LARGEST_TARE:
-            of = f"the wrench of '{self.part.segment.experiment.name}'"
-            yield Hypothesis(
-                "wrench-tare", of, strength=float(largest / LARGEST_TARE)
-            )
+            of = f"the wrench of '{self.part.transcription.experiment.name}'"
+            yield Hypothesis("wrench-tare", of, strength=float(largest / LARGEST_TARE))
 
     def misfit(self, trial: DescribedWrench) -> float:
         """Return the root mean square of the residuals of a description in standard deviations,
@@ -382,9 +329,7 @@ class _OneSensor:
         measured, predicted = self._scaled_by_sigma(trial)
         if not np.isfinite(measured).any():
             return np.inf
-        factor = (
-            1.0 if self.scale_known else max(0.0, _slope(measured, predicted))
-        )
+        factor = 1.0 if self.scale_known else max(0.0, _slope(measured, predicted))
         return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
 
     def _scaled_by_sigma(self, trial: DescribedWrench) -> tuple[Array, Array]:
@@ -393,29 +338,21 @@ class _OneSensor:
         """
         wrench = trial.wrench
         sigmas = trial.wrench.stack_sigmas()
-        predicted = (
-            np.where(wrench.is_measured, self._predicted(wrench), np.nan)
-            / sigmas
-        )
-        measured = np.where(
-            np.isfinite(predicted), wrench.values / sigmas, np.nan
-        )
-        return _without_tare(measured, trial.tare), _without_tare(
-            predicted, trial.tare
-        )
+        predicted = np.where(wrench.is_measured, self._predicted(wrench), np.nan) / sigmas
+        measured = np.where(np.isfinite(predicted), wrench.values / sigmas, np.nan)
+        return _without_tare(measured, trial.tare), _without_tare(predicted, trial.tare)
 
     def _predicted(self, wrench: Wrench) -> Array:
         """Return the predicted wrench (S, 6) [N, N m] at the times, in the frame and about the
-        point of a wrench, with the tool, without tares and delays; cached. NaN where there is no prediction.
+        point of a wrench, with the tool, without tares and delays; cached. NaN where there is no
+        prediction.
         """
         at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
         if at not in self._known:
-            phi = np.zeros(self.part.segment.nuisance.size)
-            tools = self.part.segment.nuisance.indices_of_rows(*TOOL)
+            phi = np.zeros(self.part.transcription.nuisance.size)
+            tools = self.part.transcription.nuisance.indices_of_rows(*TOOL)
             phi[tools] = self.part.phi[tools]
-            self._known[at] = self.sensor.with_wrench(wrench).predict_reactions(
-                self.forced, phi
-            )
+            self._known[at] = self.sensor.with_wrench(wrench).predict_reactions(self.forced, phi)
         return self._known[at]
 
     def _gain(self, columns: slice) -> float:
@@ -428,11 +365,7 @@ class _OneSensor:
         # A common factor cannot be told where the scale is unknown, that of one kind can.
         if not self.scale_known:
             others = np.delete(np.arange(6), np.arange(6)[columns])
-            slope /= (
-                _slope(measured[:, others], predicted[:, others])
-                if len(others)
-                else np.nan
-            )
+            slope /= _slope(measured[:, others], predicted[:, others]) if len(others) else np.nan
         return 1 / slope if slope > 0 else np.nan
 
     def _point_shift_m(self) -> Array:
@@ -447,27 +380,17 @@ class _OneSensor:
         factor = 1.0
         if (
             not self.scale_known
-            and not (
-                factor := _slope(measured[:, FORCES], predicted[:, FORCES])
-            )
-            > 0
+            and not (factor := _slope(measured[:, FORCES], predicted[:, FORCES])) > 0
         ):
             return np.zeros(3)
         wrench = self.declared.wrench
         forces = self._predicted(wrench)[:, FORCES]
         by_shift = (
-            np.cross(forces[:, None], np.eye(3)[None])
-            / wrench.stack_sigmas()[3]
+            np.cross(forces[:, None], np.eye(3)[None]) / wrench.stack_sigmas()[3]
         )  # (S, shift, 3)
-        by_shift = np.where(
-            np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan
-        )
+        by_shift = np.where(np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan)
         slopes = np.stack(
-            [
-                _without_tare(by_shift[:, k], self.declared.tare)
-                for k in range(3)
-            ],
-            axis=2,
+            [_without_tare(by_shift[:, k], self.declared.tare) for k in range(3)], axis=2
         )
         differences = (measured - factor * predicted)[:, TORQUES]
         is_measured = np.isfinite(differences)
@@ -481,12 +404,10 @@ class _OneSensor:
         """Yield each common mistake, untested, with the description that corrects it: signs, frame,
         axes, units, gains, point, clock and a free tare.
         """
-        of = f"the wrench of '{self.part.segment.experiment.name}'"
+        of = f"the wrench of '{self.part.transcription.experiment.name}'"
         wrench = self.declared.wrench
 
-        def hypothesis(
-            code: str, without: Wrench, handicap: float = 1.0, **data
-        ) -> Hypothesis:
+        def hypothesis(code: str, without: Wrench, handicap: float = 1.0, **data) -> Hypothesis:
             """Return the hypothesis of a code about the sensor with the wrench `without` in place
             of the stated one; `data` are for the message.
             """
@@ -503,34 +424,20 @@ class _OneSensor:
         for what, columns in (("forces", FORCES), ("torques", TORQUES)):
             if wrench.measured_components[columns].any():
                 yield hypothesis(
-                    "wrench-sign/part",
-                    _multiplied(wrench, columns, factor=-1.0),
-                    what=what,
+                    "wrench-sign/part", _multiplied(wrench, columns, factor=-1.0), what=what
                 )
         other: Frame = "grasp" if wrench.frame == "world" else "world"
-        yield hypothesis(
-            "wrench-frame", replace(wrench, frame=other), other=other
-        )
+        yield hypothesis("wrench-frame", replace(wrench, frame=other), other=other)
         for axes, (order, signs) in OTHER_AXES.items():
             if len({*signs}) == 1 and order == (0, 1, 2):
                 continue  # a matter of the sign
-            turned = (
-                np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
-            )
+            turned = np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
             without = replace(wrench, values=turned)
-            yield hypothesis(
-                "wrench-axes", without, handicap=ONE_OF_MANY, axes=axes
-            )
+            yield hypothesis("wrench-axes", without, handicap=ONE_OF_MANY, axes=axes)
         for what, units, columns in UNITS:
-            for unit, factor in (
-                units.items()
-                if wrench.measured_components[columns].any()
-                else ()
-            ):
+            for unit, factor in units.items() if wrench.measured_components[columns].any() else ():
                 without = _multiplied(wrench, columns, factor=factor)
-                yield hypothesis(
-                    "wrench-unit", without, what=what, unit=unit, factor=factor
-                )
+                yield hypothesis("wrench-unit", without, what=what, unit=unit, factor=factor)
         for what, columns in (
             ("forces and torques", BOTH),
             ("forces", FORCES),
@@ -553,25 +460,13 @@ class _OneSensor:
                 "point": str(np.round(point_m, 3).tolist()),
             }
             yield hypothesis(
-                "wrench-point",
-                replace(wrench, point_m=point_m),
-                handicap=FITTED,
-                **data,
+                "wrench-point", replace(wrench, point_m=point_m), handicap=FITTED, **data
             )
         span_s = LATEST * float(np.ptp(wrench.t_s))
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
-            data = {
-                "by_ms": 1e3 * abs(shift_s),
-                "when": "later" if shift_s < 0 else "earlier",
-            }
-            yield hypothesis(
-                "wrench-clock",
-                replace(wrench, t_s=wrench.t_s + shift_s),
-                **data,
-            )
-        yield Hypothesis(
-            "wrench-tare", of, corrected=replace(self.declared, tare=np.inf)
-        )
+            data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
+            yield hypothesis("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
+        yield Hypothesis("wrench-tare", of, corrected=replace(self.declared, tare=np.inf))
 
 
 def _without_tare(values: Array, tare: float) -> Array:
@@ -580,9 +475,7 @@ def _without_tare(values: Array, tare: float) -> Array:
     Columns without a value stay NaN.
     """
     is_measured = np.isfinite(values)
-    prior_weight = (
-        0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
-    )
+    prior_weight = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
     return values - np.nansum(values, axis=0) / np.maximum(
         is_measured.sum(axis=0) + prior_weight, 1e-12
     )
@@ -601,13 +494,6 @@ def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
 
     The standard deviation of forces or torques among the columns is multiplied by the absolute
     factor if that is above 1, and not decreased.
-
-    Parameters
-    ----------
-    wrench : Wrench
-    columns : slice
-        `FORCES`, `TORQUES` or `BOTH`.
-    factor : float
     """
     values: Array = np.array(wrench.values)
     values[:, columns] *= factor
@@ -618,6 +504,5 @@ def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
         wrench,
         values=values,
         sigma_n=wrench.sigma_n * (larger if of_forces else 1.0),
-        sigma_nm=wrench.sigma_nm
-        and wrench.sigma_nm * (larger if of_torques else 1.0),
+        sigma_nm=wrench.sigma_nm and wrench.sigma_nm * (larger if of_torques else 1.0),
     )

@@ -20,10 +20,7 @@ from ..recording.experiment import Experiment
 from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..statistics.assessment import forward_simulation_concerns
 from ..statistics.concerns import Concern
-from ..statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    rank,
-)
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
 from ..statistics.misspecification.plausibility import load_sign_hypotheses
 from .feature import Feature, SimulatedCheck, Units
 from .measurement_results import (
@@ -39,12 +36,7 @@ from .measurement_results import (
     misfit,
 )
 from .wrench_at_guess import MESSAGE_OF_OFFSET, wrench_deviations
-from .wrench_causes import (
-    CHECKED_SAMPLES,
-    MESSAGES,
-    wrench_causes,
-    wrench_mistakes,
-)
+from .wrench_causes import CHECKED_SAMPLES, MESSAGES, wrench_causes, wrench_mistakes
 
 # Longest fit of the first samples to the markers that needs no request [s].
 LONGEST_FIT_S = 10.0
@@ -60,15 +52,13 @@ def instruments(experiment: Experiment) -> list[str]:
     return ["the wrench"] * bool(experiment.wrenches)
 
 
-def predict(
-    segment: Transcription, trajectory: Trajectory, phi: Array
-) -> dict[str, Any]:
+def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
     """Return the predicted force and torque (S, 6) of each sensor."""
     grid, reactions = trajectory.reactions
     return {
         "wrenches": [
             sensor.on_grid(grid).predict_reactions(reactions, phi)
-            for sensor in segment.sensors
+            for sensor in transcription.sensors
         ]
     }
 
@@ -78,9 +68,7 @@ def copied(_: Experiment, other: Experiment) -> dict[str, Any]:
     return {"wrenches": [each.values for each in other.wrenches]}
 
 
-def copied_times_s(
-    experiment: Experiment, other: Experiment
-) -> Iterable[tuple[Array, Array]]:
+def copied_times_s(experiment: Experiment, other: Experiment) -> Iterable[tuple[Array, Array]]:
     """Return the sample times of each sensor in both recordings."""
     pairs = zip(experiment.wrenches, other.wrenches, strict=True)
     return [(own.t_s, theirs.t_s) for own, theirs in pairs]
@@ -92,17 +80,13 @@ def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     return "other wrenches" if differ else ""
 
 
-def errors(
-    experiment: Experiment, predicted: InstrumentPrediction
-) -> dict[str, Any]:
+def errors(experiment: Experiment, predicted: InstrumentPrediction) -> dict[str, Any]:
     """Return the RMS differences of force [N] and torque [N m]; None where not measured."""
     force_n, torque_nm = wrench_rms(experiment, predicted.wrenches)
     return {"wrench_rms_n": force_n, "wrench_rms_nm": torque_nm}
 
 
-def misfits(
-    experiment: Experiment, predicted: InstrumentPrediction
-) -> Iterator[InstrumentMisfit]:
+def misfits(experiment: Experiment, predicted: InstrumentPrediction) -> Iterator[InstrumentMisfit]:
     """Yield the differences of each sensor over its σ."""
     pairs = zip(predicted.wrenches, experiment.wrenches, strict=True)
     for values, sensor in pairs:
@@ -111,29 +95,20 @@ def misfits(
 
 
 def step_differences(
-    part: ExperimentIterate,
-    _: Trajectory,
-    predicted: InstrumentPrediction,
-    share: float,
+    part: ExperimentIterate, _: Trajectory, predicted: InstrumentPrediction, share: float
 ) -> Iterator[Array]:
     """Yield the changes (S, 2, 3) of the residuals of each sensor, force and torque; zero where not
     predicted.
     """
-    sensors = part.segment.sensors
-    fitted = (
-        predict_wrenches(sensors, part.reactions, part.phi) if sensors else []
-    )
+    sensors = part.transcription.sensors
+    fitted = predict_wrenches(sensors, part.reactions, part.phi) if sensors else []
     rows = zip(sensors, fitted, predicted.wrenches, strict=True)
     for sensor, of_fit, of_simulation in rows:
-        way = share * np.nan_to_num(
-            (of_simulation - of_fit) / sensor.wrench.stack_sigmas()
-        )
+        way = share * np.nan_to_num((of_simulation - of_fit) / sensor.wrench.stack_sigmas())
         yield way.reshape(-1, 2, 3)
 
 
-def simulated_hypotheses(
-    check: SimulatedCheck,
-) -> tuple[Sequence[Hypothesis], Sequence[str]]:
+def simulated_hypotheses(check: SimulatedCheck) -> tuple[Sequence[Hypothesis], Sequence[str]]:
     """Return likely errors of wrenches, and notes with the deviation of each from the simulation.
 
     The first samples are fitted to the markers, unless another error is likely or the fit takes
@@ -147,8 +122,7 @@ def simulated_hypotheses(
     unpredicted = {each.experiment for each in deviations}
     hypotheses: list[Hypothesis] = []
     has_both = any(
-        each.wrenches and each.markers.count_samples()
-        for each in check.problem.experiments
+        each.wrenches and each.markers.count_samples() for each in check.problem.experiments
     )
     fit_s = check.fit_s(CHECKED_SAMPLES) if has_both else 0.0
     if has_both and not check.is_full and fit_s > LONGEST_FIT_S:
@@ -157,9 +131,7 @@ def simulated_hypotheses(
             f"take about {fit_s:.2g} s; check --full does it"
         )
     elif has_both:
-        check.report_progress(
-            "comparing the wrenches with the prediction from the markers"
-        )
+        check.report_progress("comparing the wrenches with the prediction from the markers")
         comparison = wrench_mistakes(check.collocation)
         hypotheses = list(comparison.hypotheses)
         unpredicted -= set(comparison.predicted)
@@ -180,17 +152,14 @@ def fit_hypotheses(solution: Solution) -> list[Hypothesis]:
         *wrench_causes(solution),
         *(
             hypothesis
-            for segment in solution.collocation.transcriptions
-            for hypothesis in load_sign_hypotheses(segment.experiment)
+            for transcription in solution.collocation.transcriptions
+            for hypothesis in load_sign_hypotheses(transcription.experiment)
         ),
     ]
 
 
 def recorded(
-    experiment: Experiment,
-    solution: Solution,
-    predicted: InstrumentPrediction | None,
-    _: Array,
+    experiment: Experiment, solution: Solution, predicted: InstrumentPrediction | None, _: Array
 ) -> dict[str, Any]:
     """Return an array (S, 19) for each sensor: time [s], and the wrench measured, fitted and
     simulated.
@@ -221,13 +190,9 @@ def simulated_series(
         yield SERIES_KIND.series(k, columns)
 
 
-def write_predicted(
-    experiment: Experiment, trajectory: Trajectory, folder: Path
-) -> None:
+def write_predicted(experiment: Experiment, trajectory: Trajectory, folder: Path) -> None:
     """Write the predicted wrench into a folder; the experiment has at most one sensor."""
-    for sensor, wrench in zip(
-        experiment.wrenches, trajectory.wrenches, strict=True
-    ):
+    for sensor, wrench in zip(experiment.wrenches, trajectory.wrenches, strict=True):
         write_wrench_csv(folder / PREDICTED_FILE, sensor.t_s, values=wrench)
 
 
@@ -244,14 +209,8 @@ def read_predicted(table: dict[str, Any]) -> None:
         return
     wrench = grasp["wrench"]
     parts = wrench.get("symmetry", 1)
-    sigmas = {
-        key: wrench[key] / parts
-        for key in ("sigma_n", "sigma_nm")
-        if key in wrench
-    }
-    remaining = {
-        key: value for key, value in wrench.items() if key not in KEYS_OF_FILE
-    }
+    sigmas = {key: wrench[key] / parts for key in ("sigma_n", "sigma_nm") if key in wrench}
+    remaining = {key: value for key, value in wrench.items() if key not in KEYS_OF_FILE}
     grasp["wrench"] = remaining | sigmas | {"file": PREDICTED_FILE}
 
 
@@ -265,12 +224,7 @@ def prediction_residuals(
     pairs = zip(predicted.wrenches, sensors, strict=True)
     return PredictionResiduals.in_order_of_time(
         np.concatenate([sensor.t_s for sensor in sensors]),
-        np.concatenate(
-            [
-                sensor.symmetry * (read - sensor.values)[:, :3]
-                for read, sensor in pairs
-            ]
-        ),
+        np.concatenate([sensor.symmetry * (read - sensor.values)[:, :3] for read, sensor in pairs]),
         unit="N",
     )
 
@@ -280,30 +234,24 @@ def fit_rms(solution: Solution) -> dict[str, float | None]:
     return {"N": pooled_wrench_rms(solution)[0]}
 
 
-def validation_concerns(
-    name: str, error: PredictionErrors, solution: Solution
-) -> list[Concern]:
+def validation_concerns(name: str, error: PredictionErrors, solution: Solution) -> list[Concern]:
     """Return a concern if the predicted force is much worse than the forces of the fit."""
     fit_n = pooled_wrench_rms(solution)[0]
     if error.wrench_rms_n is None or fit_n is None:
         return []
     return forward_simulation_concerns(
-        f"{name}/force",
-        error.wrench_rms_n,
-        fit_rms_m=fit_n,
-        noise_rms_m=0.0,
-        is_fitted=False,
+        f"{name}/force", error.wrench_rms_n, fit_rms_m=fit_n, noise_rms_m=0.0, is_fitted=False
     )
 
 
 def fit_fields(part: ExperimentIterate, solution: Solution) -> dict[str, Any]:
     """Return RMS residuals and stated σ of force [N] and torque [N m], of the whole specimen."""
-    name = part.segment.experiment.name
+    name = part.transcription.experiment.name
     force_n, torque_nm = solution.wrench_rms.get(name, (None, None))
     squares = [
         (sensor.wrench.symmetry * sensor.wrench.stack_sigmas()) ** 2
         * np.where(sensor.wrench.measured_components, 1.0, np.nan)
-        for sensor in part.segment.sensors
+        for sensor in part.transcription.sensors
     ]
     of_force, of_torque = (
         root_mean(each[np.isfinite(each)]) or None

@@ -23,7 +23,8 @@ Elements and forces:
 
 Assembly:
 
-- `discretisation`: evaluators of all elements of a body; `expressions`, `kernel`: expressions of one
+- `discretisation`: evaluators of all elements of a body; `expressions`, `kernel`: expressions of
+  one
   quadrature point; `chain_rule`: derivatives of energies by invariants.
 - `pattern`: sparsity patterns.
 """

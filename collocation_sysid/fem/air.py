@@ -8,9 +8,9 @@ Air of density ρ_a at rest exerts three forces on a body of volume V:
   convex body A is a quarter of its surface on average over directions (Cauchy).
 
 V is the volume of the undeformed body, lumped at its nodes like the mass. The coefficients c_m and
-c_d depend on shape and motion; they are accurate to some 40 %, see `statistics.budget.systematic_effects`.
-This module provides the constants and the drag force; `model.weight` applies buoyancy and added
-mass.
+c_d depend on shape and motion; they are accurate to some 40 %, see
+`statistics.budget.systematic_effects`. This module provides the constants and the drag force;
+`model.weight` applies buoyancy and added mass.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ SMOOTH_BELOW_M_S = 1e-4
 
 @cache
 def unit_drag() -> NodeForce:
-    """Return the drag on surface nodes in a fluid at rest of density 1 kg/m³, the same object at every
-    call.
+    """Return the drag on surface nodes in a fluid at rest of density 1 kg/m³, the same object at
+    every call.
 
     The force on a node with the share A of the surface [m²] is −½ c_d ¼ A √(|v|² + v₀²) v, with v₀
     =
@@ -53,13 +53,12 @@ def unit_drag() -> NodeForce:
         speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
         return -0.5 * DRAG_COEFFICIENT * FACING_SHARE * at.area_m2 * speed * v
 
-    return replace(
-        NodeForce.from_law(air_drag, name="air drag"), is_compiled=True
-    )
+    return replace(NodeForce.from_law(air_drag, name="air drag"), is_compiled=True)
 
 
 def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:
-    """Return `unit_drag` on the nodes of a body that have a share of its surface; it has no constants.
+    """Return `unit_drag` on the nodes of a body that have a share of its surface; it has no
+    constants.
 
     Parameters
     ----------
@@ -71,9 +70,5 @@ def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:
     on_surface = np.flatnonzero(surface_shares(nodes)[0] > 0)
     no_constants = np.zeros(0, dtype=np.int64)
     return LocatedForce.on_mesh(
-        unit_drag(),
-        nodes,
-        chosen=on_surface,
-        volume_m3=volume_m3,
-        columns=no_constants,
+        unit_drag(), nodes, chosen=on_surface, volume_m3=volume_m3, columns=no_constants
     )

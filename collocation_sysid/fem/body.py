@@ -40,12 +40,7 @@ from .meshes.selection import Selection
 from .node_force import LocatedForce, NodeForce
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
-from .rest_shape import (
-    InverseEquilibrium,
-    RestShapeError,
-    UnderGravity,
-    require_supported,
-)
+from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
 from .spatial_field import Field, FieldModes
 from .two_phase import PhaseSamples, TwoPhaseModes
 
@@ -203,15 +198,11 @@ class Body(Discretisation):
             prony=prony,
             field=field,
         )
-        generated: Literal["stress_free"] | None = (
-            "stress_free" if mesh.is_generated else None
-        )
+        generated: Literal["stress_free"] | None = "stress_free" if mesh.is_generated else None
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
             generated if rest_shape is None else rest_shape
         )
-        if rest_shape not in (None, "stress_free") and not isinstance(
-            rest_shape, UnderGravity
-        ):
+        if rest_shape not in (None, "stress_free") and not isinstance(rest_shape, UnderGravity):
             raise InputError(
                 f"found {rest_shape!r}; expected 'stress_free', or for a mesh that was scanned under "
                 "its own weight cs.UnderGravity(nodes, gravity_m_s2)",
@@ -220,26 +211,17 @@ class Body(Discretisation):
         if self.scan_conditions is not None:
             require_supported(parts)
         super().__init__(
-            parts,
-            tuple(forces),
-            mesh=mesh,
-            element=element,
-            evaluator=evaluator,
-            threads=threads,
+            parts, tuple(forces), mesh=mesh, element=element, evaluator=evaluator, threads=threads
         )
         # Lumped volume of every dof (3n,) for each part.
-        self._lumped_m3 = [
-            np.repeat(self._lumped_volume(part), 3) for part in self.parts
-        ]
+        self._lumped_m3 = [np.repeat(self._lumped_volume(part), 3) for part in self.parts]
         self.has_declared_mass = mass_kg is not None
-        self.node_mass: Array = self._masses_with_densities(
-            [p.density_kg_m3 for p in self.parts]
-        )[::3]
+        self.node_mass: Array = self._masses_with_densities([p.density_kg_m3 for p in self.parts])[
+            ::3
+        ]
 
     def __repr__(self) -> str:
-        materials = ", ".join(
-            f"{p.name or 'body'}: {p.material.name}" for p in self.parts
-        )
+        materials = ", ".join(f"{p.name or 'body'}: {p.material.name}" for p in self.parts)
         return (
             f"Body({len(self.nodes_m)} nodes, {len(self.cells)} {self.element.name}, "
             f"{self.mass_kg:.4g} kg, {materials})"
@@ -247,21 +229,15 @@ class Body(Discretisation):
 
     @property
     def scan_conditions(self) -> UnderGravity | None:
-        """Gravity and held nodes during the scan of the mesh; None if the mesh counts as stress-free,
-        also where `rest_shape` was not stated.
+        """Gravity and held nodes during the scan of the mesh; None if the mesh counts as
+        stress-free, also where `rest_shape` was not stated.
         """
-        return (
-            self.rest_shape
-            if isinstance(self.rest_shape, UnderGravity)
-            else None
-        )
+        return self.rest_shape if isinstance(self.rest_shape, UnderGravity) else None
 
     @cached_property
     def inverse_equilibrium(self) -> InverseEquilibrium | None:
         """Solver of the stress-free shape; None if the mesh is stress-free."""
-        return (
-            None if self.scan_conditions is None else InverseEquilibrium(self)
-        )
+        return None if self.scan_conditions is None else InverseEquilibrium(self)
 
     def rest_shape_failure(self, theta: Theta) -> str | None:
         """Return the message of the `RestShapeError` at θ (k,), with a remedy; None if there is a
@@ -286,9 +262,7 @@ class Body(Discretisation):
         """
         if self.inverse_equilibrium is None:
             return self.geometry
-        return self._geometry_at(
-            self.inverse_equilibrium.solve(theta).positions_m
-        )
+        return self._geometry_at(self.inverse_equilibrium.solve(theta).positions_m)
 
     def with_stress_free(self, positions_m: Array) -> Body:
         """Return a copy of this body with the same masses and another stress-free shape.
@@ -332,9 +306,9 @@ class Body(Discretisation):
         count, points = self.geometry.shape[:2]
         slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
         G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
-        gradients = np.einsum(
-            "eqai,eqin->eqan", slopes, np.linalg.inv(G)
-        ).reshape(count, points, -1)
+        gradients = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(
+            count, points, -1
+        )
         volumes = self.geometry[..., -1:] * np.linalg.det(G)[..., None]
         return np.concatenate([gradients, volumes], axis=2)
 
@@ -349,9 +323,7 @@ class Body(Discretisation):
         """
         if self.inverse_equilibrium is None:
             return self.mesh
-        positions_m = self.inverse_equilibrium.solve(theta).positions_m[
-            : len(self.mesh.points_m)
-        ]
+        positions_m = self.inverse_equilibrium.solve(theta).positions_m[: len(self.mesh.points_m)]
         mesh = self.mesh
         return TetMesh(
             positions_m,
@@ -370,37 +342,20 @@ class Body(Discretisation):
 
     def __getstate__(self) -> dict[str, Any]:
         # Kernels belong to this process, and cached properties are computed again.
-        state = {
-            n: v
-            for n, v in vars(self).items()
-            if n not in self._list_cached_names()
-        }
+        state = {n: v for n, v in vars(self).items() if n not in self._list_cached_names()}
         return state | {"_evaluators": {}, "_framed": {}}
 
     def _list_cached_names(self) -> set[str]:
         """Return the names of the cached properties that have been computed."""
-        return {
-            n
-            for n in vars(self)
-            if isinstance(getattr(type(self), n, None), cached_property)
-        }
+        return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
 
     def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
-        """Return the lumped volume (n,) of a part [m³], in the mesh; zero at nodes outside the part.
-
-        Parameters
-        ----------
-        part : BodyPart
-        shares : (k,) or float
-            Factors of the volumes of the part's cells; coefficients of a field may be negative.
+        """Return the lumped volume (n,) of a part [m³], in the mesh; zero at nodes outside the
+        part.
         """
         volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
-        np.add.at(
-            volume,
-            self.cells[part.cells],
-            volumes_m3[:, None] * self.element.mass_shares,
-        )
+        np.add.at(volume, self.cells[part.cells], volumes_m3[:, None] * self.element.mass_shares)
         return volume
 
     def with_free_densities(self, parts: Collection[str]) -> Body:
@@ -429,27 +384,19 @@ class Body(Discretisation):
         """Return the correlation lengths [m] of the fields, by the names of their constants; empty
         without fields.
         """
-        return {
-            part.field_name: part.field.length_m
-            for part in self.parts
-            if part.field
-        }
+        return {part.field_name: part.field.length_m for part in self.parts if part.field}
 
     def with_field_lengths(self, lengths_m: Mapping[str, float]) -> Body:
-        """Return a copy of this body with other correlation lengths [m] of its fields, by the names of
-        the fields' constants (keys of `collect_field_lengths_m`).
+        """Return a copy of this body with other correlation lengths [m] of its fields, by the names
+        of the fields' constants (keys of `collect_field_lengths_m`).
 
         Other names are ignored; a field without a length is a KeyError.
         """
         fields = (
-            part.field and part.field.with_length(lengths_m[part.field_name])
-            for part in self.parts
+            part.field and part.field.with_length(lengths_m[part.field_name]) for part in self.parts
         )
         return self.with_parts(
-            tuple(
-                replace(part, field=own)
-                for part, own in zip(self.parts, fields, strict=True)
-            )
+            tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
         )
 
     def list_phase_samples(self) -> tuple[PhaseSamples, ...]:
@@ -470,8 +417,7 @@ class Body(Discretisation):
         """
         return self.with_parts(
             tuple(
-                replace(part, field=fields.get(part.field_name, part.field))
-                for part in self.parts
+                replace(part, field=fields.get(part.field_name, part.field)) for part in self.parts
             )
         )
 
@@ -482,26 +428,18 @@ class Body(Discretisation):
         obstacle frames; θ and everything that depends on it follow the new parts.
         """
         other = copy(self)
-        for name in self._list_cached_names() - {
-            "pattern",
-            "shape_gradients",
-            "part_of_cells",
-        }:
+        for name in self._list_cached_names() - {"pattern", "shape_gradients", "part_of_cells"}:
             vars(other).pop(name, None)
-        ConstantsModel.__init__(
-            other, parts, forces=self.forces, frictions=self.frictions
-        )
+        ConstantsModel.__init__(other, parts, forces=self.forces, frictions=self.frictions)
         other._evaluators = {}
         other._framed = {}
         return other
 
     def with_frames(
-        self,
-        count: int,
-        has_skew_frame_forces: bool = False,
-        frictions: tuple[Constant, ...] = (),
+        self, count: int, has_skew_frame_forces: bool = False, frictions: tuple[Constant, ...] = ()
     ) -> Body:
-        """Return this body with the frames of obstacles: four further nodes each, which no cell has.
+        """Return this body with the frames of obstacles: four further nodes each, which no cell
+        has.
 
         The nodes are at `frame_nodes_m`, after all others, and have no mass. Frames and friction
         coefficients that the body already has are replaced, not extended. The result is this body
@@ -517,22 +455,13 @@ class Body(Discretisation):
             Friction coefficients that are parameters; the last entries of θ.
         """
         key = count, has_skew_frame_forces, frictions
-        if key == (
-            len(self.frames),
-            self.has_skew_frame_forces,
-            self.frictions,
-        ):
+        if key == (len(self.frames), self.has_skew_frame_forces, self.frictions):
             return self
         if key not in self._framed:
             other = copy(self)
-            for name in self._list_cached_names() - {
-                "part_of_cells",
-                "frame_nodes_m",
-            }:
+            for name in self._list_cached_names() - {"part_of_cells", "frame_nodes_m"}:
                 vars(other).pop(name, None)
-            ConstantsModel.__init__(
-                other, self.parts, forces=self.forces, frictions=frictions
-            )
+            ConstantsModel.__init__(other, self.parts, forces=self.forces, frictions=frictions)
             other.has_skew_frame_forces = has_skew_frame_forces
             other._evaluators = {}
             first = len(self.nodes.points_m)
@@ -540,12 +469,9 @@ class Body(Discretisation):
             other.frames = first + np.arange(4 * count).reshape(count, 4)
             other.nodes_m = np.vstack([self.nodes.points_m, added])
             other._lumped_m3 = [
-                np.append(each[: 3 * first], np.zeros(added.size))
-                for each in self._lumped_m3
+                np.append(each[: 3 * first], np.zeros(added.size)) for each in self._lumped_m3
             ]
-            other.node_mass = np.append(
-                self.node_mass[:first], np.zeros(len(added))
-            )
+            other.node_mass = np.append(self.node_mass[:first], np.zeros(len(added)))
             self._framed[key] = other
         return self._framed[key]
 
@@ -571,19 +497,15 @@ class Body(Discretisation):
         coefficients of fields that scale a constant of the material or the damping law.
         """
         indices: list[int] = []
-        for part, start, modes in zip(
-            self.parts, self.starts, self.field_slices, strict=False
-        ):
+        for part, start, modes in zip(self.parts, self.starts, self.field_slices, strict=False):
             indices += [*range(start, start + len(part.material.constants))]
-            indices += (
-                [*range(modes.start, modes.stop)] if part.stress_field else []
-            )
+            indices += [*range(modes.start, modes.stop)] if part.stress_field else []
         return indices
 
     @property
     def mass_kg(self) -> float:
-        """Total mass with the stated densities [kg], without tied masses; free densities and density
-        fields do not change it.
+        """Total mass with the stated densities [kg], without tied masses; free densities and
+        density fields do not change it.
         """
         return float(self.node_mass.sum())
 
@@ -594,11 +516,7 @@ class Body(Discretisation):
         These are ∂M/∂ρ [m³] for free densities, and the derivatives by the coefficients of the
         field of a density [kg].
         """
-        return {
-            place: slope
-            for own in self._mass_slopes
-            for place, slope in own.items()
-        }
+        return {place: slope for own in self._mass_slopes for place, slope in own.items()}
 
     @cached_property
     def _mass_slopes(self) -> list[dict[int, Array]]:
@@ -607,19 +525,12 @@ class Body(Discretisation):
         """
         slopes: list[dict[int, Array]] = []
         places = zip(self._gamma_m_indices, self.field_slices, strict=True)
-        for part, (gamma, modes), volume in zip(
-            self.parts, places, self._lumped_m3, strict=True
-        ):
+        for part, (gamma, modes), volume in zip(self.parts, places, self._lumped_m3, strict=True):
             slopes.append({gamma + 1: volume} if part.has_free_density else {})
             if part.field is not None and part.stress_field is None:
                 shares = part.density_kg_m3 * part.field.shapes.T
-                lumped = (
-                    np.repeat(self._lumped_volume(part, share), 3)
-                    for share in shares
-                )
-                slopes[-1] |= dict(
-                    zip(range(modes.start, modes.stop), lumped, strict=True)
-                )
+                lumped = (np.repeat(self._lumped_volume(part, share), 3) for share in shares)
+                slopes[-1] |= dict(zip(range(modes.start, modes.stop), lumped, strict=True))
         return slopes
 
     def densities(self, theta: Theta) -> list[float]:
@@ -627,17 +538,13 @@ class Body(Discretisation):
         else the stated value, which a density field does not change.
         """
         return [
-            float(theta[place + 1])
-            if part.has_free_density
-            else part.density_kg_m3
-            for part, place in zip(
-                self.parts, self._gamma_m_indices, strict=True
-            )
+            float(theta[place + 1]) if part.has_free_density else part.density_kg_m3
+            for part, place in zip(self.parts, self._gamma_m_indices, strict=True)
         ]
 
     def mass_of_dofs(self, theta: Theta) -> Array:
-        """Return the lumped mass (3n,) of every degree of freedom at θ (k,) [kg], without tied masses;
-        zero at nodes of obstacle frames.
+        """Return the lumped mass (3n,) of every degree of freedom at θ (k,) [kg], without tied
+        masses; zero at nodes of obstacle frames.
         """
         if not self.mass_derivatives:
             return self.dof_mass
@@ -651,9 +558,7 @@ class Body(Discretisation):
             return None
         masses = np.array(self._part_masses(theta))[:, ::3]
         # Nodes of obstacle frames have no mass.
-        total = np.where(
-            self.sum_dof_volumes_m3()[::3] > 0, masses.sum(axis=0), np.inf
-        )
+        total = np.where(self.sum_dof_volumes_m3()[::3] > 0, masses.sum(axis=0), np.inf)
         node = int(total.argmin())
         if total[node] > 0:
             return None
@@ -676,22 +581,14 @@ class Body(Discretisation):
             self.parts, self._lumped_m3, self._mass_slopes, strict=True
         ):
             density = 0.0 if part.has_free_density else part.density_kg_m3
-            masses.append(
-                sum(
-                    (theta[k] * slope for k, slope in slopes.items()),
-                    density * volume,
-                )
-            )
+            masses.append(sum((theta[k] * slope for k, slope in slopes.items()), density * volume))
         return masses
 
     def _masses_with_densities(self, densities: Sequence[float]) -> Array:
         """Return the mass of every dof (3n,) [kg] for given densities of the parts [kg/m³], without
         fields and tied masses.
         """
-        return np.sum(
-            [d * v for d, v in zip(densities, self._lumped_m3, strict=True)],
-            axis=0,
-        )
+        return np.sum([d * v for d, v in zip(densities, self._lumped_m3, strict=True)], axis=0)
 
     @cached_property
     def placed_forces(self) -> tuple[LocatedForce, ...]:
@@ -704,23 +601,11 @@ class Body(Discretisation):
         for force in self.forces:
             columns = first + np.arange(len(force.constants))
             first += len(columns)
-            nodes = (
-                np.arange(len(self.nodes_m))
-                if force.nodes is None
-                else force.nodes
-            )
-            nodes = (
-                self.select(nodes)
-                if isinstance(nodes, Selection)
-                else np.unique(nodes)
-            )
+            nodes = np.arange(len(self.nodes_m)) if force.nodes is None else force.nodes
+            nodes = self.select(nodes) if isinstance(nodes, Selection) else np.unique(nodes)
             placed.append(
                 LocatedForce.on_mesh(
-                    force,
-                    self.nodes,
-                    chosen=nodes,
-                    volume_m3=volume,
-                    columns=columns,
+                    force, self.nodes, chosen=nodes, volume_m3=volume, columns=columns
                 )
             )
         return tuple(placed)
@@ -739,9 +624,7 @@ class Body(Discretisation):
         """Lumped mass (3n,) of every degree of freedom with the stated densities [kg]."""
         return np.repeat(self.node_mass, 3)
 
-    def joint_pattern_with(
-        self, couplings: Sequence[SymmetricPattern]
-    ) -> JointPattern:
+    def joint_pattern_with(self, couplings: Sequence[SymmetricPattern]) -> JointPattern:
         """Return the union of the mesh graph with further couplings of nodes and those of custom
         forces.
 
@@ -767,11 +650,7 @@ class Body(Discretisation):
             If an elastic constant is missing or unknown, or there are several states.
         """
         x = self._state(positions)
-        return float(
-            self._evaluate("energy", [x], theta=self.elastic_theta(constants))[
-                0, 0
-            ]
-        )
+        return float(self._evaluate("energy", [x], theta=self.elastic_theta(constants))[0, 0])
 
     def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
         """Return the elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m].
@@ -779,14 +658,10 @@ class Body(Discretisation):
         See `energy` for the constants and errors.
         """
         x = self._state(positions)
-        force = self._evaluate(
-            "force", [x, np.zeros_like(x)], theta=self.elastic_theta(constants)
-        )
+        force = self._evaluate("force", [x, np.zeros_like(x)], theta=self.elastic_theta(constants))
         return force.reshape(-1, 3)
 
-    def stiffness(
-        self, positions: ArrayLike, **constants: float
-    ) -> sp.csc_array:
+    def stiffness(self, positions: ArrayLike, **constants: float) -> sp.csc_array:
         """Return the stiffness K = ∂²Ψ/∂x², sparse (3n, 3n) [N/m], at (n, 3) node positions [m].
 
         Both triangles are stored. Row 3i + j is coordinate j of node i. See `energy` for the
@@ -794,9 +669,7 @@ class Body(Discretisation):
         """
         x = self._state(positions)
         theta = self.elastic_theta(constants)
-        return self.pattern.matrix(
-            -self.linearise(x, np.zeros_like(x), theta=theta).by_position[0]
-        )
+        return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta=theta).by_position[0])
 
     # Many states ----------------------------------------------------------------------------
 
@@ -832,9 +705,7 @@ class Body(Discretisation):
             If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         x, v = self._states(positions, velocities)
-        internal = self._evaluate(
-            "force", [x, v], theta=theta, memory_input=memory_input
-        )
+        internal = self._evaluate("force", [x, v], theta=theta, memory_input=memory_input)
         return internal - self._damping_coefficients(theta, tied_kg) * v
 
     def linearise(
@@ -875,11 +746,7 @@ class Body(Discretisation):
         """
         x, v = self._states(positions, velocities)
         rows = self._evaluate(
-            "linearisation",
-            [x, v],
-            theta=theta,
-            out=out,
-            memory_input=memory_input,
+            "linearisation", [x, v], theta=theta, out=out, memory_input=memory_input
         )
         size = self.pattern.size
         entries = self.pattern.entry_count
@@ -888,8 +755,7 @@ class Body(Discretisation):
         ends = list(accumulate([0, size, entries, entries, width]))
         end = self._width_without_fields("linearisation")
         force, by_position, by_velocity, by_theta, skew = (
-            rows[:, start:stop]
-            for start, stop in zip(ends, [*ends[1:], end], strict=True)
+            rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], end], strict=True)
         )
         drag = self._damping_coefficients(theta, tied_kg)
         force -= drag * v
@@ -899,9 +765,7 @@ class Body(Discretisation):
             columns = self.field_slices[number]
             spread = self.field_assemblies[number]
             slopes = spread.field.jacobian(np.asarray(theta)[columns])
-            spread.assemble_nodal(
-                outputs["by_theta"], slopes, out=by_theta[:, :, columns]
-            )
+            spread.assemble_nodal(outputs["by_theta"], slopes, out=by_theta[:, :, columns])
         for column, slope in self._damping_derivatives(theta, tied_kg):
             # A density also changes the stress-free shape of a mesh made under gravity.
             by_theta[:, :, column] += -slope * v
@@ -915,42 +779,17 @@ class Body(Discretisation):
             by_velocity_skew=skew[:, :0],
         )
 
-    def _field_outputs(
-        self, name: str, rows: Array
-    ) -> Iterator[tuple[int, dict[str, Array]]]:
-        """Yield the index of each part with a field, and the outputs by the logarithm of each cell.
-
-        Parameters
-        ----------
-        name : str
-            Kernel: "linearisation" or "curvature".
-        rows : (T, width)
-            Result of the kernel.
-        """
+    def _field_outputs(self, name: str, rows: Array) -> Iterator[tuple[int, dict[str, Array]]]:
+        """Yield the index of each part with a field, and the outputs by the logarithm of each cell."""
         places = self.field_output_slices(name)
         for number in self.field_assemblies:
-            yield (
-                number,
-                {
-                    out: rows[:, at]
-                    for (of, out), at in places.items()
-                    if of == number
-                },
-            )
+            yield (number, {out: rows[:, at] for (of, out), at in places.items() if of == number})
 
     def _apply_stiffening_chain_rule(
         self, by_theta: Array, memory_input: MemoryInput | None
     ) -> None:
         """Replace derivatives by the stiffening s of each part by derivatives by the constants of
         its memory, in place.
-
-        Parameters
-        ----------
-        by_theta : (T, 3n, k)
-            Derivatives; the column of a part's first branch constant has those by s and is
-            overwritten.
-        memory_input : MemoryInput or None
-            Provides ds/dθ; None for relaxed memory, where they are zero.
         """
         for first, columns in self._memory_columns:
             if memory_input is None:
@@ -964,16 +803,9 @@ class Body(Discretisation):
         """For each part with memory, in their order: the index in θ of its first branch constant,
         and the slice of θ with all its branch constants, two for each branch.
         """
-        firsts = [
-            s + p.law_constant_count
-            for p, s in zip(self.parts, self.starts, strict=False)
-        ]
+        firsts = [s + p.law_constant_count for p, s in zip(self.parts, self.starts, strict=False)]
         counts = [2 * len(part.prony) for part in self.parts]
-        return [
-            (f, slice(f, f + n))
-            for f, n in zip(firsts, counts, strict=True)
-            if n
-        ]
+        return [(f, slice(f, f + n)) for f, n in zip(firsts, counts, strict=True) if n]
 
     def second_derivatives(
         self,
@@ -1031,9 +863,7 @@ class Body(Discretisation):
             curvature.theta[:, column] += np.einsum("ti,ti->t", drag, v)
         self._set_field_curvature(curvature, rows, theta=theta)
         self._apply_stiffening_to_curvature(curvature, memory_input)
-        for gamma, mass_slopes in zip(
-            self._gamma_m_indices, self._mass_slopes, strict=True
-        ):
+        for gamma, mass_slopes in zip(self._gamma_m_indices, self._mass_slopes, strict=True):
             for place, slope in mass_slopes.items():
                 mixed = -np.einsum("ti,ti,i->t", w, v, slope)
                 curvature.theta_theta[:, place, gamma] = mixed
@@ -1041,8 +871,8 @@ class Body(Discretisation):
         return curvature
 
     def _curvature_views(self, rows: Array) -> SecondDerivatives:
-        """Return result rows (T, width) of the kernel "curvature" as views by their meaning, without
-        derivatives by fields; ∂²φ/∂v² is empty.
+        """Return result rows (T, width) of the kernel "curvature" as views by their meaning,
+        without derivatives by fields; ∂²φ/∂v² is empty.
         """
         count = len(rows)
         size = self.pattern.size
@@ -1064,19 +894,9 @@ class Body(Discretisation):
             velocity_velocity=np.zeros((count, 0)),
         )
 
-    def _set_field_curvature(
-        self, curvature: SecondDerivatives, rows: Array, theta: Theta
-    ) -> None:
+    def _set_field_curvature(self, curvature: SecondDerivatives, rows: Array, theta: Theta) -> None:
         """Set the derivatives by coefficients of fields, in place, from those by the logarithm of
         each cell.
-
-        Parameters
-        ----------
-        curvature : SecondDerivatives
-            Entries of the coefficients are overwritten.
-        rows : (T, width)
-            Result of the kernel "curvature".
-        theta : (k,)
         """
         for number, outputs in self._field_outputs("curvature", rows):
             columns = self.field_slices[number]
@@ -1087,9 +907,7 @@ class Body(Discretisation):
                 ("position_theta", curvature.position_theta),
                 ("velocity_theta", curvature.velocity_theta),
             ):
-                spread.assemble_nodal(
-                    outputs[output], slopes, out=by_nodes[:, :, columns]
-                )
+                spread.assemble_nodal(outputs[output], slopes, out=by_nodes[:, :, columns])
             by_logarithm = outputs["gradient_theta"]
             curvature.theta[:, columns] = by_logarithm @ slopes
             first = self.starts[number]
@@ -1099,12 +917,9 @@ class Body(Discretisation):
             mixed = np.einsum("tek,em->tkm", second[:, :, :count], slopes)
             curvature.theta_theta[:, constants, columns] = mixed
             curvature.theta_theta[:, columns, constants] = mixed.swapaxes(1, 2)
-            by_coefficients = spread.field.weighted_hessian(
-                coefficients, by_logarithm
-            )
+            by_coefficients = spread.field.weighted_hessian(coefficients, by_logarithm)
             curvature.theta_theta[:, columns, columns] = (
-                slopes.T @ (second[:, :, count, None] * slopes)
-                + by_coefficients
+                slopes.T @ (second[:, :, count, None] * slopes) + by_coefficients
             )
 
     def _apply_stiffening_to_curvature(
@@ -1123,24 +938,15 @@ class Body(Discretisation):
             self._apply_stiffening_chain_rule(values, memory_input)
         if memory_input is not None:
             for first, columns in self._memory_columns:
-                bends = memory_input.stiffening_second_derivatives[
-                    :, columns, columns
-                ]
-                theta_theta[:, columns, columns] += (
-                    curvature.theta[:, first, None, None] * bends
-                )
-        self._apply_stiffening_chain_rule(
-            curvature.theta[:, None], memory_input
-        )
+                bends = memory_input.stiffening_second_derivatives[:, columns, columns]
+                theta_theta[:, columns, columns] += curvature.theta[:, first, None, None] * bends
+        self._apply_stiffening_chain_rule(curvature.theta[:, None], memory_input)
 
     @cached_property
     def _gamma_m_indices(self) -> list[int]:
         """Index in θ of each part's γ_m; the density follows where it is free."""
         starts = zip(self.parts, self.starts, strict=False)
-        return [
-            start + (part.law_constant_count + 2 * len(part.prony))
-            for part, start in starts
-        ]
+        return [start + (part.law_constant_count + 2 * len(part.prony)) for part, start in starts]
 
     @cached_property
     def tied_shares(self) -> dict[int, Array]:
@@ -1149,13 +955,9 @@ class Body(Discretisation):
 
     def tied_damping_rate(self, theta: Theta) -> Array:
         """Return the mass-proportional damping rate γ_m (3n,) of tied masses at every dof [1/s]."""
-        return np.sum(
-            [theta[k] * share for k, share in self.tied_shares.items()], axis=0
-        )
+        return np.sum([theta[k] * share for k, share in self.tied_shares.items()], axis=0)
 
-    def _damped_masses(
-        self, theta: Theta, tied_kg: Array | None
-    ) -> Iterator[tuple[int, Array]]:
+    def _damped_masses(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
         """Yield for each part the index in θ of its γ_m, and the mass (3n,) or (T, 3n) [kg] damped
         by it.
 
@@ -1172,27 +974,15 @@ class Body(Discretisation):
     def _tied_shares(self) -> list[Array]:
         """Fraction (3n,) of each part in the stated mass at every dof."""
         parts = zip(self.parts, self._lumped_m3, strict=True)
-        total_kg = np.where(
-            self.dof_mass == 0, 1.0, self.dof_mass
-        )  # frames have none
-        return [
-            part.density_kg_m3 * volume / total_kg for part, volume in parts
-        ]
+        total_kg = np.where(self.dof_mass == 0, 1.0, self.dof_mass)  # frames have none
+        return [part.density_kg_m3 * volume / total_kg for part, volume in parts]
 
-    def _damping_coefficients(
-        self, theta: Theta, tied_kg: Array | None
-    ) -> Array:
+    def _damping_coefficients(self, theta: Theta, tied_kg: Array | None) -> Array:
         """Return the coefficients Σ γ_m M of mass-proportional damping [N·s/m] at θ (k,): (3n,), or
         (T, 3n) if `tied_kg` is; see `_damped_masses` for the tied masses.
         """
         # `numpy.sum` of a list takes longer than the products.
-        return reduce(
-            np.add,
-            (
-                theta[k] * mass
-                for k, mass in self._damped_masses(theta, tied_kg)
-            ),
-        )
+        return reduce(np.add, (theta[k] * mass for k, mass in self._damped_masses(theta, tied_kg)))
 
     def _damping_derivatives(
         self, theta: Theta, tied_kg: Array | None
@@ -1202,12 +992,8 @@ class Body(Discretisation):
         derivatives add up. `tied_kg` is that of `_damped_masses`.
         """
         yield from self._damped_masses(theta, tied_kg)
-        for gamma, own in zip(
-            self._gamma_m_indices, self._mass_slopes, strict=True
-        ):
-            yield from (
-                (place, theta[gamma] * slope) for place, slope in own.items()
-            )
+        for gamma, own in zip(self._gamma_m_indices, self._mass_slopes, strict=True):
+            yield from ((place, theta[gamma] * slope) for place, slope in own.items())
 
 
 def _with_weights_appended(memory_input: MemoryInput) -> MemoryInput:
@@ -1217,6 +1003,4 @@ def _with_weights_appended(memory_input: MemoryInput) -> MemoryInput:
     weights = memory_input.stress_weights
     if weights is None:
         weights = np.zeros_like(memory_input.overstress)
-    return replace(
-        memory_input, overstress=np.hstack([memory_input.overstress, weights])
-    )
+    return replace(memory_input, overstress=np.hstack([memory_input.overstress, weights]))

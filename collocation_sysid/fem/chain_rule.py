@@ -50,27 +50,16 @@ class SymbolicFunction:
         """Return the indices of the partial derivatives that occur in expressions."""
         if not self.symbols:
             return []
-        occurring = {
-            each.__hash__() for each in ca.symvar(ca.veccat(*expressions))
-        }
-        return [
-            key
-            for key, each in self.symbols.items()
-            if each.__hash__() in occurring
-        ]
+        occurring = {each.__hash__() for each in ca.symvar(ca.veccat(*expressions))}
+        return [key for key, each in self.symbols.items() if each.__hash__() in occurring]
 
-    def shifted(
-        self, indices: Sequence[PartialIndex], arguments: Sequence[int]
-    ) -> ca.SX:
-        """Return the symbols (k, a) of the derivatives of k partial derivatives by a of the arguments,
-        given by index: entry (i, j) is the derivative of the ith by the jth. New symbols are added
-        to `symbols`.
+    def shifted(self, indices: Sequence[PartialIndex], arguments: Sequence[int]) -> ca.SX:
+        """Return the symbols (k, a) of the derivatives of k partial derivatives by a of the
+        arguments, given by index: entry (i, j) is the derivative of the ith by the jth. New symbols
+        are added to `symbols`.
         """
         return ca.vertcat(
-            *(
-                ca.horzcat(*(self.symbol((*index, a)) for a in arguments))
-                for index in indices
-            )
+            *(ca.horzcat(*(self.symbol((*index, a)) for a in arguments)) for index in indices)
         )
 
 
@@ -98,9 +87,9 @@ class ChainRule:
             arguments = sorted(set(slopes.sparsity().row()))
             if indices and arguments:
                 symbols = ca.vertcat(*map(function.symbol, indices))
-                by_argument = ca.jacobian(
-                    expression, symbols
-                ) @ function.shifted(indices, arguments)
+                by_argument = ca.jacobian(expression, symbols) @ function.shifted(
+                    indices, arguments
+                )
                 total += by_argument @ slopes[arguments, :]
         return total
 
@@ -110,9 +99,7 @@ class ChainRule:
             return ca.gradient(scalar, by)
         return ca.densify(self.jacobian(scalar, by)).T
 
-    def directional_derivative(
-        self, expression: ca.SX, by: ca.SX, direction: ca.SX
-    ) -> ca.SX:
+    def directional_derivative(self, expression: ca.SX, by: ca.SX, direction: ca.SX) -> ca.SX:
         """Return the total derivative (m,) of an expression (m,) by symbols (k,) along a direction
         (k,), including the dependence through functions that occur in the expression as symbols.
         """
@@ -121,9 +108,7 @@ class ChainRule:
         for function in self.functions:
             if indices := function.indices_in([expression]):
                 symbols += map(function.symbol, indices)
-                rates.append(
-                    self._rates(function, indices, by=by, direction=direction)
-                )
+                rates.append(self._rates(function, indices, by=by, direction=direction))
         return ca.jtimes(expression, ca.vertcat(*symbols), ca.vertcat(*rates))
 
     def rates(self, by: ca.SX, direction: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -133,12 +118,9 @@ class ChainRule:
         """
         symbols = [function.symbol() for function in self.functions]
         rates = [
-            self._rates(function, [()], by=by, direction=direction)
-            for function in self.functions
+            self._rates(function, [()], by=by, direction=direction) for function in self.functions
         ]
-        return ca.vertcat(ca.SX(0, 1), *symbols), ca.vertcat(
-            ca.SX(0, 1), *rates
-        )
+        return ca.vertcat(ca.SX(0, 1), *symbols), ca.vertcat(ca.SX(0, 1), *rates)
 
     def _rates(
         self,
@@ -149,14 +131,6 @@ class ChainRule:
     ) -> ca.SX:
         """Return the derivatives (i,) of partial derivatives of a function by symbols `by` (k,)
         along a `direction` (k,), as expressions in symbols of the function.
-
-        Parameters
-        ----------
-        function : SymbolicFunction
-            Gets symbols for partial derivatives of the next order.
-        indices : sequence of PartialIndex
-            The i partial derivatives to differentiate.
-        by, direction : (k,) SX
         """
         argument_rates = ca.jtimes(function.arguments, by, direction)
         arguments = sorted(set(ca.sparsify(argument_rates).sparsity().row()))

@@ -98,9 +98,7 @@ class CoarseBody:
         return sp.csr_array((weights.ravel(), places), shape=shape)
 
 
-def coarsen_body(
-    body: Body, node_count: int, node_sets: Sequence[Index]
-) -> CoarseBody:
+def coarsen_body(body: Body, node_count: int, node_sets: Sequence[Index]) -> CoarseBody:
     """Return the body on a mesh with about a given number of nodes.
 
     Materials, stated and free densities, fields (not computed again), custom forces, the rest shape
@@ -130,10 +128,7 @@ def coarsen_body(
     for number, part in enumerate(body.parts):
         groups[part.cells] = number
     meshes = coarsen_mesh(
-        body.mesh,
-        max(4, node_count * corners // len(body.nodes.points_m)),
-        labels.ravel(),
-        groups,
+        body.mesh, max(4, node_count * corners // len(body.nodes.points_m)), labels.ravel(), groups
     )
     return _with_properties(body, meshes, groups[meshes.source_cells])
 
@@ -152,9 +147,7 @@ def _own_node_sets(body: Body) -> list[Index]:
     return sets
 
 
-def _with_properties(
-    body: Body, meshes: CoarseMesh, groups: Index
-) -> CoarseBody:
+def _with_properties(body: Body, meshes: CoarseMesh, groups: Index) -> CoarseBody:
     """Return the body on the coarse mesh; `groups` (E,) are the parts of its elements."""
     cells = [np.flatnonzero(groups == k) for k in range(len(body.parts))]
     regions = [
@@ -170,9 +163,7 @@ def _with_properties(
         if part.name
     ]
     # A region without a density has that of the body, even if regions claim all cells.
-    rest = next(
-        (part for part in body.parts if not part.has_own_density), body.parts[0]
-    )
+    rest = next((part for part in body.parts if not part.has_own_density), body.parts[0])
     nodes = ElementNodes.for_element(meshes.mesh, body.element)
     coarse = type(body)(
         meshes.mesh,
@@ -182,30 +173,23 @@ def _with_properties(
         damping=rest.damping,
         regions=regions,
         prony=rest.prony,
-        forces=[
-            _coarse_force(each, meshes, nodes) for each in body.placed_forces
-        ],
+        forces=[_coarse_force(each, meshes, nodes) for each in body.placed_forces],
         rest_shape=_coarse_rest_shape(body, meshes, nodes),
         evaluator=body.evaluator,
         threads=body.threads,
     )
     coarse.has_declared_mass = body.has_declared_mass
-    coarse = coarse.with_free_densities(
-        [part.name for part in body.parts if part.has_free_density]
-    )
+    coarse = coarse.with_free_densities([part.name for part in body.parts if part.has_free_density])
     parts = zip(coarse.parts, body.parts, strict=True)
     coarse = coarse.with_parts(
         tuple(
-            replace(part, field=_coarse_field(source, part, body, coarse))
-            for part, source in parts
+            replace(part, field=_coarse_field(source, part, body, coarse)) for part, source in parts
         )
     )
     return CoarseBody(body, coarse, meshes)
 
 
-def _transferred_nodes(
-    nodes: Index, meshes: CoarseMesh, coarse_nodes: ElementNodes
-) -> Index:
+def _transferred_nodes(nodes: Index, meshes: CoarseMesh, coarse_nodes: ElementNodes) -> Index:
     """Return the nodes of the coarse body that correspond to nodes (k,) of the given one, see
     `CoarseBody.coarse_nodes`.
     """
@@ -221,9 +205,7 @@ def _coarse_force(
     """Return a custom force for the coarse body, at the corresponding nodes."""
     if placed.force.nodes is None:
         return placed.force
-    nodes = _transferred_nodes(
-        np.unique(placed.points.nodes), meshes, coarse_nodes
-    )
+    nodes = _transferred_nodes(np.unique(placed.points.nodes), meshes, coarse_nodes)
     return replace(placed.force, nodes=Indices(nodes.tolist()))
 
 
@@ -236,28 +218,13 @@ def _coarse_rest_shape(
     scan = body.scan_conditions
     if scan is None:
         return None if body.rest_shape is None else "stress_free"
-    nodes = _transferred_nodes(
-        scan.grasped_nodes(body.nodes), meshes, coarse_nodes
-    )
+    nodes = _transferred_nodes(scan.grasped_nodes(body.nodes), meshes, coarse_nodes)
     return replace(scan, nodes=Indices(nodes.tolist()))
 
 
-def _coarse_field(
-    source: BodyPart, part: BodyPart, body: Body, coarse: Body
-) -> FieldModes | None:
+def _coarse_field(source: BodyPart, part: BodyPart, body: Body, coarse: Body) -> FieldModes | None:
     """Return the field of a part on the elements of the coarse part, each with the value of the
     nearest element; None without a field.
-
-    Parameters
-    ----------
-    source, part : BodyPart
-        Part of the given body, and of the coarse one.
-    body, coarse : Body
-
-    Raises
-    ------
-    InputError
-        For a two-phase field, whose phases belong to elements.
     """
     modes = source.field
     if modes is None:
@@ -270,6 +237,4 @@ def _coarse_field(
         )
     centres_m = body.mesh.centres_m[source.cells]
     _, nearest = KDTree(centres_m).query(coarse.mesh.centres_m[part.cells])
-    return modes.on_cells(
-        np.asarray(nearest), coarse.mesh.volumes_m3[part.cells]
-    )
+    return modes.on_cells(np.asarray(nearest), coarse.mesh.volumes_m3[part.cells])

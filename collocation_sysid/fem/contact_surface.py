@@ -61,9 +61,7 @@ class ContactSurface:
     faces: Index
 
     @classmethod
-    def from_body(
-        cls, body: Body, frame: Index, chosen: Selection | None
-    ) -> ContactSurface:
+    def from_body(cls, body: Body, frame: Index, chosen: Selection | None) -> ContactSurface:
         """Return the contact points of a body and the frame of an obstacle: 3 on each linear face,
         6 on each quadratic one, face after face.
 
@@ -103,8 +101,7 @@ class ContactSurface:
             node_count=len(body.nodes_m),
         )
         in_part = [
-            np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1)
-            for p in body.parts
+            np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1) for p in body.parts
         ]
         part = int(np.argmax([area[each].sum() for each in in_part]))
         edges_m = np.linalg.norm(sides, axis=2).mean(axis=1)

@@ -20,23 +20,12 @@ from ..errors import InputError
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, PointLaw, energy_kernel
 from .kernel import ElementKernel
-from .kernels import (
-    COMPILING,
-    Evaluator,
-    EvaluatorChoice,
-    KernelBatch,
-    available_threads,
-)
+from .kernels import COMPILING, Evaluator, EvaluatorChoice, KernelBatch, available_threads
 from .laws.memory import MemoryInput, MemoryLayout
 from .meshes.mesh import ElementNodes, TetMesh
 from .meshes.selection import Selection
 from .node_force import NodeForce
-from .pattern import (
-    SymmetricPattern,
-    dofs_of,
-    element_destinations,
-    with_ascending_nodes,
-)
+from .pattern import SymmetricPattern, dofs_of, element_destinations, with_ascending_nodes
 from .regions import BodyPart, ConstantsModel, Theta
 from .rest_shape import InverseEquilibrium
 from .spatial_field import FieldAssembly
@@ -44,12 +33,7 @@ from .spatial_field import FieldAssembly
 # Outputs with columns for θ; a field adds derivatives by the logarithm of each cell.
 BY_FIELD = {
     "linearisation": ("by_theta",),
-    "curvature": (
-        "position_theta",
-        "velocity_theta",
-        "theta_theta",
-        "gradient_theta",
-    ),
+    "curvature": ("position_theta", "velocity_theta", "theta_theta", "gradient_theta"),
 }
 
 
@@ -108,16 +92,12 @@ class Discretisation(ConstantsModel):
         self._framed: dict[tuple[Any, ...], Any] = {}
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
-        self.geometry = reference_geometry(
-            self.nodes_m, self.cells, element=self.element
-        )
+        self.geometry = reference_geometry(self.nodes_m, self.cells, element=self.element)
         self._evaluators: dict[str, list[Evaluator]] = {}
         self._choice = EvaluatorChoice(evaluator)
         # Derivatives need no operations but those of the energy and the ones every evaluator has.
         for number in range(len(self.parts)):
-            self._choice.check(
-                energy_kernel(self.element, self.law(number)).pieces
-            )
+            self._choice.check(energy_kernel(self.element, self.law(number)).pieces)
 
     def select(self, selection: Selection) -> Index:
         """Return the nodes of a `selection.Selection`, sorted.
@@ -139,8 +119,8 @@ class Discretisation(ConstantsModel):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences that state why the evaluator is "casadi" although "auto" was chosen; empty if the
-        material is not the cause.
+        """Sentences that state why the evaluator is "casadi" although "auto" was chosen; empty if
+        the material is not the cause.
         """
         return self._choice.notes
 
@@ -168,17 +148,9 @@ class Discretisation(ConstantsModel):
         """
         part = self.parts[number]
         scaled = part.field.scaled_indices if part.field else ()
-        rest = (
-            self.inverse_equilibrium.layout
-            if self.inverse_equilibrium
-            else None
-        )
+        rest = self.inverse_equilibrium.layout if self.inverse_equilibrium else None
         return PointLaw(
-            part.material,
-            part.damping,
-            has_memory=memory,
-            scaled_indices=scaled,
-            rest=rest,
+            part.material, part.damping, has_memory=memory, scaled_indices=scaled, rest=rest
         )
 
     @cached_property
@@ -195,13 +167,11 @@ class Discretisation(ConstantsModel):
         stress-free shape that is not the mesh, changes of its inputs follow; they are zero, because
         the shape has been computed at this θ.
         """
-        part_constants = np.asarray(
-            self.split_theta(theta)[number], dtype=float
-        )[: self.parts[number].point_constant_count]
+        part_constants = np.asarray(self.split_theta(theta)[number], dtype=float)[
+            : self.parts[number].point_constant_count
+        ]
         changes = np.zeros(
-            self.inverse_equilibrium.layout.input_count
-            if self.inverse_equilibrium
-            else 0
+            self.inverse_equilibrium.layout.input_count if self.inverse_equilibrium else 0
         )
         return np.concatenate([part_constants, changes])
 
@@ -234,22 +204,15 @@ class Discretisation(ConstantsModel):
             If the mesh is a shape under gravity and no stress-free shape exists at θ.
         """
         if self.inverse_equilibrium is not None:
-            return self.inverse_equilibrium.point_data(
-                theta, with_second_derivatives
-            )[number]
+            return self.inverse_equilibrium.point_data(theta, with_second_derivatives)[number]
         field = self.parts[number].stress_field
         if field is None:
             return internal_variables
-        logs = field.logarithms(np.asarray(theta)[self.field_slices[number]])[
-            None
-        ]
+        logs = field.logarithms(np.asarray(theta)[self.field_slices[number]])[None]
         if internal_variables is None:
             return logs
         return np.hstack(
-            [
-                internal_variables,
-                np.broadcast_to(logs, (len(internal_variables), logs.shape[1])),
-            ]
+            [internal_variables, np.broadcast_to(logs, (len(internal_variables), logs.shape[1]))]
         )
 
     @cached_property
@@ -318,8 +281,7 @@ class Discretisation(ConstantsModel):
         none.
         """
         first_indices = [
-            s + p.law_constant_count
-            for p, s in zip(self.parts, self.starts, strict=False)
+            s + p.law_constant_count for p, s in zip(self.parts, self.starts, strict=False)
         ]
         return MemoryLayout(
             self.parts,
@@ -330,17 +292,15 @@ class Discretisation(ConstantsModel):
 
     @cached_property
     def is_unsymmetric(self) -> bool:
-        """Whether a derivative of the forces by position or velocity can have a skew part: that of a
-        damping law given as a stress, of forces on frames (`has_skew_frame_forces`), or of a custom
-        force.
+        """Whether a derivative of the forces by position or velocity can have a skew part: that of
+        a damping law given as a stress, of forces on frames (`has_skew_frame_forces`), or of a
+        custom force.
         """
         laws = any(part.damping.stress is not None for part in self.parts)
         return (
             laws
             or self.has_skew_frame_forces
-            or any(
-                f.has_skew_stiffness or f.has_skew_damping for f in self.forces
-            )
+            or any(f.has_skew_stiffness or f.has_skew_damping for f in self.forces)
         )
 
     @cached_property
@@ -369,9 +329,7 @@ class Discretisation(ConstantsModel):
         count, points = self.geometry.shape[:2]
         x = self._states(positions)[0].reshape(-1, nodes, 3)
         by_node = np.ascontiguousarray(x.transpose(1, 2, 0)).reshape(nodes, -1)
-        slopes = (self.shape_gradients @ by_node).reshape(
-            3, count * points, 3, len(x)
-        )
+        slopes = (self.shape_gradients @ by_node).reshape(3, count * points, 3, len(x))
         a, b, c = slopes.transpose(0, 2, 1, 3)
         ratios = (
             a[0] * (b[1] * c[2] - b[2] * c[1])
@@ -387,27 +345,18 @@ class Discretisation(ConstantsModel):
         columns.
         """
         count, points = self.geometry.shape[:2]
-        gradients = self.geometry[..., :-1].reshape(
-            count, points, self.element.nodes, 3
-        )
+        gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
         values = np.moveaxis(gradients, 3, 0)
         columns = np.broadcast_to(self.cells[:, None], values.shape)
         starts = np.arange(0, values.size + 1, self.element.nodes)
         shape = (3 * count * points, len(self.nodes_m))
-        return sp.csr_array(
-            (values.ravel(), columns.ravel(), starts), shape=shape
-        )
+        return sp.csr_array((values.ravel(), columns.ravel(), starts), shape=shape)
 
     # Assembly -------------------------------------------------------------------------------
 
     def _states(self, *fields: ArrayLike) -> list[Array]:
         """Return every node field, (n, 3), (T, n, 3) or (T, 3n), as (T, 3n), contiguous; native
         code relies on these shapes.
-
-        Raises
-        ------
-        InputError
-            If a field does not fit the nodes, or numbers of states differ.
         """
         nodes = len(self.nodes_m)
         arrays = [np.ascontiguousarray(field, dtype=float) for field in fields]
@@ -441,23 +390,6 @@ class Discretisation(ConstantsModel):
         """Evaluate a kernel on all parts and add up the results (T, width).
 
         Evaluators are made at the first use of a kernel and kept.
-
-        Parameters
-        ----------
-        name : str
-            Kernel in `expressions.KERNELS`.
-        fields : sequence of (T, 3n)
-            Node fields that the kernel needs: x, v, w.
-        theta : (k,)
-        out : (T, width), optional
-            Memory for the result; overwritten.
-        memory_input : MemoryInput, optional
-            Internal variables of a body with memory; zero by default.
-
-        Raises
-        ------
-        InputError
-            If θ has another length than the constants of the body.
         """
         if len(theta) != len(self.constants):
             raise InputError(
@@ -467,28 +399,18 @@ class Discretisation(ConstantsModel):
         with COMPILING:
             if name not in self._evaluators:
                 batches = [self._batch(name, k) for k in range(len(self.parts))]
-                self._evaluators[name] = [
-                    self.make_evaluator(batch) for batch in batches
-                ]
+                self._evaluators[name] = [self.make_evaluator(batch) for batch in batches]
         width = self._width(name)
         shape = (len(fields[0]), width)
         if out is None:
             out = np.empty(shape)
-        elif (
-            out.shape != shape
-            or out.dtype != float
-            or not out.flags.c_contiguous
-        ):
-            raise InputError(
-                f"out is {out.dtype} {out.shape}; expected contiguous float64 {shape}"
-            )
+        elif out.shape != shape or out.dtype != float or not out.flags.c_contiguous:
+            raise InputError(f"out is {out.dtype} {out.shape}; expected contiguous float64 {shape}")
         theta = np.asarray(theta, dtype=float)
         for k, evaluate in enumerate(self._evaluators[name]):
             values = self.point_constants(k, theta)
             if not self.parts[k].prony or name == "energy":
-                point_data = self.point_data(
-                    k, theta, with_second_derivatives=name == "curvature"
-                )
+                point_data = self.point_data(k, theta, with_second_derivatives=name == "curvature")
                 evaluate(
                     fields,
                     values,
@@ -501,9 +423,7 @@ class Discretisation(ConstantsModel):
             past = memory_input or self.memory.relaxed(len(out))
             for rows, values[-1] in past.equal_stiffening_rows(k):
                 row_fields = [field[rows] for field in fields]
-                point_data = self.point_data(
-                    k, theta, internal_variables=past.overstress[rows]
-                )
+                point_data = self.point_data(k, theta, internal_variables=past.overstress[rows])
                 evaluate(
                     row_fields,
                     values,
@@ -535,21 +455,12 @@ class Discretisation(ConstantsModel):
         """Return the batch of a kernel for a part: where each output goes in the result row.
 
         A row holds vectors, lower triangles, and columns for all of θ.
-
-        Parameters
-        ----------
-        name : str
-            Kernel in `expressions.KERNELS`.
-        number : int
-            Index of the part.
         """
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[name](self.element, self.law(number, memory))
         cells, geometry = self.part_elements(part)
-        destinations = self._destinations(
-            name, number, cells=cells, kernel=kernel
-        )
+        destinations = self._destinations(name, number, cells=cells, kernel=kernel)
         columns = self._data_columns(name, number, points=geometry.shape[1])
         return KernelBatch(
             kernel,
@@ -560,21 +471,9 @@ class Discretisation(ConstantsModel):
             data_columns=columns if columns.shape[-1] else None,
         )
 
-    def _destinations(
-        self, name: str, number: int, cells: Index, kernel: ElementKernel
-    ) -> Index:
+    def _destinations(self, name: str, number: int, cells: Index, kernel: ElementKernel) -> Index:
         """Return the position (E, outputs) in a result row of every entry of the outputs of a
         kernel.
-
-        Parameters
-        ----------
-        name : str
-            Name of the kernel.
-        number : int
-            Index of the part.
-        cells : (E, nodes) int
-            Nodes of the part's elements, in the order of the kernel.
-        kernel : ElementKernel
         """
         part = self.parts[number]
         vector, lower = element_destinations(self.pattern, cells)
@@ -585,9 +484,7 @@ class Discretisation(ConstantsModel):
         if self.inverse_equilibrium is not None:
             # The inputs of the stress-free shape are entries of θ.
             columns = np.concatenate([columns, self.inverse_equilibrium.places])
-        by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(
-            count, -1
-        )
+        by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
         square = (columns[:, None] + total * columns).ravel()
         # Positions and length of each kind of output.
         energy = np.zeros((count, 1), dtype=np.int64), 1
@@ -632,16 +529,6 @@ class Discretisation(ConstantsModel):
     def _data_columns(self, name: str, number: int, points: int) -> Index:
         """Return the columns (E, q, m) of the data of each quadrature point in a row of data, see
         `point_data`; m = 0 if the points have none.
-
-        Parameters
-        ----------
-        name : str
-            Name of the kernel; "curvature" reads weights of the stress after the internal
-            variables, "energy" reads neither.
-        number : int
-            Index of the part.
-        points : int
-            Number q of quadrature points of an element.
         """
         if self.inverse_equilibrium is not None:
             return self.inverse_equilibrium.point_data_columns(number)
@@ -660,26 +547,12 @@ class Discretisation(ConstantsModel):
         return np.concatenate(columns, axis=-1)
 
 
-def _with_field_columns(
-    places: Index, own: Index, output: str, constants: int
-) -> Index:
+def _with_field_columns(places: Index, own: Index, output: str, constants: int) -> Index:
     """Return the positions (E, …) of derivatives by θ and by the logarithm of each cell.
 
     The logarithm follows the last constant. For "theta_theta" the result has the rows of a square
     matrix of order `constants` + 1, one after the other; for other outputs it is `places`, then
     `own`.
-
-    Parameters
-    ----------
-    places : (E, any)
-        Positions of derivatives by θ; for "theta_theta" (E, constants²), row by row.
-    own : (E, any)
-        Positions of derivatives by the logarithm, one set for each cell. For "theta_theta"
-        (E, 2 constants + 1): the last row of the matrix, then its last column without the corner.
-    output : str
-        Name of the output of the kernel.
-    constants : int
-        Number of constants of the points.
     """
     if output != "theta_theta":
         return np.hstack([places, own])

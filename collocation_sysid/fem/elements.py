@@ -151,12 +151,8 @@ def face_shape_functions(places: Array, nodes: int) -> tuple[Array, Array]:
         return places, unit
     next_places = np.roll(places, -1, axis=1)
     weights = np.hstack([places * (2 * places - 1), 4 * places * next_places])
-    side_slopes = next_places[:, :, None] * unit + places[:, :, None] * np.roll(
-        unit, 1, axis=2
-    )
-    return weights, np.hstack(
-        [(4 * places - 1)[:, :, None] * unit, 4 * side_slopes]
-    )
+    side_slopes = next_places[:, :, None] * unit + places[:, :, None] * np.roll(unit, 1, axis=2)
+    return weights, np.hstack([(4 * places - 1)[:, :, None] * unit, 4 * side_slopes])
 
 
 def element_named(name: str) -> Element:
@@ -168,15 +164,11 @@ def element_named(name: str) -> Element:
         If there is no such element.
     """
     if name not in ELEMENTS:
-        raise InputError(
-            f"no element {name!r}; available: {', '.join(ELEMENTS)}"
-        )
+        raise InputError(f"no element {name!r}; available: {', '.join(ELEMENTS)}")
     return ELEMENTS[name]
 
 
-def reference_geometry(
-    points_m: Array, cells: NDArray[np.int64], element: Element
-) -> Array:
+def reference_geometry(points_m: Array, cells: NDArray[np.int64], element: Element) -> Array:
     """Return shape gradients and volumes at every quadrature point of the undeformed mesh.
 
     Orientation is not checked: volumes of inverted cells are negative.
@@ -195,22 +187,12 @@ def reference_geometry(
         ∂N_a/∂X_j [1/m] at column 3a + j, then the volume assigned to the point [m³].
     """
     corners = points_m[cells[:, :4]]
-    edges = np.swapaxes(
-        corners[:, 1:] - corners[:, :1], 1, 2
-    )  # columns are edge vectors
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)  # columns are edge vectors
     inverse = np.linalg.inv(edges)  # rows are ∂L1..L3/∂X
-    barycentric_gradients = np.concatenate(
-        [-inverse.sum(axis=1, keepdims=True), inverse], axis=1
-    )
+    barycentric_gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
     volumes = np.linalg.det(edges) / 6.0
     gradients = np.einsum(
-        "qal,elj->eqaj",
-        element.shape_gradients(element.points),
-        barycentric_gradients,
+        "qal,elj->eqaj", element.shape_gradients(element.points), barycentric_gradients
     )
-    gradient_rows = gradients.reshape(
-        len(cells), len(element.points), 3 * element.nodes
-    )
-    return np.concatenate(
-        [gradient_rows, (volumes[:, None] * element.weights)[..., None]], axis=2
-    )
+    gradient_rows = gradients.reshape(len(cells), len(element.points), 3 * element.nodes)
+    return np.concatenate([gradient_rows, (volumes[:, None] * element.weights)[..., None]], axis=2)

@@ -72,11 +72,7 @@ class PointLaw:
         """Return the number of entries of θ at a point: constants of material and damping law, the
         stiffening by memory, and changes of the inputs of the stress-free shape.
         """
-        count = (
-            len(self.material.constants)
-            + len(self.damping.constants)
-            + self.has_memory
-        )
+        count = len(self.material.constants) + len(self.damping.constants) + self.has_memory
         return count + (self.rest.input_count if self.rest else 0)
 
     def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
@@ -85,9 +81,7 @@ class PointLaw:
         """
         return self.material.psi(F, theta[: len(self.material.constants)])
 
-    def damping_potential(
-        self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX
-    ) -> ca.SX:
+    def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
         """Return the density ψ_d of the potential of the damping law; 0 if it has none.
 
         Parameters
@@ -101,15 +95,9 @@ class PointLaw:
             Constants of the law.
         """
         potential = self.damping.potential
-        return (
-            potential(psi, F, rate, **self._damping_constants(theta))
-            if potential
-            else ca.SX(0)
-        )
+        return potential(psi, F, rate, **self._damping_constants(theta)) if potential else ca.SX(0)
 
-    def damping_stress(
-        self, F: ca.SX, rate: ca.SX, theta: ca.SX
-    ) -> tuple[ca.SX, ca.SX] | None:
+    def damping_stress(self, F: ca.SX, rate: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX] | None:
         """Return P_v (9,) and ∂P_v/∂F (9, 9) of the damping law.
 
         None if it has a potential instead.
@@ -138,16 +126,11 @@ class PointLaw:
         those of the material.
         """
         constants = theta[len(self.material.constants) :]
-        return {
-            c.name: constants[k] for k, c in enumerate(self.damping.constants)
-        }
+        return {c.name: constants[k] for k, c in enumerate(self.damping.constants)}
 
 
 def quadrature_point(
-    element: Element,
-    law: PointLaw,
-    *fields: str,
-    internal_variable_count: int | None = None,
+    element: Element, law: PointLaw, *fields: str, internal_variable_count: int | None = None
 ) -> QuadraturePoint:
     """Return the symbols of a quadrature point of an element that obeys a law.
 
@@ -161,9 +144,7 @@ def quadrature_point(
         Number of internal variables; by default that of the law.
     """
     count = (
-        (6 if law.has_memory else 0)
-        if internal_variable_count is None
-        else internal_variable_count
+        (6 if law.has_memory else 0) if internal_variable_count is None else internal_variable_count
     )
     point = QuadraturePoint.from_element(
         element,
@@ -179,9 +160,7 @@ def quadrature_point(
     return replace(point, rule=rule)
 
 
-def kernel_from_outputs(
-    name: str, point: QuadraturePoint, outputs: Outputs
-) -> ElementKernel:
+def kernel_from_outputs(name: str, point: QuadraturePoint, outputs: Outputs) -> ElementKernel:
     """Return the kernel of a name whose outputs are sums of derivatives of scalars of a quadrature
     point.
 
@@ -201,14 +180,9 @@ def kernel_from_outputs(
             )
             for term in terms
         ]
-        pieces[key] = (
-            terms[0].choose_contraction(),
-            sum(summands[1:], summands[0]),
-        )
+        pieces[key] = (terms[0].choose_contraction(), sum(summands[1:], summands[0]))
     last = point.make_phase(name, pieces)
-    return ElementKernel(
-        last.pieces, tuple(point.fields), contractions=last.contractions
-    )
+    return ElementKernel(last.pieces, tuple(point.fields), contractions=last.contractions)
 
 
 def _energy(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -221,9 +195,7 @@ def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     expression.
     """
     constants = _material_constants(point, law)
-    return law.material.psi_in(
-        point.rule, point.compute_material_gradient(), values=constants
-    )
+    return law.material.psi_in(point.rule, point.compute_material_gradient(), values=constants)
 
 
 def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -242,9 +214,7 @@ def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     return damped + point.theta[-1] * energy + memory_energy(point)
 
 
-def _damping_potential(
-    point: QuadraturePoint, law: PointLaw, energy: ca.SX
-) -> ca.SX:
+def _damping_potential(point: QuadraturePoint, law: PointLaw, energy: ca.SX) -> ca.SX:
     """Return the damping potential V ψ_d of a point from its elastic energy V ψ; 0 if it has none.
 
     A law that treats all symbols alike also gets the symbols of energies and their rates. Any
@@ -258,19 +228,13 @@ def _damping_potential(
         rate = ca.vertcat(rate, rates)
     elif law.damping.potential:
         (energy,) = point.rule.eliminate([energy])
-    return law.damping_potential(
-        energy, strain, rate=rate, theta=point.scale_constants()
-    )
+    return law.damping_potential(energy, strain, rate=rate, theta=point.scale_constants())
 
 
 def memory_energy(point: QuadraturePoint) -> ca.SX:
     """Return ½ V H : FᵀF, the energy of the overstress, whose derivative by F is V F H."""
     F = point.compute_material_gradient()
-    return (
-        point.compute_volume()
-        * ca.trace(symmetric_matrix(point.point_data[:6]) @ F.T @ F)
-        / 2
-    )
+    return point.compute_volume() * ca.trace(symmetric_matrix(point.point_data[:6]) @ F.T @ F) / 2
 
 
 def symmetric_matrix(six: ca.SX) -> ca.SX:
@@ -284,15 +248,16 @@ UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def six_entries(matrix: ca.SX) -> ca.SX:
-    """Return the entries xx, yy, zz, xy, xz, yz (6,) of a symmetric matrix (3, 3); entries below the
-    diagonal are not read.
+    """Return the entries xx, yy, zz, xy, xz, yz (6,) of a symmetric matrix (3, 3); entries below
+    the diagonal are not read.
     """
     return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
 
 
 def first_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the first Piola–Kirchhoff stress P = ∂ψ/∂F of the elastic law at a point, stacked column
-    after column (9,), by the gradient F of the positions. It contains symbols of `point.rule`.
+    """Return the first Piola–Kirchhoff stress P = ∂ψ/∂F of the elastic law at a point, stacked
+    column after column (9,), by the gradient F of the positions. It contains symbols of
+    `point.rule`.
     """
     return point.gradient(_energy_density(point, law), point.gradients["x"])
 
@@ -303,14 +268,11 @@ def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     `point.rule`.
     """
     return six_entries(
-        ca.inv_minor(point.compute_material_gradient())
-        @ ca.reshape(first_piola(point, law), 3, 3)
+        ca.inv_minor(point.compute_material_gradient()) @ ca.reshape(first_piola(point, law), 3, 3)
     )
 
 
-def _damping(
-    point: QuadraturePoint, law: PointLaw
-) -> tuple[ca.SX, ca.SX] | None:
+def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | None:
     """Return V P_v (9,) of a point and its derivative (9, 9) by F, with the viscous first
     Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law has a
     potential.
@@ -337,16 +299,14 @@ def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """
     point = quadrature_point(element, law, "x", internal_variable_count=0)
     return kernel_from_outputs(
-        "energy",
-        point,
-        outputs={"energy": (Derivative(_energy(point, law), ()),)},
+        "energy", point, outputs={"energy": (Derivative(_energy(point, law), ()),)}
     )
 
 
 @lru_cache(CACHED_KERNELS)
 def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of the forces on the nodes [N] of an element: those of the elastic law, of the
-    damping law and of the memory. Its output is "force"; the latest kernels are cached.
+    """Return the kernel of the forces on the nodes [N] of an element: those of the elastic law, of
+    the damping law and of the memory. Its output is "force"; the latest kernels are cached.
     """
     point = quadrature_point(element, law, "x", "v")
     force = (Derivative(-_potential(point, law), ("x",)),)
@@ -354,9 +314,7 @@ def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
         stress = -damping[0]
         force += (
             Derivative(
-                ca.dot(stress, point.compute_material_gradient_rate()) / 2,
-                ("v",),
-                known=stress,
+                ca.dot(stress, point.compute_material_gradient_rate()) / 2, ("v",), known=stress
             ),
         )
     return kernel_from_outputs("force", point, outputs={"force": force})
@@ -388,12 +346,8 @@ def linearisation_kernel(element: Element, law: PointLaw) -> ElementKernel:
         outputs["by_position"] += (
             Derivative(half_power, ("v", "x"), part="symmetric", known=slope),
         )
-        outputs["by_velocity"] += (
-            Derivative(half_power, ("v", "v"), known=by_rate),
-        )
-        outputs["by_theta"] += (
-            Derivative(half_power, ("v", "theta"), known=by_theta),
-        )
+        outputs["by_velocity"] += (Derivative(half_power, ("v", "v"), known=by_rate),)
+        outputs["by_theta"] += (Derivative(half_power, ("v", "theta"), known=by_theta),)
         outputs["by_position_skew"] = (
             Derivative(half_power, ("v", "x"), part="skew", known=slope),
         )
@@ -408,23 +362,14 @@ def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
     D_wK).
     """
     point = quadrature_point(
-        element,
-        law,
-        "x",
-        "v",
-        "w",
-        internal_variable_count=2 * (6 if law.has_memory else 0),
+        element, law, "x", "v", "w", internal_variable_count=2 * (6 if law.has_memory else 0)
     )
     power = -point.weighted_derivative(_potential(point, law))
     if law.has_memory:
-        power += ca.dot(
-            point.select_internal_variables()[6:], second_piola(point, law)
-        )
+        power += ca.dot(point.select_internal_variables()[6:], second_piola(point, law))
     if damping := _damping(point, law):
         power -= ca.dot(damping[0], point.weigh_material_gradient())
-    mixed = Derivative(
-        power, ("x", "v"), part="symmetric" if damping else "whole"
-    )
+    mixed = Derivative(power, ("x", "v"), part="symmetric" if damping else "whole")
     outputs: Outputs = {
         "position_position": (Derivative(power, ("x", "x")),),
         "position_velocity": (mixed,),

@@ -68,9 +68,7 @@ class ForcePoints:
         """
         count = nodes.shape[1]
         return cls(
-            nodes,
-            np.broadcast_to(np.eye(count), (len(nodes), count, count)),
-            node_count=node_count,
+            nodes, np.broadcast_to(np.eye(count), (len(nodes), count, count)), node_count=node_count
         )
 
     @property
@@ -99,9 +97,7 @@ class ForcePoints:
             Indices of the instances, in whose order the result is; None for all.
         """
         stacked = self._operator_for("operator", chosen) @ x.T
-        return stacked.reshape(
-            len(stacked) // self.dofs, self.dofs, len(x)
-        ).transpose(1, 2, 0)
+        return stacked.reshape(len(stacked) // self.dofs, self.dofs, len(x)).transpose(1, 2, 0)
 
     def assemble(self, forces: Array, chosen: Index | None = None) -> Array:
         """Return the nodal forces (T, 3n) of forces (3L, T, i) on the vectors: forces on a node add
@@ -116,9 +112,7 @@ class ForcePoints:
         force_rows = forces.transpose(2, 0, 1).reshape(
             len(forces) * forces.shape[2], forces.shape[1]
         )
-        return (
-            self._operator_for("transposed operator", chosen) @ force_rows
-        ).T
+        return (self._operator_for("transposed operator", chosen) @ force_rows).T
 
     def add_matrices(
         self,
@@ -146,65 +140,36 @@ class ForcePoints:
         skew : bool
         """
         columns, rows = np.triu_indices(len(blocks))
-        values = (
-            blocks[rows, columns] + (-1 if skew else 1) * blocks[columns, rows]
-        )
-        assembly, nonempty = self._operator_for(
-            "skew" if skew else "couplings", chosen
-        )
-        values = np.moveaxis(values, 0, 2).reshape(
-            values.shape[1], assembly.shape[1]
-        )
+        values = blocks[rows, columns] + (-1 if skew else 1) * blocks[columns, rows]
+        assembly, nonempty = self._operator_for("skew" if skew else "couplings", chosen)
+        values = np.moveaxis(values, 0, 2).reshape(values.shape[1], assembly.shape[1])
         to[:, places[nonempty]] += (assembly @ values.T).T / 2
 
     def _operator_for(self, what: str, chosen: Index | None) -> Any:
         """Return the columns or rows of a matrix that belong to chosen instances.
 
         The latest are cached.
-
-        Parameters
-        ----------
-        what : {"operator", "transposed operator", "couplings", "skew"}
-            For the last two, the rows that are not empty are returned with their indices.
-        chosen : array of int or None
-            Indices of the instances; None for all.
         """
         key = what, None if chosen is None else chosen.tobytes()
         if key not in self._operators:
             if len(self._operators) >= CACHED_MATRICES:
                 self._operators.pop(next(iter(self._operators)), None)
             if what == "operator":
-                rows = (
-                    slice(None)
-                    if chosen is None
-                    else _expanded_indices(chosen, self.dofs)
-                )
+                rows = slice(None) if chosen is None else _expanded_indices(chosen, self.dofs)
                 self._operators[key] = self._operator[rows]
             elif what == "transposed operator":
                 self._operators[key] = self._operator_for("operator", chosen).T
             else:
-                matrix: Any = (
-                    self._onto_skew if what == "skew" else self._onto_couplings
-                )
+                matrix: Any = self._onto_skew if what == "skew" else self._onto_couplings
                 if chosen is not None:
-                    matrix = matrix[
-                        :,
-                        _expanded_indices(
-                            chosen, self.dofs * (self.dofs + 1) // 2
-                        ),
-                    ]
+                    matrix = matrix[:, _expanded_indices(chosen, self.dofs * (self.dofs + 1) // 2)]
                 # Of few instances most rows are empty.
-                is_nonempty = (
-                    np.bincount(matrix.indices, minlength=matrix.shape[0]) > 0
-                )
+                is_nonempty = np.bincount(matrix.indices, minlength=matrix.shape[0]) > 0
                 number = np.cumsum(is_nonempty) - 1
                 nonempty = np.flatnonzero(is_nonempty)
                 parts = matrix.data, number[matrix.indices], matrix.indptr
                 shape = len(nonempty), matrix.shape[1]
-                self._operators[key] = (
-                    sp.csc_array(parts, shape=shape),
-                    nonempty,
-                )
+                self._operators[key] = (sp.csc_array(parts, shape=shape), nonempty)
         return self._operators[key]
 
     @cached_property
@@ -280,17 +245,10 @@ class ForcePoints:
             low = np.minimum(r, s)
             high = np.maximum(r, s)
             lower = low * d - low * (low - 1) // 2 + high - low
-            place = self.couplings.positions_of(
-                row[lower_pairs], column[lower_pairs]
-            )
-            parts.append(
-                (place, instance[first] * (d * (d + 1) // 2) + lower, value)
-            )
+            place = self.couplings.positions_of(row[lower_pairs], column[lower_pairs])
+            parts.append((place, instance[first] * (d * (d + 1) // 2) + lower, value))
         places, sources, values = map(np.concatenate, zip(*parts, strict=True))
-        shape = (
-            self.couplings.entry_count,
-            self.count * self.dofs * (self.dofs + 1) // 2,
-        )
+        shape = (self.couplings.entry_count, self.count * self.dofs * (self.dofs + 1) // 2)
         return sp.csc_array((values, (places, sources)), shape=shape)
 
 

@@ -59,22 +59,14 @@ class Phase:
         """
         sx = self.pieces
         names = sx.name_in()
-        inputs = [
-            ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)
-        ]
-        gradients = node_gradients(
-            inputs[names.index("geometry")], self.count_nodes()
-        )
+        inputs = [ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)]
+        gradients = node_gradients(inputs[names.index("geometry")], self.count_nodes())
         outputs = [
             _contracted(piece, how, gradients=gradients)
-            for piece, how in zip(
-                sx.call(inputs), self.contractions.values(), strict=True
-            )
+            for piece, how in zip(sx.call(inputs), self.contractions.values(), strict=True)
         ]
         dense = [ca.densify(ca.vec(output)) for output in outputs]
-        return ca.Function(
-            sx.name(), inputs, dense, names, sx.name_out(), {"cse": True}
-        )
+        return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
 
     def sum_over_points(self, *inputs: Any) -> list[Any]:
         """Return the sums over the points of an element, one column for each output.
@@ -84,9 +76,7 @@ class Phase:
         """
         names = self.pieces.name_in()
         point_columns = {
-            k: ca.horzsplit(inputs[k])
-            for k, name in enumerate(names)
-            if name in OF_POINTS
+            k: ca.horzsplit(inputs[k]) for k, name in enumerate(names) if name in OF_POINTS
         }
         count = len(point_columns[names.index("geometry")])
         points = [
@@ -98,10 +88,7 @@ class Phase:
             )
             for p in range(count)
         ]
-        return [
-            sum(outputs[1:], outputs[0])
-            for outputs in zip(*points, strict=True)
-        ]
+        return [sum(outputs[1:], outputs[0]) for outputs in zip(*points, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,19 +124,12 @@ class ElementKernel:
         such input.
         """
         names = self.pieces.name_in()
-        return (
-            self.pieces.nnz_in(names.index("carried"))
-            if "carried" in names
-            else 0
-        )
+        return self.pieces.nnz_in(names.index("carried")) if "carried" in names else 0
 
     @cached_property
     def phases(self) -> tuple[Phase, ...]:
         """All phases, the last one included."""
-        return (
-            *self.previous_phases,
-            Phase(self.pieces, self.contractions | self.coupled),
-        )
+        return (*self.previous_phases, Phase(self.pieces, self.contractions | self.coupled))
 
     @cached_property
     def serialized(self) -> str:
@@ -157,9 +137,7 @@ class ElementKernel:
         functions = [phase.pieces for phase in self.phases]
         functions += [self.coupling] if self.coupling else []
         contractions = f"{[phase.contractions for phase in self.phases]}"
-        return contractions + " ".join(
-            function.serialize() for function in functions
-        )
+        return contractions + " ".join(function.serialize() for function in functions)
 
     def element_function(self, points: int) -> ca.Function:
         """Return the sum over an element of `points` points as a CasADi function.
@@ -168,21 +146,15 @@ class ElementKernel:
         points.
         """
         names = self.phases[0].pieces.name_in()
-        inputs = [
-            ca.MX.sym(n, self.pieces.size1_in(k)) for k, n in enumerate(names)
-        ]
+        inputs = [ca.MX.sym(n, self.pieces.size1_in(k)) for k, n in enumerate(names)]
         for place in (k for k, name in enumerate(names) if name in OF_POINTS):
-            inputs[place] = ca.MX.sym(
-                names[place], self.pieces.size1_in(place), points
-            )
+            inputs[place] = ca.MX.sym(names[place], self.pieces.size1_in(place), points)
         size = 3 * self.phases[0].count_nodes()
         sums = ca.MX(0, 1)
         vectors = ca.MX(size, 0)
         outputs: list[ca.MX] = []
         for phase in self.phases:
-            totals = phase.sum_over_points(
-                *inputs, *([sums] if sums.numel() else [])
-            )
+            totals = phase.sum_over_points(*inputs, *([sums] if sums.numel() else []))
             for key, total in zip(phase.contractions, totals, strict=True):
                 if key in self.contractions:
                     outputs.append(total)
@@ -197,9 +169,7 @@ class ElementKernel:
                 _coupled(*each, vectors)
                 for each in zip(outputs, couplings, contractions, strict=True)
             ]
-        return ca.Function(
-            self.pieces.name(), inputs, outputs, names, list(self.contractions)
-        )
+        return ca.Function(self.pieces.name(), inputs, outputs, names, list(self.contractions))
 
 
 def node_gradients(geometry: ca.SX, nodes: int) -> ca.SX:
@@ -214,32 +184,16 @@ def from_lower_triangle(matrix: ca.SX) -> ca.SX:
     return ca.tril2symm(ca.tril(ca.densify(matrix)))
 
 
-def _coupled(
-    output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX
-) -> ca.MX:
+def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:
     """Return an output of an element with the contribution of the coupling between its points.
 
     The docstring of the module defines A, C and D.
-
-    Parameters
-    ----------
-    output : MX
-        Sum over the points, without the coupling.
-    coupling : MX
-        C (m, k) for the contraction "nodes", D (m, m) for "pairs"; ignored for "none".
-    how : Contraction
-        Contraction of the output. "nodes" adds A C, stacked column by column; "pairs" adds the
-        lower triangle of A D Aᵀ; for "none" the output is returned as it is.
-    vectors : MX
-        Summed node vectors A (3·nodes, m), one in each column.
     """
     if how == "none":
         return output
     if how == "nodes":
         return output + ca.vec(vectors @ coupling)
-    lower = ca.project(
-        vectors @ coupling @ vectors.T, ca.Sparsity.lower(vectors.shape[0])
-    )
+    lower = ca.project(vectors @ coupling @ vectors.T, ca.Sparsity.lower(vectors.shape[0]))
     return output + lower.nz[:]
 
 
@@ -268,10 +222,7 @@ def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
     """Return the columns of `stress` (9, k), conjugate to F, times the shape gradient (1, 3) of one
     node: (3, k).
     """
-    columns = [
-        ca.reshape(stress[:, k], 3, 3) @ gradient.T
-        for k in range(stress.shape[1])
-    ]
+    columns = [ca.reshape(stress[:, k], 3, 3) @ gradient.T for k in range(stress.shape[1])]
     return ca.horzcat(*columns)
 
 
@@ -399,17 +350,11 @@ class QuadraturePoint:
             {name: ca.SX.sym(name, 3 * element.nodes) for name in fields},
             geometry=ca.SX.sym("geometry", 3 * element.nodes + 1),
             theta=ca.SX.sym("theta", constants),
-            gradients={
-                name: ca.SX.sym(f"gradient_{name}", 9) for name in fields
-            },
-            stretches=tuple(
-                ca.SX.sym(f"stretch_{k}") for k in range(stretches)
-            ),
+            gradients={name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
+            stretches=tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
             point_data=ca.SX.sym(
                 "carried",
-                internal_variable_count
-                + bool(scaled)
-                + (rest.count_values() if rest else 0),
+                internal_variable_count + bool(scaled) + (rest.count_values() if rest else 0),
             ),
             scaled_indices=scaled,
             rest=rest,
@@ -426,11 +371,7 @@ class QuadraturePoint:
 
     def stack_differentiated_constants(self) -> ca.SX:
         """Return the variables of derivatives by "theta": θ, and the logarithm of the field."""
-        return (
-            ca.vertcat(self.theta, self.point_data[-1])
-            if self.scaled_indices
-            else self.theta
-        )
+        return ca.vertcat(self.theta, self.point_data[-1]) if self.scaled_indices else self.theta
 
     def select_internal_variables(self) -> ca.SX:
         """Return the internal variables, i.e. the data of the point without the logarithm of the
@@ -447,16 +388,12 @@ class QuadraturePoint:
         """Return the volume assigned to the point in the stress-free shape [m³]."""
         if self.rest is None:
             return self.mesh_volume
-        return self.mesh_volume * ca.det(
-            ca.reshape(self._expand_rest_values()[:9], 3, 3)
-        )
+        return self.mesh_volume * ca.det(ca.reshape(self._expand_rest_values()[:9], 3, 3))
 
     def _expand_rest_values(self) -> ca.SX:
         """Return the values of the stress-free shape at this point, see `RestPointLayout`."""
         assert self.rest is not None
-        data = self.point_data[
-            self.point_data.numel() - self.rest.count_values() :
-        ]
+        data = self.point_data[self.point_data.numel() - self.rest.count_values() :]
         changes = self.theta[self.theta.numel() - self.rest.input_count :]
         return self.rest.expand(data, changes)
 
@@ -488,15 +425,11 @@ class QuadraturePoint:
         """
         return self.rule.jacobian(expression, by)
 
-    def directional_derivative(
-        self, expression: ca.SX, by: ca.SX, direction: ca.SX
-    ) -> ca.SX:
+    def directional_derivative(self, expression: ca.SX, by: ca.SX, direction: ca.SX) -> ca.SX:
         """Return the derivative of an expression by symbols (k,) along a direction (k,), including
         that through `rule`.
         """
-        return self.rule.directional_derivative(
-            expression, by, direction=direction
-        )
+        return self.rule.directional_derivative(expression, by, direction=direction)
 
     def compute_material_gradient_rate(self) -> ca.SX:
         """Return the derivative of `compute_material_gradient` along v, stacked (9,)."""
@@ -510,9 +443,7 @@ class QuadraturePoint:
         """Return the derivative of `compute_material_gradient` along w, stacked (9,)."""
         weights = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
         return ca.jtimes(
-            ca.vec(self.compute_material_gradient()),
-            self.stack_strain_symbols(),
-            weights,
+            ca.vec(self.compute_material_gradient()), self.stack_strain_symbols(), weights
         )
 
     def weighted_derivative(self, scalar: ca.SX) -> ca.SX:
@@ -532,9 +463,7 @@ class QuadraturePoint:
         second variable.
         """
         inputs = [
-            self.stack_differentiated_constants()
-            if name == "theta"
-            else self.gradients[name]
+            self.stack_differentiated_constants() if name == "theta" else self.gradients[name]
             for name in by
         ]
         if not inputs:
@@ -543,9 +472,7 @@ class QuadraturePoint:
             return self.jacobian(scalar, inputs[0]).T
         return self.jacobian(self.gradient(scalar, inputs[0]), inputs[1])
 
-    def make_phase(
-        self, name: str, pieces: Pieces, sums: ca.SX | None = None
-    ) -> Phase:
+    def make_phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
         """Return a phase with these pieces.
 
         Parameters
@@ -574,11 +501,6 @@ class QuadraturePoint:
             [ca.vertcat(*gradients)],
         )
         function = ca.Function(
-            name,
-            list(inputs.values()),
-            outputs,
-            list(inputs),
-            list(pieces),
-            {"cse": True},
+            name, list(inputs.values()), outputs, list(inputs), list(pieces), {"cse": True}
         )
         return Phase(function, {key: how for key, (how, _) in pieces.items()})

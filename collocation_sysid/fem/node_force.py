@@ -149,9 +149,7 @@ class NodeForce:
         """
         name = name or str(getattr(law, "__name__", "force")).replace("_", "-")
         definitions = {constant.name: constant for constant in constants}
-        arguments = list(inspect.signature(law).parameters)[
-            4 if carries else 3 :
-        ]
+        arguments = list(inspect.signature(law).parameters)[4 if carries else 3 :]
         if "at" in arguments:
             raise InputError(
                 f"force {name!r}: the function has an argument between v and `at`; expected the "
@@ -165,25 +163,14 @@ class NodeForce:
                 "expected its name among the arguments "
                 f"{', '.join(arguments)}{hint_at(unused[0], arguments)}"
             )
-        known = tuple(
-            definitions.get(a) or constant_named(a) for a in arguments
-        )
-        chosen = (
-            nodes
-            if nodes is None or isinstance(nodes, Selection)
-            else np.asarray(nodes)
-        )
+        known = tuple(definitions.get(a) or constant_named(a) for a in arguments)
+        chosen = nodes if nodes is None or isinstance(nodes, Selection) else np.asarray(nodes)
         if on not in get_args(On):
             raise InputError(
                 f"force {name!r}: found on = {on!r}; expected one of {', '.join(get_args(On))}"
             )
         force = cls(
-            name,
-            law,
-            constants=known,
-            nodes=chosen,
-            on=on,
-            internal_variable_count=carries,
+            name, law, constants=known, nodes=chosen, on=on, internal_variable_count=carries
         )
         force._check()
         return force
@@ -206,23 +193,13 @@ class NodeForce:
         data : (11,) SX
             Entries of a `ForceContext`.
         """
-        dofs = (
-            u.numel() - len(self.constants) - self.internal_variable_count
-        ) // 2
-        ends = [
-            0,
-            dofs,
-            2 * dofs,
-            u.numel() - self.internal_variable_count,
-            u.numel(),
-        ]
+        dofs = (u.numel() - len(self.constants) - self.internal_variable_count) // 2
+        ends = [0, dofs, 2 * dofs, u.numel() - self.internal_variable_count, u.numel()]
         x, v, values, before = ca.vertsplit(u, ends)
         at = ForceContext(*ca.vertsplit(data, [*CONTEXT_OFFSETS]))
         named = {c.name: values[k] for k, c in enumerate(self.constants)}
         if self.on == "nodes":
-            return ca.vertcat(
-                *self._evaluate_law(x, v, before=before, at=at, named=named)
-            )
+            return ca.vertcat(*self._evaluate_law(x, v, before=before, at=at, named=named))
         places = ca.horzsplit(ca.reshape(x, 3, dofs // 3))
         area = area_vector(places)
         size = ca.norm_2(area)
@@ -230,37 +207,18 @@ class NodeForce:
         force, after = self._evaluate_law(
             face_middle(x), face_middle(v), before=before, at=at, named=named
         )
-        return ca.vertcat(
-            *[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3, after
-        )
+        return ca.vertcat(*[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3, after)
 
     def _evaluate_law(
-        self,
-        x: ca.SX,
-        v: ca.SX,
-        before: ca.SX,
-        at: ForceContext,
-        named: dict[str, ca.SX],
+        self, x: ca.SX, v: ca.SX, before: ca.SX, at: ForceContext, named: dict[str, ca.SX]
     ) -> tuple[ca.SX, ca.SX]:
         """Return the force (3,) and the internal variables (h,) after the evaluation, empty without
         memory.
-
-        Parameters
-        ----------
-        x, v : (3,) SX
-            Position [m] and velocity [m/s].
-        before : (h,) SX
-            Internal variables before the evaluation.
-        at : ForceContext
-        named : dict of str to SX
-            Constants by name.
         """
         if not self.internal_variable_count:
             force = cast(Column, self.law(x, v, at, **named))
             return _as_column(force), ca.SX.zeros(0)
-        force, after = cast(
-            tuple[Column, Column], self.law(x, v, before, at, **named)
-        )
+        force, after = cast(tuple[Column, Column], self.law(x, v, before, at, **named))
         return _as_column(force), _as_column(after)
 
     def input_size(self, dofs: int) -> int:
@@ -311,47 +269,26 @@ class NodeForce:
         largest = np.zeros(2)
         dofs = self._smallest_dofs
         for _ in range(3):
-            sample = [
-                rng.uniform(0.5, 1.0, size)
-                for size in (self.input_size(dofs), CONTEXT_SIZE)
-            ]
+            sample = [rng.uniform(0.5, 1.0, size) for size in (self.input_size(dofs), CONTEXT_SIZE)]
             values = self._force_and_jacobian(*sample)[1].full()
             values = values[:dofs]
-            for k, part in enumerate(
-                (values[:, :dofs], values[:, dofs : 2 * dofs])
-            ):
+            for k, part in enumerate((values[:, :dofs], values[:, dofs : 2 * dofs])):
                 size = np.abs(part).max() or 1.0
                 largest[k] = max(largest[k], np.abs(part - part.T).max() / size)
         return float(largest[0]), float(largest[1])
 
     def _check(self) -> None:
-        """Evaluate the law and its derivatives once.
-
-        Raises
-        ------
-        InputError
-            If the law cannot be evaluated, its results have the wrong shape, or force or
-            derivatives are not finite for a node at rest.
-        """
+        """Evaluate the law and its derivatives once."""
         dofs = self._smallest_dofs
         named = {c.name: ca.SX.sym(c.name) for c in self.constants}
-        x, v, before = (
-            ca.SX.sym("u", size)
-            for size in (3, 3, self.internal_variable_count)
-        )
-        at = ForceContext(
-            *ca.vertsplit(ca.SX.sym("data", CONTEXT_SIZE), [*CONTEXT_OFFSETS])
-        )
+        x, v, before = (ca.SX.sym("u", size) for size in (3, 3, self.internal_variable_count))
+        at = ForceContext(*ca.vertsplit(ca.SX.sym("data", CONTEXT_SIZE), [*CONTEXT_OFFSETS]))
         try:
-            force, after = self._evaluate_law(
-                x, v, before=before, at=at, named=named
-            )
+            force, after = self._evaluate_law(x, v, before=before, at=at, named=named)
             _ = self._symbols
         except (Exception, SystemExit) as error:
             internal_text = (
-                ", and of the new internal variables"
-                if self.internal_variable_count
-                else ""
+                ", and of the new internal variables" if self.internal_variable_count else ""
             )
             raise InputError(
                 f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function of x, "
@@ -393,8 +330,7 @@ class NodeForce:
             Nodes of the refined body, used in place of indices of nodes of the coarse body.
         """
         finds = self.nodes is None or (
-            isinstance(self.nodes, Selection)
-            and not isinstance(self.nodes, Indices)
+            isinstance(self.nodes, Selection) and not isinstance(self.nodes, Indices)
         )
         return self if finds else replace(self, nodes=nodes)
 
@@ -421,12 +357,7 @@ class LocatedForce:
 
     @classmethod
     def on_mesh(
-        cls,
-        force: NodeForce,
-        mesh: ElementNodes,
-        chosen: Index,
-        volume_m3: Array,
-        columns: Index,
+        cls, force: NodeForce, mesh: ElementNodes, chosen: Index, volume_m3: Array, columns: Index
     ) -> LocatedForce:
         """Place a force on selected nodes of a mesh.
 
@@ -447,9 +378,7 @@ class LocatedForce:
             If the force is on faces and no face has all of its nodes selected.
         """
         area, normal = surface_shares(mesh)
-        data = np.vstack(
-            [mesh.points_m.T, area, volume_m3[: len(area)], normal.T]
-        )
+        data = np.vstack([mesh.points_m.T, area, volume_m3[: len(area)], normal.T])
         if force.on == "nodes":
             nodes = chosen[:, None]
             data = data[:, chosen]
@@ -463,12 +392,7 @@ class LocatedForce:
                 )
             data = data[:, nodes[:, -3:]].mean(axis=2)
             data[3:] = 0.0
-        return cls(
-            force,
-            ForcePoints.at_nodes(nodes, len(volume_m3)),
-            data=data,
-            columns=columns,
-        )
+        return cls(force, ForcePoints.at_nodes(nodes, len(volume_m3)), data=data, columns=columns)
 
 
 def _as_column(values: Column) -> ca.SX:
@@ -496,16 +420,10 @@ def area_vector(places: Sequence[ca.SX]) -> ca.SX:
     """
     corners = places[:3]
     middles = places[3:]
-    pairs = (
-        zip(corners, middles, strict=True)
-        if middles
-        else ((corner,) for corner in corners)
-    )
+    pairs = zip(corners, middles, strict=True) if middles else ((corner,) for corner in corners)
     ring = [place - places[0] for pair in pairs for place in pair]
     neighbours = pairwise(ring)
-    return (
-        sum((ca.cross(a, b) for a, b in neighbours), start=ca.SX.zeros(3)) / 2
-    )
+    return sum((ca.cross(a, b) for a, b in neighbours), start=ca.SX.zeros(3)) / 2
 
 
 def surface_shares(mesh: ElementNodes) -> tuple[Array, Array]:
@@ -523,6 +441,4 @@ def surface_shares(mesh: ElementNodes) -> tuple[Array, Array]:
         np.add.at(normal, node, share)
         np.add.at(area, node, np.linalg.norm(share, axis=1))
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return area, np.divide(
-        normal, length, out=np.zeros_like(normal), where=length > 0
-    )
+    return area, np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)

@@ -59,9 +59,7 @@ class SymmetricPattern:
         return cls.from_entries(row[lower], column[lower], nodes=nodes)
 
     @classmethod
-    def from_entries(
-        cls, rows: Index, columns: Index, nodes: int
-    ) -> SymmetricPattern:
+    def from_entries(cls, rows: Index, columns: Index, nodes: int) -> SymmetricPattern:
         """Return the pattern of size 3 · `nodes` with these entries of the lower triangle, rows ≥
         columns, and the diagonal; repetitions are merged.
         """
@@ -81,8 +79,8 @@ class SymmetricPattern:
         return np.flatnonzero(self.rows == self.columns)
 
     def positions_of(self, row: Index, column: Index) -> Index:
-        """Return the indices among the entries of (row, column) pairs given in either triangle, in the
-        shape of `row`.
+        """Return the indices among the entries of (row, column) pairs given in either triangle, in
+        the shape of `row`.
 
         Raises
         ------
@@ -94,9 +92,7 @@ class SymmetricPattern:
         codes = self.columns * self.size + self.rows
         requested_codes = low * self.size + high
         positions = np.searchsorted(codes, requested_codes)
-        if (positions >= len(codes)).any() or (
-            codes[positions] != requested_codes
-        ).any():
+        if (positions >= len(codes)).any() or (codes[positions] != requested_codes).any():
             raise IndexError("an entry lies outside the mesh graph")
         return positions
 
@@ -106,9 +102,7 @@ class SymmetricPattern:
         strict = self.rows != self.columns
         rows = np.concatenate([self.rows, self.columns[strict]])
         columns = np.concatenate([self.columns, self.rows[strict]])
-        source = np.concatenate(
-            [np.arange(self.entry_count), np.flatnonzero(strict)]
-        )
+        source = np.concatenate([np.arange(self.entry_count), np.flatnonzero(strict)])
         order = np.lexsort((rows, columns))
         return FullEntries(rows[order], columns[order], source=source[order])
 
@@ -117,18 +111,14 @@ class SymmetricPattern:
         lower-triangle values (m,).
         """
         rows, columns, source = self.full
-        return sp.csc_array(
-            (values[source], (rows, columns)), shape=(self.size, self.size)
-        )
+        return sp.csc_array((values[source], (rows, columns)), shape=(self.size, self.size))
 
     def products(self, values: Array, vectors: Array) -> Array:
         """Return for each t the product of the symmetric matrix with lower-triangle values (T, m)
         and a vector (T, 3n); (T, 3n), for T ≥ 1.
         """
         pairs = zip(values, vectors, strict=True)
-        return np.stack(
-            [self.matrix(value) @ vector for value, vector in pairs]
-        )
+        return np.stack([self.matrix(value) @ vector for value, vector in pairs])
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,18 +144,9 @@ class JointPattern:
         """
         rows = np.concatenate([pattern.rows for pattern in patterns])
         columns = np.concatenate([pattern.columns for pattern in patterns])
-        union = SymmetricPattern.from_entries(
-            rows, columns, nodes=patterns[0].size // 3
-        )
-        union = (
-            patterns[0]
-            if union.entry_count == patterns[0].entry_count
-            else union
-        )
-        return JointPattern(
-            union,
-            tuple(union.positions_of(p.rows, p.columns) for p in patterns),
-        )
+        union = SymmetricPattern.from_entries(rows, columns, nodes=patterns[0].size // 3)
+        union = patterns[0] if union.entry_count == patterns[0].entry_count else union
+        return JointPattern(union, tuple(union.positions_of(p.rows, p.columns) for p in patterns))
 
     def expand(self, values: Array) -> Array:
         """Return values (T, m) of the first pattern as values (T, M) of the union, with zeros
@@ -186,9 +167,7 @@ def dofs_of(nodes: Index) -> Index:
     return (3 * nodes[..., None] + np.arange(3)).reshape(*nodes.shape[:-1], -1)
 
 
-def element_destinations(
-    pattern: SymmetricPattern, cells: Index
-) -> tuple[Index, Index]:
+def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index, Index]:
     """Return the positions of the vectors and lower triangles of elements in global arrays.
 
     Parameters
@@ -213,9 +192,7 @@ def element_destinations(
     dofs = dofs_of(cells)
     size = dofs.shape[1]
     local_columns, local_rows = np.triu_indices(size)
-    return dofs, pattern.positions_of(
-        dofs[:, local_rows], dofs[:, local_columns]
-    )
+    return dofs, pattern.positions_of(dofs[:, local_rows], dofs[:, local_columns])
 
 
 def with_ascending_nodes(cells: Index, geometry: Array) -> tuple[Index, Array]:
@@ -224,9 +201,7 @@ def with_ascending_nodes(cells: Index, geometry: Array) -> tuple[Index, Array]:
     """
     order = np.argsort(cells, axis=1)
     gradients = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
-    sorted_gradients = np.take_along_axis(
-        gradients, order[:, None, :, None], axis=2
-    )
+    sorted_gradients = np.take_along_axis(gradients, order[:, None, :, None], axis=2)
     gradient_rows = sorted_gradients.reshape(*geometry.shape[:2], -1)
     return np.take_along_axis(cells, order, axis=1), np.append(
         gradient_rows, geometry[..., -1:], axis=2

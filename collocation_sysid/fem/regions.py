@@ -17,14 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
 from ..errors import InputError, hint_at
-from .laws.constants import (
-    CONTRAST,
-    DENSITY,
-    FIELD_COEFFICIENT,
-    GAMMA_M,
-    MASS,
-    Constant,
-)
+from .laws.constants import CONTRAST, DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, Constant
 from .laws.damping_admissibility import require_admissible_damping
 from .laws.materials import (
     DampingLaw,
@@ -75,10 +68,7 @@ class Region:
     field: Field | None = None
 
     def __post_init__(self) -> None:
-        if (
-            not self.name
-            or not self.name.replace("_", "").replace("-", "").isalnum()
-        ):
+        if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
             raise InputError(
                 f"the region's name is {self.name!r}; expected letters, digits, - and _, because "
                 "it precedes the names of its parameters"
@@ -127,11 +117,7 @@ class BodyPart:
         """Constants of the part in the order of θ: of the material, of the damping law, of the
         Prony branches, γ_m (always), the density if it is a parameter, and those of the field.
         """
-        memory = [
-            constant
-            for branch in self.prony
-            for constant in branch.named_constants()
-        ]
+        memory = [constant for branch in self.prony for constant in branch.named_constants()]
         density = (DENSITY,) if self.has_free_density else ()
         return (
             *self.material.constants,
@@ -209,15 +195,10 @@ def parts_from_regions(
     """
     claimed = _cells_of_regions(mesh, regions)
     densities = _densities(
-        mesh,
-        regions,
-        claimed=claimed,
-        density_kg_m3=density_kg_m3,
-        mass_kg=mass_kg,
+        mesh, regions, claimed=claimed, density_kg_m3=density_kg_m3, mass_kg=mass_kg
     )
     rest = np.setdiff1d(
-        np.arange(len(mesh.tetrahedra)),
-        np.concatenate([np.zeros(0, int), *claimed]),
+        np.arange(len(mesh.tetrahedra)), np.concatenate([np.zeros(0, int), *claimed])
     )
     branches = as_branches(prony)
     remainder = BodyPart(
@@ -235,23 +216,13 @@ def parts_from_regions(
             "every cell; expected the field as an entry of one of the regions"
         )
     parts = [_with_field(remainder, field, mesh=mesh)] if rest.size else []
-    for region, cells, density in zip(
-        regions, claimed, densities[1:], strict=True
-    ):
+    for region, cells, density in zip(regions, claimed, densities[1:], strict=True):
         try:
-            law = (
-                remainder.material
-                if region.material is None
-                else as_material(region.material)
-            )
+            law = remainder.material if region.material is None else as_material(region.material)
             region_damping = (
-                remainder.damping
-                if region.damping is None
-                else as_damping(region.damping)
+                remainder.damping if region.damping is None else as_damping(region.damping)
             )
-            memory = (
-                branches if region.prony is None else as_branches(region.prony)
-            )
+            memory = branches if region.prony is None else as_branches(region.prony)
             require_admissible_damping(region_damping, law)
             has_own = region.density_kg_m3 is not None
             part = BodyPart(
@@ -266,13 +237,8 @@ def parts_from_regions(
             parts.append(_with_field(part, region.field, mesh=mesh))
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
-    mass = sum(
-        part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum())
-        for part in parts
-    )
-    return tuple(
-        replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts
-    )
+    mass = sum(part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum()) for part in parts)
+    return tuple(replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts)
 
 
 def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
@@ -281,9 +247,7 @@ def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
         return part
     law = (*part.material.constants, *part.damping.constants)
     kind = TwoPhaseModes if field.prior == TWO_PHASE else FieldModes
-    return replace(
-        part, field=kind.from_field(field, mesh, cells=part.cells, law=law)
-    )
+    return replace(part, field=kind.from_field(field, mesh, cells=part.cells, law=law))
 
 
 def _densities(
@@ -293,25 +257,7 @@ def _densities(
     density_kg_m3: float | None,
     mass_kg: float | None,
 ) -> list[float]:
-    """Return the density outside the regions, then that of each region [kg/m³].
-
-    Parameters
-    ----------
-    mesh : TetMesh
-    regions : sequence of Region
-        A region whose density is None has that of the rest.
-    claimed : sequence of arrays of int
-        Cells of each region.
-    density_kg_m3, mass_kg : float or None
-        Density of the rest, or mass of the complete body; exactly one of them is a number. The mass
-        without that of the regions with a density of their own is spread over the other cells.
-
-    Raises
-    ------
-    InputError
-        If none or both are given, if a density is not positive, if the regions alone have at least
-        the given mass, or if a mass is given and every cell has a density of its own.
-    """
+    """Return the density outside the regions, then that of each region [kg/m³]."""
     if (density_kg_m3 is None) == (mass_kg is None):
         raise InputError(
             f"found {'neither' if mass_kg is None else 'both'} of density_kg_m3 and mass_kg; "
@@ -326,15 +272,9 @@ def _densities(
             )
     if density_kg_m3 is None:
         volumes = [float(mesh.volumes_m3[cells].sum()) for cells in claimed]
-        known = [
-            (r.density_kg_m3, v) for r, v in zip(regions, volumes, strict=True)
-        ]
-        known_kg = sum(
-            density * v for density, v in known if density is not None
-        )
-        remaining_m3 = mesh.volume_m3 - sum(
-            v for density, v in known if density is not None
-        )
+        known = [(r.density_kg_m3, v) for r, v in zip(regions, volumes, strict=True)]
+        known_kg = sum(density * v for density, v in known if density is not None)
+        remaining_m3 = mesh.volume_m3 - sum(v for density, v in known if density is not None)
         if remaining_m3 <= 1e-12 * mesh.volume_m3:
             raise InputError(
                 "every cell is in a region with a density of its own, so that mass_kg has no effect; "
@@ -355,22 +295,14 @@ def _densities(
         found = density_kg_m3 if mass_kg is None else mass_kg
         raise InputError(f"{key} is {found:g}; expected {expected}")
     region_densities = [
-        default_density
-        if region.density_kg_m3 is None
-        else region.density_kg_m3
+        default_density if region.density_kg_m3 is None else region.density_kg_m3
         for region in regions
     ]
     return [default_density, *region_densities]
 
 
 def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
-    """Return the cells of each region, ascending, in the order of the regions.
-
-    Raises
-    ------
-    InputError
-        If regions overlap or share a name, or a region selects no cell.
-    """
+    """Return the cells of each region, ascending, in the order of the regions."""
     region_of_cell = np.full(len(mesh.tetrahedra), -1)
     claimed: list[Index] = []
     for k, region in enumerate(regions):
@@ -394,13 +326,7 @@ def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
 
 
 def _resolve_cells(mesh: TetMesh, cells: Selection | ArrayLike) -> Index:
-    """Return cell indices, ascending and unique, from a selection, a mask (E,) or indices.
-
-    Raises
-    ------
-    InputError
-        If the array is empty or of another kind, or an index is not that of a cell.
-    """
+    """Return cell indices, ascending and unique, from a selection, a mask (E,) or indices."""
     if isinstance(cells, Selection):
         return cells.resolve_cells(mesh)
     array = np.asarray(cells)
@@ -494,8 +420,7 @@ class ConstantsModel:
                 part.name,
                 part.material,
                 others=part.constants[
-                    len(part.material.constants) : len(part.constants)
-                    - len(part.field_constants)
+                    len(part.material.constants) : len(part.constants) - len(part.field_constants)
                 ],
                 known=known,
             )
@@ -517,18 +442,10 @@ class ConstantsModel:
             The names among `known` that give constants of the parts, and always those of field
             coefficients, contrasts, custom forces and coefficients of friction.
         """
-        used = {
-            name
-            for source in self.constant_sources(known)
-            for name in source.names.values()
-        }
-        used.update(
-            self.list_field_coefficient_names(), self.find_contrast_deviations()
-        )
+        used = {name for source in self.constant_sources(known) for name in source.names.values()}
+        used.update(self.list_field_coefficient_names(), self.find_contrast_deviations())
         further = (force.constants for force in self.forces)
-        return used.union(
-            *({c.name for c in some} for some in (*further, self.frictions))
-        )
+        return used.union(*({c.name for c in some} for some in (*further, self.frictions)))
 
     def list_parameter_names(self) -> tuple[str, ...]:
         """Return all names that a parameter may have, without repetitions: constants of each part,
@@ -536,13 +453,9 @@ class ConstantsModel:
         """
         names = []
         for part in self.parts:
-            part_names = [c.name for c in part.constants] + list(
-                elastic_names(part.material)
-            )
+            part_names = [c.name for c in part.constants] + list(elastic_names(part.material))
             part_names.append(DENSITY.name)
-            names += [
-                part.full_name(part_name) for part_name in part_names
-            ] + part_names
+            names += [part.full_name(part_name) for part_name in part_names] + part_names
         return tuple(dict.fromkeys([*names, MASS.name, *self.constants]))
 
     def assemble_theta(self, values: Mapping[str, Any]) -> list[Any]:
@@ -561,21 +474,14 @@ class ConstantsModel:
             If a constant of a part, force or friction is missing, or a constant is given twice.
         """
         theta = []
-        for part, source in zip(
-            self.parts, self.constant_sources(list(values)), strict=True
-        ):
+        for part, source in zip(self.parts, self.constant_sources(list(values)), strict=True):
             constants = source.evaluate(values)
             if source.names.get(DENSITY.name) == MASS.name:
                 constants[DENSITY.name] *= part.per_mass_1_m3
             # A field that nothing is said of is as its mean everywhere.
-            own_constants = part.constants[
-                : len(part.constants) - len(part.field_constants)
-            ]
+            own_constants = part.constants[: len(part.constants) - len(part.field_constants)]
             theta += [constants[constant.name] for constant in own_constants]
-            theta += [
-                values.get(part.full_name(c.name), c.usual)
-                for c in part.field_constants
-            ]
+            theta += [values.get(part.full_name(c.name), c.usual) for c in part.field_constants]
         for name in list(self.constants)[len(theta) :]:
             if name not in values:
                 raise InputError(
@@ -605,16 +511,10 @@ class ConstantsModel:
         """
         by_part = {}
         for part, part_constants in zip(
-            self.parts,
-            self.split_theta(np.asarray(theta, dtype=float)),
-            strict=True,
+            self.parts, self.split_theta(np.asarray(theta, dtype=float)), strict=True
         ):
             values = (
-                part.material.lame(
-                    part_constants[: len(part.material.constants)]
-                )
-                .full()
-                .ravel()
+                part.material.lame(part_constants[: len(part.material.constants)]).full().ravel()
             )
             by_part[part.name] = (float(values[0]), float(values[1]))
         return by_part
@@ -644,11 +544,7 @@ class ConstantsModel:
         """Return the names of all constants of fields that are coefficients of shapes, in the order
         of θ.
         """
-        return tuple(
-            name
-            for names in self.group_field_coefficients().values()
-            for name in names
-        )
+        return tuple(name for names in self.group_field_coefficients().values() for name in names)
 
     def group_field_coefficients(self) -> dict[str, tuple[str, ...]]:
         """Return the names of the coefficients of each smooth field in the order of θ, by the name
@@ -656,8 +552,7 @@ class ConstantsModel:
         """
         return {
             part.full_name(FIELD_COEFFICIENT.name): tuple(
-                part.full_name(constant.name)
-                for constant in part.field_constants
+                part.full_name(constant.name) for constant in part.field_constants
             )
             for part in self.parts
             if part.field and part.field.field.prior != TWO_PHASE
@@ -680,18 +575,12 @@ class ConstantsModel:
         """
         counts = (len(part.field_constants) for part in self.parts)
         ends = self.starts[1:]
-        return [
-            slice(end - count, end)
-            for end, count in zip(ends, counts, strict=True)
-        ]
+        return [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
 
     @cached_property
     def starts(self) -> list[int]:
         """Index in θ of the first constant of each part, and that after the last part."""
-        return [
-            0,
-            *np.cumsum([len(part.constants) for part in self.parts]).tolist(),
-        ]
+        return [0, *np.cumsum([len(part.constants) for part in self.parts]).tolist()]
 
     def elastic_theta(self, constants: Mapping[str, float]) -> Array:
         """Return θ (k,) from elastic constants by name, with all other constants zero.
@@ -707,11 +596,7 @@ class ConstantsModel:
                 raise InputError(
                     f"found the constant {name!r}; expected one of {', '.join(self.constants)}{hint}"
                 )
-        stored = {
-            p.full_name(c.name)
-            for p in self.parts
-            for c in p.material.constants
-        }
+        stored = {p.full_name(c.name) for p in self.parts for c in p.material.constants}
         return self.theta_from_values(
             {**dict.fromkeys(set(self.constants) - stored, 0.0), **constants}
         )

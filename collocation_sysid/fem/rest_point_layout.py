@@ -55,10 +55,5 @@ class RestPointLayout:
             values += columns[:, 1 + i] * changes[i]
         for number, (i, j) in enumerate(self.list_input_pairs()):
             factor = 0.5 if i == j else 1.0
-            values += (
-                factor
-                * changes[i]
-                * changes[j]
-                * columns[:, 1 + self.input_count + number]
-            )
+            values += factor * changes[i] * changes[j] * columns[:, 1 + self.input_count + number]
         return values

@@ -148,20 +148,14 @@ class UnderGravity:
             chosen = np.unique(np.asarray(self.nodes, dtype=np.int64))
         count = len(nodes.points_m)
         if not chosen.size or chosen[0] < 0 or chosen[-1] >= count:
-            found = (
-                f"node indices from {chosen[0]} to {chosen[-1]}"
-                if chosen.size
-                else "no nodes"
-            )
+            found = f"node indices from {chosen[0]} to {chosen[-1]}" if chosen.size else "no nodes"
             raise InputError(
                 f"found {found}; expected the nodes that were held during the scan, with indices "
                 f"from 0 to {count - 1}",
                 where="scan.nodes",
             )
         points_m = nodes.points_m[chosen]
-        spread = np.linalg.svd(
-            points_m - points_m.mean(axis=0), compute_uv=False
-        )
+        spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
         if len(spread) < 2 or spread[1] <= 1e-9 * max(spread[0], 1e-300):
             raise InputError(
                 f"found {chosen.size} nodes on one line, about which the body could turn; expected "
@@ -188,23 +182,13 @@ class RestShape:
 
 
 @lru_cache(32)
-def _point_stress(
-    material: Material, averages: bool, slopes: bool
-) -> ca.Function:
+def _point_stress(material: Material, averages: bool, slopes: bool) -> ca.Function:
     """Return the function of the Kirchhoff stress per volume of the mesh at a point.
 
     Inputs: G (9,), column after column; the mean m of det G over the element; the constants (c,) of
     the material. With F = G⁻¹, or F = (det G / m)^⅓ G⁻¹ if the element averages the dilatation, the
     stress is det G · ∂ψ/∂F Fᵀ (9,). If `slopes`, the derivatives by G (9, 9), by m (9,) and by θ
     (9, c) follow.
-
-    Parameters
-    ----------
-    material : Material
-    averages : bool
-        Whether the element averages the dilatation.
-    slopes : bool
-        Whether to include derivatives.
     """
     gradient = ca.SX.sym("G", 9)
     mean = ca.SX.sym("mean")
@@ -219,13 +203,9 @@ def _point_stress(
     stress = ca.vec(ca.det(G) * piola @ F.T)
     outputs = [stress]
     if slopes:
-        outputs += [
-            ca.jacobian(stress, each) for each in (gradient, mean, theta)
-        ]
+        outputs += [ca.jacobian(stress, each) for each in (gradient, mean, theta)]
     dense = [ca.densify(output) for output in outputs]
-    return ca.Function(
-        "inverse_stress", [gradient, mean, theta], dense, {"cse": True}
-    )
+    return ca.Function("inverse_stress", [gradient, mean, theta], dense, {"cse": True})
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,23 +240,7 @@ def _part_forces(
     averages: bool,
     slopes: bool,
 ) -> _PartForces:
-    """Return the elastic forces of cells at the mesh, with stress-free positions X (n, 3).
-
-    Parameters
-    ----------
-    cells : (E, nodes) int
-    geometry : (E, q, 3·nodes + 1)
-        Shape gradients and volumes.
-    positions_m : (n, 3)
-        Stress-free positions X.
-    constants : (c,)
-        Constants of the material.
-    material : Material
-    averages : bool
-        Whether the element averages the dilatation, and with it the pressure.
-    slopes : bool
-        Whether to compute derivatives; otherwise their arrays are empty.
-    """
+    """Return the elastic forces of cells at the mesh, with stress-free positions X (n, 3)."""
     count, points = geometry.shape[:2]
     shape_slopes = geometry[..., :-1].reshape(count, points, -1, 3)
     volumes = geometry[..., -1]
@@ -287,18 +251,14 @@ def _part_forces(
     mean = np.einsum("eq,eq->e", shares, ratios)
     point_gradients = G.reshape(count * points, 9).T
     function = _point_stress(material, averages, slopes=slopes)
-    outputs = function(
-        point_gradients, np.repeat(mean, points)[None], constants
-    )
+    outputs = function(point_gradients, np.repeat(mean, points)[None], constants)
     outputs = [np.array(each) for each in (outputs if slopes else [outputs])]
     stress = outputs[0].T.reshape(count, points, 3, 3)
     size = 3 * cells.shape[1]
     dofs = (3 * cells[:, :, None] + np.arange(3)).reshape(count, size)
     if averages:
         _average_pressure(stress[..., None], shares)
-    force = -np.einsum(
-        "eq,eqaj,eqji->eai", volumes, shape_slopes, stress
-    ).reshape(count, size)
+    force = -np.einsum("eq,eqaj,eqji->eai", volumes, shape_slopes, stress).reshape(count, size)
     if not slopes:
         empty = np.zeros((0, size, 0))
         return _PartForces(dofs, force, by_position=empty, by_theta=empty)
@@ -310,22 +270,14 @@ def _part_forces(
     by_X = by_X.reshape(count, points, 3, 3, size)
     if averages:
         weights = shares * ratios
-        mean_by_X = np.einsum(
-            "eq,eqkl,eqbl->ebk", weights, np.linalg.inv(G), shape_slopes
-        )
+        mean_by_X = np.einsum("eq,eqkl,eqbl->ebk", weights, np.linalg.inv(G), shape_slopes)
         by_mean = outputs[2].T.reshape(count, points, 3, 3)
-        by_X = by_X + by_mean[..., None] * mean_by_X.reshape(
-            count, 1, 1, 1, size
-        )
+        by_X = by_X + by_mean[..., None] * mean_by_X.reshape(count, 1, 1, 1, size)
         _average_pressure(by_X, shares)
         _average_pressure(by_theta, shares)
     weighted_slopes = -volumes[..., None, None] * shape_slopes
-    matrices = np.einsum(
-        "eqaj,eqjim->eaim", weighted_slopes, by_X, optimize=True
-    )
-    columns = np.einsum(
-        "eqaj,eqjic->eaic", weighted_slopes, by_theta, optimize=True
-    )
+    matrices = np.einsum("eqaj,eqjim->eaim", weighted_slopes, by_X, optimize=True)
+    columns = np.einsum("eqaj,eqjic->eaic", weighted_slopes, by_theta, optimize=True)
     return _PartForces(
         dofs,
         force,
@@ -392,28 +344,23 @@ class InverseEquilibrium:
         assert body.scan_conditions is not None
         self.body = body
         self.points_m: Array = body.nodes.points_m
-        self.gravity_m_s2 = np.asarray(
-            body.scan_conditions.gravity_m_s2, dtype=float
-        )
+        self.gravity_m_s2 = np.asarray(body.scan_conditions.gravity_m_s2, dtype=float)
         size = self.points_m.size
         grasped_nodes = body.scan_conditions.grasped_nodes(body.nodes)
         self.free: Index = np.setdiff1d(
             np.arange(size), (3 * grasped_nodes[:, None] + np.arange(3)).ravel()
         )
         self.places: Index = np.array(
-            [*body.elastic_indices, *body.list_density_indices()],
-            dtype=np.int64,
+            [*body.elastic_indices, *body.list_density_indices()], dtype=np.int64
         )
-        self.layout = RestPointLayout(
-            len(self.places), body.element.mean_dilatation
-        )
+        self.layout = RestPointLayout(len(self.places), body.element.mean_dilatation)
         self._shapes: dict[bytes, RestShape] = {}
         self._data: dict[tuple[bytes, bool], list[Array]] = {}
         self._size_m = float(np.linalg.norm(np.ptp(self.points_m, axis=0)))
 
     def solve(self, theta: ArrayLike) -> RestShape:
-        """Return the stress-free shape at θ (all constants of the body), with its derivatives by the
-        inputs; the latest 16 are cached.
+        """Return the stress-free shape at θ (all constants of the body), with its derivatives by
+        the inputs; the latest 16 are cached.
 
         Newton's method starts from the latest solution if that is near, then from the mesh: where
         several shapes exist, the result can depend on earlier calls.
@@ -445,24 +392,17 @@ class InverseEquilibrium:
         constants = np.asarray(theta, dtype=float)
         columns = []
         for place in self.places:
-            step = RELATIVE_DIFFERENCE_STEP * max(
-                abs(float(constants[place])), 1e-12
-            )
+            step = RELATIVE_DIFFERENCE_STEP * max(abs(float(constants[place])), 1e-12)
             ends = []
             for offset in (step, -step):
                 shifted = constants.copy()
                 shifted[place] += offset
                 ends.append(self.solve(shifted).by_input)
             columns.append((ends[0] - ends[1]) / (2 * step))
-        pairs = [
-            (columns[j][i] + columns[i][j]) / 2
-            for i, j in self.layout.list_input_pairs()
-        ]
+        pairs = [(columns[j][i] + columns[i][j]) / 2 for i, j in self.layout.list_input_pairs()]
         return np.array(pairs).reshape(-1, *self.points_m.shape)
 
-    def point_data(
-        self, theta: ArrayLike, with_second_derivatives: bool = False
-    ) -> list[Array]:
+    def point_data(self, theta: ArrayLike, with_second_derivatives: bool = False) -> list[Array]:
         """Return the data of the points of each part of the body, (1, cells · q · count) each, see
         `RestPointLayout`. The latest two results are cached; do not modify them.
 
@@ -478,19 +418,14 @@ class InverseEquilibrium:
         RestShapeError
             If there is no stress-free shape at θ.
         """
-        key = (
-            np.asarray(theta, dtype=float)[self.places].tobytes(),
-            with_second_derivatives,
-        )
+        key = (np.asarray(theta, dtype=float)[self.places].tobytes(), with_second_derivatives)
         if key not in self._data:
             shape = self.solve(theta)
             fields = [shape.positions_m, *shape.by_input]
             if with_second_derivatives:
                 fields += [*self.second_derivatives(theta)]
             else:
-                fields += [np.zeros_like(self.points_m)] * len(
-                    self.layout.list_input_pairs()
-                )
+                fields += [np.zeros_like(self.points_m)] * len(self.layout.list_input_pairs())
             while len(self._data) >= 2:
                 self._data.pop(next(iter(self._data)), None)
             self._data[key] = self._fields_at_points(fields)
@@ -513,9 +448,7 @@ class InverseEquilibrium:
             If no stress-free shape is found at the constants θ, or its equations are singular.
         """
         constants = np.asarray(theta, dtype=float)
-        at = self._assemble_forces(
-            self.solve(constants).positions_m, constants, slopes=True
-        )
+        at = self._assemble_forces(self.solve(constants).positions_m, constants, slopes=True)
         factor = self._factorise(at.by_position)
         if factor is None:
             raise RestShapeError(self._failure_message(constants, 1.0))
@@ -527,48 +460,27 @@ class InverseEquilibrium:
         zero. New arrays, with the columns of `point_data_columns`.
         """
         others = self.layout.input_count + len(self.layout.list_input_pairs())
-        return self._fields_at_points(
-            [positions_m, *[np.zeros_like(positions_m)] * others]
-        )
+        return self._fields_at_points([positions_m, *[np.zeros_like(positions_m)] * others])
 
     def _fields_at_points(self, fields: Sequence[Array]) -> list[Array]:
         """Return the data of the points of each part, (1, E · q · `layout.count`) each: G and its
         derivatives, and their volume logarithms if the layout averages the dilatation.
-
-        Parameters
-        ----------
-        fields : sequence of (n, 3)
-            X [m], then its derivatives by the inputs, and the second ones in the order of
-            `layout.list_input_pairs()`.
         """
         layout = self.layout
         data = []
         for cells, geometry in self._parts:
             slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
             # (cells, q, columns of G, rows of G): column after column.
-            columns = [
-                np.einsum("ean,eqai->eqin", f[cells], slopes) for f in fields
-            ]
-            values = np.stack(
-                [c.reshape(*c.shape[:2], 9) for c in columns], axis=2
-            )
+            columns = [np.einsum("ean,eqai->eqin", f[cells], slopes) for f in fields]
+            values = np.stack([c.reshape(*c.shape[:2], 9) for c in columns], axis=2)
             if layout.averages_dilatation:
-                values = np.concatenate(
-                    [values, self._volume_logarithms(values, geometry)], axis=3
-                )
+                values = np.concatenate([values, self._volume_logarithms(values, geometry)], axis=3)
             data.append(np.ascontiguousarray(values).reshape(1, -1))
         return data
 
     def _volume_logarithms(self, values: Array, geometry: Array) -> Array:
         """Return the logarithm ρ of each point's volume ratio det G over the mean of its element,
         with derivatives (E, q, 1 + k + pairs, 1).
-
-        Parameters
-        ----------
-        values : (E, q, 1 + k + pairs, 9)
-            G = ∂X/∂Y and its derivatives.
-        geometry : (E, q, 3·nodes + 1)
-            Shape gradients and volumes.
         """
         layout = self.layout
         shares = geometry[..., -1] / geometry[..., -1].sum(axis=1)[:, None]
@@ -585,9 +497,7 @@ class InverseEquilibrium:
             ratios
             * (
                 traces[..., i] * traces[..., j]
-                - np.einsum(
-                    "eqab,eqba->eq", relative[:, :, i], relative[:, :, j]
-                )
+                - np.einsum("eqab,eqba->eq", relative[:, :, i], relative[:, :, j])
                 + traces[..., k + number]
             )
             for number, (i, j) in enumerate(layout.list_input_pairs())
@@ -596,12 +506,9 @@ class InverseEquilibrium:
             [ratios[..., None], first, np.stack(second, axis=-1)], axis=-1
         )
         mean = np.broadcast_to(
-            np.einsum("eq,eqk->ek", shares, determinants)[:, None],
-            determinants.shape,
+            np.einsum("eq,eqk->ek", shares, determinants)[:, None], determinants.shape
         )
-        return (self._logarithm(determinants) - self._logarithm(mean))[
-            ..., None
-        ]
+        return (self._logarithm(determinants) - self._logarithm(mean))[..., None]
 
     def _logarithm(self, values: Array) -> Array:
         """Return the logarithm of positive numbers with its derivatives, from numbers with their
@@ -614,9 +521,7 @@ class InverseEquilibrium:
         for number, (i, j) in enumerate(self.layout.list_input_pairs()):
             column = k + 1 + number
             product = logarithm[..., 1 + i] * logarithm[..., 1 + j]
-            logarithm[..., column] = (
-                values[..., column] / values[..., 0] - product
-            )
+            logarithm[..., column] = values[..., column] / values[..., 0] - product
         return logarithm
 
     @cached_property
@@ -629,19 +534,10 @@ class InverseEquilibrium:
     def _solve(self, theta: Array) -> RestShape:
         """Return the stress-free shape at θ (k,) with derivatives, from the latest solution or, if
         that fails, from the mesh.
-
-        Raises
-        ------
-        RestShapeError
-            If there is none near the mesh.
         """
         weight = self._weight_n(theta)
         start = self._predict(theta)
-        x = (
-            None
-            if start is None
-            else self._newton(start, theta, weight_n=weight)
-        )
+        x = None if start is None else self._newton(start, theta, weight_n=weight)
         if x is None:
             x = self._solve_with_load_steps(theta, weight)
         force = self._assemble_forces(x, theta, slopes=True)
@@ -669,19 +565,11 @@ class InverseEquilibrium:
         change = target - known
         if (np.abs(change) > LARGEST_EXTRAPOLATION * np.abs(known)).any():
             return None
-        predicted = shape.positions_m + np.tensordot(
-            change, shape.by_input, axes=1
-        )
+        predicted = shape.positions_m + np.tensordot(change, shape.by_input, axes=1)
         return predicted if self._is_admissible(predicted) else None
 
     def _solve_with_load_steps(self, theta: Array, weight_n: Array) -> Array:
-        """Return X, solved from the mesh under shares of the weight that grow to one.
-
-        Raises
-        ------
-        RestShapeError
-            If the full weight is not reached.
-        """
+        """Return X, solved from the mesh under shares of the weight that grow to one."""
         x = self.points_m.copy()
         share_reached = 0.0
         step = 1.0
@@ -704,9 +592,7 @@ class InverseEquilibrium:
         mass_kg = self.body.mass_of_dofs(theta)[: self.points_m.size]
         return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
 
-    def _newton(
-        self, start: Array, theta: Array, weight_n: Array
-    ) -> Array | None:
+    def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
         """Return X (n, 3) [m] at a given weight (3n,) [N], from `start` (n, 3); None if Newton's
         method does not converge.
 
@@ -731,9 +617,7 @@ class InverseEquilibrium:
             for _ in range(OPTIONS.halvings):
                 trial = x + share * step
                 if self._is_admissible(trial):
-                    after = self._assemble_forces(
-                        trial, theta, slopes=False
-                    ).force_n
+                    after = self._assemble_forces(trial, theta, slopes=False).force_n
                     next_step = self._newton_step(factor, after + weight_n)
                     if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                         break
@@ -770,9 +654,7 @@ class InverseEquilibrium:
                 return False
         return True
 
-    def _assemble_forces(
-        self, positions_m: Array, theta: Array, slopes: bool
-    ) -> _AssembledForces:
+    def _assemble_forces(self, positions_m: Array, theta: Array, slopes: bool) -> _AssembledForces:
         """Return the elastic forces at the mesh if the stress-free positions X are `positions_m`
         (n, 3), with derivatives by X and θ if `slopes`, else with zeros in their place.
         """
@@ -780,9 +662,7 @@ class InverseEquilibrium:
         force = np.zeros(size)
         by_theta = np.zeros((size, len(self.places)))
         by_position = sp.csc_array((size, size))
-        places = {
-            int(place): number for number, place in enumerate(self.places)
-        }
+        places = {int(place): number for number, place in enumerate(self.places)}
         body = self.body
         for part, start, (cells, geometry) in zip(
             body.parts, body.starts, self._parts, strict=False
@@ -798,23 +678,17 @@ class InverseEquilibrium:
                 slopes=slopes,
             )
             dofs = part_forces.dofs
-            force += np.bincount(
-                dofs.ravel(), part_forces.force_n.ravel(), size
-            )
+            force += np.bincount(dofs.ravel(), part_forces.force_n.ravel(), size)
             if not slopes:
                 continue
             shape = part_forces.by_position.shape
             rows = np.broadcast_to(dofs[:, :, None], shape).ravel()
             columns = np.broadcast_to(dofs[:, None, :], shape).ravel()
-            entries = sp.coo_array(
-                (part_forces.by_position.ravel(), (rows, columns)), (size, size)
-            )
+            entries = sp.coo_array((part_forces.by_position.ravel(), (rows, columns)), (size, size))
             by_position = by_position + sp.csc_array(entries)
             for number in range(elastic):
                 values = part_forces.by_theta[..., number].ravel()
-                by_theta[:, places[start + number]] += np.bincount(
-                    dofs.ravel(), values, size
-                )
+                by_theta[:, places[start + number]] += np.bincount(dofs.ravel(), values, size)
         return _AssembledForces(force, by_position, by_theta=by_theta)
 
     def _failure_message(self, theta: Array, reached: float) -> str:

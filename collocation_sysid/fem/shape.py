@@ -71,9 +71,7 @@ class PolylineLength:
         self._segments = len(nodes) - 1
         points = np.repeat(np.arange(len(nodes)), nodes.shape[1])
         shape = (len(nodes), node_count)
-        placed = sp.csr_array(
-            (weights.ravel(), (points, nodes.ravel())), shape=shape
-        )
+        placed = sp.csr_array((weights.ravel(), (points, nodes.ravel())), shape=shape)
         self._differences = sp.csr_array(placed[1:] - placed[:-1])  # (J, n)
         self._differences.eliminate_zeros()
 
@@ -81,9 +79,7 @@ class PolylineLength:
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
         pairs = self._pairs
-        return SymmetricPattern.from_entries(
-            pairs.row, pairs.column, nodes=self.node_count
-        )
+        return SymmetricPattern.from_entries(pairs.row, pairs.column, nodes=self.node_count)
 
     @cached_property
     def _pairs(self) -> _DofPairs:
@@ -96,9 +92,7 @@ class PolylineLength:
             weights = np.repeat(segment.data, 3)
             a, b = np.nonzero(dofs[:, None] >= dofs)
             place = 6 * j + _PLACE[axes[a], axes[b]]
-            segment_parts.append(
-                (dofs[a], dofs[b], weights[a] * weights[b], place)
-            )
+            segment_parts.append((dofs[a], dofs[b], weights[a] * weights[b], place))
         rows, columns, weights, places = (
             np.concatenate(parts) for parts in zip(*segment_parts, strict=True)
         )
@@ -110,9 +104,7 @@ class PolylineLength:
         pairs = self._pairs
         entries = self.couplings.positions_of(pairs.row, pairs.column)
         shape = (6 * self._segments, self.couplings.entry_count)
-        return sp.csr_array(
-            (pairs.weight, (pairs.source, entries)), shape=shape
-        )
+        return sp.csr_array((pairs.weight, (pairs.source, entries)), shape=shape)
 
     def evaluate(self, x: Array) -> Array:
         """Return the lengths L (T,) at positions (T, 3n)."""
@@ -120,13 +112,9 @@ class PolylineLength:
 
     def gradient(self, x: Array) -> Array:
         """Return ∂L/∂x (T, 3n) at positions (T, 3n)."""
-        directions = _directions_and_lengths(self._vectors(x))[0].transpose(
-            1, 0, 2
-        )  # (J, T, 3)
+        directions = _directions_and_lengths(self._vectors(x))[0].transpose(1, 0, 2)  # (J, T, 3)
         nodal = self._differences.T @ directions.reshape(len(directions), -1)
-        return (
-            nodal.reshape(-1, len(x), 3).transpose(1, 0, 2).reshape(len(x), -1)
-        )
+        return nodal.reshape(-1, len(x), 3).transpose(1, 0, 2).reshape(len(x), -1)
 
     def hessian(self, x: Array) -> Array:
         """Return ∂²L/∂x² [1/m] at positions (T, 3n), as values (T, entries) on the pattern
@@ -145,9 +133,7 @@ class PolylineLength:
         projection = (e * delta).sum(axis=2, keepdims=True)
         mixed = (delta - projection * e)[..., :, None] * e[..., None, :]
         across = np.eye(3) - e[..., :, None] * e[..., None, :]
-        derivative = (
-            projection[..., None] * across + mixed + np.swapaxes(mixed, 2, 3)
-        )
+        derivative = projection[..., None] * across + mixed + np.swapaxes(mixed, 2, 3)
         return self._assemble(-derivative / length[..., None] ** 2)
 
     def _vectors(self, x: Array) -> Array:
@@ -171,8 +157,7 @@ def _directions_and_lengths(vectors: Array) -> tuple[Array, Array]:
 
 
 _PERMUTATIONS = [
-    (p, float(np.linalg.det(np.eye(3)[list(p)]).round()))
-    for p in permutations(range(3))
+    (p, float(np.linalg.det(np.eye(3)[list(p)]).round())) for p in permutations(range(3))
 ]
 
 
@@ -201,9 +186,7 @@ class EnclosedVolume:
         Apex of the cones; the origin by default. It matters only if the surface is open.
     """
 
-    def __init__(
-        self, faces: Index, node_count: int, apex_m: Array | None = None
-    ) -> None:
+    def __init__(self, faces: Index, node_count: int, apex_m: Array | None = None) -> None:
         self.faces = faces
         self.node_count = node_count
         self.apex_m = np.zeros(3) if apex_m is None else apex_m
@@ -212,11 +195,7 @@ class EnclosedVolume:
     def with_apex(self, apex_m: Array) -> EnclosedVolume:
         """Return this volume with cones from another apex (3,) [m]; self if it is the same."""
         is_same = (apex_m == self.apex_m).all()
-        return (
-            self
-            if is_same
-            else EnclosedVolume(self.faces, self.node_count, apex_m=apex_m)
-        )
+        return self if is_same else EnclosedVolume(self.faces, self.node_count, apex_m=apex_m)
 
     @cached_property
     def _terms(self) -> _HessianTerms:
@@ -225,34 +204,22 @@ class EnclosedVolume:
         i, j, k = np.nonzero(np.abs(form) > 1e-14)
         term_parts = []
         for (a, b, c), sign in _PERMUTATIONS:
-            row, column, by = (
-                3 * self.faces[:, n] + axis
-                for n, axis in ((i, a), (j, b), (k, c))
-            )
+            row, column, by = (3 * self.faces[:, n] + axis for n, axis in ((i, a), (j, b), (k, c)))
             term_parts.append(
-                (
-                    row,
-                    column,
-                    by,
-                    np.broadcast_to(6 * sign * form[i, j, k], row.shape),
-                )
+                (row, column, by, np.broadcast_to(6 * sign * form[i, j, k], row.shape))
             )
         rows, columns, by, factor = (
             np.concatenate([part.ravel() for part in parts])
             for parts in zip(*term_parts, strict=True)
         )
         lower = rows >= columns
-        return _HessianTerms(
-            rows[lower], columns[lower], dof=by[lower], factor=factor[lower]
-        )
+        return _HessianTerms(rows[lower], columns[lower], dof=by[lower], factor=factor[lower])
 
     @cached_property
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
         terms = self._terms
-        return SymmetricPattern.from_entries(
-            terms.row, terms.column, nodes=self.node_count
-        )
+        return SymmetricPattern.from_entries(terms.row, terms.column, nodes=self.node_count)
 
     @cached_property
     def _hessian_matrix(self) -> sp.csr_array:
@@ -269,15 +236,11 @@ class EnclosedVolume:
         Empty for a closed surface.
         """
         corners = self.faces[:, :3]
-        edges = np.stack(
-            [corners, np.roll(corners, -1, axis=1)], axis=2
-        ).reshape(-1, 2)
+        edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2)
         codes = np.sort(edges, axis=1) @ [self.node_count, 1]
         _, edge_index = np.unique(codes, return_inverse=True)
         # Neighbours go along their edge in opposite directions.
-        orientation_sum = np.bincount(
-            edge_index, np.sign(edges[:, 1] - edges[:, 0])
-        )
+        orientation_sum = np.bincount(edge_index, np.sign(edges[:, 1] - edges[:, 0]))
         is_rim = orientation_sum[edge_index] != 0
         mid = self.faces[:, 3:].reshape(len(edges), -1)
         return np.hstack([edges, mid])[is_rim]
@@ -306,9 +269,7 @@ class EnclosedVolume:
         the apex.
         """
         corners = away.reshape(len(away), -1, 3)[:, self.faces]  # (T, F, k, 3)
-        weighted = np.einsum(
-            "ijk,tfkc->tfijc", 3 * _cubic_form(self.faces.shape[1]), corners
-        )
+        weighted = np.einsum("ijk,tfkc->tfijc", 3 * _cubic_form(self.faces.shape[1]), corners)
         of_faces = np.cross(corners[:, :, None], weighted).sum(axis=3)
         nodal = np.zeros((self.node_count, len(away), 3))
         np.add.at(nodal, self.faces, of_faces.transpose(1, 2, 0, 3))
@@ -320,9 +281,7 @@ def _cubic_form(nodes: int) -> Array:
     """Return A (k, k, k) of a triangle with 3 or 6 nodes."""
     points, weights = _triangle_rule()
     values, slopes = _triangle_shape_functions(points, nodes)
-    form = np.einsum(
-        "q,qi,qj,qk->ijk", weights / 3, values, slopes[..., 0], slopes[..., 1]
-    )
+    form = np.einsum("q,qi,qj,qk->ijk", weights / 3, values, slopes[..., 0], slopes[..., 1])
     permuted = [sign * form.transpose(p) for p, sign in _PERMUTATIONS]
     return np.asarray(np.mean(permuted, axis=0))
 
@@ -338,16 +297,7 @@ def _triangle_rule() -> tuple[Array, Array]:
 
 
 def _triangle_shape_functions(points: Array, nodes: int) -> tuple[Array, Array]:
-    """Return shape functions (q, k) of a triangle and their derivatives (q, k, 2) by ξ and η.
-
-    Parameters
-    ----------
-    points : (q, 2)
-        Coordinates ξ and η: the barycentric coordinates of the second and the third corner.
-    nodes : int
-        Number k of nodes: 3 corners, or 6 with the mid nodes of the edges from the first corner to
-        the second, from the second to the third, and from the third to the first.
-    """
+    """Return shape functions (q, k) of a triangle and their derivatives (q, k, 2) by ξ and η."""
     xi, eta = points.T
     corner_slopes = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
     L = np.column_stack([1 - xi - eta, xi, eta])

@@ -32,13 +32,7 @@ from ..common.schema_tables import ByForm
 from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
 from .elements import ELEMENTS, reference_geometry
-from .laws.constants import (
-    DENSITY,
-    YOUNG,
-    Constant,
-    field_coefficient,
-    is_modulus,
-)
+from .laws.constants import DENSITY, YOUNG, Constant, field_coefficient, is_modulus
 from .meshes.mesh import TetMesh
 
 # Parameter of a field of stiffness: all moduli of the material vary with it.
@@ -50,9 +44,7 @@ TWO_PHASE_AMPLITUDE = 1.0
 SMOOTH: Literal["smooth"] = "smooth"
 TWO_PHASE: Literal["two-phase"] = "two-phase"
 Prior = Literal["smooth", "two-phase"]
-Lengths = Annotated[
-    Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByForm((int, float))
-]
+Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByForm((int, float))]
 
 
 @declaration
@@ -89,25 +81,19 @@ class Field:
     @property
     def lengths_m(self) -> tuple[float, ...]:
         """Correlation lengths to choose from [m]; one if `length_m` is a number."""
-        return (
-            self.length_m
-            if isinstance(self.length_m, tuple)
-            else (self.length_m,)
-        )
+        return self.length_m if isinstance(self.length_m, tuple) else (self.length_m,)
 
     @property
     def deviation(self) -> float:
-        """Prior standard deviation: the amplitude, or its default for None, which depends on prior and
-        parameter.
+        """Prior standard deviation: the amplitude, or its default for None, which depends on prior
+        and parameter.
 
         The default of a density is smaller, because a density, unlike a logarithm, could become
         negative.
         """
         if self.prior == TWO_PHASE:
             return self.amplitude or TWO_PHASE_AMPLITUDE
-        return self.amplitude or (
-            0.3 if self.parameter == DENSITY.name else 0.5
-        )
+        return self.amplitude or (0.3 if self.parameter == DENSITY.name else 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,9 +138,7 @@ class Laplacian:
         InputError
             If the cells have fewer than m + 3 nodes.
         """
-        nodes, local_nodes = np.unique(
-            mesh.tetrahedra[cells], return_inverse=True
-        )
+        nodes, local_nodes = np.unique(mesh.tetrahedra[cells], return_inverse=True)
         size = len(nodes)
         local_nodes = local_nodes.reshape(-1, 4)
         if not count + 2 < size:
@@ -162,23 +146,16 @@ class Laplacian:
                 f"modes is {count}; expected at most {size - 3}, because the part of the body that has "
                 f"the field has {size} nodes"
             )
-        geometry = reference_geometry(
-            mesh.points_m[nodes], local_nodes, element=ELEMENTS["tet4"]
-        )[:, 0]
+        geometry = reference_geometry(mesh.points_m[nodes], local_nodes, element=ELEMENTS["tet4"])[
+            :, 0
+        ]
         slopes = geometry[:, :-1].reshape(-1, 4, 3)
         volumes = geometry[:, -1]
         stiffness = volumes[:, None, None] * slopes @ slopes.swapaxes(1, 2)
-        places = (
-            np.repeat(local_nodes, 4, axis=1).ravel(),
-            np.tile(local_nodes, 4).ravel(),
-        )
+        places = (np.repeat(local_nodes, 4, axis=1).ravel(), np.tile(local_nodes, 4).ravel())
         mass = np.bincount(local_nodes.ravel(), np.repeat(volumes / 4, 4), size)
         root = sp.diags_array(1 / np.sqrt(mass))
-        matrix = (
-            root
-            @ sp.csc_array((stiffness.ravel(), places), (size, size))
-            @ root
-        ).tocsc()
+        matrix = (root @ sp.csc_array((stiffness.ravel(), places), (size, size)) @ root).tocsc()
         # A shift slightly below zero makes the matrix regular; a fixed start makes it repeatable.
         shift = -1e-3 * volumes.sum() ** (-2 / 3)
         start = np.random.default_rng(0).normal(size=size)
@@ -193,13 +170,9 @@ class Laplacian:
             [basis[:, constant].T @ constant_vector, np.eye(len(constant))]
         )
         basis[:, constant] = basis[:, constant] @ np.linalg.qr(combination)[0]
-        basis *= np.sign(
-            basis[np.abs(basis).argmax(axis=0), np.arange(count + 1)]
-        )
+        basis *= np.sign(basis[np.abs(basis).argmax(axis=0), np.arange(count + 1)])
         vectors = (root @ basis[:, 1:])[local_nodes].mean(axis=1).T
-        return cls(
-            np.maximum(values[1:], 0.0), vectors, matrix=matrix, basis=basis
-        )
+        return cls(np.maximum(values[1:], 0.0), vectors, matrix=matrix, basis=basis)
 
     def weights(self, length_m: float) -> Array:
         """Return 1/(1/l² + λ) (m,) for a correlation length l [m]: the prior deviations of the
@@ -216,14 +189,11 @@ class Laplacian:
         size = len(self.basis)
         own_variance = (self.weights(length_m) ** 2).sum()
         # The trace of a square is how far random signs are stretched on average.
-        signs = np.random.default_rng(0).choice(
-            [-1.0, 1.0], size=(size, PROBES)
-        )
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(size, PROBES))
         finer = signs - self.basis @ (self.basis.T @ signs)
         operator = (self.matrix + sp.eye_array(size) / length_m**2).tocsc()
         return float(
-            own_variance
-            / (own_variance + (splu(operator).solve(finer) ** 2).sum() / PROBES)
+            own_variance / (own_variance + (splu(operator).solve(finer) ** 2).sum() / PROBES)
         )
 
 
@@ -275,11 +245,7 @@ class FieldModes:
 
     @classmethod
     def from_field(
-        cls,
-        field: Field,
-        mesh: TetMesh,
-        cells: Index,
-        law: tuple[Constant, ...],
+        cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]
     ) -> FieldModes:
         """Return the shapes of a field on some cells, with the first of its correlation lengths.
 
@@ -324,8 +290,8 @@ class FieldModes:
         return self.shapes @ coefficients
 
     def jacobian(self, coefficients: Array) -> Array:
-        """Return the derivatives (E, k) of `logarithms` by the coefficients (k,), on which they do not
-        depend here.
+        """Return the derivatives (E, k) of `logarithms` by the coefficients (k,), on which they do
+        not depend here.
         """
         return self.shapes
 
@@ -358,10 +324,7 @@ class FieldModes:
 
         Σ_i φ_i² is the same in every cell: the squared prior deviation times `variance_share`.
         """
-        unscaled = (
-            self.laplacian.weights(self.length_m)[:, None]
-            * self.laplacian.vectors
-        )
+        unscaled = self.laplacian.weights(self.length_m)[:, None] * self.laplacian.vectors
         deviation = self.field.deviation * np.sqrt(self.variance_share)
         return (deviation * unscaled / np.linalg.norm(unscaled, axis=0)).T
 
@@ -439,9 +402,7 @@ class FieldAssembly:
         rows = self.dofs.ravel()
         columns = np.repeat(np.arange(cells), dofs_per_cell)
         entry_codes = np.arange(1, rows.size + 1)
-        return sp.csr_array(
-            (entry_codes, (rows, columns)), shape=(self.size, cells)
-        )
+        return sp.csr_array((entry_codes, (rows, columns)), shape=(self.size, cells))
 
     def assemble_nodal(self, values: Array, slopes: Array, out: Array) -> None:
         """Write derivatives of nodal values by the coefficients of the field to `out`.
@@ -459,7 +420,6 @@ class FieldAssembly:
         order = incidence.data - 1
         for value, derivatives in zip(values, out, strict=True):
             matrix = sp.csr_array(
-                (value[order], incidence.indices, incidence.indptr),
-                incidence.shape,
+                (value[order], incidence.indices, incidence.indptr), incidence.shape
             )
             derivatives[:] = matrix @ slopes

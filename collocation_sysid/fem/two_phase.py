@@ -110,14 +110,10 @@ class TwoPhaseModes(FieldModes):
 
     @classmethod
     def from_field(
-        cls,
-        field: Field,
-        mesh: TetMesh,
-        cells: Index,
-        law: tuple[Constant, ...],
+        cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]
     ) -> TwoPhaseModes:
-        """Return the two-phase field of some cells, see `FieldModes.from_field`; all cells are in the
-        surroundings at first.
+        """Return the two-phase field of some cells, see `FieldModes.from_field`; all cells are in
+        the surroundings at first.
 
         Raises
         ------
@@ -181,9 +177,7 @@ class TwoPhaseModes(FieldModes):
         assert isinstance(finer, TwoPhaseModes)
         samples = self.samples
         if samples is not None:
-            samples = replace(
-                samples, logarithms=np.repeat(samples.logarithms, 8, axis=1)
-            )
+            samples = replace(samples, logarithms=np.repeat(samples.logarithms, 8, axis=1))
         return replace(finer, phase=np.repeat(self.phase, 8), samples=samples)
 
     def logarithms(self, coefficients: Array) -> Array:

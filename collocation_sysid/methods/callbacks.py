@@ -102,10 +102,7 @@ class TimedFunction(ca.Callback):
             return 1
         try:
             self._evaluate(
-                [
-                    np.frombuffer(a) if a is not None else np.zeros(0)
-                    for a in arguments
-                ],
+                [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
                 [np.frombuffer(r) if r is not None else None for r in results],
             )
         except RestShapeError:
@@ -135,11 +132,7 @@ class LagrangianGradient(TimedFunction):
         """
         inputs = [*self._inputs, *self._outputs, *self._inputs]
         self._forward = TimedFunction(
-            name,
-            inputs,
-            outputs=self._outputs,
-            evaluate=self.hessian_product,
-            errors=self._errors,
+            name, inputs, outputs=self._outputs, evaluate=self.hessian_product, errors=self._errors
         )
         return self._forward
 
@@ -169,10 +162,7 @@ class NlpFunctions:
     """
 
     def __init__(
-        self,
-        collocation: Collocation,
-        hessian: HessianValues,
-        errors: list[BaseException],
+        self, collocation: Collocation, hessian: HessianValues, errors: list[BaseException]
     ) -> None:
         self.collocation = collocation
         self.errors = errors
@@ -208,42 +198,20 @@ class NlpFunctions:
             overwritten.
             """
             requests = zip(outputs, buffers, strict=True)
-            self._evaluate(
-                inputs, {output: b for output, b in requests if b is not None}
-            )
+            self._evaluate(inputs, {output: b for output, b in requests if b is not None})
 
-        needs_multipliers = any(
-            output in ("grad_l", "triu_hess", "hess") for output in outputs
-        )
+        needs_multipliers = any(output in ("grad_l", "triu_hess", "hess") for output in outputs)
         inputs = self._inputs if needs_multipliers else self._inputs[:2]
         kind = LagrangianGradient if outputs == ("grad_l",) else TimedFunction
         sparsities = [self._sparsity(output) for output in outputs]
-        callback = kind(
-            name,
-            inputs,
-            outputs=sparsities,
-            evaluate=evaluate,
-            errors=self.errors,
-        )
+        callback = kind(name, inputs, outputs=sparsities, evaluate=evaluate, errors=self.errors)
         if isinstance(callback, LagrangianGradient):
             callback.hessian_product = self._forward
         self._functions.append(callback)
         return callback
 
     def _evaluate(self, inputs: list[Array], outputs: dict[str, Array]) -> None:
-        """Write the requested outputs to `outputs`, in place.
-
-        Parameters
-        ----------
-        inputs : list of array
-            z and CasADi's parameters p, which are ignored. For outputs of the Lagrangian also the
-            weight w and the multipliers y, which may be empty, see `_weights`; without them these
-            outputs are not written.
-        outputs : dict of str to array
-            Arrays to overwrite, by the name of the output, see the class: "f" (1,), "grad_f"
-            (variables,), "g" (constraints,), "grad_l" (variables,), and the values of the nonzero
-            entries of "jac_g", "triu_hess" and "hess".
-        """
+        """Write the requested outputs to `outputs`, in place."""
         collocation = self.collocation
         z = inputs[0]
         if "f" in outputs:
@@ -265,28 +233,15 @@ class NlpFunctions:
         if "triu_hess" in outputs:
             self._upper_values(z, weight, multipliers, outputs["triu_hess"])
         if "hess" in outputs:
-            outputs["hess"][:] = self._upper_triangle(
-                z, weight, multipliers=multipliers
-            )[self._full[1]]
+            outputs["hess"][:] = self._upper_triangle(z, weight, multipliers=multipliers)[
+                self._full[1]
+            ]
 
-    def _forward(
-        self, inputs: list[Array], outputs: list[Array | None]
-    ) -> None:
+    def _forward(self, inputs: list[Array], outputs: list[Array | None]) -> None:
         """Write the directional derivative of the Lagrangian's gradient to the only output, in
         place.
-
-        Parameters
-        ----------
-        inputs : list of array
-            In CasADi's order: z, p, w and y, the gradient there, then the direction of each of the
-            four. Those of p and the gradient are ignored; the direction of z may be empty, for
-            zero.
-        outputs : list of one (variables,) array or None
-            Array to overwrite; nothing is done for None.
         """
-        z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = (
-            inputs
-        )
+        z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = inputs
         (product,) = outputs
         if product is None:
             return
@@ -294,18 +249,14 @@ class NlpFunctions:
         if len(by_z):
             structure, order = self._full
             rows, columns = structure.get_triplet()
-            values = self._upper_triangle(
-                z, *self._weights(weight, multipliers)
-            )[order]
+            values = self._upper_triangle(z, *self._weights(weight, multipliers))[order]
             np.add.at(product, rows, values * by_z[columns])
         if by_weight.any():
             product += by_weight * self.collocation.gradient(z)
         if by_multipliers.any():
             product += self.collocation.jacobian(z).T @ by_multipliers
 
-    def _upper_triangle(
-        self, z: Array, weight: float, multipliers: Array
-    ) -> Array:
+    def _upper_triangle(self, z: Array, weight: float, multipliers: Array) -> Array:
         """Return the values of the upper triangle of the Hessian of weight · f + multipliers · g at
         z, in the order of `hessian_structure`, as a new array.
         """
@@ -313,9 +264,7 @@ class NlpFunctions:
         self._upper_values(z, weight, multipliers, values)
         return values
 
-    def _weights(
-        self, weight: Array, multipliers: Array
-    ) -> tuple[float, Array]:
+    def _weights(self, weight: Array, multipliers: Array) -> tuple[float, Array]:
         """Return the weight w of the objective and the multipliers y (constraints,), from arrays
         that CasADi leaves empty for zeros.
         """
@@ -325,18 +274,14 @@ class NlpFunctions:
 
     @cached_property
     def _inputs(self) -> list[ca.Sparsity]:
-        """Sparsity of the inputs in CasADi's order: variables z (variables, 1), CasADi's parameters p,
-        which are empty (0, 1), weight w of the objective (1, 1), and multipliers y (constraints, 1).
+        """Sparsity of the inputs in CasADi's order: variables z (variables, 1), CasADi's parameters
+        p, which are empty (0, 1), weight w of the objective (1, 1), and multipliers y (constraints,
+        1).
         """
         dense = ca.Sparsity.dense
         variables = self.collocation.variable_count
         rows = self.collocation.constraint_count
-        return [
-            dense(variables, 1),
-            ca.Sparsity(0, 1),
-            dense(1, 1),
-            dense(rows, 1),
-        ]
+        return [dense(variables, 1), ca.Sparsity(0, 1), dense(1, 1), dense(rows, 1)]
 
     @cached_property
     def _full(self) -> tuple[ca.Sparsity, NDArray[np.int64]]:
@@ -346,20 +291,14 @@ class NlpFunctions:
         upper = self._sparsity("triu_hess")
         numbered = ca.DM(upper, np.arange(1.0, upper.nnz() + 1))
         symmetric = ca.triu2symm(numbered)
-        return symmetric.sparsity(), np.array(
-            symmetric.nonzeros(), dtype=np.int64
-        ) - 1
+        return symmetric.sparsity(), np.array(symmetric.nonzeros(), dtype=np.int64) - 1
 
     def _sparsity(self, output: str) -> ca.Sparsity:
         """Return the sparsity of an output, by name; values and gradients are dense columns."""
         variables = self.collocation.variable_count
         rows = self.collocation.constraint_count
         if output == "jac_g":
-            return ca.Sparsity(
-                rows,
-                variables,
-                *map(_ints, self.collocation.jacobian_structure),
-            )
+            return ca.Sparsity(rows, variables, *map(_ints, self.collocation.jacobian_structure))
         if output == "triu_hess":
             structure = self.collocation.hessian_structure
             return ca.Sparsity(variables, variables, *map(_ints, structure))
@@ -400,10 +339,7 @@ class IterationMonitor(ca.Callback):
     """
 
     def __init__(
-        self,
-        recorder: Recorder,
-        program: Collocation,
-        errors: list[BaseException],
+        self, recorder: Recorder, program: Collocation, errors: list[BaseException]
     ) -> None:
         ca.Callback.__init__(self)
         self.recorder = recorder
@@ -458,15 +394,8 @@ class IterationMonitor(ca.Callback):
 
         The best has the smallest sum of the objective and the largest violation of a constraint.
         The recorder calls `watch` with the entry; exceptions of `watch` are not caught here.
-
-        Parameters
-        ----------
-        arguments : sequence of DM
-            Outputs of `nlpsol` in CasADi's order.
         """
-        z, value, rows, _, multipliers, *_ = (
-            argument.full().ravel() for argument in arguments
-        )
+        z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
         # Objective and constraints are both of order one.
         merit = float(value[0] + np.abs(rows).max(initial=0.0))
         if merit < self._best_merit:
@@ -474,9 +403,7 @@ class IterationMonitor(ca.Callback):
             self.best = (z, multipliers)
         recorder = self.recorder
         loss = float(value[0]) / self.program.loss_scale
-        variables = convert_variables(
-            z, self.program, target=recorder.collocation
-        )
+        variables = convert_variables(z, self.program, target=recorder.collocation)
         number = recorder.history[-1].number + 1 if recorder.history else 0
         self.lines += 1
         recorder.add_variables(number, variables, loss=loss)

@@ -63,10 +63,10 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         `first` with one on the solves; notes of later solves are left out.
     """
     obstacles_by_experiment = {
-        segment.experiment.name: reachable_obstacles(
-            segment.experiment, x.reshape(len(x), -1)
+        transcription.experiment.name: reachable_obstacles(
+            transcription.experiment, x.reshape(len(x), -1)
         )
-        for segment, x in zip(
+        for transcription, x in zip(
             first.collocation.transcriptions, first.positions_m, strict=True
         )
     }
@@ -74,15 +74,9 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     relaxed = _relax(first.collocation, obstacles_by_experiment, share=0.0)
     for share in RELAXED:
         # The pressures are those of the previous solve, not those of the smaller product.
-        z = with_lifted_variables(relaxed).pack(
-            *solution.collocation.unpack(solution.z)
-        )
-        relaxed = _relax(
-            first.collocation, obstacles_by_experiment, share=share
-        )
-        solution = replace(
-            solve(relaxed, z).after(solution, ""), notes=first.notes
-        )
+        z = with_lifted_variables(relaxed).pack(*solution.collocation.unpack(solution.z))
+        relaxed = _relax(first.collocation, obstacles_by_experiment, share=share)
+        solution = replace(solve(relaxed, z).after(solution, ""), notes=first.notes)
         if not solution.status.converged:
             break
     note = (
@@ -91,9 +85,7 @@ def solve_complementarity(first: Solution, solve: Solve) -> Solution:
         f"{share:g} κδ²"
     )
     # The multipliers are computed again where needed, as the solver's contain its rounding errors.
-    return replace(
-        solution, initial_multipliers=None, notes=(*solution.notes, note)
-    )
+    return replace(solution, initial_multipliers=None, notes=(*solution.notes, note))
 
 
 def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
@@ -114,23 +106,12 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
     """
     obstacles = []
     mesh = experiment.body.mesh
-    for contact, obstacle in zip(
-        contact_terms(experiment), experiment.obstacles, strict=True
-    ):
+    for contact, obstacle in zip(contact_terms(experiment), experiment.obstacles, strict=True):
         surface = contact.law_of_contact.surface
         faces = mesh.surface[surface.faces]
-        gaps = (
-            smallest_gaps(contact, x)
-            .reshape(-1, surface.points_per_face)
-            .min(axis=1)
-        )
-        if len(
-            reachable_faces := np.unique(faces[gaps < REACH * surface.edge_m])
-        ):
-            obstacle = replace(
-                obstacle,
-                faces=Indices(mesh.file_index[reachable_faces].tolist()),
-            )
+        gaps = smallest_gaps(contact, x).reshape(-1, surface.points_per_face).min(axis=1)
+        if len(reachable_faces := np.unique(faces[gaps < REACH * surface.edge_m])):
+            obstacle = replace(obstacle, faces=Indices(mesh.file_index[reachable_faces].tolist()))
         obstacles.append(obstacle)
     return obstacles
 
@@ -139,34 +120,15 @@ def with_contact_energy(experiment: Experiment) -> Experiment:
     """Return a copy of the experiment with the contact energy for all
     obstacles, `relaxed` = None.
     """
-    return experiment.with_obstacles(
-        [replace(o, relaxed=None) for o in experiment.obstacles]
-    )
+    return experiment.with_obstacles([replace(o, relaxed=None) for o in experiment.obstacles])
 
 
 def _relax(
-    collocation: Collocation,
-    obstacles_by_experiment: Mapping[str, list[Obstacle]],
-    share: float,
+    collocation: Collocation, obstacles_by_experiment: Mapping[str, list[Obstacle]], share: float
 ) -> Collocation:
-    """Return the program with relaxed complementarity.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Program.
-    obstacles_by_experiment : mapping of str to list of Obstacle
-        Obstacles by experiment name; other experiments are unchanged.
-    share : float
-        Product of pressure and gap, in κδ² of each obstacle.
-    """
+    """Return the program with relaxed complementarity."""
     experiments = [
-        each.with_obstacles(
-            [
-                replace(o, relaxed=share)
-                for o in obstacles_by_experiment[each.name]
-            ]
-        )
+        each.with_obstacles([replace(o, relaxed=share) for o in obstacles_by_experiment[each.name]])
         if each.name in obstacles_by_experiment
         else each
         for each in collocation.experiments

@@ -40,14 +40,12 @@ def condense(complete: Collocation) -> Collocation:
     The given program is not modified.
     """
     if not any(
-        s.nuisance.affects_grasps or len(s.nuisance.clock_indices)
-        for s in complete.transcriptions
+        s.nuisance.affects_grasps or len(s.nuisance.clock_indices) for s in complete.transcriptions
     ):
         return complete
     program = object.__new__(CondensedCollocation)  # has been checked
     vars(program).update(
-        {f.name: getattr(complete, f.name) for f in fields(complete)},
-        complete=complete,
+        {f.name: getattr(complete, f.name) for f in fields(complete)}, complete=complete
     )
     return program
 
@@ -56,16 +54,10 @@ def complete_program(program: Collocation) -> Collocation:
     """Return the program with all variables: that of which a condensed program is made, otherwise
     the argument itself.
     """
-    return (
-        program.complete
-        if isinstance(program, CondensedCollocation)
-        else program
-    )
+    return program.complete if isinstance(program, CondensedCollocation) else program
 
 
-def complete_multipliers(
-    program: Collocation, z: Array, multipliers: Array
-) -> Array:
+def complete_multipliers(program: Collocation, z: Array, multipliers: Array) -> Array:
     """Return the multipliers of all constraints of the complete program, at an optimum.
 
     Parameters
@@ -88,7 +80,7 @@ class EliminatedDofs:
 
     Attributes
     ----------
-    segment : Transcription
+    transcription : Transcription
         Transcription of the experiment.
     variables : (h,) array of int
         Indices of the dofs in z of the complete program.
@@ -98,15 +90,13 @@ class EliminatedDofs:
         Indices in z of the φ that move the body in its grasps.
     """
 
-    segment: Transcription
+    transcription: Transcription
     variables: Index
     rows: Index
     phi: Index
 
     @classmethod
-    def from_segment(
-        cls, transcription: Transcription, complete: Collocation
-    ) -> EliminatedDofs:
+    def from_segment(cls, transcription: Transcription, complete: Collocation) -> EliminatedDofs:
         """Return the grasped dofs of an experiment whose positions follow from φ: those that
         constraints of the `complete` program prescribe, which contains the `transcription`.
         """
@@ -115,9 +105,7 @@ class EliminatedDofs:
         dofs = (
             transcription.dynamics.first_row + time
         ) * transcription.dof_count + transcription.constrained_dofs[place]
-        moving = transcription.nuisance_indices.indices[
-            transcription.nuisance.motion_indices
-        ]
+        moving = transcription.nuisance_indices.indices[transcription.nuisance.motion_indices]
         phi = complete.phi_columns.start - complete.nq + moving
         return cls(
             transcription,
@@ -130,15 +118,15 @@ class EliminatedDofs:
         """Return the scaled positions (h,) of the eliminated dofs, and their derivatives (h, k) by
         the k parameters of `self.phi`, from all nuisance parameters `phi` of the experiment.
         """
-        segment = self.segment
-        prescribed = self.segment.prescribed_motion.evaluate_at(phi)
+        transcription = self.transcription
+        prescribed = self.transcription.prescribed_motion.evaluate_at(phi)
         time, dof = np.divmod(
-            self.variables - segment.offsets.position, segment.dof_count
+            self.variables - transcription.offsets.position, transcription.dof_count
         )
         indices = time, np.searchsorted(prescribed.dofs, dof)
-        return prescribed.positions_m[
+        return prescribed.positions_m[indices] / transcription.length_m, prescribed.by_phi[
             indices
-        ] / segment.length_m, prescribed.by_phi[indices] / segment.length_m
+        ] / transcription.length_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,12 +181,7 @@ class EliminatedColumns:
         matrix.
         """
         shape = (len(self.rows), len(slopes))
-        return (
-            sp.csr_array(
-                (values[self.entries], (self.row, self.column)), shape=shape
-            )
-            @ slopes
-        )
+        return sp.csr_array((values[self.entries], (self.row, self.column)), shape=shape) @ slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +203,7 @@ class ColumnEntries:
     columns: Index
 
     @classmethod
-    def select(
-        cls, structure: tuple[Index, Index], selected: Index
-    ) -> ColumnEntries:
+    def select(cls, structure: tuple[Index, Index], selected: Index) -> ColumnEntries:
         """Return the entries of the columns `selected` of a matrix, whose structure is (column
         pointers, row indices).
         """
@@ -231,15 +212,11 @@ class ColumnEntries:
         shifts = indptr[selected] - (np.cumsum(counts) - counts)
         positions = np.arange(counts.sum()) + np.repeat(shifts, counts)
         return cls(
-            positions,
-            indices[positions],
-            columns=np.repeat(np.arange(len(selected)), counts),
+            positions, indices[positions], columns=np.repeat(np.arange(len(selected)), counts)
         )
 
     @classmethod
-    def select_symmetric(
-        cls, structure: tuple[Index, Index], selected: Index
-    ) -> ColumnEntries:
+    def select_symmetric(cls, structure: tuple[Index, Index], selected: Index) -> ColumnEntries:
         """Return the entries of the columns `selected` of a symmetric matrix, ascending, from the
         structure of its upper triangle.
 
@@ -319,21 +296,16 @@ class CondensedPattern:
             row_numbers[indices[is_remaining]],
         )
         shape = tuple(
-            int(np.count_nonzero(numbers >= 0))
-            for numbers in (row_numbers, column_numbers)
+            int(np.count_nonzero(numbers >= 0)) for numbers in (row_numbers, column_numbers)
         )
         return cls(
-            SparseAssembly.from_groups(
-                remaining_structure, (shape[0], shape[1]), groups=groups
-            ),
+            SparseAssembly.from_groups(remaining_structure, (shape[0], shape[1]), groups=groups),
             is_remaining,
             remaining_count=int(before[-1]),
             eliminated=eliminated,
         )
 
-    def assemble(
-        self, complete: Array, out: Array | None, groups: Sequence[Array]
-    ) -> Array:
+    def assemble(self, complete: Array, out: Array | None, groups: Sequence[Array]) -> Array:
         """Return the values of the condensed matrix.
 
         Parameters
@@ -459,15 +431,11 @@ class CondensedCollocation(Collocation):
         """
         variables = np.empty(self.complete.variable_count)
         variables[self._remaining[0]] = z
-        for each, (positions, _) in zip(
-            self.eliminated, self._prescribed(z), strict=True
-        ):
+        for each, (positions, _) in zip(self.eliminated, self._prescribed(z), strict=True):
             variables[each.variables] = positions
         return variables
 
-    def complete_multipliers(
-        self, z: Array, loss_weight: float, multipliers: Array
-    ) -> Array:
+    def complete_multipliers(self, z: Array, loss_weight: float, multipliers: Array) -> Array:
         """Return the multipliers of all constraints of the complete program; those of eliminated
         constraints make the Lagrangian stationary in the eliminated positions, also where z is no
         optimum.
@@ -498,7 +466,7 @@ class CondensedCollocation(Collocation):
         """
         p = self.parameters_from(z)
         return (
-            each.evaluate(p[each.segment.nuisance_indices.indices])
+            each.evaluate(p[each.transcription.nuisance_indices.indices])
             for each in self.eliminated
         )
 
@@ -527,9 +495,7 @@ class CondensedCollocation(Collocation):
             Gradient by the complete variables at z; not modified.
         """
         gradient = complete_gradient.copy()
-        for each, (_, by_phi) in zip(
-            self.eliminated, self._prescribed(z), strict=True
-        ):
+        for each, (_, by_phi) in zip(self.eliminated, self._prescribed(z), strict=True):
             gradient[each.phi] += by_phi.T @ gradient[each.variables]
         return gradient[self._remaining[0]]
 
@@ -537,9 +503,7 @@ class CondensedCollocation(Collocation):
         """Return the scaled values (constraints,) of the constraints g that remain, at z
         (variables,).
         """
-        return self.complete.constraint_values(self.complete_variables(z))[
-            self._remaining[1]
-        ]
+        return self.complete.constraint_values(self.complete_variables(z))[self._remaining[1]]
 
     # Matrices -----------------------------------------------------------------------------------
 
@@ -574,9 +538,7 @@ class CondensedCollocation(Collocation):
         """Column pointers and row indices of ∂g/∂z, by compressed columns."""
         return self._jacobian.assembly.structure
 
-    def constraints_and_jacobian(
-        self, z: Array, out: Array | None = None
-    ) -> tuple[Array, Array]:
+    def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
         """Return the constraints g (constraints,) and the values of ∂g/∂z, including the dependence
         through the eliminated positions, from one evaluation of the elements.
 
@@ -588,18 +550,12 @@ class CondensedCollocation(Collocation):
             Memory for the values of ∂g/∂z; it is overwritten.
         """
         pattern = self._jacobian
-        rows, complete_values = self.complete.constraints_and_jacobian(
-            self.complete_variables(z)
-        )
+        rows, complete_values = self.complete.constraints_and_jacobian(self.complete_variables(z))
         groups = [
             columns.times(complete_values, slopes).ravel()
-            for columns, (_, slopes) in zip(
-                pattern.eliminated, self._prescribed(z), strict=True
-            )
+            for columns, (_, slopes) in zip(pattern.eliminated, self._prescribed(z), strict=True)
         ]
-        return rows[self._remaining[1]], pattern.assemble(
-            complete_values, out, groups=groups
-        )
+        return rows[self._remaining[1]], pattern.assemble(complete_values, out, groups=groups)
 
     @cached_property
     def _hessian(self) -> CondensedPattern:
@@ -624,9 +580,7 @@ class CondensedCollocation(Collocation):
             eliminated.append(columns)
             rows = numbers[columns.rows]
             first, second = _products(rows[rows >= 0], numbers[each.phi])
-            groups.append(
-                (np.minimum(first, second), np.maximum(first, second))
-            )
+            groups.append((np.minimum(first, second), np.maximum(first, second)))
         return CondensedPattern.from_complete(
             structure,
             row_numbers=numbers,
@@ -636,28 +590,24 @@ class CondensedCollocation(Collocation):
             eliminated=eliminated,
         )
 
-    def _is_loss_coupling(
-        self, structure: tuple[Index, Index]
-    ) -> NDArray[np.bool_]:
+    def _is_loss_coupling(self, structure: tuple[Index, Index]) -> NDArray[np.bool_]:
         """Return a mask (entries,) of those entries of the complete Hessian, by its column pointers
         and row indices, that couple positions at times so distant that no equation of motion
         contains both.
         """
         indptr, rows = structure
         mask = np.zeros(len(rows), dtype=bool)
-        for segment in self.transcriptions:
-            first = segment.columns.start
+        for transcription in self.transcriptions:
+            first = transcription.columns.start
             # Entries of other columns are not couplings; rows of positions come after those of q.
-            entries = slice(indptr[first], indptr[segment.columns.stop])
-            times = np.arange(segment.variable_count) // segment.dof_count
+            entries = slice(indptr[first], indptr[transcription.columns.stop])
+            times = np.arange(transcription.variable_count) // transcription.dof_count
             # The first time that an equation of motion contains together with that of the column.
-            earliest = times - segment.dynamics.largest_lag
-            first_rows = first + np.maximum(earliest, 0) * segment.dof_count
-            counts = np.diff(indptr[first : segment.columns.stop + 1])
+            earliest = times - transcription.dynamics.largest_lag
+            first_rows = first + np.maximum(earliest, 0) * transcription.dof_count
+            counts = np.diff(indptr[first : transcription.columns.stop + 1])
             own_rows = rows[entries]
-            mask[entries] = (own_rows >= first) & (
-                own_rows < np.repeat(first_rows, counts)
-            )
+            mask[entries] = (own_rows >= first) & (own_rows < np.repeat(first_rows, counts))
         return mask
 
     @property
@@ -675,11 +625,7 @@ class CondensedCollocation(Collocation):
         return positions[: len(of_q)], positions[len(of_q) :]
 
     def hessian_values(
-        self,
-        z: Array,
-        loss_weight: float,
-        multipliers: Array | None,
-        out: Array | None = None,
+        self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
         """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
 
@@ -697,23 +643,17 @@ class CondensedCollocation(Collocation):
         pattern = self._hessian
         numbers, _ = self._condensed_indices
         if multipliers is not None:
-            multipliers = self.complete_multipliers(
-                z, loss_weight, multipliers=multipliers
-            )
+            multipliers = self.complete_multipliers(z, loss_weight, multipliers=multipliers)
         complete_values = self._complete_hessian(
             self.complete_variables(z), loss_weight, multipliers=multipliers
         )
         groups = []
         for each, columns, (_, slopes) in zip(
-            self.eliminated,
-            pattern.eliminated,
-            self._prescribed(z),
-            strict=True,
+            self.eliminated, pattern.eliminated, self._prescribed(z), strict=True
         ):
             product = columns.times(complete_values, slopes)
             eliminated_rows, phi_rows = (
-                np.searchsorted(columns.rows, a)
-                for a in (each.variables, each.phi)
+                np.searchsorted(columns.rows, a) for a in (each.variables, each.phi)
             )
             # An entry of φ by φ comes twice, from either side; one of the diagonal once.
             product[phi_rows] += slopes.T @ product[eliminated_rows] / 2
@@ -721,50 +661,29 @@ class CondensedCollocation(Collocation):
             groups.append(product[numbers[columns.rows] >= 0].ravel())
         return pattern.assemble(complete_values, out, groups=groups)
 
-    def _complete_hessian(
-        self, z: Array, loss_weight: float, multipliers: Array | None
-    ) -> Array:
+    def _complete_hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> Array:
         """Return the values of the complete program's Hessian, with its Gauss–Newton part evaluated
         at clocks rounded to whole samples and no other clock errors.
 
         There each residual depends on few positions. The part with the multipliers is that at z.
-
-        Parameters
-        ----------
-        z : (complete variables,) array
-            Variables of the complete program; not modified.
-        loss_weight : float
-            Weight of the objective.
-        multipliers : (complete constraints,) array or None
-            None for the Gauss–Newton part alone.
         """
         nearest = z.copy()
         p = self.complete.parameters_from(z)
-        for segment in self.transcriptions:
-            nuisance = segment.nuisance
-            places = segment.nuisance_indices.indices
+        for transcription in self.transcriptions:
+            nuisance = transcription.nuisance
+            places = transcription.nuisance_indices.indices
             clock_places = nuisance.indices_of_rows(TIME)
-            sample = (
-                segment.experiment.timestep_s / nuisance.scales[clock_places]
-            )
+            sample = transcription.experiment.timestep_s / nuisance.scales[clock_places]
             samples = np.round(p[places[clock_places]] / sample)
             p[places[nuisance.clock_indices]] = 0
             p[places[clock_places]] = samples * sample
         nearest[self.complete.phi_columns] = p[self.nq :]
         if np.array_equal(nearest, z):
-            return self.complete.hessian_values(
-                z, loss_weight, multipliers=multipliers
-            )
-        values = self.complete.hessian_values(
-            nearest, loss_weight, multipliers=None
-        )
+            return self.complete.hessian_values(z, loss_weight, multipliers=multipliers)
+        values = self.complete.hessian_values(nearest, loss_weight, multipliers=None)
         if multipliers is not None:
-            values += self.complete.hessian_values(
-                z, loss_weight, multipliers=multipliers
-            )
-            values -= self.complete.hessian_values(
-                z, loss_weight, multipliers=None
-            )
+            values += self.complete.hessian_values(z, loss_weight, multipliers=multipliers)
+            values -= self.complete.hessian_values(z, loss_weight, multipliers=None)
         return values
 
 

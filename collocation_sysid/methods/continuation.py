@@ -25,13 +25,7 @@ from .comparison.penalty import AugmentedLagrangian, Penalty
 from .comparison.shooting import Shooting
 from .initial_trajectories import complete_variables, simulate_trajectories
 from .interior_point import InteriorPoint
-from .method_options import (
-    SHARES,
-    MethodOptions,
-    Shares,
-    method_from_options,
-    samples_in_share,
-)
+from .method_options import SHARES, MethodOptions, Shares, method_from_options, samples_in_share
 from .reduced_space import ReducedSpace
 from .solution import Iteration, Method, Solution, Status, Watch
 from .solve_recorder import Recorder
@@ -65,9 +59,7 @@ class Continuation(MethodOptions):
     name: ClassVar[str] = "continuation"
 
     shares: Shares = SHARES
-    stage: Mapping[str, object] | Callable[..., Solution] = field(
-        default_factory=dict
-    )
+    stage: Mapping[str, object] | Callable[..., Solution] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Raise an `InputError` for invalid shares or a stage that is no method, see `method`."""
@@ -88,41 +80,19 @@ class Continuation(MethodOptions):
         name = options.pop("method", InteriorPoint.name)
         if name not in STAGES:
             known = f"expected one of {', '.join(STAGES)}{hint_at(str(name), STAGES)}"
-            raise InputError(
-                f"found {name!r}; {known}", None, where="stage.method"
-            )
+            raise InputError(f"found {name!r}; {known}", None, where="stage.method")
         return method_from_options(STAGES[str(name)], options, key="stage")
 
     def __call__(
-        self,
-        collocation: Collocation,
-        watch: Watch | None = None,
-        start: Array | None = None,
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
         """Solve the NLP on growing parts of the recordings, see `Method`.
 
         Numbers and times of the history continue from part to part. The solve ends with a part that
         was interrupted or refused; the notes contain the result of each part. A part that does not
         converge otherwise is followed by the next one. Exceptions of the method are not caught.
-
-        Parameters
-        ----------
-        collocation : Collocation
-            Problem with the complete recordings; not modified.
-        watch : callable, optional
-            Called with every entry of the history.
-        start : (variables,) array, optional
-            Variables of the complete problem, from whose first rows the first part starts; by
-            default as the method of the parts starts.
-
-        Returns
-        -------
-        Solution
-            Solution of the last part, as one of the complete problem.
         """
-        climb = _ContinuationState(
-            self.method, Recorder(self.name, collocation, watch=watch)
-        )
+        climb = _ContinuationState(self.method, Recorder(self.name, collocation, watch=watch))
         if start is not None:
             climb.known = collocation.unpack(start)
         for share in self.shares:
@@ -151,10 +121,8 @@ def first_share(collocation: Collocation, share: float) -> Collocation:
     """Return the problem with the first share, from 0 to 1, of every fitted experiment's samples,
     at least `FEWEST` where there are as many; validation recordings are left out.
     """
-    fitted = [segment.experiment for segment in collocation.transcriptions]
-    shorter = [
-        first_samples(e, samples_in_share(len(e.t_s), share)) for e in fitted
-    ]
+    fitted = [transcription.experiment for transcription in collocation.transcriptions]
+    shorter = [first_samples(e, samples_in_share(len(e.t_s), share)) for e in fitted]
     return replace(collocation, experiments=shorter)
 
 
@@ -193,30 +161,16 @@ class _ContinuationState:
         interrupted or refused.
         """
         recorder = self.recorder
-        part = (
-            recorder.collocation
-            if share == 1
-            else first_share(recorder.collocation, share)
-        )
-        start = (
-            None
-            if self.known is None
-            else _continue_variables(part, *self.known)
-        )
-        before = max(
-            [self.iterations, *(line.number for line in recorder.history[-1:])]
-        )
+        part = recorder.collocation if share == 1 else first_share(recorder.collocation, share)
+        start = None if self.known is None else _continue_variables(part, *self.known)
+        before = max([self.iterations, *(line.number for line in recorder.history[-1:])])
         elapsed_s = recorder.measure_elapsed_s()
 
         def record(line: Iteration) -> None:
             """Record an iteration with its number, time and share in the whole solve."""
             number = line.number + before
             time_s = line.time_s + elapsed_s
-            recorder.add(
-                replace(
-                    line, number=number, time_s=time_s, share=share * line.share
-                )
-            )
+            recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
 
         solution = self.method(part, record, start)
         self._add(solution, share)
@@ -273,28 +227,15 @@ class _ContinuationState:
         )
 
 
-def _continue_variables(
-    collocation: Collocation, p: Array, positions: list[Array]
-) -> Array:
+def _continue_variables(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
     """Return variables z (variables,) from parameters and the first rows of the positions of each
     experiment.
 
     The missing rows are simulated or, from where that fails, those of a rigid motion with the
     grasp; surplus rows are cut.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Problem.
-    p : (np,) array
-        Parameters (q, φ).
-    positions : list of (rows, 3n) array
-        Known first rows of each experiment [m].
     """
     parts = collocation.iterates_at(p, positions)
     known, _ = simulate_trajectories(
-        collocation,
-        p,
-        known_rows=[part.x[: part.segment.grid_times] for part in parts],
+        collocation, p, known_rows=[part.x[: part.transcription.grid_times] for part in parts]
     )
     return complete_variables(collocation, p, known_rows=known)

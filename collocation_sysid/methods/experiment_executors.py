@@ -48,9 +48,7 @@ class ExperimentExecutor(Protocol):
         """
         ...
 
-    def map_experiments(
-        self, run: Callable[..., Any], *columns: Sequence[Any]
-    ) -> list[Any]:
+    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
         """Apply a function to every experiment, and return the results as stored values.
 
         An exception of the function is raised here or by `fetch`.
@@ -135,22 +133,18 @@ class DaskExecutor:
         SearchEnded
             If the scheduler or all workers are lost.
         """
-        segments = collocation.transcriptions
+        transcriptions = collocation.transcriptions
         with self._end_search_if_disconnected():
-            known = all(
-                segment.experiment in self._sent for segment in segments
-            )
-            if not known or len(self._homes) != len(segments):
-                costs = [segment.variable_count for segment in segments]
+            known = all(transcription.experiment in self._sent for transcription in transcriptions)
+            if not known or len(self._homes) != len(transcriptions):
+                costs = [transcription.variable_count for transcription in transcriptions]
                 self._homes = _assign_workers(costs, self.client.nthreads())
             return [
                 self._send_segment(s, home)
-                for s, home in zip(segments, self._homes, strict=True)
+                for s, home in zip(transcriptions, self._homes, strict=True)
             ]
 
-    def map_experiments(
-        self, run: Callable[..., Any], *columns: Sequence[Any]
-    ) -> list[Any]:
+    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
         """Apply a function to every experiment on its worker, and return futures of the results at
         once; `store_segments` must have been called. Exceptions of the function are raised by
         `fetch`.
@@ -223,18 +217,14 @@ class DaskExecutor:
                 "the workers."
             ) from error
         except (Exception, dask.client.CancelledError) as error:
-            is_disconnected = isinstance(
-                error, (OSError, dask.client.CancelledError)
-            )
+            is_disconnected = isinstance(error, (OSError, dask.client.CancelledError))
             if isinstance(error, SearchEnded) or (
                 self.client.status == "running" and not is_disconnected
             ):
                 raise
             raise _disconnection("The scheduler no longer responds.") from error
 
-    def _submit(
-        self, home: str, run: Callable[..., Any], *arguments: Any
-    ) -> Any:
+    def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
         """Return a future of a function of `arguments` on the worker at the address `home`; Dask
         may choose another worker if that is lost.
 
@@ -242,12 +232,7 @@ class DaskExecutor:
         """
         key = f"{run.__name__}-{secrets.token_hex(16)}"
         return self.client.submit(
-            _run_alone,
-            run,
-            *arguments,
-            key=key,
-            workers=[home],
-            allow_other_workers=True,
+            _run_alone, run, *arguments, key=key, workers=[home], allow_other_workers=True
         )
 
     def _send_segment(self, transcription: Transcription, home: str) -> Any:
@@ -270,27 +255,21 @@ class DaskExecutor:
         def send_experiment(experiment: Experiment) -> Any:
             """Return a new future of an experiment, which refers to that of its body."""
             return self._submit(
-                home,
-                _with_body,
-                _with_fields(experiment),
-                send_once(experiment.body, send_body),
+                home, _with_body, _with_fields(experiment), send_once(experiment.body, send_body)
             )
 
         def send_transcription(complete: Transcription) -> Any:
             """Return a new future of a transcription, which refers to that of its experiment."""
             sent_experiment = send_once(complete.experiment, send_experiment)
             association = replace(
-                complete.association,
-                markers=_with_fields(complete.association.markers),
+                complete.association, markers=_with_fields(complete.association.markers)
             )
             rest = {
                 name: value
                 for name, value in complete.__getstate__().items()
                 if name not in ("experiment", "association")
             }
-            return self._submit(
-                home, _restore_segment, sent_experiment, association, rest
-            )
+            return self._submit(home, _restore_segment, sent_experiment, association, rest)
 
         return send_once(transcription, send_transcription)
 
@@ -316,23 +295,9 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 
     The experiment with the highest cost is assigned first, each to the thread with the least work
     so far.
-
-    Parameters
-    ----------
-    costs : sequence of int
-        Cost of each experiment.
-    threads : dict of str to int
-        Number of threads by worker address.
-
-    Raises
-    ------
-    SearchEnded
-        If there are no workers.
     """
     _require_workers(threads)
-    threads_of_workers = [
-        (address, k) for address, count in threads.items() for k in range(count)
-    ]
+    threads_of_workers = [(address, k) for address, count in threads.items() for k in range(count)]
     loads = dict.fromkeys(threads_of_workers, 0)
     homes = [""] * len(costs)
     for number in sorted(range(len(costs)), key=lambda k: -costs[k]):
@@ -343,13 +308,7 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 
 
 def _require_package(client: Any) -> set[str]:
-    """Return the addresses of the workers of a Dask client, after a check of their versions.
-
-    Raises
-    ------
-    InputError
-        If there are none, they do not answer, or one has another version of this package or none.
-    """
+    """Return the addresses of the workers of a Dask client, after a check of their versions."""
     own_version = version("collocation-sysid")
     try:
         versions = client.run(_version, on_error="return")
@@ -359,9 +318,7 @@ def _require_package(client: Any) -> set[str]:
             f"({reason(error)}); start it again"
         ) from error
     if not versions:
-        raise _refusal(
-            "the scheduler has no workers; start some, as with dask worker ADDRESS"
-        )
+        raise _refusal("the scheduler has no workers; start some, as with dask worker ADDRESS")
     for address, worker_version in versions.items():
         if worker_version != own_version:
             raise _refusal(
@@ -389,8 +346,7 @@ def _disconnection(reason: str) -> SearchEnded:
     the sentence `reason`.
     """
     return SearchEnded(
-        Status.CLUSTER_DISCONNECTED,
-        f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}",
+        Status.CLUSTER_DISCONNECTED, f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}"
     )
 
 
@@ -448,6 +404,4 @@ def _restore_segment(
     its other arguments by name; workers run this function.
     """
     markers = _with_fields(association.markers, experiment.body)
-    return Transcription(
-        experiment, association=replace(association, markers=markers), **rest
-    )
+    return Transcription(experiment, association=replace(association, markers=markers), **rest)

@@ -123,7 +123,7 @@ class Horizon:
             stopwatches = self._repeat(None)
             factorisations = self._repeat(factorisation)
             self.solvers = self.workers.map_experiments(
-                Sweep, self.segments, self.rows, stopwatches, factorisations
+                Sweep, self.transcriptions, self.rows, stopwatches, factorisations
             )
 
     def set_collocation(self, collocation: Collocation) -> None:
@@ -133,7 +133,7 @@ class Horizon:
         `SearchEnded` is raised if the workers are lost.
         """
         self.collocation = collocation
-        self.segments = self.workers.store_segments(collocation)
+        self.transcriptions = self.workers.store_segments(collocation)
 
     @one_blas_thread()
     def evaluate(
@@ -167,13 +167,11 @@ class Horizon:
         SearchEnded
             If the workers are lost.
         """
-        known = (
-            known_iterate.trajectories if known_iterate else self._repeat(None)
-        )
+        known = known_iterate.trajectories if known_iterate else self._repeat(None)
         sweep_results = self.workers.map_experiments(
             sweep,
             self.solvers,
-            self.segments,
+            self.transcriptions,
             self._by_experiment(p),
             trajectories,
             known,
@@ -184,11 +182,7 @@ class Horizon:
 
     @one_blas_thread()
     def evaluate_step(
-        self,
-        p: Array,
-        previous: Iterate,
-        step: Array,
-        accuracy: float = ACCURACY,
+        self, p: Array, previous: Iterate, step: Array, accuracy: float = ACCURACY
     ) -> Iterate:
         """Sweep all experiments after a step of the parameters, and return the new iterate.
 
@@ -216,7 +210,7 @@ class Horizon:
         sweep_results = self.workers.map_experiments(
             sweep_after_step,
             self.solvers,
-            self.segments,
+            self.transcriptions,
             self._by_experiment(p),
             previous.trajectories,
             self._by_experiment(step),
@@ -235,7 +229,7 @@ class Horizon:
         evaluated = self.workers.map_experiments(
             reassociate,
             self.solvers,
-            self.segments,
+            self.transcriptions,
             self._by_experiment(p),
             iterate.trajectories,
         )
@@ -248,13 +242,6 @@ class Horizon:
         the experiments, the priors of the collocation and, if the horizon has one, its own prior
         about the guess. The times of the sweeps are added to the stopwatch. `SearchEnded` is raised
         if the workers are lost.
-
-        Parameters
-        ----------
-        p : (np,) array
-            All parameters (q, φ).
-        trajectories : list of LinearisedTrajectory
-            One for each experiment, as the workers store them.
         """
         reports: list[SweepReport] = self.workers.fetch(
             self.workers.map_experiments(_report, trajectories)
@@ -270,27 +257,16 @@ class Horizon:
         prior, prior_slopes = self.collocation.prior_residuals(p)
         priors = [(prior, np.diag(prior_slopes))]
         if self.prior is not None:
-            deviation = (
-                p[:nq] - self.collocation.parameters.guess_q
-            ) / self.prior
+            deviation = (p[:nq] - self.collocation.parameters.guess_q) / self.prior
             priors.append((deviation, np.eye(nq, len(p)) / self.prior))
         for values, by in priors:
             fit = fit.with_rows(values, by)
             # The slopes of priors are the same everywhere.
             crossed += by.T @ values
-        return Iterate(
-            p,
-            trajectories,
-            reports=reports,
-            fit=fit,
-            previous_slopes_residual=crossed,
-        )
+        return Iterate(p, trajectories, reports=reports, fit=fit, previous_slopes_residual=crossed)
 
     def simulate(
-        self,
-        p: Array,
-        trajectories: Sequence[Any] | None = None,
-        guess: Iterate | None = None,
+        self, p: Array, trajectories: Sequence[Any] | None = None, guess: Iterate | None = None
     ) -> tuple[list[Any], SimulationError | None]:
         """Simulate all experiments at parameters p, as far as the simulations succeed; their times
         are added to the stopwatch.
@@ -314,12 +290,7 @@ class Horizon:
         known = trajectories or self._repeat(None)
         guesses = guess.trajectories if guess else self._repeat(None)
         results = self.workers.map_experiments(
-            simulate_rows,
-            self.solvers,
-            self.segments,
-            self._by_experiment(p),
-            known,
-            guesses,
+            simulate_rows, self.solvers, self.transcriptions, self._by_experiment(p), known, guesses
         )
         failures = []
         for failure, spent in self.workers.fetch(
@@ -336,22 +307,17 @@ class Horizon:
         `SearchEnded` is raised if the workers are lost.
         """
         return self.workers.map_experiments(
-            extrapolate,
-            self.segments,
-            iterate.trajectories,
-            self._by_experiment(step),
+            extrapolate, self.transcriptions, iterate.trajectories, self._by_experiment(step)
         )
 
-    def fit_summaries(
-        self, p: Array, trajectories: Sequence[Any]
-    ) -> list[FitSummary]:
+    def fit_summaries(self, p: Array, trajectories: Sequence[Any]) -> list[FitSummary]:
         """Return the fit of trajectories, as the workers store them, at parameters p (np,), without
         a sweep; one summary for each experiment.
 
         `SearchEnded` is raised if the workers are lost.
         """
         summaries = self.workers.map_experiments(
-            fit_summary, self.segments, self._by_experiment(p), trajectories
+            fit_summary, self.transcriptions, self._by_experiment(p), trajectories
         )
         return self.workers.fetch(summaries)
 
@@ -365,13 +331,9 @@ class Horizon:
         trajectories : sequence
             One for each experiment, as the workers store them, see `first_rows`.
         """
-        return self.workers.fetch(
-            self.workers.map_experiments(_row_count, trajectories)
-        )
+        return self.workers.fetch(self.workers.map_experiments(_row_count, trajectories))
 
-    def first_rows(
-        self, trajectories: Sequence[Any], counts: Sequence[int]
-    ) -> list[Array]:
+    def first_rows(self, trajectories: Sequence[Any], counts: Sequence[int]) -> list[Array]:
         """Return the first `counts[i]` rows of each trajectory i, as arrays (counts[i], 3n) [m].
 
         `SearchEnded` is raised if the workers are lost.
@@ -384,9 +346,7 @@ class Horizon:
         counts : sequence of int
             Number of rows for each experiment; a shorter trajectory is returned completely.
         """
-        return self.workers.fetch(
-            self.workers.map_experiments(_first_rows, trajectories, counts)
-        )
+        return self.workers.fetch(self.workers.map_experiments(_first_rows, trajectories, counts))
 
     def _by_experiment(self, p: Array) -> list[Array]:
         """Return the entries (k,) of p (np,), or of a step, that belong to each experiment."""
@@ -416,9 +376,7 @@ def _failure_and_times(
     return result.failure, result.times_s
 
 
-def _first_rows(
-    result: LinearisedTrajectory | SimulationResult | Array, count: int
-) -> Array:
+def _first_rows(result: LinearisedTrajectory | SimulationResult | Array, count: int) -> Array:
     """Return the positions (count, 3n) [m] of the first `count` rows of a trajectory, or all if
     there are fewer; workers run this function.
     """

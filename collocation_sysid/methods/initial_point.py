@@ -5,7 +5,8 @@ as dozens of sweeps of reduced space. Far from the optimum its steps also move n
 by many prior deviations, because the equations of motion hold only at the end. So reduced space
 first brings the parameters near the optimum, along motions that satisfy the equations of motion,
 and then to its own tolerance, as long as that takes few sweeps. IPOPT solves the whole program from
-these positions, parameters and multipliers; where they satisfy its conditions it factorises nothing.
+these positions, parameters and multipliers; where they satisfy its conditions it factorises
+nothing.
 """
 
 from __future__ import annotations
@@ -82,9 +83,7 @@ def compute_initial_point(
         recorder,
         recorder.collocation,
         start=start,
-        method=ReducedSpace(
-            tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS
-        ),
+        method=ReducedSpace(tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS),
         max_time_s=max_time_s,
     )
     is_usable = _reaches_end(coarse)
@@ -95,9 +94,7 @@ def compute_initial_point(
             recorder,
             coarse.collocation,
             start=coarse.z,
-            method=ReducedSpace(
-                tolerance=REFINED_CORRECTION, max_iterations=REFINING_SWEEPS
-            ),
+            method=ReducedSpace(tolerance=REFINED_CORRECTION, max_iterations=REFINING_SWEEPS),
             max_time_s=max_time_s,
         )
         if refined.status is Status.CONVERGED:
@@ -116,9 +113,7 @@ def compute_initial_point(
             f"{100 * precision:g} %; {continuation}"
         )
     elif is_usable:
-        note = (
-            f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
-        )
+        note = f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
     else:
         note = f"initial point: the method reduced-space found none ({coarse.message.rstrip('.')})"
     return InitialPoint(coarse, is_usable, is_close=is_close, note=note)
@@ -134,30 +129,13 @@ def _search(
 ) -> Solution:
     """Return the solution of a search by reduced space, and add every iteration to the recorder,
     with its numbers continued.
-
-    Parameters
-    ----------
-    recorder : Recorder
-        Recorder of the solve that needs the point.
-    collocation : Collocation
-        Problem.
-    start : (variables,) array or None
-        Initial variables; None for the guess.
-    method : ReducedSpace
-        Method with its limits.
-    max_time_s : float
-        Time of the recorder after which the search ends with `Status.TIME_LIMIT` [s].
     """
     first_number = recorder.history[-1].number + 1 if recorder.history else 0
 
     def record(line: Iteration) -> None:
         """Record an iteration, and raise `SearchEnded` if the time is over."""
         recorder.add(
-            replace(
-                line,
-                number=first_number + line.number,
-                time_s=recorder.measure_elapsed_s(),
-            )
+            replace(line, number=first_number + line.number, time_s=recorder.measure_elapsed_s())
         )
         if recorder.measure_elapsed_s() > max_time_s:
             raise SearchEnded(Status.TIME_LIMIT)
@@ -180,13 +158,6 @@ def _refined_solution(coarse: Solution, refined: Solution) -> Solution:
     evaluations and times of both.
 
     The status is that of the coarse solution, unless the refinement was interrupted or late.
-
-    Parameters
-    ----------
-    coarse : Solution
-        Solution to `LARGEST_CORRECTION`.
-    refined : Solution
-        Result of the search from there.
     """
     both = refined.after(coarse, why="")
     if refined.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
@@ -259,31 +230,16 @@ def adjoint_multipliers(
         slope = program.condense_gradient(variables, slope)
     bounds = _bound_multipliers(program, variables, slope)
     multipliers = InitialMultipliers(constraints, bounds)
-    return (
-        multipliers
-        if np.isfinite(constraints).all() and np.isfinite(bounds).all()
-        else None
-    )
+    return multipliers if np.isfinite(constraints).all() and np.isfinite(bounds).all() else None
 
 
-def _bound_multipliers(
-    program: Collocation, variables: Array, slope: Array
-) -> Array:
+def _bound_multipliers(program: Collocation, variables: Array, slope: Array) -> Array:
     """Return multipliers of the bounds (variables,), positive at upper bounds: those that balance
     the slope where a bound is active, and zero elsewhere.
 
     A bound is active if its multiplier is larger than the distance to it. Elsewhere a multiplier
     that balances the slope would be an error of the complementarity instead of one of stationarity,
     larger by the distance.
-
-    Parameters
-    ----------
-    program : Collocation
-        Program that is passed to IPOPT.
-    variables : (variables,) array
-        Its variables.
-    slope : (variables,) array
-        Derivatives of the Lagrangian without bounds.
     """
     lower, upper = program.bounds()
     distance = np.where(slope > 0, variables - lower, upper - variables)

@@ -19,10 +19,7 @@ from ..program.collocation import Collocation
 from ..program.forward.initial_equilibrium import initial_state
 from ..program.forward.loss_of_stability import explain_failure
 from ..program.forward.newton_solver import NewtonOptions, NewtonSolver
-from ..program.forward.scheme_simulation import (
-    continue_simulation,
-    simulate_scheme,
-)
+from ..program.forward.scheme_simulation import continue_simulation, simulate_scheme
 from ..program.stopwatch import Stopwatch
 from ..program.transcription import Transcription
 
@@ -35,22 +32,16 @@ def associated_at_guess(collocation: Collocation) -> Collocation:
     the grasp. The given problem is not modified; it is returned itself if all positions are known.
     Every parameter must have a guess.
     """
-    if not any(
-        segment.count_rows_to_place() for segment in collocation.transcriptions
-    ):
+    if not any(transcription.count_rows_to_place() for transcription in collocation.transcriptions):
         return collocation
     p = collocation.guess_p
     positions = []
-    for segment in collocation.transcriptions:
-        experiment = segment.experiment
-        theta = segment.constants.theta(p[: segment.nq])
+    for transcription in collocation.transcriptions:
+        experiment = transcription.experiment
+        theta = transcription.constants.theta(p[: transcription.nq])
         try:
-            first = Forces.from_experiment(
-                experiment, experiment.t_s[:1], theta=theta
-            )
-            x, _ = initial_state(
-                experiment, first, solver=NewtonSolver(experiment)
-            )
+            first = Forces.from_experiment(experiment, experiment.t_s[:1], theta=theta)
+            x, _ = initial_state(experiment, first, solver=NewtonSolver(experiment))
         except SimulationError:
             x = experiment.rigid_positions(experiment.t_s[:1]).ravel()
         positions.append(x[None])
@@ -68,24 +59,20 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     p = collocation.guess_p
     positions = []
     notes = []
-    for segment in collocation.transcriptions:
-        theta = segment.constants.theta(p[: segment.nq])
+    for transcription in collocation.transcriptions:
+        theta = transcription.constants.theta(p[: transcription.nq])
         try:
             positions.append(
-                simulate_scheme(
-                    segment.experiment, segment.dynamics.with_theta(theta)
-                )
+                simulate_scheme(transcription.experiment, transcription.dynamics.with_theta(theta))
             )
         except SimulationError as error:
-            positions.append(rigid_trajectory(segment, theta))
-            reason = explain_failure(segment.experiment, theta, error=error)
+            positions.append(rigid_trajectory(transcription, theta))
+            reason = explain_failure(transcription.experiment, theta, error=error)
             picture = (
-                ""
-                if reason.stability_loss is None
-                else "; the command simulate draws the mode"
+                "" if reason.stability_loss is None else "; the command simulate draws the mode"
             )
             notes.append(
-                f"experiment '{segment.experiment.name}': the simulation at the guess failed "
+                f"experiment '{transcription.experiment.name}': the simulation at the guess failed "
                 f"({reason}){picture}; the initial trajectory is the rest shape moving rigidly "
                 "with the grasp"
             )
@@ -128,18 +115,16 @@ def simulate_trajectories(
         Trajectories, which are shorter than requested where the simulation failed, and the first
         failure; None if there was none.
     """
-    parts = collocation.iterates_at(
-        p, known_rows or _empty_trajectories(collocation)
-    )
+    parts = collocation.iterates_at(p, known_rows or _empty_trajectories(collocation))
 
     def simulate_one(k: int) -> tuple[Array, SimulationError | None]:
         """Simulate experiment number k, from 0; return its trajectory as far as it succeeded, and
         the failure or None.
         """
         part = parts[k]
-        count = part.segment.grid_times if rows is None else rows[k]
+        count = part.transcription.grid_times if rows is None else rows[k]
         x, failure = continue_simulation(
-            part.segment.experiment,
+            part.transcription.experiment,
             part.equations.dynamics.truncated_to(count),
             known=part.x if len(part.x) else None,
             options=options,
@@ -148,23 +133,17 @@ def simulate_trajectories(
         )
         if failure is not None:
             failure = explain_failure(
-                part.segment.experiment,
-                part.equations.dynamics.theta,
-                error=failure,
+                part.transcription.experiment, part.equations.dynamics.theta, error=failure
             )
         return x, failure
 
-    reached = map_experiments(
-        simulate_one, range(len(parts)), threads=collocation.threads
-    )
+    reached = map_experiments(simulate_one, range(len(parts)), threads=collocation.threads)
     failures = [failure for _, failure in reached if failure is not None]
     return [x for x, _ in reached], failures[0] if failures else None
 
 
 def complete_variables(
-    collocation: Collocation,
-    p: Array,
-    known_rows: Sequence[Array] | None = None,
+    collocation: Collocation, p: Array, known_rows: Sequence[Array] | None = None
 ) -> Array:
     """Return variables z (variables,) from parameters and the first rows of every trajectory.
 
@@ -180,14 +159,10 @@ def complete_variables(
         First rows of every trajectory [m]; none by default, as for None.
     """
     trajectories = []
-    for part in collocation.iterates_at(
-        p, known_rows or _empty_trajectories(collocation)
-    ):
+    for part in collocation.iterates_at(p, known_rows or _empty_trajectories(collocation)):
         x = part.x
-        if len(x) < part.segment.grid_times:
-            rigid_positions = rigid_trajectory(
-                part.segment, part.equations.dynamics.theta
-            )
+        if len(x) < part.transcription.grid_times:
+            rigid_positions = rigid_trajectory(part.transcription, part.equations.dynamics.theta)
             x = np.concatenate([x, rigid_positions[len(x) :]])
         trajectories.append(x)
     return collocation.pack(p, trajectories)
@@ -195,10 +170,7 @@ def complete_variables(
 
 def _empty_trajectories(collocation: Collocation) -> list[Array]:
     """Return an empty trajectory (0, 3n) of each fitted experiment."""
-    return [
-        np.zeros((0, segment.dof_count))
-        for segment in collocation.transcriptions
-    ]
+    return [np.zeros((0, transcription.dof_count)) for transcription in collocation.transcriptions]
 
 
 def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
@@ -212,18 +184,12 @@ def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
     t_s = transcription.dynamics.t_s
     try:
         first = Forces.from_experiment(experiment, t_s[:1], theta=theta)
-        x0, _ = initial_state(
-            experiment, first, solver=NewtonSolver(experiment)
-        )
+        x0, _ = initial_state(experiment, first, solver=NewtonSolver(experiment))
     except SimulationError:
         x0 = experiment.rigid_positions(t_s[:1]).ravel()
     rotations, translations = experiment.rigid_motion(t_s)
-    shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[
-        0
-    ]  # in the grasp's frame
-    positions = (
-        np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
-    )
+    shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
+    positions = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
     return transcription.with_prescribed_positions(
         positions.reshape(len(t_s), -1), transcription.compute_guess_phi()
     )

@@ -16,30 +16,16 @@ from pydantic import BeforeValidator
 
 from ..common.array_types import Array
 from ..common.validated_classes import validated
-from ..common.validated_types import (
-    Count,
-    Finite,
-    NotNegative,
-    Positive,
-    StrictInteger,
-    Text,
-)
+from ..common.validated_types import Count, Finite, NotNegative, Positive, StrictInteger, Text
 from ..errors import located
 from ..program.collocation import Collocation
-from ..program.lifted.lifted_collocation import (
-    lifted_count,
-    with_lifted_variables,
-)
+from ..program.lifted.lifted_collocation import lifted_count, with_lifted_variables
 from ..recording.experiment import Experiment
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .complementarity import require_frictionless, solve_complementarity
 from .condensed_program import complete_program, condense
-from .initial_point import (
-    InitialPoint,
-    adjoint_multipliers,
-    compute_initial_point,
-)
+from .initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
 from .method_options import MethodOptions
 from .solution import Solution, Status, Watch
 from .solve_recorder import Recorder
@@ -57,9 +43,7 @@ def _require_ipopt_value(value: Any) -> Any:
     return value
 
 
-IpoptValue = Annotated[
-    Text | StrictInteger | Finite, BeforeValidator(_require_ipopt_value)
-]
+IpoptValue = Annotated[Text | StrictInteger | Finite, BeforeValidator(_require_ipopt_value)]
 
 IPOPT_STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
@@ -180,10 +164,7 @@ class InteriorPoint(MethodOptions):
                     require_frictionless(each.obstacles)
 
     def __call__(
-        self,
-        collocation: Collocation,
-        watch: Watch | None = None,
-        start: Array | None = None,
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
         """Solve the NLP from `start`, by default from the guess, as `initial` states; `watch` is
         called with every entry of the history. See `Method`.
@@ -191,26 +172,16 @@ class InteriorPoint(MethodOptions):
         With contact as complementarity, and obstacles, further solves follow a converged one, see
         `solve_complementarity`; the limits of iterations and time hold for each of them. Exceptions
         of `watch` are not caught.
-
-        Raises
-        ------
-        InputError
-            If IPOPT does not know an option, or contact as complementarity meets friction.
         """
-        experiments = [
-            segment.experiment for segment in collocation.transcriptions
-        ]
+        experiments = [transcription.experiment for transcription in collocation.transcriptions]
         self.require(experiments)
-        is_hard = self.contact == "complementarity" and any(
-            e.obstacles for e in experiments
-        )
+        is_hard = self.contact == "complementarity" and any(e.obstacles for e in experiments)
         solution = self._solve(collocation, watch, start=start)
         if not is_hard or not solution.status.converged:
             return solution
         relaxed_method = replace(self, initial="simulation")
         return solve_complementarity(
-            solution,
-            lambda relaxed, z: relaxed_method._solve(relaxed, watch, start=z),
+            solution, lambda relaxed, z: relaxed_method._solve(relaxed, watch, start=z)
         )
 
     def _solve(
@@ -218,27 +189,14 @@ class InteriorPoint(MethodOptions):
     ) -> Solution:
         """Return the solution with the contact law of each obstacle, without the complementarity
         solves.
-
-        Parameters
-        ----------
-        collocation : Collocation
-            Problem.
-        watch : callable or None
-            Called with each entry of the history.
-        start : (variables,) array or None
-            Initial variables; None for those of the options.
         """
         recorder = Recorder(self.name, collocation, watch=watch)
         if self.initial == "simulation":
             return self._solve_by_ipopt(recorder, start)
-        initial = compute_initial_point(
-            recorder, start, max_time_s=self.max_time_s
-        )
+        initial = compute_initial_point(recorder, start, max_time_s=self.max_time_s)
         coarse = initial.coarse
         spent = coarse.timing
-        recorder.stopwatch.add(
-            spent.build, spent.evaluations, linear_algebra=spent.linear_algebra
-        )
+        recorder.stopwatch.add(spent.build, spent.evaluations, linear_algebra=spent.linear_algebra)
         recorder.notes.append(initial.note)
         if coarse.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
             recorder.collocation = coarse.collocation
@@ -254,46 +212,24 @@ class InteriorPoint(MethodOptions):
             return self._solve_by_ipopt(recorder, start)
         recorder.collocation = coarse.collocation
         solution = self._solve_by_ipopt(recorder, coarse.z, initial=initial)
-        return replace(
-            solution, evaluations=solution.evaluations + coarse.evaluations
-        )
+        return replace(solution, evaluations=solution.evaluations + coarse.evaluations)
 
     def _solve_by_ipopt(
-        self,
-        recorder: Recorder,
-        start: Array | None,
-        initial: InitialPoint | None = None,
+        self, recorder: Recorder, start: Array | None, initial: InitialPoint | None = None
     ) -> Solution:
-        """Solve the recorder's program by IPOPT.
-
-        Parameters
-        ----------
-        recorder : Recorder
-            Record of the solve.
-        start : (variables,) array, optional
-            Initial variables; by default those of a simulation at the guess.
-        initial : InitialPoint, optional
-            Initial point to which `start` belongs. If it is near the optimum, the multipliers, the
-            barrier parameter and the Hessian are those of IPOPT's last iterations.
-        """
+        """Solve the recorder's program by IPOPT."""
         multipliers = None
         with recorder.stopwatch.building():
             program = condense(with_lifted_variables(recorder.collocation))
             if initial is not None and initial.is_close:
-                multipliers = adjoint_multipliers(
-                    program, recorder.collocation, z=initial.coarse.z
-                )
+                multipliers = adjoint_multipliers(program, recorder.collocation, z=initial.coarse.z)
             is_warm = multipliers is not None
-            hessian = _DampedHessian(
-                program, replace(self, warm_up=0.0) if is_warm else self
-            )
+            hessian = _DampedHessian(program, replace(self, warm_up=0.0) if is_warm else self)
 
         def settings(functions: NlpFunctions) -> dict[str, Any]:
             """Return the options of IPOPT with the time that remains."""
             options = self._settings(functions, is_warm=is_warm)
-            remaining_s = max(
-                SHORTEST_S, self.max_time_s - recorder.measure_elapsed_s()
-            )
+            remaining_s = max(SHORTEST_S, self.max_time_s - recorder.measure_elapsed_s())
             return {"ipopt.max_wall_time": remaining_s} | options
 
         solution = nlpsol.solve(
@@ -316,20 +252,11 @@ class InteriorPoint(MethodOptions):
         )
         return replace(solution, notes=(*solution.notes, missing))
 
-    def _settings(
-        self, functions: NlpFunctions, *, is_warm: bool
-    ) -> dict[str, Any]:
+    def _settings(self, functions: NlpFunctions, *, is_warm: bool) -> dict[str, Any]:
         """Return the options for CasADi and IPOPT, except IPOPT's time limit; those of the user
         (`ipopt`) replace the others.
 
         The callbacks that they contain are new, and are added to `functions`.
-
-        Parameters
-        ----------
-        functions : NlpFunctions
-            Functions of the program.
-        is_warm : bool
-            Whether IPOPT starts near the optimum, with multipliers.
         """
         settings: dict[str, Any] = {
             "ipopt.linear_solver": self.linear_solver,
@@ -350,9 +277,7 @@ class InteriorPoint(MethodOptions):
                 "ipopt.warm_start_mult_bound_push": WARM_MULTIPLIER,
                 "ipopt.mu_init": WARM_BARRIER * self.tolerance,
             }
-        if (
-            self.linear_solver == "mumps"
-        ):  # METIS's ordering as it is: IPOPT refines
+        if self.linear_solver == "mumps":  # METIS's ordering as it is: IPOPT refines
             settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
             settings |= {"ipopt.mumps_pivtol": PIVOT_TOLERANCE}
         if self.hessian == "limited-memory":
@@ -367,13 +292,9 @@ class InteriorPoint(MethodOptions):
                 if lifted_count(complete_program(collocation), "pressure")
                 else "yes",
                 "ipopt.jacobian_regularization_exponent": 0.0,
-                "ipopt.jacobian_regularization_value": min(
-                    ROW_PIVOT, ROW_SLOWNESS / sharpness
-                ),
+                "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
             }
-        return settings | {
-            f"ipopt.{name}": value for name, value in self.ipopt.items()
-        }
+        return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
 
 
 def _largest_curvature(collocation: Collocation) -> float:
@@ -384,14 +305,11 @@ def _largest_curvature(collocation: Collocation) -> float:
     of an experiment in its unit of length. Without markers it is one.
     """
     units = (
-        segment.length_m / float(np.min(segment.experiment.markers.sigma_m))
-        for segment in collocation.transcriptions
-        if segment.experiment.markers.names
+        transcription.length_m / float(np.min(transcription.experiment.markers.sigma_m))
+        for transcription in collocation.transcriptions
+        if transcription.experiment.markers.names
     )
-    return max(
-        1.0,
-        collocation.loss_scale * max((unit**2 for unit in units), default=0.0),
-    )
+    return max(1.0, collocation.loss_scale * max((unit**2 for unit in units), default=0.0))
 
 
 class _DampedHessian:
@@ -407,34 +325,19 @@ class _DampedHessian:
     options : InteriorPoint
     """
 
-    def __init__(
-        self, collocation: Collocation, options: InteriorPoint
-    ) -> None:
+    def __init__(self, collocation: Collocation, options: InteriorPoint) -> None:
         self.collocation = collocation
         self.options = options
         self._last_p = np.full(collocation.nq + collocation.nphi, np.inf)
         self._damping = 1.0
         self._of_q, self._of_x = collocation.hessian_diagonals
 
-    def __call__(
-        self, z: Array, weight: float, multipliers: Array, values: Array
-    ) -> None:
+    def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
         """Write the upper triangle of the Hessian at z to `values`: the exact one, or that of
         Gauss–Newton during the warm-up or by the options, with `proximal` on the diagonal of the
         positions and, during the warm-up, the damping on that of q.
 
         The parameters are stored, and the damping is adapted, see `_ends_warm_up`.
-
-        Parameters
-        ----------
-        z : (variables,) array
-            Variables.
-        weight : float
-            Weight of the objective.
-        multipliers : (constraints,) array
-            Multipliers.
-        values : array
-            Memory for the values; it is overwritten.
         """
         is_settled = self._ends_warm_up(self.collocation.parameters_from(z))
         is_exact = self.options.hessian == "exact" and is_settled
@@ -456,10 +359,7 @@ class _DampedHessian:
         steps = np.abs(p - self._last_p) / self.collocation.compute_reach_p()
         self._last_p = p
         of_q = steps[: self.collocation.nq].max(initial=0.0)
-        is_short = (
-            steps.max(initial=0.0) < self.options.warm_up
-            and self._damping <= NO_DAMPING
-        )
+        is_short = steps.max(initial=0.0) < self.options.warm_up and self._damping <= NO_DAMPING
         if np.isfinite(of_q):
             change = np.clip((of_q / STEP_LIMIT) ** 2, *DAMPING_CHANGE)
             self._damping = min(1.0, self._damping * change)

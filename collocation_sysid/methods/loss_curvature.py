@@ -41,19 +41,13 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
     """
     step = after.p - previous.p
     change = after.fit.compute_score() - previous.fit.compute_score()
-    curvature_step = (
-        after.fit.compute_score() - after.previous_slopes_residual
-    )  # B · step
+    curvature_step = after.fit.compute_score() - after.previous_slopes_residual  # B · step
     change_dot_step = float(change @ step)
     if change_dot_step <= 0:
         return curvature
     previous_curvature = float(step @ curvature @ step)
-    if (
-        previous_curvature != 0
-    ):  # scale down a B that exceeds the curvature along this step
-        curvature = curvature * min(
-            1.0, abs(float(step @ curvature_step) / previous_curvature)
-        )
+    if previous_curvature != 0:  # scale down a B that exceeds the curvature along this step
+        curvature = curvature * min(1.0, abs(float(step @ curvature_step) / previous_curvature))
     missing = curvature_step - curvature @ step
     rank_two = np.outer(missing, change) / change_dot_step
     return (
@@ -64,9 +58,7 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
     )
 
 
-def with_curvature(
-    fit: SquareRootInformation, curvature: Array
-) -> SquareRootInformation:
+def with_curvature(fit: SquareRootInformation, curvature: Array) -> SquareRootInformation:
     """Return a least-squares problem with the normal matrix SᵀS + B instead of SᵀS.
 
     The gradient at zero is unchanged, so the minimiser is that of the model with B. Only np rows
@@ -86,10 +78,7 @@ def with_curvature(
     """
     triangle = fit.jacobian[: len(curvature)]
     right = fit.residual[: len(curvature)]
-    if (
-        not curvature.any()
-        or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max()
-    ):
+    if not curvature.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
         return fit
     half = solve_triangular(triangle, curvature, trans=1)
     relative = solve_triangular(triangle, half.T, trans=1)
@@ -114,7 +103,7 @@ def require_second_derivatives(collocation: Collocation) -> None:
             "hessian = 'exact' is not available for materials with memory (prony) and forces "
             "with internal variables; expected 'gauss-newton'"
         )
-    if any(len(segment.sensed_dofs) for segment in collocation.transcriptions):
+    if any(len(transcription.sensed_dofs) for transcription in collocation.transcriptions):
         raise InputError(
             "hessian = 'exact' is not available for measured forces and readings of grasps; "
             "expected 'gauss-newton'"
@@ -122,9 +111,7 @@ def require_second_derivatives(collocation: Collocation) -> None:
 
 
 def exact_curvature(
-    collocation: Collocation,
-    iterate: Iterate,
-    stopwatch: Stopwatch | None = None,
+    collocation: Collocation, iterate: Iterate, stopwatch: Stopwatch | None = None
 ) -> Array:
     """Return B (np, np), symmetric, at an iterate of the complete recordings, by one backward
     sweep.
@@ -151,30 +138,22 @@ def exact_curvature(
     z = collocation.pack(iterate.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch=stopwatch)
     directions = np.column_stack(
-        [
-            _tangent_direction(collocation, iterate, k=k)
-            for k in range(len(iterate.p))
-        ]
+        [_tangent_direction(collocation, iterate, k=k) for k in range(len(iterate.p))]
     )
     hessian = collocation.hessian(z, 1.0, multipliers=multipliers)
-    reduced = (
-        directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
-    )
+    reduced = directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
     return (reduced + reduced.T) / 2 - iterate.fit.compute_information()
 
 
-def _tangent_direction(
-    collocation: Collocation, iterate: Iterate, k: int
-) -> Array:
+def _tangent_direction(collocation: Collocation, iterate: Iterate, k: int) -> Array:
     """Return the change (variables,) of all variables per unit of the parameter with index k, along
     the equations of motion linearised at `iterate`; other parameters do not change. Both are those
     of `collocation`, in its coordinates p and its scaling of z.
     """
     unit = np.eye(len(iterate.p))[k]
     position_changes = [
-        each.by_p
-        @ unit[segment.list_parameter_indices()[segment.dynamic_parameters]]
-        for each, segment in zip(
+        each.by_p @ unit[transcription.list_parameter_indices()[transcription.dynamic_parameters]]
+        for each, transcription in zip(
             iterate.trajectories, collocation.transcriptions, strict=True
         )
     ]

@@ -39,9 +39,7 @@ class MethodOptions:
 T = TypeVar("T", bound=MethodOptions)
 
 
-def method_from_options(
-    kind: type[T], options: Mapping[str, Any], key: str
-) -> T:
+def method_from_options(kind: type[T], options: Mapping[str, Any], key: str) -> T:
     """Return a method made from its options.
 
     Parameters
@@ -63,16 +61,12 @@ def method_from_options(
         if name not in known:
             has = f"expected one of {', '.join(known)}{hint_at(name, known)}"
             raise InputError(
-                f"the method {kind.name!r} has no option {name!r}; {has}",
-                None,
-                where=key,
+                f"the method {kind.name!r} has no option {name!r}; {has}", None, where=key
             )
     try:
         return kind(**options)
     except InputError as error:
-        raise InputError(
-            error.message, None, where=f"{key}.{error.where}"
-        ) from error
+        raise InputError(error.message, None, where=f"{key}.{error.where}") from error
 
 
 # Fewest samples, or rows of a grid, of a first part.
@@ -92,9 +86,7 @@ def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
     """
     is_ascending = all(a < b for a, b in pairwise(shares))
     if not is_ascending or shares[-1:] != (1.0,):
-        raise ValueError(
-            f"found {list(shares)}; expected numbers above 0 that ascend to 1"
-        )
+        raise ValueError(f"found {list(shares)}; expected numbers above 0 that ascend to 1")
     return shares
 
 

@@ -106,11 +106,7 @@ def solve(
         start = recorder.initial_variables(start)
         functions = NlpFunctions(program, hessian, errors=errors)
         monitor = IterationMonitor(recorder, program, errors=errors)
-        options = {
-            **_COMMON,
-            "iteration_callback": monitor,
-            **settings(functions),
-        }
+        options = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
         solver = _create_solver(plugin, functions, settings=options)
     initial_variables = convert_variables(start, collocation, target=program)
     result = _run(
@@ -126,9 +122,7 @@ def solve(
         raise errors[0]
     watch.evaluations = previous_evaluations_s + functions.sum_seconds()
     # What is neither set-up nor callback.
-    accounted_s = (
-        watch.build + watch.evaluations + monitor.seconds + unaccounted_s
-    )
+    accounted_s = watch.build + watch.evaluations + monitor.seconds + unaccounted_s
     watch.linear_algebra = max(
         previous_linear_algebra_s, recorder.measure_elapsed_s() - accounted_s
     )
@@ -136,27 +130,20 @@ def solve(
     if monitor.stop or (recorder.is_late() and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
-        z, multipliers = monitor.best or (
-            initial_variables,
-            np.zeros(program.constraint_count),
-        )
+        z, multipliers = monitor.best or (initial_variables, np.zeros(program.constraint_count))
     # A solver that never began leaves its count as memory had it.
     iterations = result.iterations or max(0, monitor.lines - 1)
     if status is Status.REFUSED:
         iterations = 0
-    problem_multipliers = complete_multipliers(
-        program, z, multipliers=multipliers
-    )[: collocation.constraint_count]
+    problem_multipliers = complete_multipliers(program, z, multipliers=multipliers)[
+        : collocation.constraint_count
+    ]
     problem_variables = convert_variables(z, program, target=collocation)
     status = judge(status, problem_variables, problem_multipliers)
     name = NAMES.get(plugin, plugin)
     # Solvers that have a limit call it max_iter, some with a prefix, as "ipopt.max_iter".
     limit = next(
-        (
-            value
-            for option, value in options.items()
-            if option.rpartition(".")[2] == "max_iter"
-        ),
+        (value for option, value in options.items() if option.rpartition(".")[2] == "max_iter"),
         None,
     )
     sentence = status.explain(recorder.method, max_iterations=limit)
@@ -171,49 +158,21 @@ def solve(
     )
 
 
-def _create_solver(
-    plugin: str, functions: NlpFunctions, settings: dict[str, Any]
-) -> ca.Function:
-    """Return CasADi's solver of a program.
-
-    Parameters
-    ----------
-    plugin : str
-        CasADi's name of the solver.
-    functions : NlpFunctions
-        Functions of the program.
-    settings : dict
-        Options of the plugin, with its functions of derivatives.
-
-    Raises
-    ------
-    InputError
-        If the plugin cannot be set up, as for an unknown option or a plugin that is not installed,
-        with the line of its message that says why.
-    """
+def _create_solver(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
+    """Return CasADi's solver of a program."""
     z = ca.MX.sym("z", functions.collocation.variable_count)
     value, rows = functions.nlp(z, ca.MX(0, 1))
     output = io.StringIO()
     try:
-        with redirect_stdout(
-            output
-        ):  # where IPOPT says which setting it refuses
-            return ca.nlpsol(
-                "solver", plugin, {"x": z, "f": value, "g": rows}, settings
-            )
+        with redirect_stdout(output):  # where IPOPT says which setting it refuses
+            return ca.nlpsol("solver", plugin, {"x": z, "f": value, "g": rows}, settings)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).strip().splitlines()]
         unknown = [line for line in lines if "Unknown option" in line]
-        reason = (
-            output.getvalue().strip() or [*unknown, lines[-1]][0]
-        ).splitlines()[0]
-        reason = re.sub(
-            r"^\S+:\d+: | Check the option documentation\.$", "", reason
-        )
+        reason = (output.getvalue().strip() or [*unknown, lines[-1]][0]).splitlines()[0]
+        reason = re.sub(r"^\S+:\d+: | Check the option documentation\.$", "", reason)
         name = NAMES.get(plugin, plugin)
-        raise InputError(
-            f"{name} cannot be set up: {reason}", None, where="solver"
-        ) from error
+        raise InputError(f"{name} cannot be set up: {reason}", None, where="solver") from error
 
 
 class _SolverAbandoned(Exception):
@@ -246,12 +205,7 @@ class _NlpsolResult(NamedTuple):
         """Return the result of a solver that failed or was abandoned, for `count` variables, with a
         `return_status`.
         """
-        return cls(
-            np.full(count, np.nan),
-            np.zeros(0),
-            return_status=return_status,
-            iterations=0,
-        )
+        return cls(np.full(count, np.nan), np.zeros(0), return_status=return_status, iterations=0)
 
 
 def _run(
@@ -264,27 +218,11 @@ def _run(
     """Run a solver, on a thread of its own if this is the main thread.
 
     A failure of the solver is part of the result, and no error.
-
-    Parameters
-    ----------
-    solver : ca.Function
-        Solver of CasADi's `nlpsol`.
-    bounds : ((variables,) array, (variables,) array)
-        Lower and upper bounds of the variables.
-    start : (variables,) array
-        Initial variables.
-    monitor : IterationMonitor
-        Can stop the solver; receives its errors.
-    multipliers : InitialMultipliers or None
-        Initial multipliers; None for those of the solver.
     """
     lower, upper = bounds
     arguments = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}
     if multipliers is not None:
-        arguments |= {
-            "lam_g0": multipliers.constraints,
-            "lam_x0": multipliers.bounds,
-        }
+        arguments |= {"lam_g0": multipliers.constraints, "lam_x0": multipliers.bounds}
     results: list[_NlpsolResult] = []
 
     def search() -> None:
@@ -310,37 +248,18 @@ def _run(
     else:
         search()
     if not results:
-        return _NlpsolResult.failure(
-            len(start), "interrupted before the solver returned a result"
-        )
+        return _NlpsolResult.failure(len(start), "interrupted before the solver returned a result")
     return results[0]
 
 
-def _run_on_thread(
-    search: Callable[[], None], monitor: IterationMonitor
-) -> None:
+def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> None:
     """Run a search on a thread and wait for its end, so that the main thread, from which this must
     be called, can handle signals during long factorisations.
 
     After a request to stop, the search is abandoned if it does not end within `GRACE_S`: the thread
     goes on, and `monitor.errors` receives an entry.
-
-    Parameters
-    ----------
-    search : callable
-        The search, which stores its result itself. Its exceptions do not reach the caller, and
-        `monitor.errors` does not receive them.
-    monitor : IterationMonitor
-        Monitor that is asked to stop by Ctrl-C.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        At a second Ctrl-C; the search is abandoned then too.
     """
-    thread = threading.Thread(
-        target=copy_context().run, args=(search,), daemon=True
-    )
+    thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
     with _interruptible(monitor):
         thread.start()
         try:
@@ -361,10 +280,7 @@ def _interruptible(monitor: IterationMonitor) -> Iterator[None]:
     SIGTERM is treated the same if its handler raises KeyboardInterrupt. The previous handlers are
     restored at the end.
     """
-    handlers = {
-        number: signal.getsignal(number)
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     if not raises_interrupt(handlers[signal.SIGTERM]):
         del handlers[signal.SIGTERM]
 

@@ -17,20 +17,10 @@ from ..common.array_types import Array
 from ..common.validated_classes import validated
 from ..common.validated_types import Count, Positive
 from ..errors import SimulationError
-from ..program.linear_algebra.factorisation import (
-    ACCURACY,
-    Choice,
-    Factoriser,
-)
+from ..program.linear_algebra.factorisation import ACCURACY, Choice, Factoriser
 from .horizon import Horizon, Iterate
 from .loss_curvature import exact_curvature, secant_update, with_curvature
-from .method_options import (
-    FEWEST,
-    SHARES,
-    MethodOptions,
-    Shares,
-    samples_in_share,
-)
+from .method_options import FEWEST, SHARES, MethodOptions, Shares, samples_in_share
 from .solution import Iteration, Status
 from .solve_recorder import Recorder
 from .trajectory_sweeps import FitSummary
@@ -80,8 +70,9 @@ ROUGH_ACCURACY = 1e-3
 # That accuracy after a short step, over the square of its length: the terms of second order that
 # Gauss–Newton neglects are larger.
 SECOND_ORDER_SHARE = 0.1
-# Highest relative accuracy of these solutions, over the tolerance: that of the parameters is better,
-# because only the part of the residuals that the model does not explain is multiplied by the error.
+# Highest relative accuracy of these solutions, over the tolerance: that of the parameters is
+# better, because only the part of the residuals that the model does not explain is multiplied by
+# the error.
 ACCURACY_SHARE = 0.01
 # Relative accuracy over the tolerance above which the point of a sweep is not the result.
 FINAL_ACCURACY_SHARE = 0.1
@@ -217,19 +208,19 @@ class ReducedSearch:
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
         self.has_correspondences = any(
-            segment.association.correspondences
-            for segment in collocation.transcriptions
+            transcription.association.correspondences
+            for transcription in collocation.transcriptions
         )
         self.largest_trust = SEEING if self.has_correspondences else WIDEST
         self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
         self.refines_solutions = not all(
             Factoriser.cached(
-                segment.experiment.sparsity,
-                segment.free_dofs,
+                transcription.experiment.sparsity,
+                transcription.free_dofs,
                 choice=options.factorisation,
             ).skyline
-            for segment in collocation.transcriptions
+            for transcription in collocation.transcriptions
         )
         self.lower, self.upper = collocation.compute_parameter_bounds()
         self.reassociations = 0
@@ -244,18 +235,14 @@ class ReducedSearch:
             start = np.clip(start, *collocation.bounds())
             self.p = collocation.parameters_from(start)
             self.trajectories = [
-                part.segment.with_prescribed_positions(part.x, part.phi)
+                part.transcription.with_prescribed_positions(part.x, part.phi)
                 for part in collocation.iterates(start)
             ]
         self.point: Iterate | None = None
         self.reassociated_trial: _ReassociatedTrial | None = None
-        nodes = [segment.body.nodes_m for segment in collocation.transcriptions]
-        self.edge_m = min(
-            segment.length_m for segment in collocation.transcriptions
-        )
-        self.size_m = max(
-            float(np.ptp(points, axis=0).max()) for points in nodes
-        )
+        nodes = [transcription.body.nodes_m for transcription in collocation.transcriptions]
+        self.edge_m = min(transcription.length_m for transcription in collocation.transcriptions)
+        self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
 
     # Horizons of increasing length ------------------------------------------------------------
 
@@ -268,10 +255,7 @@ class ReducedSearch:
         if self.trajectories is None:
             return None
         try:
-            rows = [
-                segment.grid_times
-                for segment in self.collocation.transcriptions
-            ]
+            rows = [transcription.grid_times for transcription in self.collocation.transcriptions]
             horizon = self._horizon(rows, last=True)
             accuracy = self._accuracy_at_start(horizon)
             return self.minimise(horizon, is_last=True, accuracy=accuracy)
@@ -282,8 +266,8 @@ class ReducedSearch:
     def horizon_of_share(self, share: float) -> Horizon:
         """Return the problem on a share of the recording, one of the `ladder` of the options."""
         rows = [
-            samples_in_share(segment.grid_times, share)
-            for segment in self.collocation.transcriptions
+            samples_in_share(transcription.grid_times, share)
+            for transcription in self.collocation.transcriptions
         ]
         return self._horizon(rows, last=share == self.options.ladder[-1])
 
@@ -325,9 +309,7 @@ class ReducedSearch:
                 # Rows that only nearly satisfy the equations may lead nowhere; simulated ones do.
                 restarted, restart_failure = horizon.simulate(self.p)
                 self.sweeps += 1
-                if sum(horizon.row_counts(restarted)) > sum(
-                    horizon.row_counts(reached)
-                ):
+                if sum(horizon.row_counts(restarted)) > sum(horizon.row_counts(reached)):
                     reached = restarted
                     failure = restart_failure
             if failure is None:
@@ -337,11 +319,7 @@ class ReducedSearch:
             rows = horizon.row_counts(reached)
             fewest = min(FEWEST, *horizon.rows)
             is_unstarted = previous is None and min(rows) < fewest
-            if (
-                is_unstarted
-                or sum(rows) <= furthest
-                or self.sweeps >= self.options.max_iterations
-            ):
+            if is_unstarted or sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
                 raise failure
             furthest = sum(rows)
             self.trajectories = reached
@@ -350,9 +328,7 @@ class ReducedSearch:
 
     # Steps on one horizon ---------------------------------------------------------------------
 
-    def minimise(
-        self, horizon: Horizon, is_last: bool, accuracy: float = ACCURACY
-    ) -> Status:
+    def minimise(self, horizon: Horizon, is_last: bool, accuracy: float = ACCURACY) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
 
         It starts at `p` and `trajectories`, which must exist and have the rows of the horizon, and
@@ -384,10 +360,7 @@ class ReducedSearch:
         point = self._accept(
             horizon,
             horizon.evaluate(
-                self.p,
-                self.trajectories,
-                known_iterate=self.point,
-                accuracy=accuracy,
+                self.p, self.trajectories, known_iterate=self.point, accuracy=accuracy
             ),
         )
         rejections = 0
@@ -398,7 +371,8 @@ class ReducedSearch:
         while True:
             step = self._next_step(point, curvature)
             length = self._step_length(step)
-            # A step that the trust region shortens contains no information on the remaining distance.
+            # A step that the trust region shortens contains no information on the remaining
+            # distance.
             is_full_step = length < 0.99 * self.trust and not is_rough
             is_short = is_full_step and length <= tolerance
             if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
@@ -407,9 +381,7 @@ class ReducedSearch:
             rate = min(1.0, length / previous) if previous < np.inf else 1.0
             if is_last and is_full_step and length * rate <= SAFETY * tolerance:
                 final_positions = horizon.extrapolate(point, step)
-                summaries = horizon.fit_summaries(
-                    point.p + step, final_positions
-                )
+                summaries = horizon.fit_summaries(point.p + step, final_positions)
                 if self._are_feasible(summaries):
                     self._record(
                         point.p + step,
@@ -418,37 +390,26 @@ class ReducedSearch:
                         summaries=summaries,
                     )
                     return Status.CONVERGED
-            predicted_share = 1.0 - point.predicted_loss(step) / max(
-                point.loss, 1e-300
-            )
+            predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
             if not is_last and predicted_share < self.options.rung_decrease:
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT
             trial = self._try(horizon, point, step=step)
-            is_better = trial is not None and self._judge(
-                point, step, trial=trial
-            )
+            is_better = trial is not None and self._judge(point, step, trial=trial)
             if (
                 trial is not None
                 and is_better
                 and self._is_better_reassociated(horizon, point, trial=trial)
             ):
                 if is_last and length <= LOCAL:
-                    curvature = self._update_curvature(
-                        curvature, point, after=trial
-                    )
+                    curvature = self._update_curvature(curvature, point, after=trial)
                 point = self._accept(horizon, trial)
                 rejections = 0
                 previous = length
-                is_rough = not self._is_final_accuracy(
-                    self._accuracy_after(length)
-                )
+                is_rough = not self._is_final_accuracy(self._accuracy_after(length))
                 continue
-            if (
-                is_short
-                and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
-            ):
+            if is_short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
             if self.has_correspondences and length <= LEAST_DETERMINED_SHARE:
                 # The association changes the loss by more than such a step.
@@ -458,27 +419,15 @@ class ReducedSearch:
                 return Status.STALLED
             self.trust = SHRINK * length
             rejections += 1
-            if (
-                rejections == 1
-                and point.feasibility_m > INFEASIBLE * self.size_m
-            ):
+            if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
                 point = self._make_feasible(horizon, point)
 
-    def _update_curvature(
-        self, curvature: Array, previous: Iterate, after: Iterate
-    ) -> Array:
+    def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
         """Return the part of the Hessian (np, np) at `after` that Gauss–Newton neglects: exact, or
         by a secant update of `curvature` from the point `previous`, as the options state.
-
-        Raises
-        ------
-        SimulationError
-            If a time step is singular in the sweep for the exact one.
         """
         if self.options.hessian == "exact":
-            return exact_curvature(
-                self.collocation, after, stopwatch=self.recorder.stopwatch
-            )
+            return exact_curvature(self.collocation, after, stopwatch=self.recorder.stopwatch)
         return secant_update(curvature, previous, after=after)
 
     def _step_length(self, step: Array) -> float:
@@ -499,9 +448,7 @@ class ReducedSearch:
         high = np.maximum(high, 0.0) + 1e-15
         return with_curvature(point.fit, curvature).minimiser(low, high)
 
-    def _try(
-        self, horizon: Horizon, point: Iterate, step: Array
-    ) -> Iterate | None:
+    def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
         """Return the point after a step (np,) of the parameters from `point`, clipped to the
         bounds, by one sweep on the horizon, which is counted; None if that fails or is not finite.
         Nothing else of the search changes.
@@ -510,9 +457,7 @@ class ReducedSearch:
         p = np.clip(point.p + step, self.lower, self.upper)
         accuracy = self._accuracy_after(self._step_length(step))
         try:
-            trial = horizon.evaluate_step(
-                p, point, step=step, accuracy=accuracy
-            )
+            trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
         except SimulationError:
             return None
         return trial if trial.is_finite else None
@@ -551,21 +496,11 @@ class ReducedSearch:
 
         It must decrease the loss by a share of what the model predicts, and violate the equations
         of motion little. For an accepted trial the trust region is enlarged or reduced, in place.
-
-        Parameters
-        ----------
-        point : Iterate
-            Best point so far.
-        step : (np,) array
-            Step of the parameters.
-        trial : Iterate
-            Point after the step.
         """
         predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
         if trial.feasibility_m > max(
-            CONTRACTION
-            * max(report.position_change_m for report in trial.reports),
+            CONTRACTION * max(report.position_change_m for report in trial.reports),
             SMALL_STRAIN * self.edge_m,
         ):
             return False
@@ -588,10 +523,7 @@ class ReducedSearch:
         no longer compared with a loss that is too low.
         """
         refined = self._try(horizon, point, step=np.zeros(len(point.p)))
-        if (
-            refined is None
-            or refined.feasibility_m > CONTRACTION * point.feasibility_m
-        ):
+        if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
             return self._resimulated(horizon, point)
         return self._accept(horizon, refined)
 
@@ -610,21 +542,15 @@ class ReducedSearch:
             resimulated = horizon.evaluate(point.p, x)
         except SimulationError:
             return point
-        return (
-            self._accept(horizon, resimulated)
-            if resimulated.is_finite
-            else point
-        )
+        return self._accept(horizon, resimulated) if resimulated.is_finite else point
 
     def _are_feasible(self, summaries: list[FitSummary]) -> bool:
         """Return whether the largest residual of the equations of motion of every experiment is at
         most `FEASIBLE_FORCE` times its unit of force; one summary for each, in their order.
         """
         return all(
-            each.violation_n <= FEASIBLE_FORCE * segment.force_n
-            for each, segment in zip(
-                summaries, self.collocation.transcriptions, strict=True
-            )
+            each.violation_n <= FEASIBLE_FORCE * transcription.force_n
+            for each, transcription in zip(summaries, self.collocation.transcriptions, strict=True)
         )
 
     # Association of the measurements ----------------------------------------------------------
@@ -635,35 +561,21 @@ class ReducedSearch:
 
         Nothing happens after the first time, unless the trajectories were then too short for the
         cameras; nor if all positions are known or there are no trajectories.
-
-        Parameters
-        ----------
-        horizon : Horizon
-            Problem, which is updated.
-        is_first : bool
-            Whether these are the first trajectories of the search.
         """
-        if (
-            is_first or not self.is_associated
-        ) and self.trajectories is not None:
+        if (is_first or not self.is_associated) and self.trajectories is not None:
             counts = [
-                segment.count_rows_to_place()
-                for segment in self.collocation.transcriptions
+                transcription.count_rows_to_place()
+                for transcription in self.collocation.transcriptions
             ]
             if any(counts):
                 rows = horizon.first_rows(self.trajectories, counts)
                 # Images of later rows are associated when the trajectories are long enough.
-                self.is_associated = (
-                    not self.has_correspondences or [*map(len, rows)] == counts
-                )
+                self.is_associated = not self.has_correspondences or [*map(len, rows)] == counts
                 self._set_collocation(
-                    horizon,
-                    *self.collocation.place_unknown_markers(self.p, rows),
+                    horizon, *self.collocation.place_unknown_markers(self.p, rows)
                 )
 
-    def _set_collocation(
-        self, horizon: Horizon, collocation: Collocation, p: Array
-    ) -> None:
+    def _set_collocation(self, horizon: Horizon, collocation: Collocation, p: Array) -> None:
         """Use another collocation of the same problem, and its parameters p (np,), in the search,
         the recorder and the horizon, in place.
         """
@@ -689,8 +601,8 @@ class ReducedSearch:
         else:
             stored = None
             counts = [
-                segment.count_rows_to_follow()
-                for segment in self.collocation.transcriptions
+                transcription.count_rows_to_follow()
+                for transcription in self.collocation.transcriptions
             ]
             rows = horizon.first_rows(point.trajectories, counts)
             collocation, p = self.collocation.follow_estimates(point.p, rows)
@@ -702,44 +614,29 @@ class ReducedSearch:
             return stored.reassociated
         return horizon.reassociate(p, point)
 
-    def _is_better_reassociated(
-        self, horizon: Horizon, point: Iterate, trial: Iterate
-    ) -> bool:
+    def _is_better_reassociated(self, horizon: Horizon, point: Iterate, trial: Iterate) -> bool:
         """Return whether a trial is still acceptable with correspondences found at its estimates.
 
         A point may then belong to another part of the surface, or to none. The number of
-        measurements, with those left out because of a crease (`Collocation.count_associated()`), must
-        be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per measurement at most
-        `EQUAL_MISFIT_RATIO` times that of the point. True without correspondences; false if the
-        association may not be updated any more.
+        measurements, with those left out because of a crease (`Collocation.count_associated()`),
+        must be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per measurement
+        at most `EQUAL_MISFIT_RATIO` times that of the point. True without correspondences; false if
+        the association may not be updated any more.
 
         Afterwards collocation and parameters are those of the point, in the search, the recorder
         and the horizon. The association at the trial is stored in `reassociated_trial` for
         `_reassociate`, and `most_measurements` is updated; `reassociations` is unchanged.
-
-        Parameters
-        ----------
-        horizon : Horizon
-            Problem on which both were evaluated.
-        point : Iterate
-            Best point so far, with the present association.
-        trial : Iterate
-            Point after a step that `_judge` accepts, with the same association.
         """
         before = self.collocation
         if not self.has_correspondences:
             return True
         if self.reassociations >= REREADINGS:
             return False
-        self.most_measurements = max(
-            self.most_measurements, before.count_associated()
-        )
+        self.most_measurements = max(self.most_measurements, before.count_associated())
         after = self._reassociate(horizon, trial)
         if self.collocation is not before:
             self.reassociations -= 1  # it counts when the trial is accepted
-        self.reassociated_trial = _ReassociatedTrial(
-            trial, self.collocation, reassociated=after
-        )
+        self.reassociated_trial = _ReassociatedTrial(trial, self.collocation, reassociated=after)
         associated = self.collocation.count_associated()
         each = after.loss / max(1, self.collocation.count_measurements())
         before_each = point.loss / max(1, before.count_measurements())
@@ -758,51 +655,21 @@ class ReducedSearch:
         Exceptions of the recorder's `watch` are not caught.
         """
         self.point = point = self._reassociate(horizon, point)
-        self.indefinite_steps = sum(
-            report.indefinite_steps for report in point.reports
-        )
-        self._record(
-            point.p,
-            point.trajectories,
-            loss=point.loss,
-            summaries=point.reports,
-        )
+        self.indefinite_steps = sum(report.indefinite_steps for report in point.reports)
+        self._record(point.p, point.trajectories, loss=point.loss, summaries=point.reports)
         return point
 
-    def _record(
-        self,
-        p: Array,
-        x: list[Any],
-        loss: float,
-        summaries: Sequence[FitSummary],
-    ) -> None:
+    def _record(self, p: Array, x: list[Any], loss: float, summaries: Sequence[FitSummary]) -> None:
         """Store parameters and trajectories as the best so far, and add an entry to the history.
 
         The recorder calls `watch` with the entry; exceptions of `watch` are not caught.
-
-        Parameters
-        ----------
-        p : (np,) array
-            All parameters (q, φ).
-        x : list
-            Trajectories, as the workers store them.
-        loss : float
-            Loss with priors, without the scaling of the NLP.
-        summaries : sequence of FitSummary
-            Fit of each experiment.
         """
         self.p = p
         self.trajectories = x
         squares_m2 = sum(each.squares_m2 for each in summaries)
-        rms_m = float(
-            np.sqrt(
-                squares_m2 / max(1, sum(each.samples for each in summaries))
-            )
-        )
+        rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in summaries))))
         violation_n = max(each.violation_n for each in summaries)
-        values = self.collocation.parameters.scalar_values(
-            p[: self.collocation.nq]
-        )
+        values = self.collocation.parameters.scalar_values(p[: self.collocation.nq])
         time_s = self.recorder.measure_elapsed_s()
         share = sum(each.rows for each in summaries) / sum(
             s.grid_times for s in self.collocation.transcriptions

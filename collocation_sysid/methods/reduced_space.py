@@ -93,22 +93,6 @@ class ReducedSpace(SearchOptions):
         far, and `status` says why it ended. Rows that were not simulated are then those of a rigid
         motion with the grasp, and the solution's `initial_multipliers` are zeros; else they are
         None. Exceptions of `watch` are not caught. There is no coarse start, which `solve` adds.
-
-        Parameters
-        ----------
-        collocation : Collocation
-            Problem to solve.
-        watch : callable, optional
-            Function that is called with every new `Iteration`.
-        start : (variables,) array, optional
-            Initial variables; the guess by default.
-        workers : ExperimentExecutor, optional
-            Where the experiments are processed; by default threads of this process.
-
-        Raises
-        ------
-        InputError
-            For hessian = "exact" with workers or with a problem that lacks second derivatives.
         """
         if self.hessian == "exact":
             require_second_derivatives(collocation)
@@ -132,37 +116,19 @@ class ReducedSpace(SearchOptions):
             status = status or Status.CONVERGED
             if search.ended_by_association:
                 recorder.notes.append(ENDED_BY_ASSOCIATION)
-            message = status.explain(
-                self.name, max_iterations=self.max_iterations
-            )
+            message = status.explain(self.name, max_iterations=self.max_iterations)
         except SEARCH_ENDS as end:
             status, message = status_of_end(end)
-        return _solution_of_search(
-            search, workers, status=status, message=message
-        )
+        return _solution_of_search(search, workers, status=status, message=message)
 
 
 def _solution_of_search(
-    search: ReducedSearch,
-    workers: ExperimentExecutor,
-    status: Status,
-    message: str,
+    search: ReducedSearch, workers: ExperimentExecutor, status: Status, message: str
 ) -> Solution:
     """Return the solution with the best point of a search.
 
     Rows that were not simulated are those of a rigid motion with the grasp. If workers are lost
     while the trajectories are fetched, their status and message replace those given.
-
-    Parameters
-    ----------
-    search : ReducedSearch
-        Search that has ended; notes are added to its recorder.
-    workers : ExperimentExecutor
-        Where the trajectories are stored.
-    status : Status
-        Status of the search.
-    message : str
-        Sentence for the user.
     """
     recorder = search.recorder
     collocation = recorder.collocation
@@ -176,16 +142,10 @@ def _solution_of_search(
         message = lost.message
         trajectories, _ = simulate_trajectories(collocation, search.p)
     z = complete_variables(collocation, search.p, known_rows=trajectories)
-    rows = [segment.grid_times for segment in collocation.transcriptions]
-    is_complete = (
-        trajectories is not None and [len(x) for x in trajectories] == rows
-    )
-    recorder.notes += _notes(
-        collocation, search.indefinite_steps, z=z, status=status
-    )
-    multipliers = (
-        None if is_complete else np.zeros(collocation.constraint_count)
-    )
+    rows = [transcription.grid_times for transcription in collocation.transcriptions]
+    is_complete = trajectories is not None and [len(x) for x in trajectories] == rows
+    recorder.notes += _notes(collocation, search.indefinite_steps, z=z, status=status)
+    multipliers = None if is_complete else np.zeros(collocation.constraint_count)
     return recorder.solution(
         status,
         message,
@@ -204,48 +164,30 @@ def memory_mb(collocation: Collocation) -> float:
     columns = 2 * (2 + collocation.nq) + 6
     values = columns * collocation.variable_count
     chunks = sorted(
-        Sweep(segment).estimate_chunk_bytes()
-        for segment in collocation.transcriptions
+        Sweep(transcription).estimate_chunk_bytes() for transcription in collocation.transcriptions
     )
     concurrent = concurrent_count(len(chunks), collocation.threads)
     return (8 * values + sum(chunks[-concurrent:])) / 1e6
 
 
-def _notes(
-    collocation: Collocation, indefinite_steps: int, z: Array, status: Status
-) -> list[str]:
+def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: Status) -> list[str]:
     """Return notes for the user on the answer: on time steps whose matrix is indefinite, and on
     residuals that are much larger than the noise.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Problem.
-    indefinite_steps : int
-        Number of time steps with an indefinite matrix.
-    z : (variables,) array
-        Final variables.
-    status : Status
-        Status of the search; residuals are judged only at a minimum.
     """
     notes = []
     if indefinite_steps:
-        steps = sum(
-            segment.constraint_times for segment in collocation.transcriptions
-        )
+        steps = sum(transcription.constraint_times for transcription in collocation.transcriptions)
         notes.append(
             f"the equations of {indefinite_steps} of {steps} time steps are not positive definite "
             "at the solution: the body is near buckling, or the estimated damping is too large"
         )
     if status in (Status.CONVERGED, Status.STALLED):
         squares = sum(part.loss for part in collocation.iterates(z))
-        misfit = float(
-            np.sqrt(squares / max(1, collocation.count_measurements()))
-        )
+        misfit = float(np.sqrt(squares / max(1, collocation.count_measurements())))
         if misfit > MISFIT:
             size = f" ({1e3 * collocation.rms_marker_distance_m(z):.3g} mm rms)"
             measurements, noise_key = main_measurement(
-                [segment.experiment for segment in collocation.transcriptions]
+                [transcription.experiment for transcription in collocation.transcriptions]
             )
             are_markers = noise_key == "sigma_m"
             notes.append(

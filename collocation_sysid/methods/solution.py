@@ -63,7 +63,8 @@ class Status(Enum):
         method : str
             Name of the method, such as "reduced-space".
         max_iterations : int or None
-            Limit of the method that ended; None if it is unknown, with which the result is `sentence`.
+            Limit of the method that ended; None if it is unknown, with which the result is
+            `sentence`.
         """
         if self is not Status.ITERATION_LIMIT or max_iterations is None:
             return self.sentence
@@ -176,12 +177,7 @@ class Timing:
             `time.perf_counter()` at the start of the solve [s], for the total.
         """
         total = time.perf_counter() - start_s
-        return cls(
-            watch.build,
-            watch.evaluations,
-            linear_algebra=watch.linear_algebra,
-            total=total,
-        )
+        return cls(watch.build, watch.evaluations, linear_algebra=watch.linear_algebra, total=total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,16 +256,10 @@ class Solution:
             Reason for the second solve; it is inserted between the notes of both, also if it is
             empty.
         """
-        previous_iterations = max(
-            [first.iterations, *(line.number for line in first.history[-1:])]
-        )
+        previous_iterations = max([first.iterations, *(line.number for line in first.history[-1:])])
         previous_s = first.timing.total
         shifted_history = [
-            replace(
-                each,
-                number=each.number + previous_iterations,
-                time_s=each.time_s + previous_s,
-            )
+            replace(each, number=each.number + previous_iterations, time_s=each.time_s + previous_s)
             for each in self.history
         ]
         return replace(
@@ -307,9 +297,7 @@ class Solution:
     @property
     def theta(self) -> Array:
         """Constants (k,) of the first experiment's body, see `Body.constants`."""
-        return self.collocation.transcriptions[0].body.theta_from_values(
-            self.parameters
-        )
+        return self.collocation.transcriptions[0].body.theta_from_values(self.parameters)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -339,40 +327,27 @@ class Solution:
         estimates: dict[str, float] = {}
         known: list[str] = []
         for part in self.parts:
-            nuisance = part.segment.nuisance
-            readings = part.segment.experiment.readings
+            nuisance = part.transcription.nuisance
+            readings = part.transcription.experiment.readings
             values = (part.phi * nuisance.scales).tolist()
-            for entry, full, value in zip(
-                nuisance.entries, nuisance.names, values, strict=True
-            ):
+            for entry, full, value in zip(nuisance.entries, nuisance.names, values, strict=True):
                 known.append(full)
-                names = {
-                    full,
-                    entry.label,
-                    entry.label.rpartition(" [")[0],
-                    entry.row.name,
-                }
+                names = {full, entry.label, entry.label.rpartition(" [")[0], entry.row.name}
                 if entry.row == GAUGE:
                     names.add([*readings[entry.number].unknowns][entry.axis])
                 if name in names:
                     estimates[full] = value
         if len(estimates) == 1:
             return next(iter(estimates.values()))
-        which = (
-            f"{name!r} is ambiguous"
-            if estimates
-            else f"no nuisance parameter {name!r}"
-        )
+        which = f"{name!r} is ambiguous" if estimates else f"no nuisance parameter {name!r}"
         expected = ", ".join(map(repr, estimates or dict.fromkeys(known)))
-        raise InputError(
-            f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}"
-        )
+        raise InputError(f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}")
 
     def part_of(self, experiment: str) -> ExperimentIterate | None:
         """Return the iterate of one experiment at the solution, by the experiment's name; None if
         it was not fitted.
         """
-        named = {part.segment.experiment.name: part for part in self.parts}
+        named = {part.transcription.experiment.name: part for part in self.parts}
         return named.get(experiment)
 
     @property
@@ -387,8 +362,7 @@ class Solution:
         estimated nuisance parameters φ.
         """
         return [
-            part.segment.markers.predict_positions(part.x, part.phi)
-            for part in self.parts
+            part.transcription.markers.predict_positions(part.x, part.phi) for part in self.parts
         ]
 
     @cached_property
@@ -399,11 +373,11 @@ class Solution:
         torque [N m]. NaN means that the sensor was not predicted at that sample.
         """
         return {
-            part.segment.experiment.name: predict_wrenches(
-                part.segment.sensors, part.reactions, part.phi
+            part.transcription.experiment.name: predict_wrenches(
+                part.transcription.sensors, part.reactions, part.phi
             )
             for part in self.parts
-            if part.segment.sensors
+            if part.transcription.sensors
         }
 
     @cached_property
@@ -414,11 +388,11 @@ class Solution:
         Only experiments with wrench sensors are included.
         """
         rms_by_experiment = {}
-        for segment in self.collocation.transcriptions:
-            if segment.sensors:
-                readings = self.wrenches[segment.experiment.name]
-                rms_by_experiment[segment.experiment.name] = wrench_rms(
-                    segment.experiment, readings
+        for transcription in self.collocation.transcriptions:
+            if transcription.sensors:
+                readings = self.wrenches[transcription.experiment.name]
+                rms_by_experiment[transcription.experiment.name] = wrench_rms(
+                    transcription.experiment, readings
                 )
         return rms_by_experiment
 
@@ -428,13 +402,11 @@ class Solution:
         sensor; experiments without custom sensors have empty mappings.
         """
         return {
-            part.segment.experiment.name: {
+            part.transcription.experiment.name: {
                 gauge.sensor.name: gauge.without_padding(
-                    gauge.predict_motion(
-                        part.motion_for(gauge.observable), part.phi
-                    )
+                    gauge.predict_motion(part.motion_for(gauge.observable), part.phi)
                 )
-                for gauge in part.segment.custom_sensors
+                for gauge in part.transcription.custom_sensors
             }
             for part in self.parts
         }
@@ -452,30 +424,24 @@ class Solution:
         without samples.
         """
         rms_by_experiment = {}
-        for segment, readings in zip(
+        for transcription, readings in zip(
             self.collocation.transcriptions, self.readings_m, strict=True
         ):
-            markers = segment.experiment.markers
-            squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[
-                markers.is_present
-            ]
-            rms_by_experiment[segment.experiment.name] = root_mean(squares)
+            markers = transcription.experiment.markers
+            squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.is_present]
+            rms_by_experiment[transcription.experiment.name] = root_mean(squares)
         return rms_by_experiment
 
     @cached_property
     def max_violation_n(self) -> float:
         """Largest residual of the equations of motion [N], computed from `z`."""
         violations = self.collocation.residuals_n(self.z)
-        return float(
-            max(np.abs(residual).max(initial=0.0) for residual in violations)
-        )
+        return float(max(np.abs(residual).max(initial=0.0) for residual in violations))
 
     @cached_property
     def max_violation_relative(self) -> float:
         """Largest residual of the equations of motion over the largest force in the equations."""
-        return self.max_violation_n / max(
-            self.collocation.largest_force_n(self.z), 1e-300
-        )
+        return self.max_violation_n / max(self.collocation.largest_force_n(self.z), 1e-300)
 
     @cached_property
     def kkt_residual(self) -> float:
@@ -511,9 +477,7 @@ def wrench_rms(
         component was measured.
     """
     pairs = zip(predicted, experiment.wrenches, strict=True)
-    residuals = [
-        sensor.symmetry * (read - sensor.values) for read, sensor in pairs
-    ]
+    residuals = [sensor.symmetry * (read - sensor.values) for read, sensor in pairs]
     components = np.concatenate(residuals) if residuals else np.zeros((0, 6))
     force, torque = (
         float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else None
@@ -522,9 +486,7 @@ def wrench_rms(
     return force, torque
 
 
-def custom_sensor_rms(
-    experiment: Experiment, predicted: Mapping[str, Array]
-) -> dict[str, float]:
+def custom_sensor_rms(experiment: Experiment, predicted: Mapping[str, Array]) -> dict[str, float]:
     """Return the RMS residuals of custom sensors by name, in the unit of each sensor, over all its
     values.
 
@@ -541,13 +503,8 @@ def custom_sensor_rms(
     KeyError
         If `predicted` lacks a sensor.
     """
-    residuals = (
-        (g.name, predicted[g.name] - g.measured_values)
-        for g in experiment.readings
-    )
-    return {
-        name: float(np.sqrt(np.nanmean(each**2))) for name, each in residuals
-    }
+    residuals = ((g.name, predicted[g.name] - g.measured_values) for g in experiment.readings)
+    return {name: float(np.sqrt(np.nanmean(each**2))) for name, each in residuals}
 
 
 def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
@@ -558,10 +515,8 @@ def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
     """
     squares = np.zeros(2)
     counts = np.zeros(2)
-    for segment in solution.collocation.transcriptions:
-        components = solution.wrench_rms.get(
-            segment.experiment.name, (None, None)
-        )
+    for transcription in solution.collocation.transcriptions:
+        components = solution.wrench_rms.get(transcription.experiment.name, (None, None))
         for k, value in enumerate(components):
             if value is not None:
                 squares[k] = squares[k] + value**2
@@ -584,34 +539,9 @@ class Method(Protocol):
     """
 
     def __call__(
-        self,
-        collocation: Collocation,
-        watch: Watch | None = None,
-        start: Array | None = None,
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
-        """Solve the NLP.
-
-        Parameters
-        ----------
-        collocation : Collocation
-            Problem to solve; it is not modified.
-        watch : callable, optional
-            Function that is called with every new `Iteration` of the history.
-        start : (variables,) array, optional
-            Initial variables; by default the method chooses them from the guess.
-
-        Returns
-        -------
-        Solution
-            The best iterate if the method did not converge or was interrupted (Ctrl-C).
-
-        Raises
-        ------
-        InputError
-            If the method cannot solve such a problem, or not with its options.
-        Exception
-            Those of `watch`, which end the solve.
-        """
+        """Solve the NLP."""
         ...
 
 
@@ -642,29 +572,22 @@ def constraint_multipliers(
         """Return the multipliers of one experiment's equations of motion, of its prescribed
         displacements zero.
         """
-        segment = iterate.segment
+        transcription = iterate.transcription
         gradient = collocation.loss_scale * iterate.gradient()[0]
-        solver = Sweep(segment, stopwatch=stopwatch)
-        y = segment.force_n * solver.backward(
-            iterate.x, iterate.equations, gradient=gradient
-        )
-        return segment.select_rows(y)
+        solver = Sweep(transcription, stopwatch=stopwatch)
+        y = transcription.force_n * solver.backward(iterate.x, iterate.equations, gradient=gradient)
+        return transcription.select_rows(y)
 
     multipliers_by_experiment = map_experiments(
         of_experiment, collocation.iterates(z), threads=collocation.threads
     )
     multipliers = np.concatenate(multipliers_by_experiment)
-    if any(
-        segment.is_grasp_constraint.any()
-        for segment in collocation.transcriptions
-    ):
+    if any(transcription.is_grasp_constraint.any() for transcription in collocation.transcriptions):
         _set_grasp_multipliers(collocation, z, multipliers=multipliers)
     return multipliers
 
 
-def _set_grasp_multipliers(
-    collocation: Collocation, z: Array, multipliers: Array
-) -> None:
+def _set_grasp_multipliers(collocation: Collocation, z: Array, multipliers: Array) -> None:
     """Set the multipliers (constraints,) of prescribed displacements at variables z to minus the
     remaining gradient of the Lagrangian, in place; the others are unchanged.
 
@@ -673,8 +596,8 @@ def _set_grasp_multipliers(
     """
     slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
     for part in collocation.iterates(slope):
-        segment = part.segment
-        grasped = part.segment.is_grasp_constraint
-        multipliers[segment.rows][grasped] = (
-            -segment.select_rows(part.x)[grasped] / segment.length_m
+        transcription = part.transcription
+        grasped = part.transcription.is_grasp_constraint
+        multipliers[transcription.rows][grasped] = (
+            -transcription.select_rows(part.x)[grasped] / transcription.length_m
         )

@@ -35,9 +35,7 @@ class SearchEnded(Exception):
 SEARCH_ENDS = (SearchEnded, SimulationError, KeyboardInterrupt)
 
 
-def status_of_end(
-    end: SearchEnded | SimulationError | KeyboardInterrupt,
-) -> tuple[Status, str]:
+def status_of_end(end: SearchEnded | SimulationError | KeyboardInterrupt) -> tuple[Status, str]:
     """Return the status and message of a search that one of the `SEARCH_ENDS` has ended.
 
     `SearchEnded` gives its own status, `SimulationError` gives `NOT_SIMULABLE`, and
@@ -48,10 +46,7 @@ def status_of_end(
     if isinstance(end, KeyboardInterrupt):
         return Status.INTERRUPTED, Status.INTERRUPTED.sentence
     # Another stiffness does not prevent that a surface wrinkles: stretches decide.
-    is_physical = (
-        end.stability_loss is not None
-        and end.stability_loss.is_surface_instability
-    )
+    is_physical = end.stability_loss is not None and end.stability_loss.is_surface_instability
     sentence = (
         "The recording cannot be simulated to its end:"
         if is_physical
@@ -143,18 +138,13 @@ class Recorder:
             Loss L at z, without the scaling of the NLP; it is not evaluated again.
         """
         collocation = self.collocation
-        violation_n = max(
-            float(np.abs(r).max(initial=0.0))
-            for r in collocation.residuals_n(z)
-        )
+        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in collocation.residuals_n(z))
         line = Iteration(
             number,
             loss,
             rms_m=collocation.rms_marker_distance_m(z),
             violation_n=violation_n,
-            parameters=collocation.parameters.scalar_values(
-                z[: collocation.nq]
-            ),
+            parameters=collocation.parameters.scalar_values(z[: collocation.nq]),
             time_s=self.measure_elapsed_s(),
         )
         self.add(line)

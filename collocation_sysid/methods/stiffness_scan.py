@@ -180,9 +180,7 @@ def start_problem(
     return collocation.with_parameters(result.parameters), result
 
 
-def rescue(
-    collocation: Collocation, reason: str, is_complete: bool = False
-) -> Scan | None:
+def rescue(collocation: Collocation, reason: str, is_complete: bool = False) -> Scan | None:
     """Return a scan without the given guesses, see `without_guesses`; None if no modulus is free on
     a logarithmic scale, or `scan_stiffness` finds no start.
 
@@ -198,9 +196,7 @@ def rescue(
     if not _has_free_modulus(collocation):
         return None
     try:
-        return scan_stiffness(
-            without_guesses(collocation), reason, is_complete=is_complete
-        )
+        return scan_stiffness(without_guesses(collocation), reason, is_complete=is_complete)
     except InputError:
         return None
 
@@ -229,9 +225,7 @@ def scan_stiffness(
         from the best one on.
     """
     began = time.perf_counter()
-    trial = TrialSimulation(
-        collocation.with_parameters(_with_units(collocation.parameters, 1.0))
-    )
+    trial = TrialSimulation(collocation.with_parameters(_with_units(collocation.parameters, 1.0)))
     trials = ScanState(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
     with counted_phase(StepUnit.STIFFNESS, STEPS):
@@ -259,10 +253,7 @@ def scan_stiffness(
     best = int(np.flatnonzero(young_pa == candidates[0])[0])
     start = typical_parameters(collocation.parameters, candidates[0])
     others = other_starts(misfit, best) if not is_complete else ()
-    starts = {
-        k: typical_parameters(collocation.parameters, young_pa[k])
-        for k in (best, *others)
-    }
+    starts = {k: typical_parameters(collocation.parameters, young_pa[k]) for k in (best, *others)}
     return Scan(
         reason,
         young_pa,
@@ -293,14 +284,11 @@ def other_starts(misfit: Array, best: int) -> tuple[int, ...]:
     known = np.where(np.isfinite(misfit), misfit, np.inf)
     padded = np.concatenate([[np.inf], known, [np.inf]])
     is_minimum = (known < padded[:-2]) & (known <= padded[2:])
-    candidates = {best - 1, best + 1, *np.flatnonzero(is_minimum).tolist()} - {
-        best
-    }
+    candidates = {best - 1, best + 1, *np.flatnonzero(is_minimum).tolist()} - {best}
     possible = [
         k
         for k in candidates
-        if 0 <= k < len(known)
-        and known[k] <= EQUIVALENT_LOSS_RATIO * known[best]
+        if 0 <= k < len(known) and known[k] <= EQUIVALENT_LOSS_RATIO * known[best]
     ]
     return tuple(sorted(possible, key=lambda k: known[k])[:MORE_STARTS])
 
@@ -314,9 +302,7 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
     have a prior or a typical value, which parameters are required to have where they are made.
     """
     guesses = {
-        i.name: i.guess
-        for i in parameters.components
-        if i.tied is None and i.guess is not None
+        i.name: i.guess for i in parameters.components if i.tied is None and i.guess is not None
     }
 
     def initial_value(item: Parameter) -> float:
@@ -324,9 +310,7 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
         if item.guess is not None:
             return item.guess
         region, dot, _ = item.name.rpartition(".")
-        poisson = guesses.get(
-            f"{region}{dot}poisson", guesses.get("poisson", 0.3)
-        )
+        poisson = guesses.get(f"{region}{dot}poisson", guesses.get("poisson", 0.3))
         usual = usual_value(item.name, young_pa, poisson=poisson)
         if item.prior is not None:
             usual = item.prior[0]
@@ -334,9 +318,7 @@ def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
         return float(np.clip(usual, item.lower, item.upper))
 
     sized = _with_units(parameters, young_pa)
-    return sized.with_guess(
-        {item.name: initial_value(item) for item in parameters.free}
-    )
+    return sized.with_guess({item.name: initial_value(item) for item in parameters.free})
 
 
 def typical_constants(parameters: Parameters) -> dict[str, float]:
@@ -349,22 +331,11 @@ def typical_constants(parameters: Parameters) -> dict[str, float]:
 def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
     """Return the moduli [Pa] that could be simulated: the one with the smallest misfit, followed by
     the stiffer ones in ascending order; softer ones are left out. Empty if none could be simulated.
-
-    Parameters
-    ----------
-    young_pa : (k,) array
-        Young's moduli, ascending [Pa].
-    misfit : (k,) array
-        Misfit at each modulus; NaN where the simulation failed.
     """
     if np.isnan(misfit).all():
         return []
     best = int(np.nanargmin(misfit))
-    return [
-        float(young_pa[k])
-        for k in range(best, len(young_pa))
-        if np.isfinite(misfit[k])
-    ]
+    return [float(young_pa[k]) for k in range(best, len(young_pa)) if np.isfinite(misfit[k])]
 
 
 def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
@@ -391,42 +362,20 @@ def without_guesses(collocation: Collocation) -> Collocation:
 
     def without_guess(item: Parameter) -> Parameter:
         """Return the parameter without its guess, if that can be replaced."""
-        is_replaceable = (
-            item.prior is not None or usual_value(item.name, 1.0) is not None
-        )
-        return (
-            replace(item, guess=None)
-            if is_replaceable and item in free
-            else item
-        )
+        is_replaceable = item.prior is not None or usual_value(item.name, 1.0) is not None
+        return replace(item, guess=None) if is_replaceable and item in free else item
 
     free = collocation.parameters.free
-    return replace(
-        collocation,
-        parameters=collocation.parameters.map_components(without_guess),
-    )
+    return replace(collocation, parameters=collocation.parameters.map_components(without_guess))
 
 
-def _misfit(
-    collocation: Collocation, p: Array, positions: Sequence[Array]
-) -> float:
+def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
     """Return the root mean square of all residuals on the first rows, in standard deviations.
 
     Markers of unknown position are associated with the body at the first samples.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Problem; not modified.
-    p : (np,) array
-        Parameters (q, φ).
-    positions : sequence of (rows, 3n) array
-        First rows of each trajectory [m].
     """
     # Cameras are compared by `rough_residuals`, which need no correspondences.
-    collocation, p = collocation.place_unknown_markers(
-        p, positions, only_poses=True
-    )
+    collocation, p = collocation.place_unknown_markers(p, positions, only_poses=True)
     parts = collocation.iterates_at(p, positions)
     return root_mean(np.concatenate([_residuals(part) for part in parts]) ** 2)
 
@@ -443,16 +392,16 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     slopes = []
     predictions = iterate.linearise_fixed_motion()
     for reading, (residual, slope) in zip(
-        iterate.segment.residuals, predictions, strict=True
+        iterate.transcription.residuals, predictions, strict=True
     ):
         rough = reading.rough_residuals(iterate.x, iterate.phi)
         if rough is not None:
             residuals.append(rough)
             slopes.append(np.zeros((len(rough), slope.shape[-1])))
             continue
-        is_compared = reading.compared_with(
-            len(iterate.observables[len(residuals)])
-        )[: len(residual)]
+        is_compared = reading.compared_with(len(iterate.observables[len(residuals)]))[
+            : len(residual)
+        ]
         residuals.append(residual[is_compared])
         slopes.append(slope[is_compared] * reading.has_offsets)
     residual = np.concatenate(residuals)
@@ -462,9 +411,7 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     residual = np.append(residual, np.zeros(len(priors)))
     offset_slopes = np.concatenate([offset_slopes, priors])
     return (
-        residual
-        - offset_slopes
-        @ np.linalg.lstsq(offset_slopes, residual, rcond=None)[0]
+        residual - offset_slopes @ np.linalg.lstsq(offset_slopes, residual, rcond=None)[0]
         if offset_slopes.size
         else residual
     )
@@ -475,18 +422,12 @@ def _compared_samples(transcription: Transcription) -> int:
     and at least one sample of each measurement; at most all.
     """
     t_s = transcription.experiment.t_s
-    first_samples = [
-        transcription.experiment.markers.find_first_visible_sample()
-    ]
+    first_samples = [transcription.experiment.markers.find_first_visible_sample()]
     for reading in transcription.residuals[1:]:
         first_samples.append(
-            int(np.searchsorted(t_s, reading.first_needed_s))
-            + reading.observable.delay_steps
+            int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
         )
-    return min(
-        len(t_s),
-        max(samples_in_share(len(t_s), SHARES[0]), max(first_samples) + 1),
-    )
+    return min(len(t_s), max(samples_in_share(len(t_s), SHARES[0]), max(first_samples) + 1))
 
 
 class TrialSimulation:
@@ -514,10 +455,10 @@ class TrialSimulation:
         self.samples = []
         self.rows = []
         self.all_rows = []
-        for segment in collocation.transcriptions:
-            self.samples.append(_compared_samples(segment))
-            self.rows.append((self.samples[-1] - 1) * segment.substeps + 1)
-            self.all_rows.append(segment.grid_times)
+        for transcription in collocation.transcriptions:
+            self.samples.append(_compared_samples(transcription))
+            self.rows.append((self.samples[-1] - 1) * transcription.substeps + 1)
+            self.all_rows.append(transcription.grid_times)
         self.failure: SimulationError | None = None
 
     @cached_property
@@ -526,20 +467,14 @@ class TrialSimulation:
         recordings, in standard deviations; every parameter must have a guess.
         """
         positions = []
-        for segment, rows in zip(
-            self.collocation.transcriptions, self.rows, strict=True
-        ):
-            rigid_positions = segment.experiment.rigid_positions(
-                segment.dynamics.t_s[:rows]
+        for transcription, rows in zip(self.collocation.transcriptions, self.rows, strict=True):
+            rigid_positions = transcription.experiment.rigid_positions(
+                transcription.dynamics.t_s[:rows]
             )
             positions.append(rigid_positions.reshape(rows, -1))
-        return _misfit(
-            self.collocation, self.collocation.guess_p, positions=positions
-        )
+        return _misfit(self.collocation, self.collocation.guess_p, positions=positions)
 
-    def evaluate_guess(
-        self, is_complete: bool
-    ) -> tuple[float, SimulationError | None]:
+    def evaluate_guess(self, is_complete: bool) -> tuple[float, SimulationError | None]:
         """Return the misfit of the guess and None, or NaN and the failure of its simulation.
 
         With `is_complete` the complete recordings are simulated; the misfit is always that of their
@@ -548,10 +483,7 @@ class TrialSimulation:
         """
         p = self.collocation.guess_p
         positions, failure = simulate_trajectories(
-            self.collocation,
-            p,
-            rows=self.all_rows if is_complete else self.rows,
-            options=LOOSE,
+            self.collocation, p, rows=self.all_rows if is_complete else self.rows, options=LOOSE
         )
         if failure is not None:
             return np.nan, failure
@@ -584,10 +516,7 @@ class TrialSimulation:
         succeeds; if not, the error is stored in `failure`.
         """
         _, failure = simulate_trajectories(
-            self.collocation,
-            self._p(young_pa),
-            rows=self.all_rows,
-            options=LOOSE,
+            self.collocation, self._p(young_pa), rows=self.all_rows, options=LOOSE
         )
         self.failure = failure or self.failure
         return failure is None
@@ -608,13 +537,6 @@ class TrialSimulation:
     def _evaluate(self, p: Array, positions: Sequence[Array]) -> float:
         """Return the misfit of the first part of the recordings, see `_misfit`; NaN if it is not
         finite.
-
-        Parameters
-        ----------
-        p : (np,) array
-            Parameters (q, φ).
-        positions : sequence of (N, 3n) array
-            Trajectory of each experiment [m], of which the first `rows` are used.
         """
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
         misfit = _misfit(self.collocation, p, positions=first)
@@ -653,17 +575,11 @@ class ScanState:
         same parameters only one is tried.
         """
         failures = 0
-        first, *others = (
-            [*same] for _, same in groupby(young_pa, self.trial.parameter_key)
-        )
+        first, *others = ([*same] for _, same in groupby(young_pa, self.trial.parameter_key))
         for young in (first[-1], *(same[0] for same in others)):
             misfit = self._try(young)
-            finite_misfits = [
-                m for m in self.misfits.values() if np.isfinite(m)
-            ]
-            is_failure = bool(finite_misfits) and not misfit <= WORSE * min(
-                finite_misfits
-            )
+            finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
+            is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
             failures = failures + 1 if is_failure else 0
             if failures == CONSECUTIVE_FAILURES:
                 self.is_ended_early = True
@@ -686,9 +602,7 @@ class ScanState:
         best = self.misfits[young_pa]
         beyond = young_pa * factor
         while LIMITS_PA[1] < beyond < LIMITS_PA[0]:
-            if self.trial.parameter_key(beyond) == self.trial.parameter_key(
-                beyond / factor
-            ):
+            if self.trial.parameter_key(beyond) == self.trial.parameter_key(beyond / factor):
                 return
             misfit = self._try(beyond)
             if not misfit < (1 - BETTER) * best:
@@ -702,9 +616,7 @@ class ScanState:
         False if no modulus could be simulated, and for the softest end if the scan ended before it.
         `softest` selects the end.
         """
-        finite_misfits = {
-            young: m for young, m in self.misfits.items() if np.isfinite(m)
-        }
+        finite_misfits = {young: m for young, m in self.misfits.items() if np.isfinite(m)}
         if not finite_misfits or (softest and self.is_ended_early):
             return False
         best = min(finite_misfits, key=lambda young: finite_misfits[young])

@@ -56,9 +56,7 @@ class FitSummary:
     samples: int
 
     @classmethod
-    def from_iterate(
-        cls, iterate: ExperimentIterate, x: Array, violation_n: float
-    ) -> FitSummary:
+    def from_iterate(cls, iterate: ExperimentIterate, x: Array, violation_n: float) -> FitSummary:
         """Return the fit of positions x (rows, 3n) [m] to the markers at the parameters of an
         experiment; other measurements do not count.
 
@@ -71,13 +69,8 @@ class FitSummary:
         violation_n : float
             Largest residual of the equations of motion [N], as the caller knows it.
         """
-        squares = iterate.segment.markers.squared_distances_m2(x, iterate.phi)
-        return cls(
-            len(x),
-            violation_n,
-            squares_m2=float(squares.sum()),
-            samples=len(squares),
-        )
+        squares = iterate.transcription.markers.squared_distances_m2(x, iterate.phi)
+        return cls(len(x), violation_n, squares_m2=float(squares.sum()), samples=len(squares))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +124,7 @@ class LinearisedTrajectory(SweepResult):
         cls, result: SweepResult, slope: Array, report: SweepReport
     ) -> LinearisedTrajectory:
         """Return a sweep result with the linearised residuals; arguments as the attributes."""
-        swept = {
-            field.name: getattr(result, field.name)
-            for field in fields(SweepResult)
-        }
+        swept = {field.name: getattr(result, field.name) for field in fields(SweepResult)}
         return cls(**swept, slope=slope, report=report)
 
     def __sizeof__(self) -> int:
@@ -164,9 +154,7 @@ class SimulationResult:
     times_s: tuple[float, float, float]
 
 
-def trajectory_positions(
-    trajectory: LinearisedTrajectory | SimulationResult | Array,
-) -> Array:
+def trajectory_positions(trajectory: LinearisedTrajectory | SimulationResult | Array) -> Array:
     """Return the positions (rows, 3n) [m] of a sweep result (before its feasibility step) or of a
     simulation; an array of positions is returned as it is.
     """
@@ -217,11 +205,7 @@ def sweep(
     return _linearised_trajectory(
         part,
         solver.forward(
-            part.x,
-            part.equations,
-            known=known_sweep,
-            accuracy=accuracy,
-            similar=previous,
+            part.x, part.equations, known=known_sweep, accuracy=accuracy, similar=previous
         ),
         previous=previous,
         times_s=solver.stopwatch.read_and_reset(),
@@ -263,19 +247,10 @@ def sweep_after_step(
     SimulationError
         If a time step is singular or not finite, or a node has no mass.
     """
-    part = _iterate(
-        transcription, p, x=extrapolate(transcription, previous, step=step)
-    )
+    part = _iterate(transcription, p, x=extrapolate(transcription, previous, step=step))
     dynamics = part.equations.dynamics
 
-    sweep_from = partial(
-        sweep,
-        solver,
-        transcription,
-        p,
-        previous=previous,
-        accuracy=accuracy,
-    )
+    sweep_from = partial(sweep, solver, transcription, p, previous=previous, accuracy=accuracy)
 
     def equilibria(options: NewtonOptions) -> Array | None:
         """Return the equilibria near the extrapolated positions; None if one is not found."""
@@ -302,10 +277,7 @@ def sweep_after_step(
 
 
 def reassociate(
-    solver: Sweep,
-    transcription: Transcription,
-    p: Array,
-    sweep_result: LinearisedTrajectory,
+    solver: Sweep, transcription: Transcription, p: Array, sweep_result: LinearisedTrajectory
 ) -> LinearisedTrajectory:
     """Return the sweep with its measurements evaluated by another transcription.
 
@@ -332,9 +304,7 @@ def reassociate(
 
 
 def extrapolate(
-    transcription: Transcription,
-    sweep_result: LinearisedTrajectory,
-    step: Array,
+    transcription: Transcription, sweep_result: LinearisedTrajectory, step: Array
 ) -> Array:
     """Return positions (rows, 3n) [m] after the feasibility step of `sweep_result` and a step (k,)
     of the experiment's parameters, to first order. The sweep is that of the `transcription`; it is
@@ -388,13 +358,9 @@ def simulate_rows(
     )
     if failure is not None:
         failure = explain_failure(
-            transcription.experiment,
-            part.equations.dynamics.theta,
-            error=failure,
+            transcription.experiment, part.equations.dynamics.theta, error=failure
         )
-    return SimulationResult(
-        x, failure, times_s=solver.stopwatch.read_and_reset()
-    )
+    return SimulationResult(x, failure, times_s=solver.stopwatch.read_and_reset())
 
 
 def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
@@ -407,13 +373,9 @@ def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
     )
 
 
-def _iterate(
-    transcription: Transcription, p: Array, x: Array
-) -> ExperimentIterate:
+def _iterate(transcription: Transcription, p: Array, x: Array) -> ExperimentIterate:
     """Return the experiment at parameters p (k,) and positions x (rows, 3n)."""
-    return ExperimentIterate(
-        transcription, p[: transcription.nq], phi=p[transcription.nq :], x=x
-    )
+    return ExperimentIterate(transcription, p[: transcription.nq], phi=p[transcription.nq :], x=x)
 
 
 def _linearised_trajectory(
@@ -424,51 +386,29 @@ def _linearised_trajectory(
 ) -> LinearisedTrajectory:
     """Return the sweep result with the measurement residuals and slopes after the feasibility step,
     as least squares with Huber's loss.
-
-    Parameters
-    ----------
-    iterate : ExperimentIterate
-        Experiment at the parameters and positions of the sweep.
-    swept : SweepResult
-        Feasibility step and sensitivities.
-    previous : LinearisedTrajectory or None
-        Previous trajectory; for None the change of positions and `previous_slopes_residual` are
-        zero.
-    times_s : tuple of three floats
-        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     """
     response = ObservableResponse.from_array(
         iterate, swept.by_p, swept.grasp_forces, step=swept.step
     )
-    matches = zip(response.linearise(), iterate.segment.residuals, strict=True)
+    matches = zip(response.linearise(), iterate.transcription.residuals, strict=True)
     residuals_and_slopes = [
-        huber_as_least_squares(*each, reading.huber)
-        for each, reading in matches
+        huber_as_least_squares(*each, reading.huber) for each, reading in matches
     ]
-    residual = np.concatenate(
-        [values.ravel() for values, _ in residuals_and_slopes]
-    )
+    residual = np.concatenate([values.ravel() for values, _ in residuals_and_slopes])
     slope = np.concatenate(
-        [
-            by.reshape(values.size, by.shape[-1])
-            for values, by in residuals_and_slopes
-        ]
+        [by.reshape(values.size, by.shape[-1]) for values, by in residuals_and_slopes]
     )
     summary = FitSummary.from_iterate(
         iterate, iterate.x + swept.step, violation_n=swept.violation_n
     )
     report = SweepReport(
         **vars(summary),
-        fit=SquareRootInformation.empty(slope.shape[1]).with_rows(
-            residual, slope
-        ),
+        fit=SquareRootInformation.empty(slope.shape[1]).with_rows(residual, slope),
         previous_slopes_residual=np.zeros(slope.shape[1])
         if previous is None
         else previous.slope.T @ residual,
         feasibility_m=float(np.abs(swept.step).max()),
-        position_change_m=0.0
-        if previous is None
-        else float(np.abs(iterate.x - previous.x).max()),
+        position_change_m=0.0 if previous is None else float(np.abs(iterate.x - previous.x).max()),
         indefinite_steps=swept.indefinite_count,
         times_s=times_s,
     )

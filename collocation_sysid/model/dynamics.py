@@ -30,11 +30,7 @@ from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
 from .force_internal_variables import ForceHistory
 from .forces import Forces
-from .internal_variables import (
-    AnyHistory,
-    histories_of_trajectory,
-    insert_histories,
-)
+from .internal_variables import AnyHistory, histories_of_trajectory, insert_histories
 from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
 from .weight import DofMasses
 
@@ -58,24 +54,15 @@ class StencilTables:
     r: Array = field(metadata=over_time())
 
     @classmethod
-    def from_scheme(
-        cls, scheme: Scheme, rows: int, first_row: int
-    ) -> StencilTables:
+    def from_scheme(cls, scheme: Scheme, rows: int, first_row: int) -> StencilTables:
         """Return the tables of rows 0 … `rows` − 1; rows before `first_row` are zero. Row 0 has the
         stencil of statics.
         """
-        p, q, w, s = (
-            np.zeros((rows, scheme.compute_largest_lag() + 1)) for _ in range(4)
-        )
+        p, q, w, s = (np.zeros((rows, scheme.compute_largest_lag() + 1)) for _ in range(4))
         r = np.zeros(rows)
         for row in range(first_row, rows):
             stencil = scheme.stencil(row)
-            for table, values in (
-                (p, stencil.p),
-                (q, stencil.q),
-                (w, stencil.w),
-                (s, stencil.s),
-            ):
+            for table, values in ((p, stencil.p), (q, stencil.q), (w, stencil.w), (s, stencil.s)):
                 table[row, : len(values)] = values
             r[row] = stencil.r
         return cls(p, q, w=w, s=s, r=r)
@@ -156,17 +143,10 @@ class Dynamics:
         """
         if experiment.is_static:
             t_s = experiment.t_s
-            table = (
-                SLIDING
-                if any(o.has_friction for o in experiment.obstacles)
-                else QUASI_STATIC
-            )
+            table = SLIDING if any(o.has_friction for o in experiment.obstacles) else QUASI_STATIC
         else:
             rows = (len(experiment.t_s) - 1) * substeps + 1
-            t_s = (
-                experiment.t_s[0]
-                + np.arange(rows) * experiment.timestep_s / substeps
-            )
+            t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
             table = as_scheme(scheme, experiment.start_rule)
         rows = len(t_s)
         first_row = 0 if experiment.start == "equilibrium" else 1
@@ -178,9 +158,7 @@ class Dynamics:
         averaged_s = 0.0
         if not experiment.is_static and table.is_midpoint():
             averaged_s = experiment.timestep_s / substeps
-        forces = Forces.from_experiment(
-            experiment, evaluated_s, step_s=averaged_s
-        )
+        forces = Forces.from_experiment(experiment, evaluated_s, step_s=averaged_s)
         goals = experiment.prescribed_displacements(t_s)[1].reshape(rows, -1)
         is_prescribed = ~np.isnan(goals)
         is_prescribed[:, experiment.prescribed_dofs] = False
@@ -194,9 +172,7 @@ class Dynamics:
             prescribed_m=goals,
             is_temporarily_prescribed=is_prescribed,
             evaluated_s=evaluated_s,
-            start_velocity_m_s=np.zeros(dofs)
-            if velocity is None
-            else np.array(velocity).ravel(),
+            start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
             is_static=experiment.is_static,
         )
@@ -217,18 +193,14 @@ class Dynamics:
         """Return these equations with other forces, and with the masses of these forces."""
         if forces.mass is self.forces.mass:
             return replace(self, forces=forces)
-        return replace(
-            self, forces=forces, mass=_row_masses(self.tables, forces.mass)
-        )
+        return replace(self, forces=forces, mass=_row_masses(self.tables, forces.mass))
 
     def rows_to_evaluations(self, row_values: Array) -> Array:
         """Return quantities of the rows (N, …), distributed to the evaluations (N, …) by the
         transpose of `evaluations_to_rows`. A row without forces has its value at its own
         evaluation.
         """
-        total = self.tables.w.sum(axis=1).reshape(
-            (-1,) + (1,) * (row_values.ndim - 1)
-        )
+        total = self.tables.w.sum(axis=1).reshape((-1,) + (1,) * (row_values.ndim - 1))
         shares = row_values / np.where(total == 0, 1.0, total)
         return np.where(total == 0, row_values, 0.0) + self.combine_transposed(
             self.tables.w, shares
@@ -308,9 +280,7 @@ class Dynamics:
         if self.is_static:
             return np.append(np.diff(self.t_s), 1.0)
         lags = self.tables.p @ np.arange(self.largest_lag + 1.0)
-        return self.step_s * np.append(
-            np.diff(np.arange(self.row_count) - lags), 1.0
-        )
+        return self.step_s * np.append(np.diff(np.arange(self.row_count) - lags), 1.0)
 
     @property
     def theta(self) -> Array:
@@ -331,10 +301,7 @@ class Dynamics:
             Given internal variables of the previous evaluation, by the index of the history in the
             result. Internal variables that are not given are computed from x.
         """
-        if not (
-            self.body.has_memory
-            or self.forces.find_terms_with_internal_variables()
-        ):
+        if not (self.body.has_memory or self.forces.find_terms_with_internal_variables()):
             return ()
         first_rows = slice(len(x))
         states = self.all_evaluation_states(x)
@@ -398,9 +365,7 @@ class Dynamics:
             Indices of the rows; by default all from `first_row` on.
         """
         rows = slice(self.first_row, self.row_count) if rows is None else rows
-        return insert_histories(
-            at_times(self.forces, rows), histories, rows=rows
-        )
+        return insert_histories(at_times(self.forces, rows), histories, rows=rows)
 
     def combine(self, table: Array, rows: Array) -> Array:
         """Return Σ_i table[t, i] rows[t − i] for every t, from coefficients (N, lags) and `rows`
@@ -466,10 +431,7 @@ class Dynamics:
         total = np.zeros_like(x)
         total[self.first_row :] = force
         inertia = self.mass.inertia_kg * self.acceleration(x)
-        return (
-            self.combine(self.tables.w, self.zero_prescribed_forces(total))
-            - inertia
-        )
+        return self.combine(self.tables.w, self.zero_prescribed_forces(total)) - inertia
 
     def zero_prescribed_forces(self, rows: Array) -> Array:
         """Set the forces at temporarily prescribed dofs to zero, in place, and return the array.
@@ -487,19 +449,14 @@ class Dynamics:
         rows before `first_row` and in static experiments.
         """
         acceleration = self.combine(self.tables.s, x) / self.step_s**2
-        acceleration += np.outer(
-            self.tables.r / self.step_s, self.start_velocity_m_s
-        )
+        acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
         return acceleration
 
     def linearise(
-        self,
-        x: Array,
-        out: Array | None = None,
-        histories: Sequence[AnyHistory] = (),
+        self, x: Array, out: Array | None = None, histories: Sequence[AnyHistory] = ()
     ) -> Linearisation:
-        """Return forces and derivatives at the evaluation states of x, for the rows from `first_row`
-        on: T = N − first_row in the shapes of `Linearisation`.
+        """Return forces and derivatives at the evaluation states of x, for the rows from
+        `first_row` on: T = N − first_row in the shapes of `Linearisation`.
 
         Forces at temporarily prescribed dofs are included, see `zero_prescribed_forces`.
 
@@ -557,12 +514,10 @@ def _combine(table: Array, rows: Array) -> Array:
 
 
 def _row_masses(tables: StencilTables, at_evaluations: DofMasses) -> DofMasses:
-    """Return the mass in each row, from the mass at the evaluations: tied masses are averaged with the
-    weights of the forces, the others are constant.
+    """Return the mass in each row, from the mass at the evaluations: tied masses are averaged with
+    the weights of the forces, the others are constant.
     """
-    return replace(
-        at_evaluations, tied_kg=_evaluation_mean(tables, at_evaluations.tied_kg)
-    )
+    return replace(at_evaluations, tied_kg=_evaluation_mean(tables, at_evaluations.tied_kg))
 
 
 def _evaluation_mean(tables: StencilTables, at_evaluations: Array) -> Array:
@@ -575,9 +530,7 @@ def _evaluation_mean(tables: StencilTables, at_evaluations: Array) -> Array:
     """
     if (at_evaluations == at_evaluations[:1]).all():
         return at_evaluations
-    total = tables.w.sum(axis=1).reshape(
-        (-1,) + (1,) * (at_evaluations.ndim - 1)
-    )
+    total = tables.w.sum(axis=1).reshape((-1,) + (1,) * (at_evaluations.ndim - 1))
     mean = _combine(tables.w, at_evaluations) / np.where(total == 0, 1.0, total)
     return np.where(total == 0, at_evaluations, mean)
 
@@ -624,9 +577,7 @@ class StencilRow:
         """
         return [i for i in range(1, len(self.p)) if self.p[i] or self.q[i]]
 
-    def block(
-        self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern
-    ) -> Array:
+    def block(self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern) -> Array:
         """Return the lower triangle (m,) of −∂c_t/∂x_t, symmetric part.
 
         Parameters
@@ -641,9 +592,7 @@ class StencilRow:
         values[pattern.diagonal] += self.s[0] * self.mass_kg
         return values
 
-    def skew_block(
-        self, by_position_skew: Array, by_velocity_skew: Array
-    ) -> Array:
+    def skew_block(self, by_position_skew: Array, by_velocity_skew: Array) -> Array:
         """Return the lower triangle, (m,) or (0,), of the skew part of −∂c_t/∂x_t.
 
         Parameters
@@ -651,22 +600,14 @@ class StencilRow:
         by_position_skew, by_velocity_skew : (m,) or (0,)
             Lower triangles of the skew parts of G and C; empty where there is no such part.
         """
-        return -self.w[0] * self.skew(
-            0, by_position_skew, by_velocity_skew=by_velocity_skew
-        )
+        return -self.w[0] * self.skew(0, by_position_skew, by_velocity_skew=by_velocity_skew)
 
-    def skew(
-        self, lag: int, by_position_skew: Array, by_velocity_skew: Array
-    ) -> Array:
+    def skew(self, lag: int, by_position_skew: Array, by_velocity_skew: Array) -> Array:
         """Return the skew part (m,) of p G + q C at a lag, from those of G (m,) and C (m,); that of
         C may be empty, which stands for zero.
         """
         skew_part = self.p[lag] * by_position_skew
-        return (
-            skew_part + self.q[lag] * by_velocity_skew
-            if by_velocity_skew.size
-            else skew_part
-        )
+        return skew_part + self.q[lag] * by_velocity_skew if by_velocity_skew.size else skew_part
 
 
 def weighted_sum_of_past(
@@ -684,9 +625,7 @@ def weighted_sum_of_past(
     shape : tuple of int
         Shape of the result where no coefficient is nonzero.
     """
-    terms = [
-        c * item for c, item in zip(coefficients[1:], past, strict=False) if c
-    ]
+    terms = [c * item for c, item in zip(coefficients[1:], past, strict=False) if c]
     if not terms:
         return np.zeros(shape)
     for term in terms[1:]:

@@ -52,9 +52,7 @@ class EquationsAtParameters:
         """Derivatives ∂θ/∂p of the constants (k, m); zero for the nuisance parameters among p."""
         return np.array(self.input_derivatives[0, : len(self.dynamics.theta)])
 
-    def force_derivatives(
-        self, rows: int | slice, input_slopes: Array
-    ) -> Array:
+    def force_derivatives(self, rows: int | slice, input_slopes: Array) -> Array:
         """Return the derivatives ∂F/∂p (…, 3n, m) of the total forces at some evaluations, at fixed
         states: ∂F/∂u ∂u/∂p.
 
@@ -66,9 +64,7 @@ class EquationsAtParameters:
             Derivatives of the forces by the inputs at these evaluations.
         """
         return input_slopes @ (
-            self.input_derivatives[0]
-            if self._is_constant_in_time
-            else self.input_derivatives[rows]
+            self.input_derivatives[0] if self._is_constant_in_time else self.input_derivatives[rows]
         )
 
     @property
@@ -108,9 +104,9 @@ class EquationsAtParameters:
         if not self.mass_depends_on_parameters:
             return 0.0
         masses = self.dynamics.forces.mass_derivatives
-        by_p = self._row_input_derivatives[
-            0 if self._is_constant_in_time else rows
-        ][..., [*masses], :]
+        by_p = self._row_input_derivatives[0 if self._is_constant_in_time else rows][
+            ..., [*masses], :
+        ]
         mass = np.array([*masses.values()])[:, dofs]
         return acceleration[..., None] * (mass.T @ by_p)
 
@@ -135,9 +131,7 @@ class EquationsAtParameters:
         step_s = self.dynamics.step_s
         by_xi = force_curvature.position_theta @ self.input_derivatives
         by_nu = force_curvature.velocity_theta @ self.input_derivatives / step_s
-        by_x = dynamics.combine_transposed(
-            dynamics.compute_state_weights(), by_xi
-        )
+        by_x = dynamics.combine_transposed(dynamics.compute_state_weights(), by_xi)
         by_x += dynamics.combine_transposed(dynamics.tables.q, by_nu)
         by_u = force_curvature.theta
         inertia = np.zeros_like(force_curvature.theta)
@@ -149,10 +143,7 @@ class EquationsAtParameters:
             mass_derivatives = row_weights[..., None] * (
                 mass.T @ self._row_input_derivatives[:, places]
             )
-            by_x -= (
-                dynamics.combine_transposed(dynamics.tables.s, mass_derivatives)
-                / step_s**2
-            )
+            by_x -= dynamics.combine_transposed(dynamics.tables.s, mass_derivatives) / step_s**2
             inertia[:, places] = (row_weights * acceleration) @ mass.T
             by_u = by_u - dynamics.rows_to_evaluations(inertia)
         second_order = (
@@ -160,6 +151,4 @@ class EquationsAtParameters:
             @ force_curvature.theta_theta
             @ self.input_derivatives
         )
-        return by_x, second_order.sum(axis=0) + self.inputs.weighted_hessian(
-            self.p, by_u
-        )
+        return by_x, second_order.sum(axis=0) + self.inputs.weighted_hessian(self.p, by_u)

@@ -83,24 +83,18 @@ class ForceHistory:
         """
         term = forces.pointwise_term(number)[0]
         shape = term.internal_variable_count, len(xi), term.points.count
-        previous = PreviousState(
-            np.zeros(shape) if before is None else before, since_s
-        )
+        previous = PreviousState(np.zeros(shape) if before is None else before, since_s)
         history = cls(forces, number, xi=xi, nu=nu, previous_state=previous)
         if before is None:
             for k in range(len(xi) - 1):
-                previous.before[:, k + 1] = history.internal_variables(
-                    slice(k, k + 1)
-                )[:, 0]
+                previous.before[:, k + 1] = history.internal_variables(slice(k, k + 1))[:, 0]
         return history
 
     def internal_variables(self, rows: slice) -> Array:
         """Return the internal variables h (n, T, I) after some evaluations."""
         return self.term_at(rows).internal_variables(self._states(rows))
 
-    def term_at(
-        self, rows: slice, variable_weights: Array | None = None
-    ) -> Pointwise:
+    def term_at(self, rows: slice, variable_weights: Array | None = None) -> Pointwise:
         """Return the force term at some evaluations, with its previous internal variables.
 
         Parameters
@@ -138,9 +132,7 @@ class ForceHistory:
         """Return the derivatives of F and h at the evaluations `rows`, each (d + n, …, T, I): first
         those of the d forces, then of the n internal variables.
         """
-        return self._without_static_velocity(
-            self.term_at(rows).derivatives(self._states(rows))
-        )
+        return self._without_static_velocity(self.term_at(rows).derivatives(self._states(rows)))
 
     def _without_static_velocity(self, parts: LawDerivatives) -> LawDerivatives:
         """Return the derivatives; those by ẏ are zero if the force gets no velocities, in a static
@@ -167,9 +159,7 @@ class ForceHistory:
         inputs.
         """
 
-    def mixed_second_derivatives(
-        self, mu: Array, weights: Array
-    ) -> LawDerivatives:
+    def mixed_second_derivatives(self, mu: Array, weights: Array) -> LawDerivatives:
         """Return the second derivatives of weights · F + μ · h by (u, b), each (…, n, N, I).
 
         Parameters
@@ -181,18 +171,13 @@ class ForceHistory:
         """
         all_rows = slice(None)
         return self._without_static_velocity(
-            self.term_at(all_rows, mu).mixed_second_derivatives(
-                self._states(all_rows), weights
-            )
+            self.term_at(all_rows, mu).mixed_second_derivatives(self._states(all_rows), weights)
         )
 
     # Along a motion -------------------------------------------------------------------------------
 
     def forward_columns(
-        self,
-        by_p: Callable[[int], Array],
-        done: int = 0,
-        known: Array | None = None,
+        self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
     ) -> ForceForwardColumns:
         """Return an iterator of the columns db forward in time, see `ForceForwardColumns`.
 
@@ -211,9 +196,7 @@ class ForceHistory:
         """Return an iterator of the weights μ backward in time, see `ForceAdjoint`."""
         return ForceAdjoint(self)
 
-    def vector_jacobian_product(
-        self, force_weights: Array, by_p: Array
-    ) -> HistoryGradient:
+    def vector_jacobian_product(self, force_weights: Array, by_p: Array) -> HistoryGradient:
         """Return the derivatives of Σ λ_k · F_k(h_{k−1}) through the internal variables h.
 
         Parameters
@@ -229,9 +212,7 @@ class ForceHistory:
         by_parameters = np.zeros(by_p.shape[2])
         for k in reversed(range(len(self.xi))):
             by_xi[k], by_nu[k] = pulling.state_gradient()
-            by_parameters += (
-                pulling.input_gradient() @ by_p[k][self.find_input_columns()]
-            )
+            by_parameters += pulling.input_gradient() @ by_p[k][self.find_input_columns()]
             pulling.step_back(force_weights[k])
         return HistoryGradient(by_xi, by_nu, by_parameters=by_parameters)
 
@@ -255,9 +236,7 @@ class ForcePreviousState:
     after: Array
 
     @classmethod
-    def from_state(
-        cls, forces: Forces, number: int, x: Array, v: Array
-    ) -> ForcePreviousState:
+    def from_state(cls, forces: Forces, number: int, x: Array, v: Array) -> ForcePreviousState:
         """Return the internal variables h after an evaluation at (x, v), (3n,) each.
 
         Parameters
@@ -270,11 +249,7 @@ class ForcePreviousState:
             Position [m] and velocity [m/s].
         """
         term = forces.pointwise_term(number)[0]
-        return cls(
-            number,
-            term,
-            after=term.internal_variables(forces.states_of_terms(x, v)(term)),
-        )
+        return cls(number, term, after=term.internal_variables(forces.states_of_terms(x, v)(term)))
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
         """Return `forces`, given at one time, in the same state, with the internal variables before
@@ -284,26 +259,20 @@ class ForcePreviousState:
         if previous is None:
             return forces
         return forces.with_term(
-            self.number,
-            forces.pointwise_term(self.number)[0].with_previous_state(previous),
+            self.number, forces.pointwise_term(self.number)[0].with_previous_state(previous)
         )
 
-    def insert_after_interval(
-        self, forces: Forces, interval_s: float
-    ) -> Forces:
+    def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
         """Return `forces`, given at one time, an interval [s] later than this state, with the
         internal variables after this evaluation as the previous ones. The argument and self are
         unchanged.
         """
         previous = PreviousState(self.after, np.array([interval_s]))
         return forces.with_term(
-            self.number,
-            forces.pointwise_term(self.number)[0].with_previous_state(previous),
+            self.number, forces.pointwise_term(self.number)[0].with_previous_state(previous)
         )
 
-    def advance(
-        self, forces: Forces, x: Array, v: Array, interval_s: float
-    ) -> ForcePreviousState:
+    def advance(self, forces: Forces, x: Array, v: Array, interval_s: float) -> ForcePreviousState:
         """Return the internal variables in the state (x, v) one interval later; self is unchanged.
 
         Parameters
@@ -317,10 +286,7 @@ class ForcePreviousState:
             Interval [s], positive: 0 would mean a start.
         """
         return ForcePreviousState.from_state(
-            self.insert_after_interval(forces, interval_s),
-            self.number,
-            x=x,
-            v=v,
+            self.insert_after_interval(forces, interval_s), self.number, x=x, v=v
         )
 
 
@@ -351,9 +317,7 @@ class _DerivativeIterator:
         d = self.points.dofs
         if chunk != self._chunk:
             self._chunk = chunk
-            self._parts = self.history.derivatives(
-                slice(chunk * CHUNK, (chunk + 1) * CHUNK)
-            )
+            self._parts = self.history.derivatives(slice(chunk * CHUNK, (chunk + 1) * CHUNK))
         now = [part[:, :, k] for part in self._parts]
         return LawDerivatives(*(part[:d] for part in now)), LawDerivatives(
             *(part[d:] for part in now)
@@ -397,14 +361,10 @@ class ForceForwardColumns(_DerivativeIterator):
         """Return the contribution of the internal variables to dF at the next evaluation, (3n,
         columns) [N]; the iterator does not advance.
         """
-        contribution = np.einsum(
-            "abi,bic->aci", self.derivatives()[0].b, self.columns
-        )
+        contribution = np.einsum("abi,bic->aci", self.derivatives()[0].b, self.columns)
         return self.points.assemble(contribution).T
 
-    def advance(
-        self, of_state: Callable[[], Array], of_rate: Callable[[], Array]
-    ) -> None:
+    def advance(self, of_state: Callable[[], Array], of_rate: Callable[[], Array]) -> None:
         """Pass the next evaluation: replace `columns` by a new array with the columns after it, and
         increase `next` by one.
 
@@ -420,9 +380,7 @@ class ForceForwardColumns(_DerivativeIterator):
         columns += np.einsum("abi,bc->aic", by.c, of_inputs)
         for part, state_change in ((by.y, of_state), (by.v, of_rate)):
             if part.any():
-                columns += np.einsum(
-                    "abi,bci->aic", part, self.points.vectors(state_change().T)
-                )
+                columns += np.einsum("abi,bci->aic", part, self.points.vectors(state_change().T))
         self.columns = columns
         self.next = self.next + 1
 
@@ -452,8 +410,7 @@ class ForceAdjoint(_DerivativeIterator):
         """
         by = self.derivatives()[1]
         by_x, by_v = (
-            self.points.assemble(self._weighted_by_mu(each)[:, None])[0]
-            for each in (by.y, by.v)
+            self.points.assemble(self._weighted_by_mu(each)[:, None])[0] for each in (by.y, by.v)
         )
         return by_x, by_v
 

@@ -101,9 +101,7 @@ class ForceTerm(ABC):
     def force(self, states: States) -> Array:
         """Return the forces F (T, 3n) [N]."""
 
-    def local_force(
-        self, theta: Array, pattern: SymmetricPattern
-    ) -> LocalForce:
+    def local_force(self, theta: Array, pattern: SymmetricPattern) -> LocalForce:
         """Return this force in one time step, with forces on the body alone; only if `is_local`.
 
         Parameters
@@ -135,10 +133,7 @@ class ForceTerm(ABC):
 
     @abstractmethod
     def add_derivatives(
-        self,
-        linearisation: Linearisation,
-        places: AssemblyIndices,
-        states: States,
+        self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
         """Add the forces and their first derivatives to a linearisation, in place.
 
@@ -153,11 +148,7 @@ class ForceTerm(ABC):
 
     @abstractmethod
     def add_second_derivatives(
-        self,
-        curvature: SecondDerivatives,
-        places: AssemblyIndices,
-        states: States,
-        weights: Array,
+        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
         """Add the second derivatives of weightsᵀ F by positions, velocities and inputs to a
         curvature, in place, and its first ones by the inputs.
@@ -234,31 +225,20 @@ class Potential(ForceTerm):
         return -self.amplitude * self.scalar.gradient(states.xi)
 
     def add_derivatives(
-        self,
-        linearisation: Linearisation,
-        places: AssemblyIndices,
-        states: States,
+        self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
         """Add the forces and their first derivatives by positions and by the amplitude to a
         linearisation, in place, at the entries and the input column `places`.
         """
         gradient = self.scalar.gradient(states.xi)
-        np.subtract(
-            linearisation.force,
-            self.amplitude * gradient,
-            out=linearisation.force,
-        )
-        linearisation.by_position[:, places.entries] -= (
-            self.amplitude * self.scalar.hessian(states.xi)
+        np.subtract(linearisation.force, self.amplitude * gradient, out=linearisation.force)
+        linearisation.by_position[:, places.entries] -= self.amplitude * self.scalar.hessian(
+            states.xi
         )
         linearisation.by_theta[:, :, places.inputs.start] -= gradient
 
     def add_second_derivatives(
-        self,
-        curvature: SecondDerivatives,
-        places: AssemblyIndices,
-        states: States,
-        weights: Array,
+        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
         """Add the second derivatives of Σ weights · F, and its first ones by the inputs, to a
         curvature, in place, at `places`; the weights are (T, 3n).
@@ -266,13 +246,7 @@ class Potential(ForceTerm):
         xi = states.xi
         column = places.inputs.start
         third_derivatives = self.scalar.hessian_derivative(xi, weights)
-        curvature.position_position[:, places.entries] -= (
-            self.amplitude * third_derivatives
-        )
-        hessian_products = self.couplings.products(
-            self.scalar.hessian(xi), weights
-        )
+        curvature.position_position[:, places.entries] -= self.amplitude * third_derivatives
+        hessian_products = self.couplings.products(self.scalar.hessian(xi), weights)
         curvature.position_theta[:, :, column] -= hessian_products
-        curvature.theta[:, column] -= np.einsum(
-            "ti,ti->t", weights, self.scalar.gradient(xi)
-        )
+        curvature.theta[:, column] -= np.einsum("ti,ti->t", weights, self.scalar.gradient(xi))

@@ -90,10 +90,7 @@ class Forces:
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         potentials = tuple(
-            Potential(
-                actuator.require_measure(),
-                actuator.energy_amplitude_at(times)[:, None],
-            )
+            Potential(actuator.require_measure(), actuator.energy_amplitude_at(times)[:, None])
             for actuator in experiment.actuators
         )
         further = (
@@ -114,9 +111,7 @@ class Forces:
         return forces if theta is None else forces.with_theta(theta)
 
     @classmethod
-    def of_body_alone(
-        cls, body: Body, theta: Sequence[float] | Array
-    ) -> Forces:
+    def of_body_alone(cls, body: Body, theta: Sequence[float] | Array) -> Forces:
         """Return the forces on a body without loads, gravity, air or obstacles, at one time (0 s).
 
         Internal forces at θ (k,) and the custom forces of the body are included.
@@ -124,12 +119,7 @@ class Forces:
         custom = custom_force_terms(body, np.zeros(1))
         known = np.asarray(theta, dtype=float)
         weight = Weight.of_body_alone(body).with_theta(known)
-        return cls(
-            weight,
-            custom,
-            joint_pattern=body.joint_pattern_with(()),
-            theta=known,
-        )
+        return cls(weight, custom, joint_pattern=body.joint_pattern_with(()), theta=known)
 
     def with_theta(self, theta: Sequence[float] | Array) -> Forces:
         """Return these forces for a body with constants θ (k,), which are copied; masses follow the
@@ -181,10 +171,7 @@ class Forces:
         weight, *further = (
             term.with_inputs(u[:, start:stop])
             for term, start, stop in zip(
-                forces.terms,
-                self._input_offsets,
-                self._input_offsets[1:],
-                strict=False,
+                forces.terms, self._input_offsets, self._input_offsets[1:], strict=False
             )
         )
         return replace(forces, weight=weight, external_terms=tuple(further))
@@ -212,17 +199,13 @@ class Forces:
         """Return these forces without the local ones, see `local_forces`; the sparsity pattern is
         unchanged.
         """
-        further = tuple(
-            term for term in self.external_terms if not term.is_local
-        )
+        further = tuple(term for term in self.external_terms if not term.is_local)
         places = [
             indices.entries
             for term, indices in self._terms_with_indices
             if term.couplings and not term.is_local
         ]
-        pattern = JointPattern(
-            self.pattern, (self.joint_pattern.places[0], *places)
-        )
+        pattern = JointPattern(self.pattern, (self.joint_pattern.places[0], *places))
         return replace(self, external_terms=further, joint_pattern=pattern)
 
     def local_forces(self) -> LocalForces:
@@ -239,9 +222,7 @@ class Forces:
         and `memory_state` stay. The sparsity pattern is that of the body alone.
         """
         return replace(
-            self,
-            external_terms=(),
-            joint_pattern=JointPattern.from_patterns((self.body.pattern,)),
+            self, external_terms=(), joint_pattern=JointPattern.from_patterns((self.body.pattern,))
         )
 
     def total(self, xi: Array, nu: Array) -> Array:
@@ -260,11 +241,9 @@ class Forces:
             total = total + term.force(states_for(term))
         return total
 
-    def linearise(
-        self, xi: Array, nu: Array, out: Array | None = None
-    ) -> Linearisation:
-        """Return the forces and their first derivatives by state and inputs; columns of `by_theta` are
-        those of θ, then of the inputs of each term.
+    def linearise(self, xi: Array, nu: Array, out: Array | None = None) -> Linearisation:
+        """Return the forces and their first derivatives by state and inputs; columns of `by_theta`
+        are those of θ, then of the inputs of each term.
 
         Internal variables of `memory_state` and of the terms are constant. In a static experiment
         `by_velocity` has only the parts of terms with `uses_increments`. Skew parts are empty, (T,
@@ -298,10 +277,7 @@ class Forces:
                 by_theta=self._with_input_columns(at.by_theta),
                 by_position_skew=spread(at.by_position_skew),
                 by_velocity_skew=np.zeros(
-                    (
-                        len(at.force),
-                        self.pattern.entry_count * self.has_skew_damping,
-                    )
+                    (len(at.force), self.pattern.entry_count * self.has_skew_damping)
                 ),
             )
         for term, places in self._terms_with_indices:
@@ -348,11 +324,7 @@ class Forces:
             memory_input=self.memory_state,
         )
         if self.is_static:
-            for by_velocity in (
-                at.position_velocity,
-                at.velocity_theta,
-                at.position_velocity_skew,
-            ):
+            for by_velocity in (at.position_velocity, at.velocity_theta, at.position_velocity_skew):
                 by_velocity[:] = 0.0
         if self._has_external_derivatives():
             spread = self.joint_pattern.expand
@@ -362,27 +334,18 @@ class Forces:
                 spread(at.position_velocity),
                 position_theta=with_columns(at.position_theta),
                 velocity_theta=with_columns(at.velocity_theta),
-                theta_theta=with_columns(
-                    with_columns(at.theta_theta).swapaxes(1, 2)
-                ),
+                theta_theta=with_columns(with_columns(at.theta_theta).swapaxes(1, 2)),
                 theta=with_columns(at.theta),
                 position_velocity_skew=spread(at.position_velocity_skew),
                 # Room for the curvature by velocities, where forces may have some.
                 velocity_velocity=np.zeros(
-                    (
-                        len(at.theta),
-                        self.pattern.entry_count
-                        * self._is_nonlinear_in_velocity,
-                    )
+                    (len(at.theta), self.pattern.entry_count * self._is_nonlinear_in_velocity)
                 ),
             )
         for term, places in self._terms_with_indices:
             states = states_for(term)
             term.add_second_derivatives(
-                at,
-                places,
-                states=states,
-                weights=weights.reshape(states.xi.shape),
+                at, places, states=states, weights=weights.reshape(states.xi.shape)
             )
         return at
 
@@ -394,13 +357,9 @@ class Forces:
     @cached_property
     def _is_nonlinear_in_velocity(self) -> bool:
         """Whether derivatives by the velocity of any term depend on the velocity."""
-        return any(
-            term.is_nonlinear_in_velocity for term in self.external_terms
-        )
+        return any(term.is_nonlinear_in_velocity for term in self.external_terms)
 
-    def states_of_terms(
-        self, xi: Array, nu: Array
-    ) -> Callable[[ForceTerm], States]:
+    def states_of_terms(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:
         """Return a function that gives each term its states, from positions ξ and velocities ν, (T,
         3n), or (3n,) for T = 1.
 
@@ -409,14 +368,8 @@ class Forces:
         body. Arrays of the states are views of ξ and ν, except zeros.
         """
         size = self.body.pattern.size
-        moving = States(
-            xi.reshape(-1, size), nu.reshape(-1, size), theta=self.theta
-        )
-        resting = (
-            replace(moving, nu=np.zeros_like(moving.nu))
-            if self.is_static
-            else moving
-        )
+        moving = States(xi.reshape(-1, size), nu.reshape(-1, size), theta=self.theta)
+        resting = replace(moving, nu=np.zeros_like(moving.nu)) if self.is_static else moving
         return lambda term: moving if term.uses_increments else resting
 
     @cached_property
@@ -428,15 +381,11 @@ class Forces:
             (
                 term,
                 AssemblyIndices(
-                    slice(start, stop),
-                    nowhere if term.couplings is None else next(entries),
+                    slice(start, stop), nowhere if term.couplings is None else next(entries)
                 ),
             )
             for term, start, stop in zip(
-                self.terms,
-                self._input_offsets,
-                self._input_offsets[1:],
-                strict=False,
+                self.terms, self._input_offsets, self._input_offsets[1:], strict=False
             )
         ]
 
@@ -463,11 +412,7 @@ class Forces:
 
     def find_terms_with_internal_variables(self) -> list[int]:
         """Return the indices in `external_terms` of the terms with internal variables."""
-        return [
-            k
-            for k, term in enumerate(self.external_terms)
-            if term.internal_variable_count
-        ]
+        return [k for k, term in enumerate(self.external_terms) if term.internal_variable_count]
 
     def find_complementarity_terms(self) -> list[int]:
         """Return the indices in `external_terms` of the forces of a complementarity condition."""
@@ -475,8 +420,7 @@ class Forces:
         return [
             k
             for k, term in further
-            if isinstance(term, ComplementarityForce)
-            and term.is_complementarity
+            if isinstance(term, ComplementarityForce) and term.is_complementarity
         ]
 
     def _with_input_columns(self, by_theta: Array) -> Array:
@@ -486,6 +430,4 @@ class Forces:
         further = self._input_offsets[-1] - self._input_offsets[0]
         if not further:
             return by_theta
-        return np.concatenate(
-            [by_theta, np.zeros((*by_theta.shape[:-1], further))], axis=-1
-        )
+        return np.concatenate([by_theta, np.zeros((*by_theta.shape[:-1], further))], axis=-1)

@@ -62,13 +62,9 @@ class GeneratedFunction:
         The axes … of the result are those of the data, also if their product is zero; (0, …) are
         data of an expression that uses none.
         """
-        return self._evaluate_at_instances("value", self._value, u, data)[0][
-            :, 0
-        ]
+        return self._evaluate_at_instances("value", self._value, u, data)[0][:, 0]
 
-    def evaluate_with_jacobian(
-        self, u: Array, data: Array
-    ) -> tuple[Array, Array]:
+    def evaluate_with_jacobian(self, u: Array, data: Array) -> tuple[Array, Array]:
         """Return the values y (m, …) and the derivatives ∂y/∂u (m, k, …) at all instances.
 
         Parameters
@@ -78,14 +74,10 @@ class GeneratedFunction:
         data : (d, …)
             Data, which are not differentiated; their axes after the first are the instances.
         """
-        value, slopes = self._evaluate_at_instances(
-            "slopes", self._slopes, u, data
-        )
+        value, slopes = self._evaluate_at_instances("slopes", self._slopes, u, data)
         return value[:, 0], slopes
 
-    def weighted_hessian(
-        self, u: Array, data: Array, weights: Array | None = None
-    ) -> Array:
+    def weighted_hessian(self, u: Array, data: Array, weights: Array | None = None) -> Array:
         """Return the second derivatives (k, k, …) of Σ weights · y by u.
 
         Parameters
@@ -96,13 +88,9 @@ class GeneratedFunction:
             Weights of the values; 1 by default.
         """
         weights = (
-            np.ones((self._symbols.y.numel(), *data.shape[1:]))
-            if weights is None
-            else weights
+            np.ones((self._symbols.y.numel(), *data.shape[1:])) if weights is None else weights
         )
-        return self._evaluate_at_instances(
-            "curvature", self._curvature, u, data, weights
-        )[0]
+        return self._evaluate_at_instances("curvature", self._curvature, u, data, weights)[0]
 
     @cached_property
     def dependent_inputs(self) -> NDArray[np.bool_]:
@@ -136,9 +124,7 @@ class GeneratedFunction:
     def jacobian_pattern(self) -> NDArray[np.bool_]:
         """Mask (m, k) of the structurally nonzero derivatives ∂y/∂u."""
         u, _, y = self._symbols
-        return np.array(
-            ca.DM(ca.jacobian(y, u).sparsity(), 1.0).full(), dtype=bool
-        )
+        return np.array(ca.DM(ca.jacobian(y, u).sparsity(), 1.0).full(), dtype=bool)
 
     @cached_property
     def hessian_pattern(self) -> NDArray[np.bool_]:
@@ -165,12 +151,7 @@ class GeneratedFunction:
     def _slopes(self) -> ca.Function:
         """Function of u and data with y and the dense Jacobian ∂y/∂u (m, k)."""
         u, data, y = self._symbols
-        return ca.Function(
-            "slopes",
-            [u, data],
-            [y, ca.densify(ca.jacobian(y, u))],
-            CASADI_OPTIONS,
-        )
+        return ca.Function("slopes", [u, data], [y, ca.densify(ca.jacobian(y, u))], CASADI_OPTIONS)
 
     @cached_property
     def _curvature(self) -> ca.Function:
@@ -178,12 +159,7 @@ class GeneratedFunction:
         u, data, y = self._symbols
         weights = ca.SX.sym("weights", y.numel())
         second, _ = ca.hessian(ca.dot(weights, y), u)
-        return ca.Function(
-            "curvature",
-            [u, data, weights],
-            [ca.densify(second)],
-            CASADI_OPTIONS,
-        )
+        return ca.Function("curvature", [u, data, weights], [ca.densify(second)], CASADI_OPTIONS)
 
     def _evaluate_at_instances(
         self, name: str, function: ca.Function, u: Array, *others: Array
@@ -191,41 +167,22 @@ class GeneratedFunction:
         """Return the outputs of a CasADi function at all instances, each (rows, columns, …).
 
         Evaluators are created on the first call and stored.
-
-        Parameters
-        ----------
-        function : Function
-        u : (k, …) or (k,)
-            Inputs; (k,) are the same at all instances.
-        *others : arrays (size, …)
-            Data and, for second derivatives, weights; the axes after the first are the instances.
         """
         shape = others[0].shape[1:]
         count = math.prod(shape)
         if u.ndim == 1:
-            u = np.broadcast_to(
-                u.reshape(-1, *(1 for _ in shape)), (len(u), *shape)
-            )
+            u = np.broadcast_to(u.reshape(-1, *(1 for _ in shape)), (len(u), *shape))
         if name not in self._output_sizes:
-            self._output_sizes[name] = [
-                function.size_out(k) for k in range(function.n_out())
-            ]
+            self._output_sizes[name] = [function.size_out(k) for k in range(function.n_out())]
         sizes = self._output_sizes[name]
         if not count:
             return [np.zeros((*size, *shape)) for size in sizes]
         with COMPILING:
             if name not in self._evaluators:
-                self._evaluators[name] = make_instance_evaluator(
-                    function, self.is_compiled
-                )
-        outputs = self._evaluators[name](
-            [x.reshape(len(x), count) for x in (u, *others)]
-        )
+                self._evaluators[name] = make_instance_evaluator(function, self.is_compiled)
+        outputs = self._evaluators[name]([x.reshape(len(x), count) for x in (u, *others)])
         pairs = zip(outputs, sizes, strict=True)
-        return [
-            each.reshape(*size[::-1], *shape).swapaxes(0, 1)
-            for each, size in pairs
-        ]
+        return [each.reshape(*size[::-1], *shape).swapaxes(0, 1) for each, size in pairs]
 
     @cached_property
     def _output_sizes(self) -> dict[str, list[tuple[int, int]]]:

@@ -80,13 +80,9 @@ class GraspConstraint:
             return self._constant_positions
         places, slopes = self.displaced_nodes(phi)
         rotations, shifts = self.pose_rows
-        by_phi = self._direct_derivatives + np.einsum(
-            "tgj,gjk->tgk", rotations, slopes
-        )
+        by_phi = self._direct_derivatives + np.einsum("tgj,gjk->tgk", rotations, slopes)
         positions = np.einsum("tgj,gj->tg", rotations, places) + shifts
-        positions += (
-            self._direct_derivatives @ phi[self.nuisance.motion_indices]
-        )
+        positions += self._direct_derivatives @ phi[self.nuisance.motion_indices]
         by_phi[np.isnan(positions)] = 0.0
         return PrescribedDisplacements(self.dofs, positions, by_phi=by_phi)
 
@@ -101,39 +97,22 @@ class GraspConstraint:
         places, by_own = self.nuisance.grasp_motion.evaluate_with_jacobian(
             self._phi_of_grasps(phi), self._find_points()
         )
-        places[:, ~self._is_body_node] = self._find_points()[
-            :, ~self._is_body_node
-        ]
+        places[:, ~self._is_body_node] = self._find_points()[:, ~self._is_body_node]
         by_own[..., ~self._is_body_node] = 0
-        slopes = np.zeros(
-            (3, len(self.nuisance.motion_indices), places.shape[1])
-        )
+        slopes = np.zeros((3, len(self.nuisance.motion_indices), places.shape[1]))
         slopes[:, self._find_columns()] = by_own
         places = places.T[self._nodes[1]]
         slopes = np.moveaxis(slopes, 2, 0)[self._nodes[1]]
-        for (
-            columns,
-            obstacle,
-            row,
-            axis,
-            place,
-        ) in self._iterate_obstacle_parameters():
+        for columns, obstacle, row, axis, place in self._iterate_obstacle_parameters():
             if row != OBSTACLE_TIME:
-                column = np.flatnonzero(self.nuisance.motion_indices == place)[
-                    0
-                ]
+                column = np.flatnonzero(self.nuisance.motion_indices == place)[0]
                 frame_m = self.experiment.body.nodes_m[obstacle.nodes]
-                directions = np.broadcast_to(
-                    obstacle.offset_direction, frame_m.shape
-                )
+                directions = np.broadcast_to(obstacle.offset_direction, frame_m.shape)
                 if row == OBSTACLE_TILT:
                     directions = np.cross(
-                        obstacle.tilt_axes[axis],
-                        frame_m - obstacle.shape.tilt_centre_m,
+                        obstacle.tilt_axes[axis], frame_m - obstacle.shape.tilt_centre_m
                     )
-                displacement = self.nuisance.scales[place] * np.repeat(
-                    directions, 3, axis=0
-                )
+                displacement = self.nuisance.scales[place] * np.repeat(directions, 3, axis=0)
                 slopes[columns, :, column] = displacement
                 places[columns] += phi[place] * displacement
         return places, slopes
@@ -142,21 +121,15 @@ class GraspConstraint:
         """Return Σ weights[t, g] ∂²position/∂φ² (m, m) by the φ of the motion, for weights (N, g)
         that are zero while a dof is free.
         """
-        point_weights = np.einsum(
-            "tgj,tg->gj", np.nan_to_num(self.pose_rows[0]), weights
-        )
+        point_weights = np.einsum("tgj,tg->gj", np.nan_to_num(self.pose_rows[0]), weights)
         node_weights = np.zeros_like(self._find_points().T)
         np.add.at(node_weights, self._nodes[1], point_weights)
         node_weights[~self._is_body_node] = 0.0
         hessian = np.zeros((len(self.nuisance.motion_indices),) * 2)
         second = self.nuisance.grasp_motion.weighted_hessian(
-            self._phi_of_grasps(phi),
-            self._find_points(),
-            weights=node_weights.T,
+            self._phi_of_grasps(phi), self._find_points(), weights=node_weights.T
         )
-        hessian[np.ix_(self._find_columns(), self._find_columns())] = (
-            second.sum(axis=2)
-        )
+        hessian[np.ix_(self._find_columns(), self._find_columns())] = second.sum(axis=2)
         return hessian
 
     def _phi_of_grasps(self, phi: Array) -> Array:
@@ -172,54 +145,34 @@ class GraspConstraint:
         """Derivatives of positions (N, g, m) by zeros of displacements and of the strain, and by
         delays of obstacles, which enter to first order; zero for all other φ.
         """
-        derivatives = np.zeros(
-            (len(self.t_s), len(self.dofs), len(self.nuisance.motion_indices))
-        )
+        derivatives = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.motion_indices)))
         for number, grasp in enumerate(self.experiment.body_grasps):
             rows = np.flatnonzero(grasp.is_active(self.t_s))
             for axis, place in zip(
-                grasp.zero,
-                self.nuisance.displacement_zero_indices(number),
-                strict=False,
+                grasp.zero, self.nuisance.displacement_zero_indices(number), strict=False
             ):
-                columns = np.searchsorted(
-                    self.dofs, 3 * grasp.nodes + "xyz".index(axis)
-                )
+                columns = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
                 column = np.flatnonzero(self.nuisance.motion_indices == place)
-                derivatives[np.ix_(rows, columns, column)] = (
-                    self.nuisance.scales[place]
-                )
+                derivatives[np.ix_(rows, columns, column)] = self.nuisance.scales[place]
             for place in self.nuisance.strain_zero_indices:
                 columns = np.searchsorted(self.dofs, grasp.prescribed_dofs)
                 column = np.flatnonzero(self.nuisance.motion_indices == place)
-                shifts_m = np.tile(
-                    self.nuisance.strain_shifts_m[number], len(grasp.nodes)
-                )
+                shifts_m = np.tile(self.nuisance.strain_shifts_m[number], len(grasp.nodes))
                 own_m = shifts_m.reshape(-1, 3)[:, grasp.axis_indices].ravel()
                 derivatives[np.ix_(rows, columns, column)] = (
                     self.nuisance.scales[place] * own_m[None, :, None]
                 )
         half_interval_s = 0.5e-3 * self.experiment.timestep_s
-        for (
-            columns,
-            obstacle,
-            row,
-            _,
-            place,
-        ) in self._iterate_obstacle_parameters():
+        for columns, obstacle, row, _, place in self._iterate_obstacle_parameters():
             if row == OBSTACLE_TIME:
                 places_m = self.experiment.body.nodes_m[obstacle.nodes]
                 after, before = (
                     obstacle.poses.moved_positions(places_m, self.t_s + s)
                     for s in (half_interval_s, -half_interval_s)
                 )
-                rate = (before - after).reshape(len(self.t_s), -1) / (
-                    2 * half_interval_s
-                )
+                rate = (before - after).reshape(len(self.t_s), -1) / (2 * half_interval_s)
                 column = np.flatnonzero(self.nuisance.motion_indices == place)
-                derivatives[:, columns, column] = (
-                    self.nuisance.scales[place] * rate
-                )
+                derivatives[:, columns, column] = self.nuisance.scales[place] * rate
         return derivatives
 
     def _iterate_obstacle_parameters(
@@ -252,20 +205,14 @@ class GraspConstraint:
         """Return the positions of the parameters of H among the nuisance parameters that affect the
         motion.
         """
-        return np.flatnonzero(
-            np.isin(self.nuisance.motion_indices, self.nuisance.grasp_indices)
-        )
+        return np.flatnonzero(np.isin(self.nuisance.motion_indices, self.nuisance.grasp_indices))
 
     @cached_property
     def _constant_positions(self) -> PrescribedDisplacements:
         """Prescribed positions where they do not depend on φ, with derivatives (N, g, 0)."""
-        goals_m = self.experiment.prescribed_displacements(self.t_s)[1].reshape(
-            len(self.t_s), -1
-        )
+        goals_m = self.experiment.prescribed_displacements(self.t_s)[1].reshape(len(self.t_s), -1)
         return PrescribedDisplacements(
-            self.dofs,
-            goals_m[:, self.dofs],
-            by_phi=np.zeros((len(goals_m), len(self.dofs), 0)),
+            self.dofs, goals_m[:, self.dofs], by_phi=np.zeros((len(goals_m), len(self.dofs), 0))
         )
 
     @cached_property
@@ -274,8 +221,7 @@ class GraspConstraint:
         [m], so that the position is rotation · H X + shift; NaN while the dof is free.
         """
         rotations, shifts_m = (
-            np.full((len(self.t_s), len(self.dofs), *s), np.nan)
-            for s in ((3,), ())
+            np.full((len(self.t_s), len(self.dofs), *s), np.nan) for s in ((3,), ())
         )
         for grasp in self.experiment.grasps:
             times = np.flatnonzero(grasp.is_active(self.t_s))

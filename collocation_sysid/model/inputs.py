@@ -93,9 +93,7 @@ class Inputs:
         if rows == self.time_count:
             return u, by_p
         full_shape = self.time_count, *by_p.shape[1:]
-        return np.broadcast_to(u, full_shape[:2]), np.broadcast_to(
-            by_p, full_shape
-        )
+        return np.broadcast_to(u, full_shape[:2]), np.broadcast_to(by_p, full_shape)
 
     def weighted_hessian(self, p: Array, weights: Array) -> Array:
         """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m), summed over all evaluations and entries, at
@@ -107,9 +105,7 @@ class Inputs:
             group_weights = weights[:, offset : offset + each.size].T
             if each.data.shape[1] == 1:
                 group_weights = group_weights.sum(axis=1, keepdims=True)
-            hessian += generated.weighted_hessian(
-                p, each.data, weights=group_weights
-            ).sum(axis=2)
+            hessian += generated.weighted_hessian(p, each.data, weights=group_weights).sum(axis=2)
             offset += each.size
         return hessian
 
@@ -117,9 +113,7 @@ class Inputs:
     def _functions(self) -> list[GeneratedFunction]:
         """Expressions of the groups with derivatives, in the order of `groups`."""
         return [
-            GeneratedFunction(
-                e.expression, self.parameter_count, data_size=len(e.data)
-            )
+            GeneratedFunction(e.expression, self.parameter_count, data_size=len(e.data))
             for e in self.groups
         ]
 
@@ -134,25 +128,21 @@ class Inputs:
 
 
 def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
-    """Return equations of motion whose weight has the inputs that φ changes: gravity, if a parameter
-    rotates it, and the shares of loads with an estimated time. The argument is not modified.
+    """Return equations of motion whose weight has the inputs that φ changes: gravity, if a
+    parameter rotates it, and the shares of loads with an estimated time. The argument is not
+    modified.
 
     Values are unchanged until `Dynamics.with_inputs` sets the inputs.
     """
     forces = dynamics.forces
     loads = [timed.load for timed in nuisance.timed_loads]
     has_gravity_input = len(nuisance.gravity_indices) > 0
-    weight = forces.weight.with_load_inputs(
-        has_gravity_input, loads, t_s=dynamics.evaluated_s
-    )
+    weight = forces.weight.with_load_inputs(has_gravity_input, loads, t_s=dynamics.evaluated_s)
     return replace(dynamics, forces=replace(forces, weight=weight))
 
 
 def inputs_from_experiment(
-    experiment: Experiment,
-    parameters: Parameters,
-    nuisance: NuisanceMap,
-    evaluated_s: Array,
+    experiment: Experiment, parameters: Parameters, nuisance: NuisanceMap, evaluated_s: Array
 ) -> Inputs:
     """Return the inputs of an experiment, in the order that the module states.
 
@@ -172,9 +162,7 @@ def inputs_from_experiment(
     constants = ThetaMap(parameters, experiment.body)
     no_data = np.zeros((0, 1))
     nq = len(parameters.free)
-    place = {
-        phi: nq + k for k, phi in enumerate(nuisance.motion_indices.tolist())
-    }
+    place = {phi: nq + k for k, phi in enumerate(nuisance.motion_indices.tolist())}
 
     def theta(p: ca.SX, _: ca.SX) -> ca.SX:
         """Return the constants θ of the body, of q alone."""
@@ -182,15 +170,11 @@ def inputs_from_experiment(
 
     def value(p: ca.SX, phi: int) -> ca.SX:
         """Return a nuisance parameter with its unit; zero for the index −1, which means none."""
-        return (
-            ca.SX(0) if phi < 0 else float(nuisance.scales[phi]) * p[place[phi]]
-        )
+        return ca.SX(0) if phi < 0 else float(nuisance.scales[phi]) * p[place[phi]]
 
     def gravity(p: ca.SX, _: ca.SX) -> ca.SX:
         """Return gravity (3,) in the frame of the body."""
-        return nuisance.gravity_expression(
-            p[[place[k] for k in nuisance.gravity_indices.tolist()]]
-        )
+        return nuisance.gravity_expression(p[[place[k] for k in nuisance.gravity_indices.tolist()]])
 
     def share(phi: int, timed: TimedLoad) -> Input:
         """Return the input of the share of a load: the change from its share at the stated time."""
@@ -201,8 +185,7 @@ def inputs_from_experiment(
             """Return the change of the share, from the time since the stated one [s]."""
             late_s = value(p, phi)
             return sign * (
-                smooth_ramp((since_s - late_s) / interval_s)
-                - smooth_ramp(since_s / interval_s)
+                smooth_ramp((since_s - late_s) / interval_s) - smooth_ramp(since_s / interval_s)
             )
 
         return Input(1, change, data=evaluated_s[None] - timed.declared_s)
@@ -216,9 +199,7 @@ def inputs_from_experiment(
             """Return the amplitude at the calibration in p."""
             calibration = (
                 nominal + value(p, phi)
-                for nominal, phi in zip(
-                    declared_calibration, places, strict=True
-                )
+                for nominal, phi in zip(declared_calibration, places, strict=True)
             )
             return actuator.calibrated_amplitude(data, *calibration)
 
@@ -226,19 +207,8 @@ def inputs_from_experiment(
 
     groups = [Input(len(experiment.body.constants), theta, data=no_data)]
     if len(nuisance.gravity_indices):
-        groups.append(
-            Input(3, gravity, data=no_data, is_coupled_to_state=False)
-        )
-    joining = zip(
-        nuisance.indices_of_rows(JOINING).tolist(),
-        nuisance.timed_loads,
-        strict=True,
-    )
+        groups.append(Input(3, gravity, data=no_data, is_coupled_to_state=False))
+    joining = zip(nuisance.indices_of_rows(JOINING).tolist(), nuisance.timed_loads, strict=True)
     groups += [share(phi, timed) for phi, timed in joining]
-    groups += [
-        amplitude(k, actuator)
-        for k, actuator in enumerate(experiment.actuators)
-    ]
-    return Inputs(
-        groups, nq + len(nuisance.motion_indices), time_count=len(evaluated_s)
-    )
+    groups += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
+    return Inputs(groups, nq + len(nuisance.motion_indices), time_count=len(evaluated_s))

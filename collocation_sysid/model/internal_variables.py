@@ -28,8 +28,8 @@ def histories_of_trajectory(
     loaded_s: float,
     previous_states: Mapping[int, Array],
 ) -> tuple[AnyHistory, ...]:
-    """Return the internal variables along a motion: of the memory, if the body has one, then of each
-    force with internal variables, in the order of the forces.
+    """Return the internal variables along a motion: of the memory, if the body has one, then of
+    each force with internal variables, in the order of the forces.
 
     Parameters
     ----------
@@ -62,16 +62,12 @@ def histories_of_trajectory(
     for number in forces.find_terms_with_internal_variables():
         before = previous_states.get(len(collected))
         collected.append(
-            ForceHistory.from_states(
-                forces, number, xi=xi, nu=nu, since_s=since_s, before=before
-            )
+            ForceHistory.from_states(forces, number, xi=xi, nu=nu, since_s=since_s, before=before)
         )
     return tuple(collected)
 
 
-def insert_histories(
-    forces: Forces, histories: Sequence[AnyHistory], rows: slice
-) -> Forces:
+def insert_histories(forces: Forces, histories: Sequence[AnyHistory], rows: slice) -> Forces:
     """Return the forces of some evaluations with the internal variables of the histories; without
     histories, the forces themselves.
 
@@ -89,9 +85,7 @@ def insert_histories(
     return forces
 
 
-def start_states(
-    forces: Forces, x: Array, v: Array, loaded_s: float
-) -> tuple[PreviousState, ...]:
+def start_states(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[PreviousState, ...]:
     """Return the internal variables in the start state: positions x [m] and velocities v [m/s],
     (3n,) each.
 
@@ -112,10 +106,7 @@ def start_states(
     ]
     if forces.body.has_memory:
         states.insert(
-            0,
-            MemoryState.at_start(
-                forces.body, x, theta=forces.theta, loaded_s=loaded_s
-            ),
+            0, MemoryState.at_start(forces.body, x, theta=forces.theta, loaded_s=loaded_s)
         )
     return tuple(states)
 
@@ -141,11 +132,7 @@ def insert_previous_states(
 
 
 def advance_states(
-    forces: Forces,
-    previous_states: Sequence[PreviousState],
-    x: Array,
-    v: Array,
-    interval_s: float,
+    forces: Forces, previous_states: Sequence[PreviousState], x: Array, v: Array, interval_s: float
 ) -> tuple[PreviousState, ...]:
     """Return the internal variables in a state that follows the previous states after an interval,
     in the order of `previous_states`; no argument is modified.
@@ -161,7 +148,4 @@ def advance_states(
     interval_s : float
         Interval [s].
     """
-    return tuple(
-        each.advance(forces, x, v=v, interval_s=interval_s)
-        for each in previous_states
-    )
+    return tuple(each.advance(forces, x, v=v, interval_s=interval_s) for each in previous_states)

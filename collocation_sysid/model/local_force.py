@@ -52,11 +52,7 @@ class CandidatePoints:
 
     @classmethod
     def from_nodes(
-        cls,
-        point_indices: Index,
-        nodes: Index,
-        weights: Array,
-        pattern: SymmetricPattern,
+        cls, point_indices: Index, nodes: Index, weights: Array, pattern: SymmetricPattern
     ) -> CandidatePoints:
         """Return candidate points with the given nodes and weights, see the attributes, and a
         pattern that contains the couplings of these nodes.
@@ -96,9 +92,7 @@ class CandidatePoints:
         candidates.
         """
         on_nodes = self.weights[:, :, None] * push.T[:, None]
-        summed = np.bincount(
-            self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size
-        )
+        summed = np.bincount(self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size)
         return np.asarray(summed, dtype=float)
 
 
@@ -166,9 +160,7 @@ class ActivePoints:
         if np.all(acts):
             return acts
         changes = np.any(self.slopes, axis=2).reshape(3, -1, 3)
-        return (
-            acts | np.any(changes, axis=(0, 1)) | np.any(changes, axis=(1, 2))
-        )
+        return acts | np.any(changes, axis=(0, 1)) | np.any(changes, axis=(1, 2))
 
     def assemble(self, size: int) -> Array:
         """Return the forces (size,) [N] on the dofs of a body."""
@@ -247,9 +239,7 @@ class LocalForces:
             total += part.force(xi, nu)
         return total
 
-    def linearise(
-        self, xi: Array, nu: Array, rates: tuple[float, float]
-    ) -> LinearisedLocalForce:
+    def linearise(self, xi: Array, nu: Array, rates: tuple[float, float]) -> LinearisedLocalForce:
         """Return the sum of the forces at ξ and ν, and its derivative by the unknown positions.
 
         Parameters
@@ -269,14 +259,12 @@ class LocalForces:
             force += points.assemble(xi.size)
             weights = candidates.weights[indices]
             entries = candidates.entries[indices]
-            blocks = np.einsum(
-                "pa,ijp,pb->paibj", weights, points.slope, weights
-            ).reshape(entries.shape)
+            blocks = np.einsum("pa,ijp,pb->paibj", weights, points.slope, weights).reshape(
+                entries.shape
+            )
             symmetric += np.bincount(
                 entries.ravel(),
-                weights=(
-                    candidates.symmetric_factors[indices] * blocks
-                ).ravel(),
+                weights=(candidates.symmetric_factors[indices] * blocks).ravel(),
                 minlength=len(symmetric),
             )
             if points.slopes.shape[1] > 3:
@@ -287,9 +275,7 @@ class LocalForces:
                 )
         return LinearisedLocalForce(force, symmetric, skew=skew)
 
-    def active_points(
-        self, xi: Array, nu: Array, rates: tuple[float, float]
-    ) -> list[ActivePoints]:
+    def active_points(self, xi: Array, nu: Array, rates: tuple[float, float]) -> list[ActivePoints]:
         """Return the points on which each force with candidates acts at ξ and ν, (1, 3n) each;
         `rates` are the derivatives of both by the unknown positions.
         """

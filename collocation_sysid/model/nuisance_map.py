@@ -178,9 +178,7 @@ class NuisanceMap(RecordingQuantities):
     strain_shifts_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
-    def from_experiment(
-        cls, experiment: Experiment, pivot_m: Array | None = None
-    ) -> NuisanceMap:
+    def from_experiment(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
         """Return the nuisance parameters of an experiment.
 
         A parameter that recordings share has the same name in all of them.
@@ -200,37 +198,25 @@ class NuisanceMap(RecordingQuantities):
         entries = tuple(_entries(experiment))
         body = experiment.body
         scope = experiment.nuisance.scope
-        middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(
-            axis=0
-        )
+        middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
         scales = np.array([entry.sigma for entry in entries], dtype=float)
         # Of each kind once: a body may carry thousands of markers.
         rows = {entry.row.name: entry.row for entry in entries}
-        steps = {
-            name: row.step(experiment)
-            for name, row in rows.items()
-            if row.step is not None
-        }
-        reach = [
-            min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma)
-            for e in entries
-        ]
+        steps = {name: row.step(experiment) for name, row in rows.items() if row.step is not None}
+        reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
         grasped_nodes = prescribed_nodes(experiment.body_grasps)
         nuisance_map = cls(
             entries=entries,
-            names=tuple(
-                f"{scope.get(e.row.name, experiment.name)}: {e.label}"
-                for e in entries
-            ),
+            names=tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
             scales=scales,
             step_limits=np.array(reach),
             interval_s=experiment.timestep_s,
             duration_s=experiment.duration_s,
             gravity_m_s2=np.array(experiment.gravity_m_s2),
             pivot_m=middle_m if pivot_m is None else pivot_m,
-            grasp_pivot_m=body.nodes_m[
-                grasped_nodes if len(grasped_nodes) else slice(None)
-            ].mean(axis=0),
+            grasp_pivot_m=body.nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(
+                axis=0
+            ),
             declared_calibration=np.array(
                 [a.make_calibration() for a in experiment.actuators]
             ).reshape(-1, 3),
@@ -243,13 +229,7 @@ class NuisanceMap(RecordingQuantities):
         return nuisance_map
 
     def _require_valid_expression(self, row: NuisanceRow) -> None:
-        """Check that the reading or clock of a custom kind can be evaluated and differentiated.
-
-        Raises
-        ------
-        InputError
-            If it cannot, or has the wrong shape.
-        """
+        """Check that the reading or clock of a custom kind can be evaluated and differentiated."""
         y = ca.SX.sym("y", 3)
         t_s = ca.SX.sym("t_s")
         values = ca.SX.sym("values", max(1, len(row.axes.split())))
@@ -257,20 +237,14 @@ class NuisanceMap(RecordingQuantities):
         what = f"{kind} of the nuisance parameter {row.name!r}"
         try:
             expression: Any = row.reading and row.reading(y, values, t_s, self)
-            expression = ca.SX(
-                row.clock(values, t_s, self) if row.clock else expression
-            )
+            expression = ca.SX(row.clock(values, t_s, self) if row.clock else expression)
         except Exception as error:
             raise InputError(f"the {what} failed: {reason(error)}") from error
         expected = (3, 1) if row.reading else (1, 1)
         if expression.shape != expected:
-            raise InputError(
-                f"the {what} has the shape {expression.shape}; expected {expected}"
-            )
+            raise InputError(f"the {what} has the shape {expression.shape}; expected {expected}")
         slopes = ca.Function(
-            "slopes",
-            [y, values, t_s],
-            [expression, ca.jacobian(expression, values)],
+            "slopes", [y, values, t_s], [expression, ca.jacobian(expression, values)]
         )
         evaluated = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
         if not all(np.isfinite(part.full()).all() for part in evaluated):
@@ -285,21 +259,15 @@ class NuisanceMap(RecordingQuantities):
         """Number k of nuisance parameters."""
         return len(self.names)
 
-    def iterate_values(
-        self, phi: Array
-    ) -> Iterator[tuple[NuisanceEntry, str, float]]:
+    def iterate_values(self, phi: Array) -> Iterator[tuple[NuisanceEntry, str, float]]:
         """Yield entry, name and value (in the entry's unit) of each parameter at φ (k,), in the
         order of φ, without the places of markers.
         """
-        for entry, name, value in zip(
-            self.entries, self.names, phi * self.scales, strict=True
-        ):
+        for entry, name, value in zip(self.entries, self.names, phi * self.scales, strict=True):
             if entry.row != PLACE:
                 yield entry, name, float(value)
 
-    def indices_of_rows(
-        self, *rows: NuisanceRow, component: int | None = None
-    ) -> Index:
+    def indices_of_rows(self, *rows: NuisanceRow, component: int | None = None) -> Index:
         """Return the indices in φ of some rows, of all components or of one, ascending.
 
         Their order is that of φ, whatever the order of `rows`. Rows that are not estimated have no
@@ -311,26 +279,20 @@ class NuisanceMap(RecordingQuantities):
         component : int, optional
             Number of the instance, such as the index of a camera; None for all.
         """
-        return self._indices_where(
-            lambda e: e.row in rows and component in (None, e.number)
-        )
+        return self._indices_where(lambda e: e.row in rows and component in (None, e.number))
 
     def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
         """Return the indices in φ, ascending, of the entries for which a function is true; empty if
         there are none.
         """
-        return np.array(
-            [k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64
-        )
+        return np.array([k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64)
 
     @cached_property
     def motion_indices(self) -> Index:
         """Indices in φ, ascending, of the parameters that affect the motion: gravity, grasps,
         obstacles, loads, actuators.
         """
-        return self._indices_where(
-            lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes)
-        )
+        return self._indices_where(lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes))
 
     @cached_property
     def actuator_indices(self) -> Index:
@@ -345,11 +307,7 @@ class NuisanceMap(RecordingQuantities):
         number : int
             Index of the actuator: tendons first, then pressures.
         """
-        columns = {
-            TENSION_OFFSET.name: 1,
-            PRESSURE_OFFSET.name: 1,
-            PRESSURE_LAG.name: 2,
-        }
+        columns = {TENSION_OFFSET.name: 1, PRESSURE_OFFSET.name: 1, PRESSURE_LAG.name: 2}
         indices = [-1, -1, -1]
         for k in self.actuator_indices:
             if self.entries[k].number == number:
@@ -363,12 +321,8 @@ class NuisanceMap(RecordingQuantities):
         calibration = self.declared_calibration.copy()
         values = phi * self.scales
         for number in range(len(calibration)):
-            for column, place in enumerate(
-                self.actuator_calibration_indices(number)
-            ):
-                calibration[number, column] += (
-                    0.0 if place < 0 else values[place]
-                )
+            for column, place in enumerate(self.actuator_calibration_indices(number)):
+                calibration[number, column] += 0.0 if place < 0 else values[place]
         return calibration
 
     # What markers read --------------------------------------------------------------------------
@@ -379,22 +333,12 @@ class NuisanceMap(RecordingQuantities):
 
         f is the same for all markers; it may be 0.
         """
-        read = self._indices_where(
-            lambda e: e.row.reading is not None or e.row.clock is not None
-        )
+        read = self._indices_where(lambda e: e.row.reading is not None or e.row.clock is not None)
         single = [k for k in read if self.entries[k].row.of == "marker"]
-        of_marker = [
-            [k for k in single if self.entries[k].number == m]
-            for m in range(count)
-        ]
+        of_marker = [[k for k in single if self.entries[k].number == m] for m in range(count)]
         common = np.tile(np.setdiff1d(read, single), (count, 1))
         return np.hstack(
-            [
-                np.array(of_marker, dtype=np.int64).reshape(
-                    count, -1 if count else 0
-                ),
-                common,
-            ]
+            [np.array(of_marker, dtype=np.int64).reshape(count, -1 if count else 0), common]
         )
 
     @cached_property
@@ -416,14 +360,9 @@ class NuisanceMap(RecordingQuantities):
             Time of the sample.
         """
         values = self.values_by_row(phi, places)
-        return sum(
-            (row.clock(values[row], t_s, self) for row in values if row.clock),
-            ca.SX(0),
-        )
+        return sum((row.clock(values[row], t_s, self) for row in values if row.clock), ca.SX(0))
 
-    def marker_measurement(
-        self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX
-    ) -> ca.SX:
+    def marker_measurement(self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
         """Return the measured position (3,) [m] of a marker whose true position is y (3,) [m].
 
         Effects common to all markers are applied before those of the single marker.
@@ -440,19 +379,15 @@ class NuisanceMap(RecordingQuantities):
         """
         values = self.values_by_row(phi, places)
         for row in sorted(values, key=lambda row: row.of == "marker"):
-            y = (
-                y
-                if row.reading is None
-                else row.reading(y, values[row], t_s, self)
-            )
+            y = y if row.reading is None else row.reading(y, values[row], t_s, self)
         return y
 
     # What moves the body ------------------------------------------------------------------------
 
     @cached_property
     def affects_grasps(self) -> bool:
-        """Whether any φ that affects the motion is not of gravity; only then may prescribed positions
-        depend on φ (loads and actuators count, too).
+        """Whether any φ that affects the motion is not of gravity; only then may prescribed
+        positions depend on φ (loads and actuators count, too).
         """
         return len(np.setdiff1d(self.motion_indices, self.gravity_indices)) > 0
 
@@ -467,9 +402,7 @@ class NuisanceMap(RecordingQuantities):
         """Indices in φ of the zero of the strain of a specimen; empty if it is not estimated."""
         return self.indices_of_rows(STRAIN_ZERO)
 
-    def obstacle_parameters(
-        self, number: int
-    ) -> list[tuple[NuisanceRow, int, int]]:
+    def obstacle_parameters(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
         """Return row, axis and index in φ of every nuisance parameter of an obstacle, ascending in
         φ; empty for a gripper.
 
@@ -478,21 +411,11 @@ class NuisanceMap(RecordingQuantities):
         number : int
             Index among the grasps, in which obstacles follow the grippers.
         """
-        own = (
-            k
-            for k in self.motion_indices.tolist()
-            if self.entries[k].row.of == "obstacle"
-        )
-        here = (
-            (self.entries[k], k)
-            for k in own
-            if self.entries[k].number == number
-        )
+        own = (k for k in self.motion_indices.tolist() if self.entries[k].row.of == "obstacle")
+        here = ((self.entries[k], k) for k in own if self.entries[k].number == number)
         return [(entry.row, entry.axis, k) for entry, k in here]
 
-    def with_grasps(
-        self, grasps: Sequence[Grasp], phi: Array
-    ) -> tuple[Grasp, ...]:
+    def with_grasps(self, grasps: Sequence[Grasp], phi: Array) -> tuple[Grasp, ...]:
         """Return grasps and obstacles at their poses at φ (k,): with the hand–eye transform and the
         zeros of displacement and strain, obstacles with offset, tilt and delay.
 
@@ -504,48 +427,26 @@ class NuisanceMap(RecordingQuantities):
         """
         motion = self.grasp_motion_matrix(phi)
         return tuple(
-            self._with_grasp(k, grasp, motion=motion, phi=phi)
-            for k, grasp in enumerate(grasps)
+            self._with_grasp(k, grasp, motion=motion, phi=phi) for k, grasp in enumerate(grasps)
         )
 
-    def _with_grasp(
-        self, number: int, grasp: Grasp, motion: Array, phi: Array
-    ) -> Grasp:
-        """Return one grasp or obstacle at its pose at φ.
-
-        Parameters
-        ----------
-        number : int
-            Index of the grasp.
-        grasp : Grasp
-        motion : (4, 4)
-            Motion H of the body in its grasp.
-        phi : (k,)
-        """
+    def _with_grasp(self, number: int, grasp: Grasp, motion: Array, phi: Array) -> Grasp:
+        """Return one grasp or obstacle at its pose at φ."""
         if isinstance(grasp, Obstacle):
             deviations: dict[NuisanceRow, Array] = {}
             for row, axis, place in self.obstacle_parameters(number):
-                deviations.setdefault(row, np.zeros(2))[axis] = (
-                    phi[place] * self.scales[place]
-                )
+                deviations.setdefault(row, np.zeros(2))[axis] = phi[place] * self.scales[place]
             zeros = np.zeros(2)
             offset, delay_s = (
-                deviations.get(r, zeros)[0]
-                for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
+                deviations.get(r, zeros)[0] for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
             )
-            return grasp.displaced(
-                offset, deviations.get(OBSTACLE_TILT, zeros), delay_s=delay_s
-            )
+            return grasp.displaced(offset, deviations.get(OBSTACLE_TILT, zeros), delay_s=delay_s)
         zero_m = np.zeros(3)
         for place in self.displacement_zero_indices(number):
             zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
         for place in self.strain_zero_indices:
-            zero_m += (
-                phi[place] * self.scales[place] * self.strain_shifts_m[number]
-            )
-        return replace(
-            grasp, poses=grasp.poses.after(motion).with_shift(zero_m)
-        )
+            zero_m += phi[place] * self.scales[place] * self.strain_shifts_m[number]
+        return replace(grasp, poses=grasp.poses.after(motion).with_shift(zero_m))
 
     def bounds(self, samples: int) -> tuple[Array, Array]:
         """Return the lowest and the highest φ with valid measurements and loads, (k,) each, in
@@ -570,12 +471,8 @@ class NuisanceMap(RecordingQuantities):
             largest_s = max(range_s, LARGEST_DELAY_FRACTION * self.duration_s)
             low[k] = max(middle_s - range_s, -largest_s) / unit
             high[k] = min(middle_s + range_s, largest_s) / unit
-        for k, timed in zip(
-            self.indices_of_rows(JOINING), self.timed_loads, strict=True
-        ):
-            margins = (
-                np.array(self.recorded_s) - timed.declared_s
-            ) / self.scales[k]
+        for k, timed in zip(self.indices_of_rows(JOINING), self.timed_loads, strict=True):
+            margins = (np.array(self.recorded_s) - timed.declared_s) / self.scales[k]
             low[k], high[k] = np.clip(
                 INSIDE_RECORDING_FACTOR * margins,
                 -LARGEST_JOINING_DELAY_SIGMAS,
@@ -614,9 +511,7 @@ class NuisanceMap(RecordingQuantities):
     @cached_property
     def grasp_motion(self) -> GeneratedFunction:
         """Expression of H X for a point X, of the φ of `grasp_indices`."""
-        return GeneratedFunction(
-            self._displaced_point, len(self.grasp_indices), data_size=3
-        )
+        return GeneratedFunction(self._displaced_point, len(self.grasp_indices), data_size=3)
 
     def _displaced_point(self, phi: ca.SX, point: ca.SX) -> ca.SX:
         """Return H X (3,) of a point X (3,) of the undeformed body [m], with the hand–eye transform
@@ -625,9 +520,7 @@ class NuisanceMap(RecordingQuantities):
         values = self.values_by_row(phi, self.grasp_indices)
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
-            point = (
-                cayley_rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
-            )
+            point = cayley_rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
         if GRASP_SHIFT in values:
             point = point + values[GRASP_SHIFT]
         return point
@@ -639,9 +532,7 @@ class NuisanceMap(RecordingQuantities):
         points = np.hstack([np.zeros((3, 1)), np.eye(3)])
         images = self.grasp_motion.evaluate(phi[self.grasp_indices], points)
         matrix = np.eye(4)
-        matrix[:3] = np.column_stack(
-            [images[:, 1:] - images[:, :1], images[:, 0]]
-        )
+        matrix[:3] = np.column_stack([images[:, 1:] - images[:, :1], images[:, 0]])
         return matrix
 
     def gravity(self, phi: Array) -> Array:
@@ -650,11 +541,7 @@ class NuisanceMap(RecordingQuantities):
         """
         if not len(self.gravity_indices):
             return self.gravity_m_s2
-        return (
-            ca.evalf(self.gravity_expression(ca.SX(phi[self.gravity_indices])))
-            .full()
-            .ravel()
-        )
+        return ca.evalf(self.gravity_expression(ca.SX(phi[self.gravity_indices]))).full().ravel()
 
     @cached_property
     def gravity_indices(self) -> Index:
@@ -674,9 +561,7 @@ class NuisanceMap(RecordingQuantities):
             gravity = cayley_rotation(values[POSE_TURN]).T @ gravity
         return ca.SX(gravity)
 
-    def values_by_row(
-        self, phi: ca.SX, places: Index
-    ) -> dict[NuisanceRow, ca.SX]:
+    def values_by_row(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
         """Return parameters with units by row, each a column vector; rows without an index are left
         out.
 
@@ -715,12 +600,7 @@ def _strain_shifts_m(experiment: Experiment) -> Array:
         return np.zeros((0, 3))
     moving = experiment.specimen.displaced_nodes()
     still = np.zeros(3), np.zeros(3)
-    return np.array(
-        [
-            sum(moving.get(int(g.nodes[0]), still))
-            for g in experiment.body_grasps
-        ]
-    )
+    return np.array([sum(moving.get(int(g.nodes[0]), still)) for g in experiment.body_grasps])
 
 
 def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
@@ -729,38 +609,24 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
     Consecutive kinds of one sort of component are ordered by component, then by kind and axis; the
     unknowns of custom sensors come last. Exact quantities are left out.
     """
-    for _, rows in groupby(
-        experiment.nuisance.list_kinds(), key=lambda row: row.of
-    ):
+    for _, rows in groupby(experiment.nuisance.list_kinds(), key=lambda row: row.of):
         applicable = [row for row in rows if row.applies(experiment)]
         for number, component_name in (
             _components(experiment, applicable[0].of) if applicable else ()
         ):
             for row in applicable:
-                for axis, name, unit, sigma in _component_axes(
-                    experiment, row, number=number
-                ):
+                for axis, name, unit, sigma in _component_axes(experiment, row, number=number):
                     label = row.label.format(which=component_name, axis=name)
                     yield NuisanceEntry(
-                        row,
-                        number,
-                        axis=axis,
-                        label=f"{label} [{unit}]",
-                        sigma=sigma,
+                        row, number, axis=axis, label=f"{label} [{unit}]", sigma=sigma
                     )
     for number, gauge in enumerate(experiment.readings):
         for axis, (name, sigma) in enumerate(gauge.unknowns.items()):
-            label = (
-                f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
-            )
-            yield NuisanceEntry(
-                GAUGE, number, axis=axis, label=label, sigma=sigma
-            )
+            label = f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
+            yield NuisanceEntry(GAUGE, number, axis=axis, label=label, sigma=sigma)
 
 
-def _components(
-    experiment: Experiment, of: Component
-) -> Iterable[tuple[int, str]]:
+def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, str]]:
     """Return index and name of all components of one kind, such as all markers; of the kind "place"
     only markers whose position is estimated. Indices of obstacles follow those of grasps, those of
     pressures those of tendons.
@@ -772,18 +638,12 @@ def _components(
         return enumerate(names)
     if of == "place":
         return [
-            (m, names[m])
-            for m in np.flatnonzero(
-                experiment.compute_place_sigma_m() > 0
-            ).tolist()
+            (m, names[m]) for m in np.flatnonzero(experiment.compute_place_sigma_m() > 0).tolist()
         ]
     if of == "grasp":
         return [(k, str(k + 1)) for k in range(len(experiment.body_grasps))]
     if of == "obstacle":
-        return enumerate(
-            (each.name for each in experiment.obstacles),
-            len(experiment.body_grasps),
-        )
+        return enumerate((each.name for each in experiment.obstacles), len(experiment.body_grasps))
     if of == "camera":
         return enumerate(experiment.camera_names)
     if of == "load":
@@ -803,14 +663,6 @@ def _component_axes(
     """Return index, name, unit and prior deviation of each estimated axis of a component.
 
     The list is empty if the component is exact or the row does not apply to it.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    row : NuisanceRow
-        Kind of nuisance parameter.
-    number : int
-        Index of the component among those of the kind `row.of`: a marker, grasp, sensor, camera, …
     """
     sigma = experiment.nuisance.sigma(row)
     names = row.axes.split() or [""]
@@ -822,32 +674,24 @@ def _component_axes(
     if row == TARE:
         sensor = [*experiment.sensors_by_grasp.values()][number]
         return [
-            (k, name, unit, sigma * sigma_k)
-            for k, name, unit, sigma_k in sensor.component_noises()
+            (k, name, unit, sigma * sigma_k) for k, name, unit, sigma_k in sensor.component_noises()
         ]
     if not row.applies_to(experiment, number):
         return []
     axes = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
-    return [
-        each
-        for each in axes
-        if row != ZERO or each[1] in experiment.grasps[number].zero
-    ]
+    return [each for each in axes if row != ZERO or each[1] in experiment.grasps[number].zero]
 
 
 def _timed_loads(experiment: Experiment) -> list[tuple[str, TimedLoad]]:
-    """Return label and load for every time of a load that is to be estimated, masses first: those that
-    change within the recording. Empty if times count as exact.
+    """Return label and load for every time of a load that is to be estimated, masses first: those
+    that change within the recording. Empty if times count as exact.
     """
     if not experiment.nuisance.joining_s:
         return []
     verbs: dict[LoadTime, str] = {"from_s": "joining", "until_s": "leaving"}
     return [
         (f"{verbs[change]} of {kind} {number}", TimedLoad(load, change))
-        for kind, loads in (
-            ("mass", experiment.masses),
-            ("force", experiment.forces),
-        )
+        for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
         for number, load in enumerate(loads, start=1)
         for change in get_args(LoadTime)
         if experiment.changes_within(load, change)

@@ -44,10 +44,7 @@ class NumericalMode:
 
 
 def numerical_mode(
-    scheme: Scheme,
-    angular_frequency_rad_s: float,
-    timestep_s: float,
-    damping_ratio: float = 0.0,
+    scheme: Scheme, angular_frequency_rad_s: float, timestep_s: float, damping_ratio: float = 0.0
 ) -> NumericalMode:
     """Return damping and period error of the regular rows of a scheme.
 
@@ -67,23 +64,17 @@ def numerical_mode(
         For a damping ratio outside [0, 1): a critically damped mode does not oscillate.
     """
     if not 0 <= damping_ratio < 1:
-        raise InputError(
-            f"damping_ratio = {damping_ratio:g}, expected 0 <= damping_ratio < 1"
-        )
+        raise InputError(f"damping_ratio = {damping_ratio:g}, expected 0 <= damping_ratio < 1")
     h = angular_frequency_rad_s * timestep_s
     z = principal_root(scheme.regular, h, damping_ratio=damping_ratio)
     rate = -float(np.log(abs(z)))
     angle = float(np.angle(z))
     exact = h * float(np.sqrt(1 - damping_ratio**2))
     period_error = float(exact / angle - 1) if angle > 0 else np.inf
-    return NumericalMode(
-        rate / float(np.hypot(rate, angle)) - float(damping_ratio), period_error
-    )
+    return NumericalMode(rate / float(np.hypot(rate, angle)) - float(damping_ratio), period_error)
 
 
-def principal_root(
-    stencil: Stencil, h: float, damping_ratio: float = 0.0
-) -> complex:
+def principal_root(stencil: Stencil, h: float, damping_ratio: float = 0.0) -> complex:
     """Return the root z of the characteristic polynomial that corresponds to the exact solution.
 
     The principal root has the largest modulus of all roots with a non-negative imaginary part.
@@ -97,9 +88,7 @@ def principal_root(
     damping_ratio : float
         Physical damping ratio ζ.
     """
-    force = _polynomial_sum(
-        h**2 * np.array(stencil.p), 2 * damping_ratio * h * np.array(stencil.q)
-    )
+    force = _polynomial_sum(h**2 * np.array(stencil.p), 2 * damping_ratio * h * np.array(stencil.q))
     in_u = _polynomial_sum(np.convolve(stencil.w, force), np.array(stencil.s))
     roots = np.roots(in_u)  # of z: the coefficient of u⁰ leads
     upper = roots[roots.imag >= -1e-12 * np.abs(roots)]
@@ -153,10 +142,7 @@ def substeps_needed(
             )
             for ratio in (0.0, damping_ratio)
         )
-        return (
-            abs(damped.damping_ratio) <= damping_limit
-            and abs(mode.period_error) <= period_error
-        )
+        return abs(damped.damping_ratio) <= damping_limit and abs(mode.period_error) <= period_error
 
     high = 1
     while not suffices(high):

@@ -69,12 +69,7 @@ class Unknown:
 
 
 # Keys of the table of a parameter in a problem file.
-PARAMETER_KEYS = (
-    *(field.name for field in fields(Unknown)),
-    "fixed",
-    "tied_to",
-    "ratio",
-)
+PARAMETER_KEYS = (*(field.name for field in fields(Unknown)), "fixed", "tied_to", "ratio")
 
 
 @dataclass(frozen=True)
@@ -140,22 +135,15 @@ class Parameter:
         if self.is_fixed:
             self._check_fixed()
             return
-        least = (
-            0.0 if self.scale == "log" else constant_named(self.name).at_least
-        )
-        if not least <= self.lower < self.upper or (
-            self.scale == "log" and self.lower == 0
-        ):
+        least = 0.0 if self.scale == "log" else constant_named(self.name).at_least
+        if not least <= self.lower < self.upper or (self.scale == "log" and self.lower == 0):
             raise InputError(
                 f"lower = {self.lower:g}, upper = {self.upper:g}, expected "
                 f"{'0 < ' if self.scale == 'log' else _lower_limit_text(least)}lower < upper",
                 None,
                 where=self.name,
             )
-        if (
-            self.guess is not None
-            and not self.lower <= self.guess <= self.upper
-        ):
+        if self.guess is not None and not self.lower <= self.guess <= self.upper:
             raise InputError(
                 f"guess = {self.guess:g}, expected a value within [{self.lower:g}, {self.upper:g}]",
                 None,
@@ -187,23 +175,13 @@ class Parameter:
         )
         value = np.nan if self.guess is None else self.guess
         if not (np.isfinite(value) and value >= least):
-            expected = (
-                "a number" if least == -np.inf else f"a number >= {least:g}"
-            )
-            raise InputError(
-                f"fixed = {value:g}, expected {expected}", None, where=self.name
-            )
+            expected = "a number" if least == -np.inf else f"a number >= {least:g}"
+            raise InputError(f"fixed = {value:g}, expected {expected}", None, where=self.name)
         self._require_below_limit(value, "fixed")
 
     def _require_below_limit(self, value: float, what: str) -> None:
         """Raise an `InputError` if a value reaches the upper limit of the constant, such as ν =
         0.5.
-
-        Parameters
-        ----------
-        value : float
-        what : str
-            Key of the value in the message: "upper" or "fixed".
         """
         if not value < (limit := constant_named(self.name).below):
             why = (
@@ -212,18 +190,14 @@ class Parameter:
                 else ""
             )
             raise InputError(
-                f"{what} = {value:g}, expected less than {limit:g}{why}",
-                None,
-                where=self.name,
+                f"{what} = {value:g}, expected less than {limit:g}{why}", None, where=self.name
             )
 
     def to_coordinate(self, value: float) -> float:
         """Return the solver's coordinate q of a value: its logarithm, −∞ for 0, or the value
         divided by `unit`, NaN while `unit` is.
         """
-        return (
-            float(np.log(value)) if self.scale == "log" else value / self.unit
-        )
+        return float(np.log(value)) if self.scale == "log" else value / self.unit
 
     def from_coordinate(self, q: float) -> float:
         """Return the value at a solver's coordinate q."""
@@ -245,9 +219,7 @@ FIRST_CONTRAST = 2.0
 
 
 def complete_parameter(
-    name: str,
-    user_statement: Unknown | Tied | float,
-    definition: Constant | None = None,
+    name: str, user_statement: Unknown | Tied | float, definition: Constant | None = None
 ) -> Parameter:
     """Return the complete definition of a parameter, with defaults from its constant.
 
@@ -289,11 +261,7 @@ def complete_parameter(
     if scale == "log" and low <= 0:
         low = 1e-9 * high
     prior = user_statement.prior or constant.prior
-    if (
-        user_statement.guess is None
-        and prior is None
-        and usual_value(name, 1.0) is None
-    ):
+    if user_statement.guess is None and prior is None and usual_value(name, 1.0) is None:
         raise InputError(
             "this parameter has no guess, and no usual value of it is known; expected guess = a "
             "value",
@@ -304,10 +272,7 @@ def complete_parameter(
     size = np.nan if is_modulus(name) else 0.0
     size = size if user_statement.guess is None else abs(user_statement.guess)
     typical = user_statement.typical or constant.typical or size
-    for what, value in (
-        ("lower", user_statement.lower),
-        ("upper", user_statement.upper),
-    ):
+    for what, value in (("lower", user_statement.lower), ("upper", user_statement.upper)):
         if value is not None and not is_known:
             _require_admissible(constant, float(value), f"{name}: {what}")
     if scale == "linear" and typical == 0:
@@ -321,24 +286,15 @@ def complete_parameter(
     try:
         return Parameter(
             name,
-            None
-            if user_statement.guess is None
-            else float(user_statement.guess),
-            lower=low
-            if user_statement.lower is None
-            else float(user_statement.lower),
-            upper=high
-            if user_statement.upper is None
-            else float(user_statement.upper),
+            None if user_statement.guess is None else float(user_statement.guess),
+            lower=low if user_statement.lower is None else float(user_statement.lower),
+            upper=high if user_statement.upper is None else float(user_statement.upper),
             prior=prior,
             scale=scale,
             unit=float(typical) if scale == "linear" else 1.0,
         )
     except InputError as error:
-        if (
-            user_statement.lower is not None
-            and user_statement.upper is not None
-        ):
+        if user_statement.lower is not None and user_statement.upper is not None:
             raise
         message = (
             f"{error.message}; a bound that is not stated has a default value, which lower or "
@@ -347,9 +303,7 @@ def complete_parameter(
         raise InputError(message, None, where=name) from error
 
 
-def _with_usual_guess(
-    name: str, user_statement: Unknown, constant: Constant
-) -> Unknown:
+def _with_usual_guess(name: str, user_statement: Unknown, constant: Constant) -> Unknown:
     """Return a statement with the usual value of a user-defined constant as its guess, within the
     bounds, if it states neither a guess nor a prior; the statement itself for known constants,
     whose usual value follows from the name.
@@ -424,9 +378,7 @@ class Parameters:
         for name, count in Counter(self.names).items():
             if count > 1:
                 raise InputError(
-                    "this parameter is given twice, expected one value",
-                    None,
-                    where=name,
+                    "this parameter is given twice, expected one value", None, where=name
                 )
         # A scalar cannot be tied to a component of a vector.
         self._check_ties(self.scalars)
@@ -481,9 +433,7 @@ class Parameters:
         shared = {without_region(name): known[name] for name in known}
         return cls(
             tuple(
-                complete_parameter(
-                    name, value, known.get(name) or shared.get(name)
-                )
+                complete_parameter(name, value, known.get(name) or shared.get(name))
                 for name, value in statements.items()
             )
         )
@@ -523,9 +473,7 @@ class Parameters:
         )
         other_components = {
             field.name: tuple(
-                component
-                for component in field.components
-                if component.name not in coefficients
+                component for component in field.components if component.name not in coefficients
             )
             for field in self.fields
         }
@@ -533,11 +481,7 @@ class Parameters:
             FieldCoefficients(
                 vector,
                 (
-                    *(
-                        stated.get(name)
-                        or complete_parameter(name, Unknown(0.0))
-                        for name in names
-                    ),
+                    *(stated.get(name) or complete_parameter(name, Unknown(0.0)) for name in names),
                     *other_components.pop(vector, ()),
                 ),
             )
@@ -556,9 +500,7 @@ class Parameters:
         """Return these parameters without the components of these names; a vector without
         components is left out.
         """
-        return self._with_components(
-            lambda item: () if item.name in names else (item,)
-        )
+        return self._with_components(lambda item: () if item.name in names else (item,))
 
     def only_fixed(self, values: Mapping[str, float]) -> Parameters:
         """Return only the parameters with these names, fixed at these values; tied ones become
@@ -574,14 +516,10 @@ class Parameters:
         """
         omitted = set(self.names) - set(values)
         return self.without(omitted).map_components(
-            lambda item: replace(
-                item, guess=values[item.name], is_fixed=True, tied=None
-            )
+            lambda item: replace(item, guess=values[item.name], is_fixed=True, tied=None)
         )
 
-    def map_components(
-        self, function: Callable[[Parameter], Parameter]
-    ) -> Parameters:
+    def map_components(self, function: Callable[[Parameter], Parameter]) -> Parameters:
         """Return these parameters with each component replaced by its value of a function."""
         return self._with_components(lambda item: (function(item),))
 
@@ -595,9 +533,7 @@ class Parameters:
         for item in self.items:
             if isinstance(item, Parameter):
                 items += function(item)
-            elif components := tuple(
-                new for old in item.components for new in function(old)
-            ):
+            elif components := tuple(new for old in item.components for new in function(old)):
                 items.append(FieldCoefficients(item.name, components))
         return Parameters(tuple(items))
 
@@ -607,9 +543,7 @@ class Parameters:
         return tuple(
             component
             for item in self.items
-            for component in (
-                (item,) if isinstance(item, Parameter) else item.components
-            )
+            for component in ((item,) if isinstance(item, Parameter) else item.components)
         )
 
     @cached_property
@@ -620,9 +554,7 @@ class Parameters:
     @cached_property
     def fields(self) -> tuple[FieldCoefficients, ...]:
         """Vectors of the coefficients of fields."""
-        return tuple(
-            item for item in self.items if isinstance(item, FieldCoefficients)
-        )
+        return tuple(item for item in self.items if isinstance(item, FieldCoefficients))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -632,11 +564,7 @@ class Parameters:
     @cached_property
     def free(self) -> tuple[Parameter, ...]:
         """Components that are estimated, in the order of q."""
-        return tuple(
-            item
-            for item in self.components
-            if not item.is_fixed and item.tied is None
-        )
+        return tuple(item for item in self.components if not item.is_fixed and item.tied is None)
 
     @cached_property
     def free_scalars(self) -> tuple[Parameter, ...]:
@@ -647,15 +575,11 @@ class Parameters:
     def scalar_coordinates(self) -> tuple[int, ...]:
         """Indices in q of the scalar parameters."""
         scalars = {item.name for item in self.scalars}
-        return tuple(
-            k for k, item in enumerate(self.free) if item.name in scalars
-        )
+        return tuple(k for k, item in enumerate(self.free) if item.name in scalars)
 
     def list_linear_names(self) -> frozenset[str]:
         """Return the names of the components with linear scale."""
-        return frozenset(
-            item.name for item in self.components if item.scale == "linear"
-        )
+        return frozenset(item.name for item in self.components if item.scale == "linear")
 
     def scale_and_bounds(self, name: str) -> tuple[bool, tuple[float, float]]:
         """Return whether a parameter has a linear scale (else a logarithmic one), and the (lower,
@@ -683,9 +607,7 @@ class Parameters:
         InputError
             If a parameter has no guess.
         """
-        return np.array(
-            [item.to_coordinate(_guess(item)) for item in self.free]
-        )
+        return np.array([item.to_coordinate(_guess(item)) for item in self.free])
 
     def compute_bounds_q(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of q, (nq,) each, in the order of `free`; infinite
@@ -700,13 +622,9 @@ class Parameters:
         """Return every parameter, in SI units, as an expression in q (nq,), by name; fixed ones are
         constants, tied ones multiples of the other parameter.
         """
-        by_name = {
-            item.name: ca.SX(item.guess or 0.0) for item in self.components
-        }
+        by_name = {item.name: ca.SX(item.guess or 0.0) for item in self.components}
         for k, item in enumerate(self.free):
-            by_name[item.name] = (
-                ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
-            )
+            by_name[item.name] = ca.exp(q[k]) if item.scale == "log" else q[k] * item.unit
         for item in self.components:
             if item.tied is not None:
                 by_name[item.name] = item.tied.ratio * by_name[item.tied.to]
@@ -716,9 +634,7 @@ class Parameters:
         """Return the value of every parameter in SI units at q (nq,), by name; fixed and tied ones
         are included. Another length of q is a ValueError.
         """
-        by_name = {
-            item.name: float(item.guess or 0.0) for item in self.components
-        }
+        by_name = {item.name: float(item.guess or 0.0) for item in self.components}
         for item, coordinate in zip(self.free, q, strict=True):
             by_name[item.name] = item.from_coordinate(float(coordinate))
         for item in self.components:
@@ -756,9 +672,7 @@ class Parameters:
         for k, item in enumerate(self.free):
             if item.prior is not None:
                 mean, deviation = item.prior
-                slopes[k] = (
-                    1.0 if item.scale == "log" else item.unit
-                ) / deviation
+                slopes[k] = (1.0 if item.scale == "log" else item.unit) / deviation
                 residuals[k] = (q[k] - item.to_coordinate(mean)) * slopes[k]
         return residuals, slopes
 
@@ -777,11 +691,7 @@ class Parameters:
                 f"{hint_at(unknown[0], self.names)}"
             )
         return self.map_components(
-            lambda item: (
-                replace(item, guess=values[item.name])
-                if item.name in values
-                else item
-            )
+            lambda item: replace(item, guess=values[item.name]) if item.name in values else item
         )
 
     def with_estimates(self, values: Mapping[str, float]) -> Parameters:
@@ -840,15 +750,11 @@ class Parameters:
             no region uses, or a fixed stiffness or density of zero.
         """
         bodies = list(bodies)
-        known = [
-            name for body in bodies for name in body.list_parameter_names()
-        ]
+        known = [name for body in bodies for name in body.list_parameter_names()]
         for name in self.names:
             if name not in known:
                 parameter, _, key = name.rpartition(".")
-                if (
-                    parameter in known
-                ):  # a misspelt key of a parameter's table reads like a region
+                if parameter in known:  # a misspelt key of a parameter's table reads like a region
                     raise InputError(
                         "unknown key; expected one of "
                         f"{', '.join(PARAMETER_KEYS)}{hint_at(key, PARAMETER_KEYS)}",
@@ -864,9 +770,7 @@ class Parameters:
                     where=name,
                 )
         used = {name for body in bodies for name in body.used_names(self.names)}
-        used |= {
-            item.tied.to for item in self.components if item.tied is not None
-        }
+        used |= {item.tied.to for item in self.components if item.tied is not None}
         for name in self.names:
             if name not in used:
                 raise InputError(
@@ -877,15 +781,9 @@ class Parameters:
                 )
         for item in self.scalars:
             stiff = without_region(item.name) in ("mu_pa", "young_pa")
-            if (
-                item.is_fixed
-                and item.guess == 0
-                and (stiff or is_density(item.name))
-            ):
+            if item.is_fixed and item.guess == 0 and (stiff or is_density(item.name)):
                 what = "a stiffness" if stiff else "a density"
-                raise InputError(
-                    f"fixed = 0, expected {what} above 0", None, where=item.name
-                )
+                raise InputError(f"fixed = 0, expected {what} above 0", None, where=item.name)
 
 
 def _guess(item: Parameter) -> float:
@@ -928,9 +826,7 @@ class ThetaMap:
 
     def expression(self, q: ca.SX, _: ca.SX | None = None) -> ca.SX:
         """Return θ (k,) as an expression in q; the second argument is not used."""
-        return ca.vertcat(
-            *self.body.assemble_theta(self.parameters.expressions(q))
-        )
+        return ca.vertcat(*self.body.assemble_theta(self.parameters.expressions(q)))
 
     def theta(self, q: Sequence[float] | Array) -> Array:
         """Return the constants θ (k,) at q (nq,), in the order of `body.constants`."""
@@ -938,9 +834,7 @@ class ThetaMap:
 
     def jacobian(self, q: Array) -> Array:
         """Return the derivatives ∂θ/∂q (k, nq) at q (nq,)."""
-        return self._theta.evaluate_with_jacobian(_as_float_array(q), NOTHING)[
-            1
-        ]
+        return self._theta.evaluate_with_jacobian(_as_float_array(q), NOTHING)[1]
 
     @property
     def derived_names(self) -> tuple[str, ...]:
@@ -953,16 +847,12 @@ class ThetaMap:
         """Return the derived moduli (d,) at q, in the order of their names, and derivatives by q
         (d, nq).
         """
-        return self._derived[1].evaluate_with_jacobian(
-            _as_float_array(q), NOTHING
-        )
+        return self._derived[1].evaluate_with_jacobian(_as_float_array(q), NOTHING)
 
     @cached_property
     def _theta(self) -> GeneratedFunction:
         """Expression of θ with derivatives."""
-        return GeneratedFunction(
-            self.expression, len(self.parameters.free), data_size=0
-        )
+        return GeneratedFunction(self.expression, len(self.parameters.free), data_size=0)
 
     @cached_property
     def _derived(self) -> tuple[tuple[str, ...], GeneratedFunction]:
@@ -972,18 +862,14 @@ class ThetaMap:
         names = self.parameters.names
         body = self.body
         derived_names, _ = _derived_moduli(
-            names,
-            body,
-            theta=self.expression(ca.SX.sym("q", self._theta.input_size)),
+            names, body, theta=self.expression(ca.SX.sym("q", self._theta.input_size))
         )
 
         def values(q: ca.SX, _: ca.SX) -> ca.SX:
             """Return the derived moduli as an expression in q."""
             return _derived_moduli(names, body, theta=self.expression(q))[1]
 
-        return derived_names, GeneratedFunction(
-            values, self._theta.input_size, data_size=0
-        )
+        return derived_names, GeneratedFunction(values, self._theta.input_size, data_size=0)
 
 
 # Data of an expression that depends on q alone.
@@ -1003,32 +889,16 @@ def _derived_moduli(
     These are (E, ν) of every part at small strain, unless they are parameters themselves, and (λ,
     μ) of the parts that are parametrised by (E, ν). With memory they are the long-term moduli; the
     instantaneous modulus E(1 + Σg) is added. A region that has the moduli of the others is omitted.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the parameters.
-    body : Body
-    theta : (k,) SX
     """
     derived: dict[str, ca.SX] = {}
     shares = body.split_theta(theta)
-    for part, share, source in zip(
-        body.parts, shares, body.constant_sources(names), strict=True
-    ):
+    for part, share, source in zip(body.parts, shares, body.constant_sources(names), strict=True):
         lame = part.material.lame(share[: len(part.material.constants)])
         young, poisson = engineering_constants(lame[0], lame[1])
-        moduli = {
-            "young_pa": young,
-            "poisson": poisson,
-            "lambda_pa": lame[0],
-            "mu_pa": lame[1],
-        }
+        moduli = {"young_pa": young, "poisson": poisson, "lambda_pa": lame[0], "mu_pa": lame[1]}
         by_young = "young_pa" in source.names
         prefix = f"{part.name}."
-        shares_all = not any(
-            name.startswith(prefix) for name in source.names.values()
-        )
+        shares_all = not any(name.startswith(prefix) for name in source.names.values())
         if derived and shares_all:
             continue  # it has the moduli of the rest
         for own, value in moduli.items():
@@ -1036,20 +906,16 @@ def _derived_moduli(
                 derived[part.full_name(own)] = value
         if part.prony:
             memory_constants = share[
-                part.law_constant_count : part.law_constant_count
-                + 2 * len(part.prony)
+                part.law_constant_count : part.law_constant_count + 2 * len(part.prony)
             ]
             derived[part.full_name(INSTANTANEOUS.name)] = young * (
                 1 + ca.sum1(memory_constants[::2])
             )
-    return tuple(derived), ca.vertcat(*derived.values()) if derived else ca.SX(
-        0, 1
-    )
+    return tuple(derived), ca.vertcat(*derived.values()) if derived else ca.SX(0, 1)
 
 
 def resolve_theta(
-    body: Body,
-    values: Parameters | Mapping[str, float] | Sequence[float] | Array,
+    body: Body, values: Parameters | Mapping[str, float] | Sequence[float] | Array
 ) -> Array:
     """Return the constants θ (k,) of a body from parameters, values by name, or θ itself (copied).
 
@@ -1068,9 +934,7 @@ def resolve_theta(
     if isinstance(values, Parameters):
         return body.theta_from_values(values.guesses)
     if isinstance(values, Mapping):
-        Parameters.from_mapping(
-            values, definitions=body.constants
-        ).require_constants_of([body])
+        Parameters.from_mapping(values, definitions=body.constants).require_constants_of([body])
         return body.theta_from_values(values)
     if len(values) != len(body.constants):
         raise InputError(

@@ -118,9 +118,7 @@ class Pointwise(ForceTerm):
         return self.points.couplings
 
     def with_previous_state(
-        self,
-        previous_state: PreviousState,
-        variable_weights: Array | None = None,
+        self, previous_state: PreviousState, variable_weights: Array | None = None
     ) -> Self:
         """Return this force with given internal variables of the previous evaluations, and with
         weights of h in second derivatives, (n, T, I), which are zero for None.
@@ -140,11 +138,7 @@ class Pointwise(ForceTerm):
         times : int
             Number T of evaluations.
         """
-        since_s = (
-            np.zeros(times)
-            if self.previous_state is None
-            else self.previous_state.since_s
-        )
+        since_s = np.zeros(times) if self.previous_state is None else self.previous_state.since_s
         return since_s, (since_s == 0).astype(float)
 
     def _inputs_at(self, states: States) -> _LawInputs:
@@ -156,18 +150,12 @@ class Pointwise(ForceTerm):
         chosen, y = self.active_points(states)
         constants = self.constants(states)
         velocities = (
-            (self.points.vectors(states.nu, chosen),)
-            if self.is_nonlinear_in_velocity
-            else ()
+            (self.points.vectors(states.nu, chosen),) if self.is_nonlinear_in_velocity else ()
         )
-        steady = np.broadcast_to(
-            constants[..., None], (len(constants), *y.shape[1:])
-        )
+        steady = np.broadcast_to(constants[..., None], (len(constants), *y.shape[1:]))
         before = np.zeros((self.internal_variable_count, *y.shape[1:]))
         if self.previous_state is not None:
-            before = self.previous_state.before[
-                ..., slice(None) if chosen is None else chosen
-            ]
+            before = self.previous_state.before[..., slice(None) if chosen is None else chosen]
         u = np.concatenate([y, *velocities, steady, before])
         data = self.data(chosen)
         return _LawInputs(
@@ -175,8 +163,7 @@ class Pointwise(ForceTerm):
             u,
             data=np.broadcast_to(data, (len(data), *y.shape[1:])),
             velocity_offset=len(y),
-            constants_offset=len(y)
-            * (2 if self.is_nonlinear_in_velocity else 1),
+            constants_offset=len(y) * (2 if self.is_nonlinear_in_velocity else 1),
             variables_offset=len(u) - len(before),
         )
 
@@ -189,10 +176,7 @@ class Pointwise(ForceTerm):
         return self.factor * self.points.assemble(value, at.chosen)
 
     def add_derivatives(
-        self,
-        linearisation: Linearisation,
-        places: AssemblyIndices,
-        states: States,
+        self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
         """Add the forces and their first derivatives by positions, velocities and the constants of
         the law to a linearisation, in place, at the entries and input columns `places`.
@@ -202,56 +186,28 @@ class Pointwise(ForceTerm):
         """
         evaluated = self._inputs_at(states)
         points = self.points
-        value, slopes = self.law.evaluate_with_jacobian(
-            evaluated.u, evaluated.data
-        )
+        value, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
         value = value[evaluated.y]
         slopes = self.factor * slopes[evaluated.y]
-        linearisation.force[:] += self.factor * points.assemble(
-            value, evaluated.chosen
-        )
-        by_x, by_v, by_c = (
-            slopes[:, part] for part in (evaluated.y, evaluated.v, evaluated.c)
-        )
+        linearisation.force[:] += self.factor * points.assemble(value, evaluated.chosen)
+        by_x, by_v, by_c = (slopes[:, part] for part in (evaluated.y, evaluated.v, evaluated.c))
         entries = places.entries
         chosen = evaluated.chosen
         add = points.add_matrices
         depends_on_place = bool(self.law.dependent_inputs[evaluated.y].any())
         if depends_on_place:
             add(linearisation.by_position, entries, blocks=by_x, chosen=chosen)
-        if (
-            depends_on_place
-            and self.has_skew_stiffness
-            and linearisation.by_position_skew.size
-        ):
-            add(
-                linearisation.by_position_skew,
-                entries,
-                blocks=by_x,
-                chosen=chosen,
-                skew=True,
-            )
+        if depends_on_place and self.has_skew_stiffness and linearisation.by_position_skew.size:
+            add(linearisation.by_position_skew, entries, blocks=by_x, chosen=chosen, skew=True)
         if self.is_nonlinear_in_velocity:
             add(linearisation.by_velocity, entries, blocks=by_v, chosen=chosen)
         if self.has_skew_damping:
-            add(
-                linearisation.by_velocity_skew,
-                entries,
-                blocks=by_v,
-                chosen=chosen,
-                skew=True,
-            )
+            add(linearisation.by_velocity_skew, entries, blocks=by_v, chosen=chosen, skew=True)
         for k, column in enumerate(self.constant_columns(places)):
-            linearisation.by_theta[:, :, column] += points.assemble(
-                by_c[:, k], evaluated.chosen
-            )
+            linearisation.by_theta[:, :, column] += points.assemble(by_c[:, k], evaluated.chosen)
 
     def add_second_derivatives(
-        self,
-        curvature: SecondDerivatives,
-        places: AssemblyIndices,
-        states: States,
-        weights: Array,
+        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
         """Add the derivatives of Σ weights · F + Σ `variable_weights` · h to a curvature, in place.
 
@@ -274,26 +230,14 @@ class Pointwise(ForceTerm):
         w = self._weights(evaluated, weights)
         x = evaluated.y
         v = evaluated.v
-        second = self.law.weighted_hessian(
-            evaluated.u, evaluated.data, weights=w
-        )
+        second = self.law.weighted_hessian(evaluated.u, evaluated.data, weights=w)
         add = points.add_matrices
         chosen = evaluated.chosen
         depends_on_place = bool(self.law.dependent_inputs[x].any())
         if depends_on_place:
-            add(
-                curvature.position_position,
-                entries,
-                blocks=second[x, x],
-                chosen=chosen,
-            )
+            add(curvature.position_position, entries, blocks=second[x, x], chosen=chosen)
         if self.is_nonlinear_in_velocity and depends_on_place:
-            add(
-                curvature.position_velocity,
-                entries,
-                blocks=second[x, v],
-                chosen=chosen,
-            )
+            add(curvature.position_velocity, entries, blocks=second[x, v], chosen=chosen)
             if curvature.position_velocity_skew.size:
                 add(
                     curvature.position_velocity_skew,
@@ -303,16 +247,9 @@ class Pointwise(ForceTerm):
                     skew=True,
                 )
         if self.is_nonlinear_in_velocity:
-            add(
-                curvature.velocity_velocity,
-                entries,
-                blocks=second[v, v],
-                chosen=chosen,
-            )
+            add(curvature.velocity_velocity, entries, blocks=second[v, v], chosen=chosen)
         _, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
-        columns = list(
-            enumerate(self.constant_columns(places), evaluated.c.start)
-        )
+        columns = list(enumerate(self.constant_columns(places), evaluated.c.start))
         for k, column in columns:
             curvature.position_theta[:, :, column] += points.assemble(
                 second[x, k], evaluated.chosen
@@ -321,13 +258,9 @@ class Pointwise(ForceTerm):
                 curvature.velocity_theta[:, :, column] += points.assemble(
                     second[v, k], evaluated.chosen
                 )
-            curvature.theta[:, column] += np.einsum(
-                "itk,itk->t", w, slopes[:, k]
-            )
+            curvature.theta[:, column] += np.einsum("itk,itk->t", w, slopes[:, k])
             for other, place in columns:
-                curvature.theta_theta[:, column, place] += second[k, other].sum(
-                    axis=1
-                )
+                curvature.theta_theta[:, column, place] += second[k, other].sum(axis=1)
 
     def _weights(self, here: _LawInputs, weights: Array) -> Array:
         """Return the weights (d + n, T, i) of the values of the law: of the forces on y, then of
@@ -343,9 +276,7 @@ class Pointwise(ForceTerm):
         shape = self.internal_variable_count, *force_weights.shape[1:]
         some = slice(None) if here.chosen is None else here.chosen
         variable_weights = (
-            np.zeros(shape)
-            if self.variable_weights is None
-            else self.variable_weights[..., some]
+            np.zeros(shape) if self.variable_weights is None else self.variable_weights[..., some]
         )
         return np.concatenate([force_weights, variable_weights])
 
@@ -357,8 +288,7 @@ class Pointwise(ForceTerm):
         """
         evaluated = self._inputs_at(states)
         return self._expanded(
-            self.law.evaluate(evaluated.u, evaluated.data)[evaluated.y.stop :],
-            evaluated,
+            self.law.evaluate(evaluated.u, evaluated.data)[evaluated.y.stop :], evaluated
         )
 
     def derivatives(self, states: States) -> LawDerivatives:
@@ -371,9 +301,7 @@ class Pointwise(ForceTerm):
         slopes[evaluated.y] *= self.factor
         return evaluated.split(self._expanded(slopes, evaluated), 1)
 
-    def mixed_second_derivatives(
-        self, states: States, weights: Array
-    ) -> LawDerivatives:
+    def mixed_second_derivatives(self, states: States, weights: Array) -> LawDerivatives:
         """Return second derivatives of weights · F + Σ `variable_weights` · h by u and h_{k−1}.
 
         They are split along u = (y, ẏ, c, h_{k−1}), (…, n, T, I) each.
@@ -386,13 +314,9 @@ class Pointwise(ForceTerm):
         """
         evaluated = self._inputs_at(states)
         second = self.law.weighted_hessian(
-            evaluated.u,
-            evaluated.data,
-            weights=self._weights(evaluated, weights),
+            evaluated.u, evaluated.data, weights=self._weights(evaluated, weights)
         )
-        return evaluated.split(
-            self._expanded(second[:, evaluated.b], evaluated), 0
-        )
+        return evaluated.split(self._expanded(second[:, evaluated.b], evaluated), 0)
 
     def _expanded(self, values: Array, here: _LawInputs) -> Array:
         """Return values (…, T, I) of all instances, zero at those that are not chosen."""
@@ -494,11 +418,7 @@ class _LawInputs:
         return LawDerivatives(
             *np.split(
                 values,
-                [
-                    self.velocity_offset,
-                    self.constants_offset,
-                    self.variables_offset,
-                ],
+                [self.velocity_offset, self.constants_offset, self.variables_offset],
                 axis=axis,
             )
         )
@@ -600,9 +520,7 @@ def law_function(force: NodeForce, dofs: int) -> GeneratedFunction:
     )
 
 
-def air_drag_terms(
-    experiment: Experiment, t_s: Array
-) -> tuple[CustomForce, ...]:
+def air_drag_terms(experiment: Experiment, t_s: Array) -> tuple[CustomForce, ...]:
     """Return the drag of the air on the body of an experiment; empty if there is none.
 
     Drag is linear in the density of the air, which is the factor of the drag at a density of 1

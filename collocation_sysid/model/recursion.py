@@ -73,12 +73,7 @@ class Recursion:
         """Return the end indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of
         `step_function`.
         """
-        sizes = [
-            self.state_size,
-            self.signal_size,
-            self.signal_size,
-            self.constant_count,
-        ]
+        sizes = [self.state_size, self.signal_size, self.signal_size, self.constant_count]
         return np.cumsum(sizes).tolist()
 
     @cached_property
@@ -87,15 +82,11 @@ class Recursion:
 
         def expression(u: ca.SX, data: ca.SX) -> ca.SX:
             """Return h_k from the stacked inputs."""
-            before, now, last, constants = ca.vertsplit(
-                u, [0, *self.compute_input_offsets()]
-            )
+            before, now, last, constants = ca.vertsplit(u, [0, *self.compute_input_offsets()])
             return self.expression(before, now, last, constants, data)
 
         return GeneratedFunction(
-            expression,
-            self.compute_input_offsets()[-1],
-            data_size=self.data_size,
+            expression, self.compute_input_offsets()[-1], data_size=self.data_size
         )
 
     def linear_coefficients(self, constants: ca.SX, data: ca.SX) -> ca.SX:
@@ -113,12 +104,8 @@ class Recursion:
             The Jacobian (n, n + 2 i), stacked column by column.
         """
         u = ca.SX.sym("u", self.compute_input_offsets()[2])
-        before, now, last = ca.vertsplit(
-            u, [0, *self.compute_input_offsets()[:3]]
-        )
-        return ca.vec(
-            ca.jacobian(self.expression(before, now, last, constants, data), u)
-        )
+        before, now, last = ca.vertsplit(u, [0, *self.compute_input_offsets()[:3]])
+        return ca.vec(ca.jacobian(self.expression(before, now, last, constants, data), u))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +150,7 @@ class RecursionTrajectory:
         """
         data = np.broadcast_to(data, (recursion.data_size, *signal.shape[1:]))
         states = np.zeros((recursion.state_size, *signal.shape[1:]))
-        trajectory = cls(
-            recursion, constants, data=data, signal=signal, states=states
-        )
+        trajectory = cls(recursion, constants, data=data, signal=signal, states=states)
         for k in range(signal.shape[1]):
             now = slice(k, k + 1)
             states[:, now] = recursion.step_function.evaluate(
@@ -181,10 +166,7 @@ class RecursionTrajectory:
         before = np.arange(times.start, times.stop) - 1
         states = np.where((before < 0)[:, None], 0.0, self.states[:, before])
         last = self.signal[:, np.maximum(before, 0)]
-        c = np.broadcast_to(
-            self.constants[:, None, None],
-            (len(self.constants), *last.shape[1:]),
-        )
+        c = np.broadcast_to(self.constants[:, None, None], (len(self.constants), *last.shape[1:]))
         return np.concatenate([states, self.signal[:, times], last, c])
 
     @cached_property
@@ -192,16 +174,10 @@ class RecursionTrajectory:
         """Derivatives of R by h_{k−1}, s_k, s_{k−1} and c, a list of arrays (n, …, N, I)."""
         step = self.recursion.step_function
         all_times = slice(0, self.signal.shape[1])
-        by_u = step.evaluate_with_jacobian(
-            self._stacked_inputs(all_times), self.data
-        )[1]
-        return np.split(
-            by_u, self.recursion.compute_input_offsets()[:-1], axis=1
-        )
+        by_u = step.evaluate_with_jacobian(self._stacked_inputs(all_times), self.data)[1]
+        return np.split(by_u, self.recursion.compute_input_offsets()[:-1], axis=1)
 
-    def jacobian_vector_product(
-        self, signal_changes: Array, constant_changes: Array
-    ) -> Array:
+    def jacobian_vector_product(self, signal_changes: Array, constant_changes: Array) -> Array:
         """Return the changes of the states (n, N, I, c) for c directions at once, including those
         through earlier states.
 
@@ -215,13 +191,9 @@ class RecursionTrajectory:
         by_state, by_now, by_last, by_constants = self._jacobians
         changes = np.einsum("abkp,bkpc->akpc", by_now, signal_changes)
         changes += np.einsum("abkp,bc->akpc", by_constants, constant_changes)
-        changes[:, 1:] += np.einsum(
-            "abkp,bkpc->akpc", by_last[:, :, 1:], signal_changes[:, :-1]
-        )
+        changes[:, 1:] += np.einsum("abkp,bkpc->akpc", by_last[:, :, 1:], signal_changes[:, :-1])
         for k in range(1, changes.shape[1]):
-            changes[:, k] += np.einsum(
-                "abp,bpc->apc", by_state[:, :, k], changes[:, k - 1]
-            )
+            changes[:, k] += np.einsum("abp,bpc->apc", by_state[:, :, k], changes[:, k - 1])
         return changes
 
     def vector_jacobian_product(self, weights: Array) -> tuple[Array, Array]:
@@ -236,13 +208,9 @@ class RecursionTrajectory:
         by_state, by_now, by_last, by_constants = self._jacobians
         total = weights.copy()
         for k in range(total.shape[1] - 1, 0, -1):
-            total[:, k - 1] += np.einsum(
-                "abp,ap->bp", by_state[:, :, k], total[:, k]
-            )
+            total[:, k - 1] += np.einsum("abp,ap->bp", by_state[:, :, k], total[:, k])
         by_signal = np.einsum("abkp,akp->bkp", by_now, total)
-        by_signal[:, :-1] += np.einsum(
-            "abkp,akp->bkp", by_last[:, :, 1:], total[:, 1:]
-        )
+        by_signal[:, :-1] += np.einsum("abkp,akp->bkp", by_last[:, :, 1:], total[:, 1:])
         return by_signal, np.einsum("abkp,akp->b", by_constants, total)
 
 
@@ -261,5 +229,6 @@ def relaxation_coefficients(tau: ca.SX) -> tuple[ca.SX, ca.SX]:
     return ca.exp(-ratio), -tau * ca.expm1(-ratio)
 
 
-# Time constant, in units of the interval, below which the state has relaxed: exp(−1e6) is 0 in doubles.
+# Time constant, in units of the interval, below which the state has relaxed: exp(−1e6) is 0 in
+# doubles.
 SMALLEST_TIME_CONSTANT = 1e-6

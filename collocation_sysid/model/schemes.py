@@ -85,9 +85,7 @@ class Scheme:
         The last two states are then ξ ∓ Δt ν/2, and a force may be averaged over the step.
         """
         stencils = (self.regular, *self.start)
-        return all(
-            (each.p, each.q) == ((0.5, 0.5), (1.0, -1.0)) for each in stencils
-        )
+        return all((each.p, each.q) == ((0.5, 0.5), (1.0, -1.0)) for each in stencils)
 
     def compute_largest_lag(self) -> int:
         """Return the largest lag l with ∂c_t/∂x_{t−l} ≠ 0, in time steps."""
@@ -103,35 +101,24 @@ STATIC = Stencil(p=(1.0,), q=(0.0,), w=(1.0,), s=(0.0,))
 QUASI_STATIC = Scheme("quasi-static", 1, regular=STATIC, start=())
 # Scheme of static experiments with friction: ν is the displacement since the previous sample.
 SLIDING = Scheme(
-    "sliding",
-    1,
-    regular=Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(0.0,)),
-    start=(),
+    "sliding", 1, regular=Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(0.0,)), start=()
 )
 
 BACKWARD_EULER = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -2.0, 1.0))
 _FIRST_STEP = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -1.0), r=-1.0)
-MIDPOINT = Stencil(
-    p=(0.5, 0.5), q=(1.0, -1.0), w=(0.5, 0.5), s=(1.0, -2.0, 1.0)
-)
+MIDPOINT = Stencil(p=(0.5, 0.5), q=(1.0, -1.0), w=(0.5, 0.5), s=(1.0, -2.0, 1.0))
 # Weights of the latest three positions in the velocity by BDF2, over the time step.
 _BDF2_VELOCITY = (1.5, -2.0, 0.5)
 
 SCHEMES: dict[str, Scheme] = {
     # The scheme of the paper. It damps a mode of angular frequency ω with the ratio ωΔt/2.
-    "backward-euler": Scheme(
-        "backward-euler", 1, regular=BACKWARD_EULER, start=(_FIRST_STEP,)
-    ),
+    "backward-euler": Scheme("backward-euler", 1, regular=BACKWARD_EULER, start=(_FIRST_STEP,)),
     # Variational midpoint rule (Marsden & West 2001, sec. 2.6): no numerical damping.
     "midpoint": Scheme(
         "midpoint",
         2,
         regular=MIDPOINT,
-        start=(
-            Stencil(
-                p=(0.5, 0.5), q=(1.0, -1.0), w=(0.5,), s=(1.0, -1.0), r=-1.0
-            ),
-        ),
+        start=(Stencil(p=(0.5, 0.5), q=(1.0, -1.0), w=(0.5,), s=(1.0, -1.0), r=-1.0),),
     ),
     # BDF2 in velocity and acceleration; v_1 is that of backward Euler, v_0 is given, and rows 2
     # and 3 are a_t = (3 v_t − 4 v_{t−1} + v_{t−2}) / 2Δt with these velocities inserted.
@@ -139,34 +126,18 @@ SCHEMES: dict[str, Scheme] = {
         "bdf2",
         2,
         regular=Stencil(
-            p=(1.0,),
-            q=_BDF2_VELOCITY,
-            w=(1.0,),
-            s=(9 / 4, -24 / 4, 22 / 4, -8 / 4, 1 / 4),
+            p=(1.0,), q=_BDF2_VELOCITY, w=(1.0,), s=(9 / 4, -24 / 4, 22 / 4, -8 / 4, 1 / 4)
         ),
         start=(
             _FIRST_STEP,
-            Stencil(
-                p=(1.0,),
-                q=_BDF2_VELOCITY,
-                w=(1.0,),
-                s=(9 / 4, -20 / 4, 11 / 4),
-                r=0.5,
-            ),
-            Stencil(
-                p=(1.0,),
-                q=_BDF2_VELOCITY,
-                w=(1.0,),
-                s=(9 / 4, -24 / 4, 21 / 4, -6 / 4),
-            ),
+            Stencil(p=(1.0,), q=_BDF2_VELOCITY, w=(1.0,), s=(9 / 4, -20 / 4, 11 / 4), r=0.5),
+            Stencil(p=(1.0,), q=_BDF2_VELOCITY, w=(1.0,), s=(9 / 4, -24 / 4, 21 / 4, -6 / 4)),
         ),
     ),
 }
 
 
-def as_scheme(
-    scheme_or_name: str | Scheme, start_rule: str = "standard"
-) -> Scheme:
+def as_scheme(scheme_or_name: str | Scheme, start_rule: str = "standard") -> Scheme:
     """Return a scheme by its name in `SCHEMES`, or the given scheme, with the start rule applied.
 
     Parameters
@@ -182,20 +153,12 @@ def as_scheme(
         For an unknown scheme or start rule, or "paper" with another scheme than backward Euler.
     """
     if isinstance(scheme_or_name, str) and scheme_or_name not in SCHEMES:
-        raise InputError(
-            f"no scheme {scheme_or_name!r}; available: {', '.join(SCHEMES)}"
-        )
-    scheme = (
-        SCHEMES[scheme_or_name]
-        if isinstance(scheme_or_name, str)
-        else scheme_or_name
-    )
+        raise InputError(f"no scheme {scheme_or_name!r}; available: {', '.join(SCHEMES)}")
+    scheme = SCHEMES[scheme_or_name] if isinstance(scheme_or_name, str) else scheme_or_name
     if start_rule == "standard":
         return scheme
     if start_rule != "paper":
-        raise InputError(
-            f"no start rule {start_rule!r}; expected one of standard, paper"
-        )
+        raise InputError(f"no start rule {start_rule!r}; expected one of standard, paper")
     if scheme != SCHEMES["backward-euler"]:
         raise InputError(
             f"found start rule 'paper' and scheme {scheme.name!r}; expected start rule 'standard', "

@@ -1,7 +1,7 @@
 """Memory of a viscoelastic body along a motion, with derivatives forward and backward in time.
 
-Use this module for the Prony branches of a material (see `fem.laws.memory`). The internal variables that
-evaluation k passes to the next one are, for each branch,
+Use this module for the Prony branches of a material (see `fem.laws.memory`). The internal variables
+that evaluation k passes to the next one are, for each branch,
 
     m_k = d_k m_{k−1} + a_k S_k,   d_k = e_{k+1},   a_k = e_{k+1} c_k − c_{k+1},
 
@@ -46,15 +46,7 @@ RELAXED_TIMES = 1e3
 
 
 def _interval_coefficients(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
-    """Return e and c (2,) of an interval in which S changes linearly.
-
-    Parameters
-    ----------
-    u : (2,) SX
-        Share g and relaxation time τ.
-    spacing_s : SX
-        Length of the interval.
-    """
+    """Return e and c (2,) of an interval in which S changes linearly."""
     e, c = relaxation_coefficients(u[1] / spacing_s)
     return ca.vertcat(e, u[0] * c)
 
@@ -70,9 +62,7 @@ def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
     return began * at_once + (1 - began) * over_interval
 
 
-def _overstress(
-    before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX
-) -> ca.SX:
+def _overstress(before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX) -> ca.SX:
     """Return m_k from m_{k−1} (`before`) and S_k (`now`), with u = (g, τ).
 
     Data are the time since the previous evaluation, or at the start since the load was applied; 1
@@ -82,25 +72,14 @@ def _overstress(
     return e * before + (e * _stiffening(u, data) - c) * now
 
 
-OVERSTRESS = Recursion(
-    _overstress, 1, signal_size=1, constant_count=2, data_size=3
-)
+OVERSTRESS = Recursion(_overstress, 1, signal_size=1, constant_count=2, data_size=3)
 
 
 def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
     """Return the coefficients (3,) of an evaluation: c of the stress in its overstress
     Q_k = m_{k−1} + c S_k, then d and a of the recursion m_k = d m_{k−1} + a S_k.
-
-    Parameters
-    ----------
-    u : (2,) SX
-        Share g and relaxation time τ [s].
-    data : (3,) SX
-        Times, see `_overstress`.
     """
-    return ca.vertcat(
-        _stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2]
-    )
+    return ca.vertcat(_stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2])
 
 
 COEFFICIENTS = GeneratedFunction(_coefficients, 2, data_size=3)
@@ -151,9 +130,7 @@ class FadingCoefficients:
         loaded_s : float
             Time for which the body has been in its start shape; infinite if its memory has relaxed.
         """
-        places = np.array(
-            [(each.share, each.tau) for each in body.memory.branches]
-        ).T
+        places = np.array([(each.share, each.tau) for each in body.memory.branches]).T
         branches = len(body.memory.branches)
         shape = (branches, len(until_next_s))
         since_s = np.empty(shape)
@@ -161,9 +138,7 @@ class FadingCoefficients:
         since_s[:, 1:] = until_next_s[:-1]
         began = np.broadcast_to(np.arange(shape[1]) == 0, shape)
         data = np.stack([since_s, began, np.broadcast_to(until_next_s, shape)])
-        u = np.broadcast_to(
-            theta[places][..., None], (2, branches, len(until_next_s))
-        )
+        u = np.broadcast_to(theta[places][..., None], (2, branches, len(until_next_s)))
         (c, d, a), by = COEFFICIENTS.evaluate_with_jacobian(u, data)
         return cls(places, u, data=data, c=c, d=d, a=a, by=by)
 
@@ -171,9 +146,7 @@ class FadingCoefficients:
         """Return the derivatives (q, B, N) of the coefficients d and a along the q directions
         `theta_q` (k, q) of θ.
         """
-        d_q, a_q = np.einsum(
-            "cjbn,jbq->cqbn", self.by[1:], theta_q[self.places]
-        )
+        d_q, a_q = np.einsum("cjbn,jbq->cqbn", self.by[1:], theta_q[self.places])
         return d_q, a_q
 
 
@@ -240,16 +213,9 @@ class MemoryHistory:
             d, a = map(body.memory.repeat_over_points, (fades.d, fades.a))
             previous_variables = np.zeros(borne.shape)
             for k in range(len(previous_variables) - 1):
-                previous_variables[k + 1] = (
-                    d[k] * previous_variables[k] + a[k] * borne[k]
-                )
+                previous_variables[k + 1] = d[k] * previous_variables[k] + a[k] * borne[k]
         return cls(
-            body,
-            theta,
-            xi=xi,
-            stress=stress,
-            fading=fades,
-            previous_variables=previous_variables,
+            body, theta, xi=xi, stress=stress, fading=fades, previous_variables=previous_variables
         )
 
     def past_at(self, rows: slice) -> MemoryInput:
@@ -260,18 +226,14 @@ class MemoryHistory:
         """
         past = self.body.memory.relaxed(len(self.xi[rows]))
         fades = self.fading
-        past.overstress[:] = self.body.memory.sum_over_branches(
-            self.previous_variables[rows]
-        )
+        past.overstress[:] = self.body.memory.sum_over_branches(self.previous_variables[rows])
         for branch, c in zip(self.body.memory.branches, fades.c, strict=True):
             past.stiffening[:, branch.part] += c[rows]
         second = STIFFENING.weighted_hessian(fades.u, fades.data)
-        past.stiffening_derivatives[:, fades.places] = np.moveaxis(
-            fades.by[0, ..., rows], 2, 0
+        past.stiffening_derivatives[:, fades.places] = np.moveaxis(fades.by[0, ..., rows], 2, 0)
+        past.stiffening_second_derivatives[:, fades.places[:, None], fades.places] = np.moveaxis(
+            second[..., rows], 3, 0
         )
-        past.stiffening_second_derivatives[
-            :, fades.places[:, None], fades.places
-        ] = np.moveaxis(second[..., rows], 3, 0)
         return past
 
     def insert_into(self, forces: Forces, rows: slice) -> Forces:
@@ -289,16 +251,11 @@ class MemoryHistory:
             Forces at all N evaluations; not modified.
         mu : (N, all branches)
         """
-        past = replace(
-            self.past_at(slice(None)), stress_weights=self.stress_weights(mu)
-        )
+        past = replace(self.past_at(slice(None)), stress_weights=self.stress_weights(mu))
         return replace(forces, memory_state=past)
 
     def forward_columns(
-        self,
-        by_p: Callable[[int], Array],
-        done: int = 0,
-        known: Array | None = None,
+        self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
     ) -> MemoryForwardColumns:
         """Return an iterator of the columns dm forward in time, see `MemoryForwardColumns`.
 
@@ -311,9 +268,7 @@ class MemoryHistory:
         known : (columns, all branches), optional
             Columns after those evaluations; 0 by default.
         """
-        return MemoryForwardColumns(
-            self, by_p(0)[: len(self.theta)], done=done, known=known
-        )
+        return MemoryForwardColumns(self, by_p(0)[: len(self.theta)], done=done, known=known)
 
     def adjoint(self) -> MemoryAdjoint:
         """Return an iterator of the weights μ backward in time, see `MemoryAdjoint`."""
@@ -322,12 +277,8 @@ class MemoryHistory:
     def extract_final_state(self) -> MemoryState:
         """Return the state of the memory after the last evaluation."""
         c = self.body.memory.repeat_over_points(self.fading.c)[-1]
-        overstress = self.previous_variables[
-            -1
-        ] + c * self.body.memory.to_branches(self.stress[-1])
-        return MemoryState(
-            self.body, self.theta, stress=self.stress[-1], overstress=overstress
-        )
+        overstress = self.previous_variables[-1] + c * self.body.memory.to_branches(self.stress[-1])
+        return MemoryState(self.body, self.theta, stress=self.stress[-1], overstress=overstress)
 
     def compute_recursion_residuals(self) -> Array:
         """Return the residuals m_k − d_k m_{k−1} − a_k S_k for k = 0 … N − 2 (N − 1, all branches)
@@ -359,14 +310,11 @@ class MemoryHistory:
         """
         borne = self.body.memory.to_branches(self.stress)
         before, now = (
-            self.body.memory.sum_over_points(mu * each)
-            for each in (self.previous_variables, borne)
+            self.body.memory.sum_over_points(mu * each) for each in (self.previous_variables, borne)
         )
         return np.stack([before, now, 0 * now, *self.fading.u])
 
-    def stress_derivatives(
-        self, theta_q: Array
-    ) -> Iterator[tuple[slice, Array]]:
+    def stress_derivatives(self, theta_q: Array) -> Iterator[tuple[slice, Array]]:
         """Yield consecutive slices of at most `EVALUATIONS_PER_CHUNK` evaluations, each with the
         derivatives ∂S/∂θ θ_q (T, q, width) there, for q directions θ_q (k, q) in θ.
         """
@@ -379,9 +327,7 @@ class MemoryHistory:
                 ),
             )
 
-    def vector_jacobian_product(
-        self, force_weights: Array, by_p: Array
-    ) -> HistoryGradient:
+    def vector_jacobian_product(self, force_weights: Array, by_p: Array) -> HistoryGradient:
         """Return the derivatives of Σ λ_k · f_H(H_k) through H; those by ν are zero.
 
         Parameters
@@ -438,13 +384,9 @@ class MemoryHistory:
         data = self.fading.data
         elastic = self.body.elastic_indices
         fading_inputs = slice(OVERSTRESS.compute_input_offsets()[2], None)
-        slopes = OVERSTRESS.step_function.evaluate_with_jacobian(inputs, data)[
-            1
-        ]
+        slopes = OVERSTRESS.step_function.evaluate_with_jacobian(inputs, data)[1]
         second = OVERSTRESS.step_function.weighted_hessian(inputs, data)
-        curvature.theta[:, places] += np.moveaxis(
-            slopes[0, fading_inputs], 2, 0
-        )
+        curvature.theta[:, places] += np.moveaxis(slopes[0, fading_inputs], 2, 0)
         curvature.theta_theta[:, places[:, None], places] += np.moveaxis(
             second[fading_inputs, fading_inputs], 3, 0
         )
@@ -453,19 +395,11 @@ class MemoryHistory:
             memory.repeat_over_points(np.eye(len(memory.branches)))
         ):
             weights = memory.sum_over_branches(branch_mask * mu)
-            by_xi = self.body.stresses.stress_vjp(
-                self.xi, weights, theta=self.theta
-            )
-            for place, factor in zip(
-                places[:, number], mixed[:, number], strict=True
-            ):
+            by_xi = self.body.stresses.stress_vjp(self.xi, weights, theta=self.theta)
+            for place, factor in zip(places[:, number], mixed[:, number], strict=True):
                 curvature.position_theta[:, :, place] += factor[:, None] * by_xi
-        for rows, by in self.stress_derivatives(
-            np.eye(len(self.theta))[:, elastic]
-        ):
-            by_moduli = memory.sum_over_points(
-                memory.to_branches(by) * mu[rows, None]
-            )
+        for rows, by in self.stress_derivatives(np.eye(len(self.theta))[:, elastic]):
+            by_moduli = memory.sum_over_points(memory.to_branches(by) * mu[rows, None])
             both = np.einsum("jbt,bte->tjbe", mixed[..., rows], by_moduli)
             curvature.theta_theta[rows, places[..., None], elastic] += both
             curvature.theta_theta[rows, elastic, places[..., None]] += both
@@ -492,20 +426,14 @@ class MemoryState:
     overstress: Array
 
     @classmethod
-    def at_start(
-        cls, body: Body, x: Array, theta: Array, loaded_s: float
-    ) -> MemoryState:
+    def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> MemoryState:
         """Return the memory in the start shape x (3n,) [m] of a body with constants θ (k,), which
         has been loaded for a time `loaded_s` [s]; infinite if the memory has relaxed.
 
         The body must have memory (IndexError otherwise).
         """
         return MemoryHistory.from_states(
-            body,
-            x[None],
-            theta=theta,
-            until_next_s=np.ones(1),
-            loaded_s=loaded_s,
+            body, x[None], theta=theta, until_next_s=np.ones(1), loaded_s=loaded_s
         ).extract_final_state()
 
     def insert_at_same_time(self, forces: Forces) -> Forces:
@@ -516,9 +444,7 @@ class MemoryState:
         past.overstress[0] = self.body.memory.sum_over_branches(self.overstress)
         return replace(forces, memory_state=past)
 
-    def insert_after_interval(
-        self, forces: Forces, interval_s: float
-    ) -> Forces:
+    def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
         """Return `forces`, given at one time, an interval [s] later than this state: their
         `memory_state` is replaced by the overstress that remains and the stiffening by the memory.
         The argument and self are unchanged.
@@ -530,9 +456,7 @@ class MemoryState:
             past.stiffening[0, branch.part] += own
         return replace(forces, memory_state=past)
 
-    def advance(
-        self, forces: Forces, x: Array, v: Array, interval_s: float
-    ) -> MemoryState:
+    def advance(self, forces: Forces, x: Array, v: Array, interval_s: float) -> MemoryState:
         """Return the memory in the state x (3n,) [m] that follows after an interval [s]; `self` is
         unchanged.
 
@@ -541,12 +465,8 @@ class MemoryState:
         memory = self.body.memory
         previous, c = self._after_interval(interval_s)
         stress = self.body.stresses.stress(x[None], self.theta)[0]
-        overstress = previous + memory.repeat_over_points(
-            c
-        ) * memory.to_branches(stress)
-        return MemoryState(
-            self.body, self.theta, stress=stress, overstress=overstress
-        )
+        overstress = previous + memory.repeat_over_points(c) * memory.to_branches(stress)
+        return MemoryState(self.body, self.theta, stress=stress, overstress=overstress)
 
     def _after_interval(self, interval_s: float) -> tuple[Array, Array]:
         """Return e Q − c S (all branches,) [Pa] of the overstress Q and the stress S, and the
@@ -556,9 +476,9 @@ class MemoryState:
         u = self.theta[[(b.share, b.tau) for b in memory.branches]].T
         e, c = INTERVAL.evaluate(u, np.full((1, u.shape[1]), interval_s))
         borne = memory.to_branches(self.stress)
-        return memory.repeat_over_points(
-            e
-        ) * self.overstress - memory.repeat_over_points(c) * borne, c
+        return memory.repeat_over_points(e) * self.overstress - memory.repeat_over_points(
+            c
+        ) * borne, c
 
 
 def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
@@ -603,11 +523,7 @@ class MemoryForwardColumns:
     """
 
     def __init__(
-        self,
-        history: MemoryHistory,
-        theta_q: Array,
-        done: int = 0,
-        known: Array | None = None,
+        self, history: MemoryHistory, theta_q: Array, done: int = 0, known: Array | None = None
     ) -> None:
         self.history = history
         self.next = done
@@ -620,19 +536,13 @@ class MemoryForwardColumns:
         self._stress = np.zeros((len(self.columns), self.stresses.width))
         self._state = np.zeros((len(self.columns), history.xi.shape[1]))
         self._direction = np.zeros_like(self._state)
-        self._moduli = np.flatnonzero(
-            theta_q[history.body.elastic_indices].any(axis=0)
-        )
+        self._moduli = np.flatnonzero(theta_q[history.body.elastic_indices].any(axis=0))
         self._theta_q = theta_q[:, self._moduli]
         self._by_moduli = np.zeros((0, 0, 0))
         fades = history.fading
         self._own = np.flatnonzero(theta_q[fades.places].any(axis=(0, 1)))
-        self._d, self._a = map(
-            self.memory.repeat_over_points, (fades.d, fades.a)
-        )
-        self._d_own, self._a_own = fades.jacobian_vector_product(
-            theta_q[:, self._own]
-        )
+        self._d, self._a = map(self.memory.repeat_over_points, (fades.d, fades.a))
+        self._d_own, self._a_own = fades.jacobian_vector_product(theta_q[:, self._own])
 
     def force_columns(self) -> Array:
         """Return the contribution of the memory to dF at the next evaluation, (3n, columns); the
@@ -640,14 +550,10 @@ class MemoryForwardColumns:
         """
         self._state[:] = self.history.xi[self.next]
         return self.stresses.memory_force(
-            self._state,
-            self.memory.sum_over_branches(self.columns),
-            theta=self.theta,
+            self._state, self.memory.sum_over_branches(self.columns), theta=self.theta
         ).T
 
-    def advance(
-        self, of_state: Callable[[], Array], _: Callable[[], Array]
-    ) -> None:
+    def advance(self, of_state: Callable[[], Array], _: Callable[[], Array]) -> None:
         """Pass the next evaluation: overwrite `columns` with the columns after it, and increase
         `next` by one.
 
@@ -672,12 +578,8 @@ class MemoryForwardColumns:
             self._direction *= a
         else:
             stress.fill(0.0)
-        self.stresses.stress_jvp(
-            self._state, self._direction, theta=self.theta, out=stress
-        )
-        for column, slope in zip(
-            self._moduli, self._elastic_stress_derivatives(k), strict=True
-        ):
+        self.stresses.stress_jvp(self._state, self._direction, theta=self.theta, out=stress)
+        for column, slope in zip(self._moduli, self._elastic_stress_derivatives(k), strict=True):
             stress[column] += a * slope if alone else slope
         if not alone:
             self.columns += a * self.memory.to_branches(stress)
@@ -730,13 +632,10 @@ class MemoryAdjoint:
         history = self.history
         k = self.next
         weights = history.body.memory.sum_over_branches(
-            history.body.memory.repeat_over_points(history.fading.a[:, k])
-            * self.columns
+            history.body.memory.repeat_over_points(history.fading.a[:, k]) * self.columns
         )
         state = history.xi[k]
-        by_x = history.body.stresses.stress_vjp(
-            state[None], weights[None], theta=history.theta
-        )[0]
+        by_x = history.body.stresses.stress_vjp(state[None], weights[None], theta=history.theta)[0]
         return by_x, np.zeros_like(by_x)
 
     def step_back(self, force_weight: Array) -> None:
@@ -752,9 +651,7 @@ class MemoryAdjoint:
         k = self.next
         state = history.xi[k][None]
         weight = force_weight[None]
-        push = history.body.stresses.memory_force_vjp(
-            state, weight, theta=history.theta
-        )[0]
+        push = history.body.stresses.memory_force_vjp(state, weight, theta=history.theta)[0]
         d = history.body.memory.repeat_over_points(history.fading.d[:, k])
         self.columns = d * self.columns + history.body.memory.to_branches(push)
         self.next -= 1

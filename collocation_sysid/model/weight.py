@@ -81,9 +81,7 @@ class DofMasses:
         result.
         """
         if len(self.tied_kg) and self.tied_kg.strides[0] == 0:
-            return np.broadcast_to(
-                constant_kg + self.tied_kg[0], self.tied_kg.shape
-            )
+            return np.broadcast_to(constant_kg + self.tied_kg[0], self.tied_kg.shape)
         return constant_kg + self.tied_kg
 
     @cached_property
@@ -159,9 +157,7 @@ class Weight(ForceTerm):
         """Return the weight of a body without gravity, loads and air, at one time."""
         nothing = np.zeros((1, body.pattern.size))
         no_air_kg = nothing[0]
-        mass = DofMasses(
-            _own_kg(body), nothing, displaced_kg=no_air_kg, added_kg=no_air_kg
-        )
+        mass = DofMasses(_own_kg(body), nothing, displaced_kg=no_air_kg, added_kg=no_air_kg)
         return cls(
             body,
             mass,
@@ -177,15 +173,10 @@ class Weight(ForceTerm):
         """
         if not self.body.mass_derivatives:
             return self
-        return replace(
-            self, mass=replace(self.mass, own_kg=self.body.mass_of_dofs(theta))
-        )
+        return replace(self, mass=replace(self.mass, own_kg=self.body.mass_of_dofs(theta)))
 
     def with_load_inputs(
-        self,
-        has_gravity_input: bool,
-        loads: Sequence[PointMass | Force],
-        t_s: Array,
+        self, has_gravity_input: bool, loads: Sequence[PointMass | Force], t_s: Array
     ) -> Weight:
         """Return this weight with gravity and the shares of some loads as inputs; other loads stay
         as they are.
@@ -207,9 +198,7 @@ class Weight(ForceTerm):
             else:
                 forces_n = load.node_forces_n(t_s, nodes)
                 joining.joining_n[k] = forces_n.reshape(len(t_s), -1)
-        return replace(
-            self, has_gravity_input=has_gravity_input, **joining._asdict()
-        )
+        return replace(self, has_gravity_input=has_gravity_input, **joining._asdict())
 
     @property
     def size(self) -> int:  # type: ignore[override]
@@ -225,19 +214,13 @@ class Weight(ForceTerm):
         """
         if not self.size:
             return self
-        weight = (
-            replace(self, gravity_m_s2=u[0, :3])
-            if self.has_gravity_input
-            else self
-        )
+        weight = replace(self, gravity_m_s2=u[0, :3]) if self.has_gravity_input else self
         if not len(self.joining_kg):
             return weight
         share = u[:, 3 * self.has_gravity_input :]
         change = share - self.share
         tied_kg = self.mass.tied_kg + change @ self.joining_kg
-        applied_n = self.applied_n + np.einsum(
-            "tl,ltd->td", change, self.joining_n
-        )
+        applied_n = self.applied_n + np.einsum("tl,ltd->td", change, self.joining_n)
         mass = replace(self.mass, tied_kg=tied_kg)
         return replace(weight, mass=mass, applied_n=applied_n, share=share)
 
@@ -270,10 +253,7 @@ class Weight(ForceTerm):
         return self.mass.weight_kg * self.gravity + self.applied_n
 
     def add_derivatives(
-        self,
-        linearisation: Linearisation,
-        places: AssemblyIndices,
-        states: States,
+        self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
         """Add the forces and their first derivatives by the inputs and by free densities to a
         linearisation, in place.
@@ -295,23 +275,17 @@ class Weight(ForceTerm):
         first_column = places.inputs.start
         if self.has_gravity_input:
             for axis in range(3):
-                linearisation.by_theta[:, axis::3, first_column + axis] += (
-                    self.mass.weight_kg[:, axis::3]
-                )
+                linearisation.by_theta[:, axis::3, first_column + axis] += self.mass.weight_kg[
+                    :, axis::3
+                ]
         for k, (kg, newtons) in enumerate(
             zip(self.joining_kg, self.joining_n, strict=True),
             first_column + 3 * self.has_gravity_input,
         ):
-            linearisation.by_theta[:, :, k] += (
-                kg * self._load_acceleration(states) + newtons
-            )
+            linearisation.by_theta[:, :, k] += kg * self._load_acceleration(states) + newtons
 
     def add_second_derivatives(
-        self,
-        curvature: SecondDerivatives,
-        places: AssemblyIndices,
-        states: States,
-        weights: Array,
+        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
         """Add the derivatives of Σ weights · F by inputs, free densities and velocities to a
         curvature, in place.
@@ -333,9 +307,7 @@ class Weight(ForceTerm):
         first_column = places.inputs.start
         if self.has_gravity_input:
             gravity_columns = slice(first_column, first_column + 3)
-            curvature.theta[:, gravity_columns] += _sum_over_nodes(
-                weights * self.mass.weight_kg
-            )
+            curvature.theta[:, gravity_columns] += _sum_over_nodes(weights * self.mass.weight_kg)
             for place, kg in self.mass_derivatives(first_column).items():
                 mixed = _sum_over_nodes(weights * kg)
                 curvature.theta_theta[:, place, gravity_columns] += mixed
@@ -345,9 +317,7 @@ class Weight(ForceTerm):
             first_column + 3 * self.has_gravity_input,
         ):
             share_derivative = kg * self._load_acceleration(states) + newtons
-            curvature.theta[:, k] += np.einsum(
-                "ti,ti->t", weights, share_derivative
-            )
+            curvature.theta[:, k] += np.einsum("ti,ti->t", weights, share_derivative)
             curvature.velocity_theta[:, :, k] -= (
                 self.body.tied_damping_rate(states.theta) * kg * weights
             )
@@ -358,14 +328,12 @@ class Weight(ForceTerm):
 
     def _load_acceleration(self, states: States) -> Array:
         """Return the acceleration g − γ_m ν (T, 3n) by which a tied mass loads the body [m/s²]."""
-        return (
-            self.gravity - self.body.tied_damping_rate(states.theta) * states.nu
-        )
+        return self.gravity - self.body.tied_damping_rate(states.theta) * states.nu
 
 
 def _own_kg(body: Body) -> Array:
-    """Return the masses (3n,) of a body whose constants are not known yet [kg]; NaN where a density or
-    a density field is a parameter.
+    """Return the masses (3n,) of a body whose constants are not known yet [kg]; NaN where a density
+    or a density field is a parameter.
     """
     return body.mass_of_dofs(np.full(len(body.constants), np.nan))
 
@@ -389,20 +357,10 @@ class _JoiningLoads(NamedTuple):
 
 
 def _zero_loads(rows: Array, count: int = 0) -> _JoiningLoads:
-    """Return new arrays of zeros for L loads: masses (L, 3n), forces (L, T, 3n), shares (T, L).
-
-    Parameters
-    ----------
-    rows : (T, 3n)
-        Array whose shape is used.
-    count : int
-        Number L of loads.
-    """
+    """Return new arrays of zeros for L loads: masses (L, 3n), forces (L, T, 3n), shares (T, L)."""
     times, dofs = rows.shape
     return _JoiningLoads(
-        np.zeros((count, dofs)),
-        np.zeros((count, times, dofs)),
-        share=np.zeros((times, count)),
+        np.zeros((count, dofs)), np.zeros((count, times, dofs)), share=np.zeros((times, count))
     )
 
 
@@ -415,8 +373,4 @@ def _as_constant_view(rows: Array) -> Array:
     """Return equal rows as a read-only view of a copy of one row, with stride 0; another array
     itself, also if a value is NaN. There must be at least one row.
     """
-    return (
-        np.broadcast_to(rows[0].copy(), rows.shape)
-        if (rows == rows[:1]).all()
-        else rows
-    )
+    return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows

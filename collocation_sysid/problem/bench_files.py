@@ -53,9 +53,7 @@ def strain_length_m(table: DisplacementSection, body: Body) -> float | None:
 
 def has_displacement_table(section: ExperimentSection) -> bool:
     """Whether a grasp or an obstacle of an experiment is moved by a table of displacements."""
-    return any(
-        moved.displacement is not None for moved in section.moved_sections
-    )
+    return any(moved.displacement is not None for moved in section.moved_sections)
 
 
 def table_name(section: ExperimentSection, table: TableSection) -> str:
@@ -115,9 +113,7 @@ class BenchTable:
         KeyError
             If a key of `values` is not among `known_quantities`.
         """
-        quantities = {
-            quantity.key: quantity for quantity in (TIME, *known_quantities)
-        }
+        quantities = {quantity.key: quantity for quantity in (TIME, *known_quantities)}
         time = {TIME.key: self.t_s}
         for key, column in (time | dict(values)).items():
             quantity = quantities[key]
@@ -135,10 +131,7 @@ class BenchTable:
 
 
 def add_displacement(
-    table: BenchTable,
-    layout: DisplacementSection,
-    grasp: Grasp,
-    rest_length_m: float | None,
+    table: BenchTable, layout: DisplacementSection, grasp: Grasp, rest_length_m: float | None
 ) -> None:
     """Add the translations of a grasp at the times of the table, in place, as `read_displacement`
     reads them.
@@ -164,13 +157,8 @@ def add_displacement(
     """
     shifts_m = layout.sign / layout.scale * grasp.poses.at(table.t_s)[1]
     displacement_m = shifts_m[:, "xyz".index(layout.axis)]
-    values = {
-        "displacement": displacement_m,
-        **dict(zip("xyz", shifts_m.T, strict=True)),
-    }
-    usual = (
-        ["displacement"] if grasp.zero in ("", layout.axis) else [*grasp.zero]
-    )
+    values = {"displacement": displacement_m, **dict(zip("xyz", shifts_m.T, strict=True))}
+    usual = ["displacement"] if grasp.zero in ("", layout.axis) else [*grasp.zero]
     if rest_length_m is not None:
         values["strain"] = displacement_m / rest_length_m
         usual = ["strain"]
@@ -179,9 +167,7 @@ def add_displacement(
     table.add(layout, {key: values[key] for key in chosen}, known)
 
 
-def add_loads(
-    table: BenchTable, layout: ForceSensorSection, at_s: Array, loads: Array
-) -> None:
+def add_loads(table: BenchTable, layout: ForceSensorSection, at_s: Array, loads: Array) -> None:
     """Add measured forces and torques to a table, in place, such that they are read back.
 
     Parameters
@@ -231,9 +217,7 @@ def _named_quantities(layout: TableSection) -> list[str]:
 
 
 def bench_tables(
-    section: ExperimentSection,
-    experiment: Experiment,
-    loads: Iterable[Array],
+    section: ExperimentSection, experiment: Experiment, loads: Iterable[Array]
 ) -> dict[str, BenchTable]:
     """Return the tables of a test bench that a simulation writes, by file name, see `table_name`.
 
@@ -247,7 +231,8 @@ def bench_tables(
     experiment : Experiment
         Simulated experiment, with the grasps and obstacles of `section` in the same order.
     loads : iterable of (S, 6) array
-        Simulated force and torque of each grasp or obstacle with a sensor, at its own times [N, N m].
+        Simulated force and torque of each grasp or obstacle with a sensor, at its own times [N, N
+        m].
 
     Raises
     ------
@@ -256,16 +241,9 @@ def bench_tables(
     """
     moved = list(zip(section.moved_sections, experiment.grasps, strict=True))
     declared_tables = [
-        t
-        for each in section.moved_sections
-        for t in (each.displacement, each.sensor)
-        if t
+        t for each in section.moved_sections for t in (each.displacement, each.sensor) if t
     ]
-    usual_time = (
-        OTHER_TIME
-        if any(table.columns for table in declared_tables)
-        else TIME.column
-    )
+    usual_time = OTHER_TIME if any(table.columns for table in declared_tables) else TIME.column
     # A time that one table names is also that of the other tables of the same file.
     time_columns = {
         table_name(section, table): table.columns[TIME.key]
@@ -292,7 +270,5 @@ def bench_tables(
     for declared, grasp in moved:
         if (sensed := declared.sensor) is not None and grasp.has_sensor():
             at_s = grasp.list_load_times_s()
-            add_loads(
-                table_of(sensed, at_s), sensed, at_s=at_s, loads=next(measured)
-            )
+            add_loads(table_of(sensed, at_s), sensed, at_s=at_s, loads=next(measured))
     return tables

@@ -1,5 +1,5 @@
-"""Keys of [[experiment.depth]] and of the nuisance parameters of depth cameras, and how the files of
-a camera or scanner are read.
+"""Keys of [[experiment.depth]] and of the nuisance parameters of depth cameras, and how the files
+of a camera or scanner are read.
 """
 
 from __future__ import annotations
@@ -24,11 +24,7 @@ from ..recording.formats.depth_files import DepthFileContent, read_depth
 from ..recording.formats.units import METRES_PER_UNIT
 from ..recording.node_selection import Nodes
 from ..recording.time_tables import is_within_experiment
-from .measurement_section import (
-    MeasurementSection,
-    RecordingFolder,
-    require_file_name,
-)
+from .measurement_section import MeasurementSection, RecordingFolder, require_file_name
 from .named_files import existing_file
 from .nuisance_priors import NuisancePriorSection
 
@@ -108,9 +104,7 @@ class DepthSection(MeasurementSection):
     background: Background = "auto"
     outline_sigma_px: Positive = 0.5
     file: Text
-    camera: DepthCameraSection = Field(
-        default_factory=lambda: DepthCameraSection.model_construct()
-    )
+    camera: DepthCameraSection = Field(default_factory=lambda: DepthCameraSection.model_construct())
     t_s: list[Finite] | None = None
     count_m: Positive | None = None
     length_unit: Unit = "m"
@@ -134,35 +128,20 @@ class DepthSection(MeasurementSection):
         content, at_s = self._read_images(folder, where)
         camera = self._camera(folder, content, where=f"{where}.camera")
         with located(where=where):
-            is_used = is_within_experiment(
-                at_s, t_s, name=self.file, is_static=folder.is_static
-            )
+            is_used = is_within_experiment(at_s, t_s, name=self.file, is_static=folder.is_static)
             used = np.flatnonzero(is_used).tolist()
-            clouds = (
-                [content.clouds_m[k] for k in used] if content.clouds_m else []
-            )
+            clouds = [content.clouds_m[k] for k in used] if content.clouds_m else []
             images = []
             outlined = samples_with_outlines(len(used))
-            for number, sample in enumerate(
-                used if len(content.images_m) else ()
-            ):
+            for number, sample in enumerate(used if len(content.images_m) else ()):
                 image = content.images_m[sample]
                 clouds.append(points_from_image(image, camera))
                 images.append(image if number in outlined else None)
-            arguments = {
-                "name": self.name,
-                **declared_in(self, Depth, where=where),
-            }
+            arguments = {"name": self.name, **declared_in(self, Depth, where=where)}
             depth = Depth(
-                t_s=at_s[is_used],
-                clouds=clouds,
-                camera=camera,
-                images_m=images,
-                **arguments,
+                t_s=at_s[is_used], clouds=clouds, camera=camera, images_m=images, **arguments
             )
-        folder.add_note(
-            f"{self.file}: {len(clouds)} of {len(at_s)} images are used"
-        )
+        folder.add_note(f"{self.file}: {len(clouds)} of {len(at_s)} images are used")
         return depth
 
     def _camera(
@@ -172,37 +151,22 @@ class DepthSection(MeasurementSection):
         `InputError` at `where` if it is incomplete.
         """
         names = ("matrix", "pose", "distortion")
-        arguments: dict[str, Any] = {
-            name: getattr(content, name) for name in names
-        }
+        arguments: dict[str, Any] = {name: getattr(content, name) for name in names}
         arguments |= declared_in(self.camera, DepthCamera, where=where)
         if self.camera.poses is not None:
-            file = existing_file(
-                folder.path, self.camera.poses, key=f"{where}.poses"
-            )
+            file = existing_file(folder.path, self.camera.poses, key=f"{where}.poses")
             arguments["poses"] = read_poses(file)
         with located(where=where):
             return DepthCamera(
-                **{
-                    name: value
-                    for name, value in arguments.items()
-                    if value is not None
-                }
+                **{name: value for name, value in arguments.items() if value is not None}
             )
 
-    def _read_images(
-        self, folder: RecordingFolder, where: str
-    ) -> tuple[DepthFileContent, Array]:
+    def _read_images(self, folder: RecordingFolder, where: str) -> tuple[DepthFileContent, Array]:
         """Return the content of the file or folder of the table, and the times of its images or
         clouds [s].
 
         Times are the stated ones, or those of the file; for equilibria, or a single image, without
         times they are 0, 1, 2, …
-
-        Raises
-        ------
-        InputError
-            If several images of a motion have no times, or the number of times is wrong.
         """
         file = folder.path / self.file
         if not file.is_dir():
@@ -216,15 +180,15 @@ class DepthSection(MeasurementSection):
         count = len(content.images_m) or len(content.clouds_m)
         t_s = self.t_s if self.t_s is not None else content.t_s
         if t_s is None and count > 1 and not folder.is_static:
-            message = f"{self.file} does not contain times of its {count} images; expected them in t_s"
+            message = (
+                f"{self.file} does not contain times of its {count} images; expected them in t_s"
+            )
             raise InputError(message, where=f"{where}.t_s")
-        times = (
-            np.arange(float(count))
-            if t_s is None
-            else np.array(t_s, dtype=float).ravel()
-        )
+        times = np.arange(float(count)) if t_s is None else np.array(t_s, dtype=float).ravel()
         if len(times) != count:
-            message = f"found {len(times)} times for {count} images or clouds; expected one time for each"
+            message = (
+                f"found {len(times)} times for {count} images or clouds; expected one time for each"
+            )
             raise InputError(message, where=f"{where}.t_s")
         return content, times
 

@@ -58,9 +58,7 @@ class CodeLoader:
         InputError
             See `function`; also if the function is no energy density, see `Material.from_energy`.
         """
-        file, loaded = self.function(
-            section.file, section.function, f"{key}.file"
-        )
+        file, loaded = self.function(section.file, section.function, f"{key}.file")
         if isinstance(loaded, Material):
             return loaded
         with located(file):
@@ -86,14 +84,8 @@ class CodeLoader:
             See `function`; also if the function is no force, see `NodeForce.from_law`, or if
             `carries` is stated and differs from that of a `NodeForce`.
         """
-        file, loaded = self.function(
-            section.file, section.function, f"{key}.file"
-        )
-        nodes = (
-            None
-            if section.nodes is None
-            else selection_from_section(section.nodes)
-        )
+        file, loaded = self.function(section.file, section.function, f"{key}.file")
+        nodes = None if section.nodes is None else selection_from_section(section.nodes)
         name = section.function
         carries = section.carries
         if isinstance(loaded, NodeForce):
@@ -120,13 +112,9 @@ class CodeLoader:
             return isinstance(value, NuisanceRow)
 
         key = "nuisance.own.file"
-        return self._load(
-            section.file, section.row, key, "NuisanceRow", is_row
-        )[1]
+        return self._load(section.file, section.row, key, "NuisanceRow", is_row)[1]
 
-    def function(
-        self, file: str, name: str, key: str
-    ) -> tuple[Path, Callable[..., Any]]:
+    def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
         """Run a Python file, and return its path and the function in it that has a name.
 
         Any callable and any `NodeForce` count as functions. The file is run in every call.
@@ -151,38 +139,12 @@ class CodeLoader:
             """Whether a value of the file is callable or a `NodeForce`."""
             return callable(value) or isinstance(value, NodeForce)
 
-        return self._load(
-            file, name, key=key, kind="function", is_kind=is_function
-        )
+        return self._load(file, name, key=key, kind="function", is_kind=is_function)
 
     def _load(
-        self,
-        name: str,
-        value_name: str,
-        key: str,
-        kind: str,
-        is_kind: Callable[[Any], bool],
+        self, name: str, value_name: str, key: str, kind: str, is_kind: Callable[[Any], bool]
     ) -> tuple[Path, Any]:
-        """Run a file, which is done in every call, and return its path and the value with a name.
-
-        Parameters
-        ----------
-        name : str
-            Name of the file.
-        value_name : str
-            Name of the value.
-        key : str
-            Key of the problem file, for messages.
-        kind : str
-            Kind of value, for messages.
-        is_kind : callable
-            Function that returns whether a value is of this kind.
-
-        Raises
-        ------
-        InputError
-            See `function`.
-        """
+        """Run a file, which is done in every call, and return its path and the value with a name."""
         if not self.is_allowed:
             message = (
                 f"found the file {name}, which would be run as Python code; allow that with "
@@ -194,18 +156,12 @@ class CodeLoader:
             names = runpy.run_path(str(file))
         except (Exception, SystemExit) as error:
             raise InputError(
-                f"this Python file raised an error when it was run: {reason(error)}",
-                file,
+                f"this Python file raised an error when it was run: {reason(error)}", file
             ) from error
         if not is_kind(names.get(value_name)):
             known_names = [
-                n
-                for n, value in names.items()
-                if is_kind(value) and not n.startswith("_")
+                n for n, value in names.items() if is_kind(value) and not n.startswith("_")
             ]
             known = f"{', '.join(known_names) or 'none'}{hint_at(value_name, known_names)}"
-            raise InputError(
-                f"there is no {kind} {value_name!r}; expected one of {known}",
-                file,
-            )
+            raise InputError(f"there is no {kind} {value_name!r}; expected one of {known}", file)
         return file, names[value_name]

@@ -14,9 +14,7 @@ from .schema import ObjectSection, ParameterSection, RegionSection
 Sections = Mapping[str, ParameterSection | float]
 
 
-def with_guessed_densities(
-    section: ObjectSection, parameters: Sections
-) -> ObjectSection:
+def with_guessed_densities(section: ObjectSection, parameters: Sections) -> ObjectSection:
     """Return a copy of [object] in which missing densities of the body and of regions are guesses
     of parameters (or their prior means or fixed values).
 
@@ -35,17 +33,11 @@ def with_guessed_densities(
     InputError
         If the body states neither mass nor density, and the parameters give none or both of them.
     """
-    regions = [
-        _with_guessed_density(region, parameters) for region in section.region
-    ]
+    regions = [_with_guessed_density(region, parameters) for region in section.region]
     changes: dict[str, object] = {"region": regions}
     if section.mass_kg is None and section.density_kg_m3 is None:
-        guesses = {
-            name: _guess(parameters, name) for name in (DENSITY.name, MASS.name)
-        }
-        known = {
-            name: guess for name, guess in guesses.items() if guess is not None
-        }
+        guesses = {name: _guess(parameters, name) for name in (DENSITY.name, MASS.name)}
+        known = {name: guess for name, guess in guesses.items() if guess is not None}
         if len(known) != 1:
             names = " and ".join(known) or f"no {MASS.name} or {DENSITY.name}"
             raise InputError(
@@ -63,9 +55,7 @@ def with_declared_densities(
     guess or prior has the value that the body states as its guess; all others are unchanged.
     """
     return {
-        name: section.model_copy(
-            update={"guess": _declared_density(body, name)}
-        )
+        name: section.model_copy(update={"guess": _declared_density(body, name)})
         if isinstance(section, ParameterSection)
         and is_density(name)
         and section.fixed is None
@@ -76,9 +66,7 @@ def with_declared_densities(
     }
 
 
-def _with_guessed_density(
-    region: RegionSection, parameters: Sections
-) -> RegionSection:
+def _with_guessed_density(region: RegionSection, parameters: Sections) -> RegionSection:
     """Return a region with its density [kg/m³]: the region itself if it states one, else a copy
     with the guess of its parameter "NAME.density_kg_m3", or None.
     """
@@ -111,7 +99,5 @@ def _declared_density(body: Body, name: str) -> float | None:
         return body.mass_kg
     region = name.rpartition(".")[0]
     fitting = [part.density_kg_m3 for part in body.parts if part.name == region]
-    shared = [
-        part.density_kg_m3 for part in body.parts if not part.has_own_density
-    ]
+    shared = [part.density_kg_m3 for part in body.parts if not part.has_own_density]
     return next(iter(fitting or shared), None)

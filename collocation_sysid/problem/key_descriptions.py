@@ -19,12 +19,7 @@ _TYPE_WORDS = {
     "string": "text",
 }
 # Values of keywords of a schema that limit a number, with the sign that states them.
-_LIMITS = {
-    "minimum": "≥",
-    "exclusiveMinimum": ">",
-    "maximum": "≤",
-    "exclusiveMaximum": "<",
-}
+_LIMITS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 _REFERENCE = "#/$defs/"
 
 
@@ -77,19 +72,7 @@ def _keys_of(
     path: tuple[str, ...],
     seen: tuple[str, ...],
 ) -> Iterator[KeyDescription]:
-    """Yield the keys of a part of a schema, and of all tables within.
-
-    Parameters
-    ----------
-    part : mapping
-        Schema of one value.
-    definitions : mapping
-        Schemas by the names that references state.
-    path : tuple of str
-        Keys that lead to the value.
-    seen : tuple of str
-        References that lead to the value; these are not followed again.
-    """
+    """Yield the keys of a part of a schema, and of all tables within."""
     if (reference := part.get("$ref")) and reference not in seen:
         target = definitions[reference.removeprefix(_REFERENCE)]
         yield from _keys_of(target, definitions, path, (*seen, reference))
@@ -114,9 +97,7 @@ def _keys_of(
 
 def _form(part: Mapping[str, Any]) -> str:
     """Return the values that a schema allows in words; empty if it states none."""
-    if choices := part.get("enum") or (
-        [part["const"]] if "const" in part else ()
-    ):
+    if choices := part.get("enum") or ([part["const"]] if "const" in part else ()):
         return ", ".join(json.dumps(each) for each in choices)
     if "$ref" in part:
         return "table"
@@ -125,9 +106,5 @@ def _form(part: Mapping[str, Any]) -> str:
         forms = [_form(each) for each in parts if each.get("type") != "null"]
         return " or ".join(dict.fromkeys(each for each in forms if each))
     kind = str(part.get("type", ""))
-    limits = [
-        f"{sign} {part[word]:g}"
-        for word, sign in _LIMITS.items()
-        if word in part
-    ]
+    limits = [f"{sign} {part[word]:g}" for word, sign in _LIMITS.items() if word in part]
     return " ".join([_TYPE_WORDS.get(kind, kind), *limits])

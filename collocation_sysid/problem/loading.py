@@ -13,13 +13,7 @@ from ..common.schema_tables import Section, declared_in
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, located
 from ..fem.body import Body
-from ..fem.laws.constants import (
-    FRICTION,
-    GAMMA_M,
-    GAMMA_R,
-    Constant,
-    constant_named,
-)
+from ..fem.laws.constants import FRICTION, GAMMA_M, GAMMA_R, Constant, constant_named
 from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import (
     box_of_edge,
@@ -36,10 +30,7 @@ from ..recording.homogeneous_deformation import DEFORMATIONS
 from ..recording.node_selection import selection_from_section
 from ..recording.specimen import cell_body
 from ..recording.specimen_checks import require_equal_units
-from ..statistics.misspecification.plausibility import (
-    SIZES_M,
-    size_and_density_hypotheses,
-)
+from ..statistics.misspecification.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader
 from .density_guesses import with_declared_densities, with_guessed_densities
 from .load_schema import LOADS
@@ -48,13 +39,7 @@ from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible
 from .recording_reader import RecordingReader
-from .schema import (
-    CodeSection,
-    ObjectSection,
-    ParameterSection,
-    PriorSection,
-    ProblemFile,
-)
+from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
 from .specimen_reader import SpecimenReader
 from .specimen_schema import SpecimenSection
 
@@ -82,12 +67,9 @@ def problem_arguments(
         For the first mistake, with file and key; see `Problem.read`.
     """
     file, text = read_problem_file(path, overrides)
-    if not simulation and all(
-        section.validation for section in file.experiment
-    ):
+    if not simulation and all(section.validation for section in file.experiment):
         raise InputError(
-            "every experiment has validation = true; expected at least one to fit",
-            path,
+            "every experiment has validation = true; expected at least one to fit", path
         )
     folder = path.parent if folder is None else Path(folder)
     unknowns = file.parameters
@@ -99,12 +81,8 @@ def problem_arguments(
     with _locate_in_table(path, "object"):
         cells = SpecimenCells(file.object, code)
         if file.list_recordings():
-            body, size = _load_object(
-                file, folder, code=code, simulation=simulation, say=say
-            )
-            mesh_warnings = [
-                oddity.message for oddity in size_and_density_hypotheses(body)
-            ]
+            body, size = _load_object(file, folder, code=code, simulation=simulation, say=say)
+            mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
         else:
             body = cells.body_for(file.list_specimens()[0].test)
             unknowns = cells.with_undamped(unknowns)
@@ -123,10 +101,7 @@ def problem_arguments(
             where = f"experiment '{section.name}'"
             if isinstance(section, SpecimenSection):
                 specimen_reader = SpecimenReader(
-                    section,
-                    folder,
-                    body=cells.body_for(section.test),
-                    simulation=simulation,
+                    section, folder, body=cells.body_for(section.test), simulation=simulation
                 )
                 with _locate_in_table(path, where):
                     specimens[section.name], experiment = specimen_reader.read()
@@ -166,54 +141,24 @@ def problem_arguments(
 
 
 def _load_object(
-    file: ProblemFile,
-    folder: Path,
-    code: CodeLoader,
-    simulation: bool,
-    say: Say | None,
+    file: ProblemFile, folder: Path, code: CodeLoader, simulation: bool, say: Say | None
 ) -> tuple[Body, Size]:
     """Return the body of the recordings, with the parts whose density is estimated marked, and the
     size of the problem with one sample.
-
-    Parameters
-    ----------
-    file : ProblemFile
-    folder : Path
-        Folder of the named files.
-    code : CodeLoader
-    simulation : bool
-        Whether nothing is estimated.
-    say : callable or None
-        Called with a sentence if a solve with one sample will take long.
-
-    Raises
-    ------
-    InputError
-        If the mesh, the material or a density is missing or invalid, or if one sample exceeds the
-        memory.
     """
     with _lengths_checked(file.object):
         generated = _generated_counts(file.object)
         if generated:
             corners, elements = generated
-            size = _smallest_size(
-                file, corners=corners, elements=elements, simulation=simulation
-            )
+            size = _smallest_size(file, corners=corners, elements=elements, simulation=simulation)
             require_feasible(replace(size, substeps=1), say)
         mesh = _load_mesh(file.object, folder)
     size = _smallest_size(
-        file,
-        corners=len(mesh.points_m),
-        elements=len(mesh.tetrahedra),
-        simulation=simulation,
+        file, corners=len(mesh.points_m), elements=len(mesh.tetrahedra), simulation=simulation
     )
     require_feasible(replace(size, substeps=1), None if generated else say)
-    body = _load_body(
-        with_guessed_densities(file.object, file.parameters), mesh, code=code
-    )
-    return body.with_free_densities(
-        body.parts_with_free_density(file.parameters)
-    ), size
+    body = _load_body(with_guessed_densities(file.object, file.parameters), mesh, code=code)
+    return body.with_free_densities(body.parts_with_free_density(file.parameters)), size
 
 
 class SpecimenCells:
@@ -251,9 +196,7 @@ class SpecimenCells:
             self._bodies[has_inner_node] = cell_body(
                 test,
                 material,
-                prony=tuple(
-                    b.name for b in self._section.prony if b.region is None
-                ),
+                prony=tuple(b.name for b in self._section.prony if b.region is None),
                 damping=self._section.damping,
             )
         return self._bodies[has_inner_node]
@@ -266,10 +209,7 @@ class SpecimenCells:
         """
         constants = next(iter(self._bodies.values())).constants.values()
         damping = {c.name: 0.0 for c in constants if c in (GAMMA_R, GAMMA_M)}
-        return {
-            **parameters,
-            **{n: v for n, v in damping.items() if n not in parameters},
-        }
+        return {**parameters, **{n: v for n, v in damping.items() if n not in parameters}}
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
@@ -283,32 +223,13 @@ def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
         return count_box_elements(section.box_m, length_m)
     if (shape := section.cylinder) is not None:
         return count_cylinder_elements(
-            shape.diameter_m,
-            shape.height_m,
-            edge_length_m=length_m,
-            quarter=shape.quarter,
+            shape.diameter_m, shape.height_m, edge_length_m=length_m, quarter=shape.quarter
         )
     return None
 
 
-def _smallest_size(
-    file: ProblemFile, corners: int, elements: int, *, simulation: bool
-) -> Size:
-    """Return the size of the problem with one sample, before a mesh exists.
-
-    Parameters
-    ----------
-    file : ProblemFile
-    corners, elements : int
-        Numbers of corner nodes and elements of the mesh.
-    simulation : bool
-        Whether nothing is estimated, so that there are no sensitivities.
-
-    Returns
-    -------
-    Size
-        A quadratic mesh counts eight nodes per corner; substeps "auto" count as one.
-    """
+def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation: bool) -> Size:
+    """Return the size of the problem with one sample, before a mesh exists."""
     # A quadratic element has a node on every edge; a mesh has about 7 edges per corner.
     nodes = corners if file.object.element == "tet4" else 8 * corners
     substeps = file.transcription.substeps
@@ -335,35 +256,17 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     for section in file.list_recordings():
         names += section.list_measurement_files()
         for _, word, kind in LOADS:
-            keys = [
-                key.name for _, key in keys_of(kind) if key.constant is not None
-            ]
-            names += [
-                getattr(table, key)
-                for table in getattr(section, word)
-                for key in keys
-            ]
+            keys = [key.name for _, key in keys_of(kind) if key.constant is not None]
+            names += [getattr(table, key) for table in getattr(section, word) for key in keys]
     return tuple(folder / name for name in names if name is not None)
 
 
 @contextmanager
-def _locate_in_table(
-    path: Path, table: str, odd: Sequence[str] = ()
-) -> Iterator[None]:
+def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]:
     """Context that adds file and table to errors that have no file.
 
     Each `InputError` is replaced by a new one. Errors of another file keep it; an error of the
     air's density is located in the table `environment` of this file.
-
-    Parameters
-    ----------
-    path : Path
-        File of the problem.
-    table : str
-        Name of the table, or a description such as "experiment 'a'"; the key of the error follows.
-    odd : sequence of str
-        Warnings on the body that may explain the error; the message of every error begins with
-        them.
     """
     try:
         yield
@@ -378,9 +281,7 @@ def _locate_in_table(
             separator = ": " if " " in table else "."
             source = path
             where = separator.join(part for part in (table, inner) if part)
-        raise InputError(
-            "; ".join([*odd, error.message]), source, where=where
-        ) from error
+        raise InputError("; ".join([*odd, error.message]), source, where=where) from error
 
 
 def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
@@ -388,11 +289,6 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
     shape.
 
     Meshes of surfaces are cached in ``.meshes`` in `folder`, the folder of the problem.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or unusable.
     """
     if section.mesh is not None:
         file = existing_file(folder, section.mesh, key="mesh")
@@ -403,28 +299,17 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
     surface = existing_file(folder, section.surface, key="surface")
     cache = folder / ".meshes"
     return TetMesh.from_surface(
-        surface,
-        section.edge_length_m,
-        length_unit=section.length_unit,
-        cache=cache,
+        surface, section.edge_length_m, length_unit=section.length_unit, cache=cache
     )
 
 
 def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
     """Return a mesh of the cylinder, or else of the box, that the section states, with edges of
     about this length [m].
-
-    Raises
-    ------
-    InputError
-        If the lengths are unusable.
     """
     if (shape := section.cylinder) is not None:
         return cylinder_of_edge(
-            shape.diameter_m,
-            shape.height_m,
-            edge_length_m=edge_length_m,
-            quarter=shape.quarter,
+            shape.diameter_m, shape.height_m, edge_length_m=edge_length_m, quarter=shape.quarter
         )
     return box_of_edge(section.box_m or (0.0, 0.0, 0.0), edge_length_m)
 
@@ -435,10 +320,7 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
     box, if that is above the largest plausible size; other errors pass.
     """
     if (shape := section.cylinder) is not None:
-        lengths_m = {
-            "cylinder.diameter_m": shape.diameter_m,
-            "cylinder.height_m": shape.height_m,
-        }
+        lengths_m = {"cylinder.diameter_m": shape.diameter_m, "cylinder.height_m": shape.height_m}
     else:
         lengths_m = {"box_m": max(section.box_m or (0.0,))}
     try:
@@ -449,29 +331,12 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
         if length_m <= largest_m:
             raise
         likely = f"likely {length_m / 1e3:g}, if it was in mm"
-        message = (
-            f"found {length_m:g} m; expected at most {largest_m:g} m, {likely}"
-        )
+        message = f"found {length_m:g} m; expected at most {largest_m:g} m, {likely}"
         raise InputError(message, None, where=key) from error
 
 
 def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
-    """Return the body with its materials, regions, forces and fields.
-
-    Parameters
-    ----------
-    section : ObjectSection
-        Table of the object, with mass or density.
-    mesh : TetMesh
-        Mesh of the body.
-    code : CodeLoader
-        Loader of the Python files of materials and forces.
-
-    Raises
-    ------
-    InputError
-        If a selection, material, force or field is invalid.
-    """
+    """Return the body with its materials, regions, forces and fields."""
 
     def material(law: str | CodeSection | None, key: str) -> Any:
         """Return a custom material if `law` is the table of a Python file, else the name itself, or
@@ -483,19 +348,13 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         """Return the names of the memory branches of a region; None stands for branches without a
         region.
         """
-        return [
-            branch.name for branch in section.prony if branch.region == region
-        ]
+        return [branch.name for branch in section.prony if branch.region == region]
 
     def field(section: Section | None, where: str) -> Field | None:
         """Return the spatially varying constant that a table states at the key `where`; None
         without a table.
         """
-        return (
-            None
-            if section is None
-            else Field(**declared_in(section, Field, where=where))
-        )
+        return None if section is None else Field(**declared_in(section, Field, where=where))
 
     regions = [
         Region(
@@ -518,27 +377,19 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         damping=section.damping,
         regions=regions,
         prony=branches(None),
-        forces=[
-            code.force(force, f"force.{k}")
-            for k, force in enumerate(section.force)
-        ],
+        forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
         field=field(section.field, "field"),
         rest_shape=_rest_shape(section),
         evaluator=section.evaluator,
     )
 
 
-def _rest_shape(
-    section: ObjectSection,
-) -> UnderGravity | Literal["stress_free"] | None:
+def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"] | None:
     """Return the stated stress-free shape: that of a scan under gravity, "stress_free", or None if
     the file states none.
     """
     if section.scan is not None:
-        return UnderGravity(
-            selection_from_section(section.scan.nodes),
-            section.scan.gravity_m_s2,
-        )
+        return UnderGravity(selection_from_section(section.scan.nodes), section.scan.gravity_m_s2)
     return "stress_free" if section.rest_shape is not None else None
 
 
@@ -547,22 +398,12 @@ def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
     frictions given as numbers are left out, and so are names that do not end with that of a
     coefficient of friction.
     """
-    declared = (
-        each.friction
-        for section in file.list_recordings()
-        for each in section.obstacle
-    )
-    named = (
-        one
-        for one in declared
-        if isinstance(one, str) and one.endswith(FRICTION.name)
-    )
+    declared = (each.friction for section in file.list_recordings() for each in section.obstacle)
+    named = (one for one in declared if isinstance(one, str) and one.endswith(FRICTION.name))
     return tuple(dict.fromkeys(map(constant_named, named)))
 
 
-def _as_parameter(
-    name: str, section: ParameterSection | float
-) -> Unknown | Tied | float:
+def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
     """Return one parameter from its table: its fixed value, a `Tied` one if it has `tied_to` (with
     the ratio 1 by default), else one that is estimated; a number is returned as it is.
     """
@@ -571,9 +412,7 @@ def _as_parameter(
     if section.fixed is not None:
         return section.fixed
     if section.tied_to is not None:
-        return Tied(
-            section.tied_to, 1.0 if section.ratio is None else section.ratio
-        )
+        return Tied(section.tied_to, 1.0 if section.ratio is None else section.ratio)
     linear = (section.scale or constant_named(name).scale) == "linear"
     return Unknown(
         guess=section.guess,
@@ -593,9 +432,5 @@ def _prior(section: PriorSection, linear: bool) -> tuple[float, float]:
     """
     size = abs(section.mean)
     if linear:
-        return section.mean, section.deviation or (
-            section.relative or 0.0
-        ) * size
-    return section.mean, section.relative or (section.deviation or 0.0) / max(
-        size, 1e-300
-    )
+        return section.mean, section.deviation or (section.relative or 0.0) * size
+    return section.mean, section.relative or (section.deviation or 0.0) / max(size, 1e-300)

@@ -9,13 +9,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..errors import InputError
-from ..recording import (
-    MarkerTable,
-    PoseSequence,
-    align_to_template,
-    fit_poses,
-    read_markers,
-)
+from ..recording import MarkerTable, PoseSequence, align_to_template, fit_poses, read_markers
 from ..recording.rigid_fit import least_rigid_marker
 from .recording_schema import ExperimentSection, MarkersSection, MovedSection
 
@@ -29,9 +23,7 @@ def gripper_markers(section: ExperimentSection) -> set[str]:
     """Return the names of the markers from which poses of grasps and obstacles are computed; empty
     if there are none.
     """
-    return {
-        name for moved in section.moved_sections for name in moved.markers or ()
-    }
+    return {name for moved in section.moved_sections for name in moved.markers or ()}
 
 
 def read_marker_tracks(section: ExperimentSection, file: Path) -> MarkerTable:
@@ -48,14 +40,8 @@ def read_marker_tracks(section: ExperimentSection, file: Path) -> MarkerTable:
     markers = section.markers
     names = None
     if markers.names is not None:
-        other_names = [
-            *(markers.template_m or ()),
-            *sorted(gripper_markers(section)),
-        ]
-        names = [
-            *markers.names,
-            *(n for n in dict.fromkeys(other_names) if n not in markers.names),
-        ]
+        other_names = [*(markers.template_m or ()), *sorted(gripper_markers(section))]
+        names = [*markers.names, *(n for n in dict.fromkeys(other_names) if n not in markers.names)]
     return read_markers(
         file,
         names=names,
@@ -87,9 +73,7 @@ def transform_to_body_frame(
     """
     if markers.template_m is None or markers.template_window_s is None:
         return table, []
-    fit = align_to_template(
-        table, markers.template_m, window_s=markers.template_window_s
-    )
+    fit = align_to_template(table, markers.template_m, window_s=markers.template_window_s)
     names = list(markers.template_m)
     residuals_m = fit.residual_m
     worst = int(np.nanargmax(residuals_m))
@@ -111,9 +95,7 @@ def transform_to_body_frame(
 
 
 def poses_from_markers(
-    grasp: MovedSection,
-    table: MarkerTable,
-    window_s: tuple[float, float] | None,
+    grasp: MovedSection, table: MarkerTable, window_s: tuple[float, float] | None
 ) -> tuple[PoseSequence, list[str]]:
     """Return poses fitted to the tracks of a grasp's markers, and notes on residuals and missing
     frames.
@@ -141,11 +123,7 @@ def poses_from_markers(
     names = list(grasp.markers)
     reference_m = np.array([grasp.markers[name] for name in names])
     tracks = table.positions_m[:, [table.names.index(name) for name in names]]
-    fit = fit_poses(
-        reference_m,
-        tracks,
-        weights=[grasp.weights.get(name, 1.0) for name in names],
-    )
+    fit = fit_poses(reference_m, tracks, weights=[grasp.weights.get(name, 1.0) for name in names])
     poses = replace(fit.poses(table.t_s), interpolation=grasp.interpolation)
     first_s, last_s = window_s or (-np.inf, np.inf)
     is_in_window = (table.t_s >= first_s) & (table.t_s <= last_s)
@@ -178,23 +156,7 @@ def _rigidity_note(
     residual_m: Array,
     max_residual_m: float | None,
 ) -> str:
-    """Return a note on the residuals of the rigid fit, with the worst marker if a frame is unusual.
-
-    Parameters
-    ----------
-    names : list of str
-        Names of the M markers.
-    reference_m : (M, 3) array
-        Positions on the undeformed body [m].
-    tracks : (T, M, 3) array
-        Measured positions [m].
-    t_s : (T,) array
-        Times [s].
-    residual_m : (T,) array
-        Residual of each frame [m]; NaN where it is not to be reported.
-    max_residual_m : float or None
-        Residual above which a frame is reported [m]; None for a limit from the median.
-    """
+    """Return a note on the residuals of the rigid fit, with the worst marker if a frame is unusual."""
     median_m = float(np.nanmedian(residual_m))
     worst = int(np.nanargmax(residual_m))
     size_m = float(np.linalg.norm(np.ptp(reference_m, axis=0)))

@@ -8,12 +8,7 @@ from pathlib import Path
 
 from ..common.files import replaced_file, require_possible, write_text_file
 from ..errors import InputError
-from .editor_schema import (
-    SCHEMA_FILE,
-    schema_text,
-    schema_url,
-    with_schema_reference,
-)
+from .editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
 
 # A folder for each kind, see scripts/make_templates.py.
 TEMPLATES = Path(__file__).parent / "templates"
@@ -48,19 +43,13 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     file = folder / "problem.toml"
     template = TEMPLATES / (kind or "swing")
     require_possible(folder)
-    data = sorted(
-        each for each in template.iterdir() if kind and each.name != file.name
-    )
+    data = sorted(each for each in template.iterdir() if kind and each.name != file.name)
     url = schema_url()
     schema = [] if url else [folder / SCHEMA_FILE]
     for each in (file, *(folder / each.name for each in data), *schema):
         if each.exists():
-            raise InputError(
-                "this file exists already; choose another folder", each
-            )
-    title = json.dumps(
-        folder.resolve().name, ensure_ascii=False
-    )  # quoted as TOML quotes
+            raise InputError("this file exists already; choose another folder", each)
+    title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
     text = (template / file.name).read_text(encoding="utf-8")
     if kind is None:
         text = _without_simulated_settings(text)

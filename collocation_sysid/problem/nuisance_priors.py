@@ -52,13 +52,9 @@ class NuisancePriorSection(Scoped):
         the parameter has a default and another scope than "recording" is stated.
         """
         priors = [key for key in type(self).model_fields if key != "scope"]
-        if not used_keys(self, *priors) and (
-            self.scope == "recording" or not self.has_default
-        ):
+        if not used_keys(self, *priors) and (self.scope == "recording" or not self.has_default):
             expected = "one or both" if len(priors) > 1 else "it"
-            raise ValueError(
-                f"found no {' and no '.join(priors)}; expected {expected}"
-            )
+            raise ValueError(f"found no {' and no '.join(priors)}; expected {expected}")
         return self
 
 

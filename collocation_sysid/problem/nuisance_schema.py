@@ -46,9 +46,7 @@ from .nuisance_priors import (
     ToolPrior,
 )
 
-KEYS = {
-    key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)
-}
+KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)}
 
 
 class CustomNuisanceSection(Scoped):
@@ -126,8 +124,8 @@ class NuisanceSection(Section):
         Delay of the time at which each point mass or force begins or ends, if this time is within
         the recording: prior_s, 10 ms by default.
     tare : TarePrior or "none", optional
-        A constant offset of each component of a force sensor, in multiples of its sigma: prior_sigmas, 10
-        by default.
+        A constant offset of each component of a force sensor, in multiples of its sigma:
+        prior_sigmas, 10 by default.
     sensor_time : SensorTimePrior or "none", optional
         Delay of the force sensors, limited to three standard deviations of its prior: prior_s, 5 ms
         by default.
@@ -160,9 +158,7 @@ class NuisanceSection(Section):
     marker_offsets: PriorOrNone[MarkerOffsetsPrior] | None = None
     camera_offsets: PriorOrNone[CameraOffsetsPrior] | None = None
     calibration_scale: PriorOrNone[CalibrationScalePrior] | None = None
-    calibration_distortion: PriorOrNone[CalibrationDistortionPrior] | None = (
-        None
-    )
+    calibration_distortion: PriorOrNone[CalibrationDistortionPrior] | None = None
     time_shift: PriorOrNone[TimeShiftPrior] | None = None
     clock_rate: PriorOrNone[ClockRatePrior] | None = None
     pose: PriorOrNone[PosePrior] | None = None
@@ -227,12 +223,7 @@ def nuisance_from_section(
                 scope |= {row.name: prior.scope for row in rows}
     custom_rows = [row_of(each) for each in section.own]
     scopes_by_name = {
-        row.name: each.scope
-        for row, each in zip(custom_rows, section.own, strict=True)
+        row.name: each.scope for row, each in zip(custom_rows, section.own, strict=True)
     }
-    scope |= {
-        name: word
-        for name, word in scopes_by_name.items()
-        if word != "recording"
-    }
+    scope |= {name: word for name, word in scopes_by_name.items() if word != "recording"}
     return Nuisance(**deviations, scope=scope, own=custom_rows)

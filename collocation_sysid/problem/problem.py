@@ -24,34 +24,25 @@ from ..program.collocation import Collocation
 from ..program.shared_nuisances import nuisance_indices
 from ..program.simulation import require_steps
 from ..recording import Experiment
-from ..statistics.misspecification.plausibility import (
-    size_and_density_hypotheses,
-)
+from ..statistics.misspecification.plausibility import size_and_density_hypotheses
 from ..statistics.scale_identifiability import scale_concerns, static_concerns
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 
 
-def _unconverted(
-    parameters: Parameters | Mapping[str, Unknown | Tied | float],
-) -> Parameters:
+def _unconverted(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
     """Return the argument; a mapping is converted when the bodies are known."""
     return cast(Parameters, parameters)
 
 
 def _as_parameters(
-    parameters: Parameters | Mapping[str, Unknown | Tied | float],
-    bodies: Iterable[Body],
+    parameters: Parameters | Mapping[str, Unknown | Tied | float], bodies: Iterable[Body]
 ) -> Parameters:
     """Return parameters as they are; a mapping by name is converted by `Parameters.from_mapping`
     with the definitions of the constants of the bodies.
     """
     if isinstance(parameters, Parameters):
         return parameters
-    definitions = {
-        name: constant
-        for body in bodies
-        for name, constant in body.constants.items()
-    }
+    definitions = {name: constant for body in bodies for name, constant in body.constants.items()}
     return Parameters.from_mapping(parameters, definitions=definitions)
 
 
@@ -108,9 +99,7 @@ class Problem:
     explicit_grasps: bool = False
     huber: float | None = None
     method: str | Method = "reduced-space"
-    methods: Mapping[str, Method] = key(
-        converter=dict[str, Method], default_factory=dict
-    )
+    methods: Mapping[str, Method] = key(converter=dict[str, Method], default_factory=dict)
     rollout: RolloutOptions = field(default_factory=RolloutOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
     title: str = ""
@@ -122,40 +111,23 @@ class Problem:
         notes; then validate the problem.
         """
         vars(self)["parameters"] = _as_parameters(self.parameters, self.bodies)
-        vars(self)["experiments"] = _with_free_densities(
-            self.experiments, self.parameters
-        )
+        vars(self)["experiments"] = _with_free_densities(self.experiments, self.parameters)
         vars(self)["parameters"] = self.parameters.with_fields(self.bodies)
-        cleaned = (
-            note
-            for body in self.bodies
-            for note in (*body.mesh.notes, *body.notes)
-        )
+        cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
         odd = (
-            oddity.message
-            for body in self.bodies
-            for oddity in size_and_density_hypotheses(body)
+            oddity.message for body in self.bodies for oddity in size_and_density_hypotheses(body)
         )
-        still = (
-            c.message
-            for c in static_concerns(self.experiments, self.parameters)
-        )
-        vars(self)["notes"] = tuple(
-            dict.fromkeys((*odd, *still, *cleaned, *self.notes))
-        )
+        still = (c.message for c in static_concerns(self.experiments, self.parameters))
+        vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *self.notes)))
         self._validate()
-        unscaled = (
-            c.message for c in scale_concerns(self.experiments, self.parameters)
-        )
+        unscaled = (c.message for c in scale_concerns(self.experiments, self.parameters))
         vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
 
     def __repr__(self) -> str:
         """Return the title (if there is one), the names of the experiments and the parameters as
         text.
         """
-        names = ", ".join(
-            repr(experiment.name) for experiment in self.experiments
-        )
+        names = ", ".join(repr(experiment.name) for experiment in self.experiments)
         title = f"{self.title!r}, " if self.title else ""
         return f"Problem({title}experiments {names}; {self.parameters!r})"
 
@@ -193,18 +165,11 @@ class Problem:
         InputError
             For the first mistake in the file, or if this machine's memory is too small.
         """
-        from .loading import (
-            problem_arguments,
-        )  # the schema is only built to read a file
+        from .loading import problem_arguments  # the schema is only built to read a file
 
         path = Path(path)
         contents = problem_arguments(
-            path,
-            overrides,
-            allow_code=allow_code,
-            simulation=simulation,
-            folder=folder,
-            say=say,
+            path, overrides, allow_code=allow_code, simulation=simulation, folder=folder, say=say
         )
         with located(path):
             return cls(**contents)
@@ -242,14 +207,9 @@ class Problem:
         """
         if dict(lengths_m) == self.collect_lengths_m():
             return self
-        bodies = {
-            id(body): body.with_field_lengths(lengths_m) for body in self.bodies
-        }
+        bodies = {id(body): body.with_field_lengths(lengths_m) for body in self.bodies}
         return replace(
-            self,
-            experiments=[
-                replace(e, body=bodies[id(e.body)]) for e in self.experiments
-            ],
+            self, experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments]
         )
 
     def find_two_phase_fields(self) -> dict[str, TwoPhaseModes]:
@@ -275,24 +235,16 @@ class Problem:
         removed_names = {
             n
             for b in self.bodies
-            for n in (
-                *b.list_field_coefficient_names(),
-                *b.find_contrast_deviations(),
-            )
+            for n in (*b.list_field_coefficient_names(), *b.find_contrast_deviations())
         }
         removed_names -= {
             n
             for b in bodies.values()
-            for n in (
-                *b.list_field_coefficient_names(),
-                *b.find_contrast_deviations(),
-            )
+            for n in (*b.list_field_coefficient_names(), *b.find_contrast_deviations())
         }
         return replace(
             self,
-            experiments=[
-                replace(e, body=bodies[id(e.body)]) for e in self.experiments
-            ],
+            experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments],
             parameters=self.parameters.without(removed_names),
         )
 
@@ -332,9 +284,7 @@ class Problem:
             chosen = METHODS[chosen]()
         if isinstance(chosen, InteriorPoint):
             # Validation recordings are only simulated forward, by the energies of obstacles.
-            chosen.require(
-                each for each in self.experiments if not each.validation
-            )
+            chosen.require(each for each in self.experiments if not each.validation)
         return chosen
 
     def _validate(self) -> None:
@@ -348,20 +298,14 @@ class Problem:
         names = [experiment.name for experiment in self.experiments]
         if not names:
             raise InputError("there is no experiment; expected at least one")
-        if repeated := sorted(
-            {name for name in names if names.count(name) > 1}
-        ):
-            raise InputError(
-                f"two experiments are named {repeated[0]!r}; expected different names"
-            )
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"two experiments are named {repeated[0]!r}; expected different names")
         if isinstance(self.substeps, str) and self.substeps != "auto":
             raise InputError(
                 f"found {self.substeps!r}; expected a whole number or 'auto'",
                 where="transcription.substeps",
             )
-        if self.choose_first_substeps() != 1 and all(
-            each.is_static for each in self.experiments
-        ):
+        if self.choose_first_substeps() != 1 and all(each.is_static for each in self.experiments):
             raise InputError(
                 f"found {self.substeps}, but every experiment is static, and there are no time steps "
                 "between equilibria; expected no substeps",
@@ -370,9 +314,7 @@ class Problem:
         self.parameters.require_constants_of(self.bodies)
         _require_rest_shapes(self.bodies, self.parameters)
         _require_equal_fields(self.bodies)
-        nuisance_indices(
-            [each for each in self.experiments if not each.validation], 0
-        )
+        nuisance_indices([each for each in self.experiments if not each.validation], 0)
         for experiment in self.experiments:
             with located(where=f"experiment '{experiment.name}'"):
                 as_scheme(self.scheme, experiment.start_rule)
@@ -389,22 +331,12 @@ class Problem:
                 )
 
 
-def _require_rest_shapes(
-    bodies: Iterable[Body], parameters: Parameters
-) -> None:
+def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None:
     """Raise `InputError` if no stress-free shape exists for the mesh under gravity at the guess.
 
     Nothing is checked if a parameter has no guess: the search then starts where the shape exists.
-
-    Notes
-    -----
-    The message is located at "object.rest_shape". Bodies without a scan under gravity pass.
     """
-    if any(
-        item.guess is None
-        for item in parameters.components
-        if item.tied is None
-    ):
+    if any(item.guess is None for item in parameters.components if item.tied is None):
         return
     for body in bodies:
         theta = body.theta_from_values(parameters.values(parameters.guess_q))
@@ -420,9 +352,7 @@ def _require_equal_fields(bodies: Iterable[Body]) -> None:
     for part in (part for body in bodies for part in body.parts if part.field):
         assert part.field is not None
         shapes = part.field.shapes
-        if not np.array_equal(
-            shapes_by_name.setdefault(part.field_name, shapes), shapes
-        ):
+        if not np.array_equal(shapes_by_name.setdefault(part.field_name, shapes), shapes):
             raise InputError(
                 f"two bodies have a field of {part.field_name}, whose shapes differ as their "
                 "meshes do; expected one body, or fields of regions with names of their own"
@@ -439,12 +369,8 @@ def _with_free_densities(
     bodies = {}
     experiments = tuple(experiments)
     for body in {id(e.body): e.body for e in experiments}.values():
-        bodies[id(body)] = body.with_free_densities(
-            body.parts_with_free_density(parameters.names)
-        )
+        bodies[id(body)] = body.with_free_densities(body.parts_with_free_density(parameters.names))
     return tuple(
-        e
-        if bodies[id(e.body)] is e.body
-        else replace(e, body=bodies[id(e.body)])
+        e if bodies[id(e.body)] is e.body else replace(e, body=bodies[id(e.body)])
         for e in experiments
     )

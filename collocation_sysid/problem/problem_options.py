@@ -11,11 +11,7 @@ from typing import Annotated, Literal
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Text
 from ..statistics.budget.shape_error import CORRELATION
-from ..statistics.budget.systematic_effects import (
-    CORRELATION_KEY,
-    Assumptions,
-    ExactIfNone,
-)
+from ..statistics.budget.systematic_effects import CORRELATION_KEY, Assumptions, ExactIfNone
 from ..statistics.uncertainty import ErrorModel
 
 
@@ -54,18 +50,14 @@ class UncertaintyOptions(ErrorModel):
 
     profile: tuple[Text, ...] = ()
     numerical: bool = False
-    assumptions: Annotated[Assumptions, ExactIfNone()] = field(
-        default_factory=Assumptions
-    )
+    assumptions: Annotated[Assumptions, ExactIfNone()] = field(default_factory=Assumptions)
     surface_correlation: Positive = CORRELATION
 
     def collect_considered(self) -> dict[str, float | None]:
         """Return the standard deviations of systematic effects by name (None for exact ones), and
         the surface's correlation length under `CORRELATION_KEY`.
         """
-        return self.assumptions.collect_deviations() | {
-            CORRELATION_KEY: self.surface_correlation
-        }
+        return self.assumptions.collect_deviations() | {CORRELATION_KEY: self.surface_correlation}
 
 
 @dataclass(frozen=True)

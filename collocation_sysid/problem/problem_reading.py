@@ -30,9 +30,7 @@ _PLAINER = {
 }
 
 
-def read_problem_file(
-    path: str | Path, overrides: Sequence[str] = ()
-) -> tuple[ProblemFile, str]:
+def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[ProblemFile, str]:
     """Read and validate a problem file.
 
     Parameters
@@ -78,9 +76,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         keys of 100 or more parts, and integers with too many digits.
     """
     try:
-        if (
-            _ENDLESS_KEY.search(text) is not None
-        ):  # on which the parser would spend minutes
+        if _ENDLESS_KEY.search(text) is not None:  # on which the parser would spend minutes
             raise RecursionError
         content = tomllib.loads(text)
         if _nesting_level_count(content) > DEEPEST:
@@ -88,10 +84,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         return content
     except tomllib.TOMLDecodeError as error:
         raise _bad_syntax(str(error), text, path=path) from error
-    except (
-        RecursionError,
-        ValueError,
-    ) as error:  # Python's limits of nesting and of digits
+    except (RecursionError, ValueError) as error:  # Python's limits of nesting and of digits
         raise InputError(_beyond_limits(error), path) from error
 
 
@@ -102,15 +95,8 @@ def _nesting_level_count(content: Any) -> int:
     level = [content]
     level_count = 0
     while level and level_count <= DEEPEST:
-        tables = [
-            each.values() if isinstance(each, dict) else each for each in level
-        ]
-        level = [
-            each
-            for table in tables
-            for each in table
-            if isinstance(each, (dict, list))
-        ]
+        tables = [each.values() if isinstance(each, dict) else each for each in level]
+        level = [each for table in tables for each in table if isinstance(each, (dict, list))]
         level_count += 1
     return level_count
 
@@ -143,48 +129,30 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError(
-            f"there is no such file; expected {what}", path
-        ) from None
+        raise InputError(f"there is no such file; expected {what}", path) from None
     except IsADirectoryError:
         raise InputError(f"this is a folder; expected {what}", path) from None
     except UnicodeDecodeError:
-        raise InputError(
-            f"this is not a text file; expected {what}", path
-        ) from None
+        raise InputError(f"this is not a text file; expected {what}", path) from None
     except OSError as error:
-        raise InputError(
-            f"the file cannot be read: {error.strerror}", path
-        ) from error
+        raise InputError(f"the file cannot be read: {error.strerror}", path) from error
 
 
 def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
     """Return (not raise) the error for invalid TOML, with the line and its text if the parser
     states it.
-
-    Parameters
-    ----------
-    complaint : str
-        Message of the parser.
-    text : str
-        Text of the file.
-    path : Path
-        File, for the message.
     """
     reason, _, place = complaint.rpartition(" (at ")
     reason = _PLAINER.get(reason, reason)
     matched = re.match(r"line (\d+)", place)
     if matched is None:
         return InputError(
-            f"the file is not valid TOML: {reason or complaint}, at the end of the file",
-            path,
+            f"the file is not valid TOML: {reason or complaint}, at the end of the file", path
         )
     number = int(matched[1])
     line = excerpt(text.splitlines()[number - 1].strip())
     return InputError(
-        f"the file is not valid TOML: {reason} in: {line}",
-        path,
-        where=f"line {number}",
+        f"the file is not valid TOML: {reason} in: {line}", path, where=f"line {number}"
     )
 
 
@@ -197,18 +165,6 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
 
     If a part of a table that an experiment has from [experiment_defaults] is set, the experiment
     gets a copy of the complete table.
-
-    Parameters
-    ----------
-    content : dict
-        Content of the file; modified.
-    override : str
-        Text "dotted.key=value"; see `_item_key` and `_parse_value`.
-
-    Raises
-    ------
-    InputError
-        For an invalid key or value.
     """
     key, equals, value = override.partition("=")
     key = key.strip()
@@ -228,17 +184,8 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
         item: Any = _item_key(table, part, key=key)
         if isinstance(table, dict):
             # An experiment gets a default of its own, a part of which is to be overridden.
-            has_default = (
-                level == 2
-                and leading[0] == "experiment"
-                and isinstance(shared, dict)
-            )
-            table.setdefault(
-                item,
-                deepcopy(shared[item])
-                if has_default and item in shared
-                else {},
-            )
+            has_default = level == 2 and leading[0] == "experiment" and isinstance(shared, dict)
+            table.setdefault(item, deepcopy(shared[item]) if has_default and item in shared else {})
         table = table[item]
     item = _item_key(table, last, key=key)
     table[item] = _parse_value(value, key)
@@ -247,13 +194,6 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
 def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
     """Return the parts of a key, with those parts joined by dots that together are a key of the
     content, such as "core.mu_pa"; the longest such key counts.
-
-    Parameters
-    ----------
-    content : Any
-        Content of a problem file; not modified.
-    parts : list of str
-        Parts of a dotted key, not empty.
     """
     names = []
     table = content
@@ -261,9 +201,7 @@ def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
         count = 1
         if isinstance(table, dict):
             several = range(len(parts), 1, -1)
-            count = next(
-                (n for n in several if ".".join(parts[:n]) in table), 1
-            )
+            count = next((n for n in several if ".".join(parts[:n]) in table), 1)
         names.append(".".join(parts[:count]))
         parts = parts[count:]
         table = table.get(names[-1]) if isinstance(table, dict) else None
@@ -271,22 +209,7 @@ def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
 
 
 def _item_key(place: Any, part: str, key: str) -> str | int:
-    """Return the key in a table, or the index in a list, that a part of a dotted key refers to.
-
-    Parameters
-    ----------
-    place : Any
-        Table or list.
-    part : str
-        Part: a key, an index from 0, or the name of a table in a list.
-    key : str
-        Complete dotted key, for messages.
-
-    Raises
-    ------
-    InputError
-        If the list has no such item, or `place` is neither table nor list.
-    """
+    """Return the key in a table, or the index in a list, that a part of a dotted key refers to."""
     if isinstance(place, dict):
         return part
     if not isinstance(place, list):
@@ -294,36 +217,18 @@ def _item_key(place: Any, part: str, key: str) -> str | int:
             f"{key} goes beyond the value {place!r}, which is not a table; expected "
             "a key of a table"
         )
-    names = [
-        item.get("name") if isinstance(item, dict) else None for item in place
-    ]
+    names = [item.get("name") if isinstance(item, dict) else None for item in place]
     if part in names:
         return names.index(part)
     if part.isascii() and part.isdecimal() and int(part) < len(place):
         return int(part)
     expected = f"its number, from 0 to {len(place) - 1}"
     expected += "".join(f", or its name {name}" for name in names if name)
-    raise InputError(
-        f"found {part!r} for a table of the list in {key}; expected {expected}"
-    )
+    raise InputError(f"found {part!r} for a table of the list in {key}; expected {expected}")
 
 
 def _parse_value(text: str, key: str) -> Any:
-    """Return a value in TOML syntax; words without quotes are strings.
-
-    Parameters
-    ----------
-    text : str
-        Value as typed.
-    key : str
-        Its dotted key, for messages.
-
-    Raises
-    ------
-    InputError
-        If a list, table or quoted string is not valid, or the value is nested too deeply or has too
-        many digits.
-    """
+    """Return a value in TOML syntax; words without quotes are strings."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -93,9 +93,7 @@ class Size:
         if self.unknowns:
             # Derivatives of all residuals of markers by all parameters are one array.
             parameters = self.unknowns + 3 * self.unplaced_markers
-            values += (
-                DERIVATIVE_COPIES * 3 * self.markers * self.samples * parameters
-            )
+            values += DERIVATIVE_COPIES * 3 * self.markers * self.samples * parameters
         values += FACTOR_ENTRIES * (self.nodes / NODES) ** FACTOR_POWER
         return (8 * values + BYTES_PER_ELEMENT * self.elements) / 1e6
 
@@ -104,11 +102,7 @@ class Size:
         nothing is estimated, on one thread.
         """
         step_s = max(LEAST_STEP_S, STEP_S * (self.nodes / NODES) ** STEP_POWER)
-        return (
-            (SWEEPS if self.unknowns else 1)
-            * (self.samples * self.substeps)
-            * step_s
-        )
+        return (SWEEPS if self.unknowns else 1) * (self.samples * self.substeps) * step_s
 
 
 def require_feasible(size: Size, say: Say | None = None) -> None:

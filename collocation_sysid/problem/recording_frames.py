@@ -17,11 +17,7 @@ from ..common.array_types import Array
 from ..errors import InputError, hint_at, located
 from ..recording.checked_arrays import point_text
 from ..recording.experiment import EARTH_M_S2
-from ..recording.formats.log_frames import (
-    LogFrames,
-    TopicFrames,
-    topic_frames,
-)
+from ..recording.formats.log_frames import LogFrames, TopicFrames, topic_frames
 from ..recording.formats.logs import TopicAddress
 from ..recording.poses import Frame
 from .recording_schema import ExperimentSection, ForceSensorSection
@@ -65,8 +61,8 @@ class SensorMounting:
         return float(np.degrees(rotation.magnitude()))
 
     def rotate(self, values: Array) -> Array:
-        """Return forces and torques (S, 6) in the sensor's axes, expressed in the axes of `frame`; NaN if any
-        component of the force, or of the torque, is missing.
+        """Return forces and torques (S, 6) in the sensor's axes, expressed in the axes of `frame`;
+        NaN if any component of the force, or of the torque, is missing.
         """
         rows = values.reshape(-1, 2, 3) @ self.pose[:3, :3].T
         return rows.reshape(-1, 6)
@@ -88,8 +84,7 @@ class SensorMounting:
         """
         offset_m = np.linalg.norm(self.point_m - np.array(section.point_m))
         return section.frame == self.frame and bool(
-            self.compute_angle_deg() > LARGEST_ROTATION_DEG
-            or offset_m > LARGEST_OFFSET_M
+            self.compute_angle_deg() > LARGEST_ROTATION_DEG or offset_m > LARGEST_OFFSET_M
         )
 
 
@@ -175,14 +170,7 @@ class RecordingFrames:
         return rotated
 
     def _require_static_transform(self, parent: str, child: str) -> Array:
-        """Return the pose (4, 4) of a frame in another one from the log's static transforms.
-
-        Raises
-        ------
-        InputError
-            If there is no log, the log does not state the frame `parent` (empty), or the frames are
-            not connected by static transforms.
-        """
+        """Return the pose (4, 4) of a frame in another one from the log's static transforms."""
         if self.transforms is None:
             raise InputError(
                 f"found {child!r}, but poses and markers are not topics of a log, from which the "
@@ -213,9 +201,7 @@ class RecordingFrames:
         """Return a note if gravity is along −z of the world by default, but the log tilts that
         frame against one that is level by its name (`LEVEL_FRAMES`); else an empty list.
         """
-        states_gravity = {"gravity_m_s2", "gravity_frame"} & (
-            self.section.model_fields_set
-        )
+        states_gravity = {"gravity_m_s2", "gravity_frame"} & (self.section.model_fields_set)
         if states_gravity or not self.world or self.transforms is None:
             return []
         names = self.transforms.static_neighbours(self.world)
@@ -224,9 +210,7 @@ class RecordingFrames:
                 return []
             matrix = self.transforms.static_transform(self.world, name)
             assert matrix is not None
-            tilt_deg = float(
-                np.degrees(np.arccos(np.clip(matrix[2, 2], -1, 1)))
-            )
+            tilt_deg = float(np.degrees(np.arccos(np.clip(matrix[2, 2], -1, 1))))
             if tilt_deg > SMALLEST_TILT_DEG:
                 gravity = matrix[:3, :3] @ np.array(EARTH_M_S2)
                 vector = ", ".join(f"{value:.4g}" for value in gravity)
@@ -249,9 +233,7 @@ class RecordingFrames:
         """
         poses = [
             (moved.poses, frames)
-            for moved, frames in zip(
-                self.section.moved_sections, self.poses, strict=True
-            )
+            for moved, frames in zip(self.section.moved_sections, self.poses, strict=True)
             if frames is not None and frames.parent
         ]
         if not self.markers:
@@ -276,9 +258,7 @@ class RecordingFrames:
             if not is_readable:
                 return f"{fault}: convert the poses or the markers"
             address = str(name).removesuffix(chain)
-            return (
-                f'{fault}: set poses = "{address}{self.markers}>{frames.child}"'
-            )
+            return f'{fault}: set poses = "{address}{self.markers}>{frames.child}"'
         return ""
 
     # Force sensors --------------------------------------------------------------------------------
@@ -319,11 +299,7 @@ class RecordingFrames:
                 if transform is not None:
                     pose = np.linalg.inv(transform.to_matrix()) @ pose
                 return SensorMounting(sensor, "grasp", pose)
-        pose = (
-            self.transforms.static_transform(self.world, sensor)
-            if self.world
-            else None
-        )
+        pose = self.transforms.static_transform(self.world, sensor) if self.world else None
         if pose is not None:
             return SensorMounting(sensor, "world", pose)
         if section.sensor_frame is not None:
@@ -341,11 +317,9 @@ class RecordingFrames:
         frames = topic_frames(self.folder / file)
         return frames.parent if frames is not None else ""
 
-    def sensor_note(
-        self, section: ForceSensorSection, mounting: SensorMounting | None
-    ) -> str:
-        """Return a note on the axes of a force sensor: those that the log gives, or that the stated ones
-        contradict the log, or that the frame of the messages is not connected; else "".
+    def sensor_note(self, section: ForceSensorSection, mounting: SensorMounting | None) -> str:
+        """Return a note on the axes of a force sensor: those that the log gives, or that the stated
+        ones contradict the log, or that the frame of the messages is not connected; else "".
         """
         file = self.section.file_of(section)
         if mounting is None:

@@ -42,9 +42,7 @@ from ..recording.gap_interpolation import interpolation_error
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.time_tables import is_within_experiment, read_custom_sensor
-from ..statistics.misspecification.modal_misspecifications import (
-    find_misspecifications_by_modes,
-)
+from ..statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader
 from .load_schema import LOADS
@@ -77,8 +75,8 @@ LEAST_SPAN = 0.005
 LARGEST_SPAN = 10.0
 # Largest distance of a marker from its rigidly moved position, over the body's size.
 LARGEST_MISS = 3.0
-# Estimated error of interpolated markers, in their sigma_m, from which on it is noted: residuals are
-# 4 % larger.
+# Estimated error of interpolated markers, in their sigma_m, from which on it is noted: residuals
+# are 4 % larger.
 LARGEST_INTERPOLATION_SIGMAS = 0.3
 
 
@@ -134,14 +132,9 @@ class RecordingReader:
             grasped, or if the problem exceeds this machine's memory.
         """
         section = self.section
-        aligned = self._align(
-            [*map(self._poses, range(len(section.moved_sections)))]
-        )
+        aligned = self._align([*map(self._poses, range(len(section.moved_sections)))])
         t_s = aligned.t_s
-        grasps = [
-            self._grasp(k, sequence, t_s=t_s)
-            for k, sequence in enumerate(aligned.poses)
-        ]
+        grasps = [self._grasp(k, sequence, t_s=t_s) for k, sequence in enumerate(aligned.poses)]
         if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
                 f"all {n} nodes of the body are selected, so that nothing can move; select fewer, "
@@ -149,10 +142,7 @@ class RecordingReader:
             )
             raise InputError(message, where="grasp")
         loads: dict[str, Any] = {
-            name: [
-                self._from_table(kind, word, k=k)
-                for k in range(len(getattr(section, word)))
-            ]
+            name: [self._from_table(kind, word, k=k) for k in range(len(getattr(section, word)))]
             for name, word, kind in LOADS
         }
         declared = declared_in(section, Experiment, where="")
@@ -164,14 +154,11 @@ class RecordingReader:
             t_s=t_s,
             grasps=grasps,
             readings=[
-                self._custom_sensor(k, each, t_s=t_s)
-                for k, each in enumerate(section.reading)
+                self._custom_sensor(k, each, t_s=t_s) for k, each in enumerate(section.reading)
             ],
             **self._measurements(t_s),
             markers=self._markers(t_s, aligned.table),
-            nuisance=nuisance_from_section(
-                section.nuisance, self.code.nuisance_row
-            ),
+            nuisance=nuisance_from_section(section.nuisance, self.code.nuisance_row),
             air_density_kg_m3=self.air_density_kg_m3,
             **declared,
             **loads,
@@ -179,9 +166,7 @@ class RecordingReader:
         if section.has_markers and not self.simulation:
             frames_fault = self._frames.markers_fault()
             require_plausible_markers(
-                experiment,
-                typical_constants(self.parameters),
-                frames_fault=frames_fault,
+                experiment, typical_constants(self.parameters), frames_fault=frames_fault
             )
             if frames_fault:
                 self._add_notes(frames_fault)
@@ -200,9 +185,7 @@ class RecordingReader:
 
     def _add_notes(self, *notes: str) -> None:
         """Add notes to `notes`, in place, each with the experiment's name in front."""
-        self.notes += [
-            f"experiment '{self.section.name}': {note}" for note in notes
-        ]
+        self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
 
     # Files ----------------------------------------------------------------------------------------
 
@@ -210,13 +193,9 @@ class RecordingReader:
         """Whether a file must be read: in a solve always, also without a name (None); in a
         simulation if it is named and exists.
         """
-        return not self.simulation or bool(
-            name and stored_files(self.folder / name)
-        )
+        return not self.simulation or bool(name and stored_files(self.folder / name))
 
-    def _require_existing(
-        self, name: str | None, key: str, what: str = "a file"
-    ) -> Path:
+    def _require_existing(self, name: str | None, key: str, what: str = "a file") -> Path:
         """Return the path of a file; raise `InputError` at `key` if none is named (None) or it does
         not exist. `what` is the expected kind of file, for the message.
         """
@@ -227,18 +206,10 @@ class RecordingReader:
     def _table_file(self, table: TableSection, key: str) -> Path:
         """Return the path of the existing file of a displacement or a wrench: its own, else that of
         the experiment.
-
-        Raises
-        ------
-        InputError
-            If there is none, or it does not exist: at `key`, or at "file" if the experiment's file
-            is meant.
         """
         key = "file" if table.file is None and self.section.file else key
         return self._require_existing(
-            self.section.file_of(table),
-            key,
-            what="a file here, or a file of the experiment",
+            self.section.file_of(table), key, what="a file here, or a file of the experiment"
         )
 
     @property
@@ -268,64 +239,37 @@ class RecordingReader:
 
         They come from its markers, its displacement table or its file; without any of these they
         are constant. `gripper_to_body` and the interpolation of the section are applied.
-
-        Raises
-        ------
-        InputError
-            If a file is missing or unusable.
         """
         grasp = self.section.moved_sections[k]
         if grasp.markers is not None:
-            return self._poses_from_markers(
-                grasp, self._grasp_key(k, "markers")
-            )
+            return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
         if grasp.displacement is not None:
-            file = self._table_file(
-                grasp.displacement, self._grasp_key(k, "displacement")
-            )
+            file = self._table_file(grasp.displacement, self._grasp_key(k, "displacement"))
             layout = grasp.displacement.dump_layout()
-            layout |= {
-                "length_m": strain_length_m(grasp.displacement, self.body)
-            }
-            poses = read_displacement(
-                file, **layout, timed=self._requires_times
-            )
+            layout |= {"length_m": strain_length_m(grasp.displacement, self.body)}
+            poses = read_displacement(file, **layout, timed=self._requires_times)
         elif grasp.poses is None:
             return PoseSequence.fixed()
         else:
-            file = existing_file(
-                self.folder, grasp.poses, key=self._grasp_key(k, "poses")
-            )
-            poses = read_poses(
-                file, grasp.quaternion, length_unit=grasp.length_unit
-            )
+            file = existing_file(self.folder, grasp.poses, key=self._grasp_key(k, "poses"))
+            poses = read_poses(file, grasp.quaternion, length_unit=grasp.length_unit)
         if (transform := grasp.gripper_to_body) is not None:
             with located(where=self._grasp_key(k, "gripper_to_body")):
                 transform_pose = PoseSequence(
-                    [0.0],
-                    [transform.position_m],
-                    quaternions_xyzw=[transform.quaternion_xyzw],
+                    [0.0], [transform.position_m], quaternions_xyzw=[transform.quaternion_xyzw]
                 )
                 poses = poses.after(transform_pose)
         return replace(poses, interpolation=grasp.interpolation)
 
     def _poses_from_markers(self, grasp: Moved, key: str) -> PoseSequence:
-        """Return the poses of a grasp fitted to its markers, and add notes on the fit.
-
-        Raises
-        ------
-        InputError
-            At `key`, if there are no tracks, or a marker is unknown.
-        """
+        """Return the poses of a grasp fitted to its markers, and add notes on the fit."""
         if self._marker_tracks is None:
             message = (
                 "the poses are to be fitted to markers, but there are no marker tracks; expected "
                 "markers.file, or poses"
             )
             raise InputError(message, where=key)
-        _require_known_markers(
-            grasp.markers or (), self._marker_tracks.names, key=key
-        )
+        _require_known_markers(grasp.markers or (), self._marker_tracks.names, key=key)
         with located(where=key):
             poses, notes = poses_from_markers(
                 grasp, self._marker_tracks, window_s=self.section.window_s
@@ -338,35 +282,18 @@ class RecordingReader:
         times t_s.
 
         A grasp is placed on the nodes of the body; obstacles without a name are numbered from 1.
-
-        Parameters
-        ----------
-        k : int
-        poses : PoseSequence
-            Its poses on the clock of the experiment.
-        t_s : (N,) array
-            Times of the experiment [s].
-
-        Raises
-        ------
-        InputError
-            If a file or key is invalid, or the grasp selects no nodes.
         """
         section = self.section.moved_sections[k]
         zero = ""
         if (table := section.displacement) is not None:
             file = self._table_file(table, self._grasp_key(k, "displacement"))
             rest_m = strain_length_m(table, self.body)
-            zero = displaced_axes(
-                file, table.columns, axis=table.axis, length_m=rest_m
-            )
+            zero = displaced_axes(file, table.columns, axis=table.axis, length_m=rest_m)
         is_obstacle = isinstance(section, ObstacleSection)
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasp_list)
         defaults = {"name": f"obstacle {number}"} if is_obstacle else {}
-        arguments: dict[str, Any] = defaults | declared_in(
-            section, kind, where=self._grasp_key(k)
-        )
+        arguments: dict[str, Any] = defaults | declared_in(section, kind, where=self._grasp_key(k))
         wrench = section.sensor and self._wrench(
             section.sensor, self._grasp_key(k, word), k=k, t_s=t_s
         )
@@ -385,24 +312,15 @@ class RecordingReader:
 
     # What is measured, and what acts --------------------------------------------------------------
 
-    def _read_wrench(
-        self, section: ForceSensorSection, key: str
-    ) -> tuple[Array, Array]:
+    def _read_wrench(self, section: ForceSensorSection, key: str) -> tuple[Array, Array]:
         """Return times (S,) [s] and values (S, 6) [N, N m] of a wrench's file, divided by the
         section's `symmetry`; `key` is that of the section, for messages.
         """
         file = self._table_file(section, f"{key}.file")
         layout = section.dump_layout()
-        return read_wrench(
-            file,
-            **layout,
-            symmetry=section.symmetry,
-            timed=self._requires_times,
-        )
+        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._requires_times)
 
-    def _wrench(
-        self, section: ForceSensorSection, key: str, k: int, t_s: Array
-    ) -> Wrench:
+    def _wrench(self, section: ForceSensorSection, key: str, k: int, t_s: Array) -> Wrench:
         """Return the measured wrench within the times t_s of the experiment, and note how many
         samples are used.
 
@@ -411,22 +329,6 @@ class RecordingReader:
         If a simulation has no file, the wrench is zero at t_s, with a `sigma_nm` of 1 unless
         stated. Of equilibria without markers, only measurements at the times t_s are used, if there
         are any. Stated sigmas are divided by the section's `symmetry`.
-
-        Parameters
-        ----------
-        section : ForceSensorSection
-        key : str
-            Dotted key of the section, for messages.
-        k : int
-            Index of the grasp, or of the obstacle after the grasps.
-        t_s : (N,) array
-            Times of the experiment [s].
-
-        Raises
-        ------
-        InputError
-            If the file is missing in a solve or cannot be read, or if fewer than three of its
-            samples (one for equilibria) are within the times of the experiment.
         """
         name = self.section.file_of(section)
         arguments: dict[str, Any] = declared_in(section, Wrench, where=key)
@@ -434,11 +336,7 @@ class RecordingReader:
             arguments[sigma] /= section.symmetry
         with located(where=key):
             if not self._must_read(name):
-                return Wrench(
-                    t_s,
-                    np.zeros((len(t_s), 6)),
-                    **{"sigma_nm": 1.0, **arguments},
-                )
+                return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **arguments})
             at_s, values = self._read_wrench(section, key)
             mounting = self._frames.sensor_mounting(section, key, k=k)
             if note := self._frames.sensor_note(section, mounting):
@@ -447,68 +345,43 @@ class RecordingReader:
                 values = mounting.rotate(values)
                 arguments["frame"] = mounting.frame
                 arguments["point_m"] = mounting.point_m
-            is_used = is_within_experiment(
-                at_s, t_s, name=str(name), is_static=self._is_static
-            )
+            is_used = is_within_experiment(at_s, t_s, name=str(name), is_static=self._is_static)
             if self._is_static and not self.section.has_markers:
                 # Between equilibria it would be read off their chord, unless all of it is.
-                is_at_sample = (
-                    np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
-                )
+                is_at_sample = np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
                 is_used &= is_at_sample if is_at_sample.any() else True
-            self._add_notes(
-                f"{name}: {is_used.sum()} of {len(at_s)} samples are used"
-            )
+            self._add_notes(f"{name}: {is_used.sum()} of {len(at_s)} samples are used")
             return Wrench(at_s[is_used], values[is_used], **arguments)
 
-    def _custom_sensor(
-        self, k: int, section: ReadingSection, t_s: Array
-    ) -> Gauge:
+    def _custom_sensor(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
         """Return the custom sensor with index k and its values within the times t_s [s], and note
         how many samples are used.
 
         If a simulation has no file, the values are None and the times are t_s.
-
-        Raises
-        ------
-        InputError
-            If the code may not be run, the file is missing in a solve or unusable, or there is no
-            such grasp.
         """
         key = f"reading.{k}"
-        arguments: dict[str, Any] = {
-            "name": section.name,
-            **declared_in(section, Gauge, where=key),
-        }
+        arguments: dict[str, Any] = {"name": section.name, **declared_in(section, Gauge, where=key)}
         _, arguments["expression"] = self.code.function(
             section.code, section.function, key=f"{key}.code"
         )
-        if section.grasp and section.grasp > (
-            count := len(self.section.grasp_list)
-        ):
+        if section.grasp and section.grasp > (count := len(self.section.grasp_list)):
             message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
             raise InputError(message, where=f"{key}.grasp")
         with located(where=key):
             if not self._must_read(section.file):
                 return Gauge(t_s=t_s, values=None, **arguments)
             file = self._require_existing(section.file, f"{key}.file")
-            at_s, values, arguments["columns"] = read_custom_sensor(
-                file, section.columns
-            )
+            at_s, values, arguments["columns"] = read_custom_sensor(file, section.columns)
             is_used = is_within_experiment(
                 at_s, t_s, name=str(section.file), is_static=self._is_static
             )
-            self._add_notes(
-                f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used"
-            )
+            self._add_notes(f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used")
             return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
 
     @property
     def _recording_folder(self) -> RecordingFolder:
         """Folder of the files, for tables that read themselves."""
-        return RecordingFolder(
-            self.folder, is_static=self._is_static, add_note=self._add_notes
-        )
+        return RecordingFolder(self.folder, is_static=self._is_static, add_note=self._add_notes)
 
     def _measurements(self, t_s: Array) -> dict[str, list[Any]]:
         """Return the measurements of all tables that read themselves within the times t_s (T,) of
@@ -527,38 +400,14 @@ class RecordingReader:
 
         Values over time are read from the files that the table names. An object without a name is
         called by `list_key` and its number from 1, such as tendon_1.
-
-        Parameters
-        ----------
-        kind : type
-            Class of the object.
-        list_key : str
-            Key of the list.
-        k : int
-            Index of the table in it.
-
-        Raises
-        ------
-        InputError
-            If a file is missing or unusable, or the object does not fit the body.
         """
         table = getattr(self.section, list_key)[k]
         where = f"{list_key}.{k}"
-        defaults = (
-            {"name": f"{list_key}_{k + 1}"}
-            if "name" in type(table).model_fields
-            else {}
-        )
+        defaults = {"name": f"{list_key}_{k + 1}"} if "name" in type(table).model_fields else {}
         arguments = defaults | declared_in(table, kind, where=where)
         for name, key in keys_of(kind):
-            if (
-                key.constant
-                and key.read
-                and (file_name := getattr(table, key.name))
-            ):
-                file = existing_file(
-                    self.folder, file_name, key=f"{where}.{key.name}"
-                )
+            if key.constant and key.read and (file_name := getattr(table, key.name)):
+                file = existing_file(self.folder, file_name, key=f"{where}.{key.name}")
                 arguments[name], arguments[key.constant] = key.read(file)
         with located(where=f"{where}.nodes" if "nodes" in arguments else where):
             return kind(**arguments).on_body(self.body)
@@ -575,14 +424,10 @@ class RecordingReader:
         markers = self.section.markers
         if not self.section.has_markers or not self._must_read(markers.file):
             return None
-        file = self._require_existing(
-            markers.file, "markers.file", what="a file of marker tracks"
-        )
+        file = self._require_existing(markers.file, "markers.file", what="a file of marker tracks")
         table = read_marker_tracks(self.section, file)
         self._add_notes(*(f"{markers.file}: {note}" for note in table.notes))
-        _require_known_markers(
-            markers.template_m or (), table.names, key="markers.template_m"
-        )
+        _require_known_markers(markers.template_m or (), table.names, key="markers.template_m")
         with located(where="markers.template_m"):
             table, notes = transform_to_body_frame(markers, table)
         self._add_notes(*notes)
@@ -593,29 +438,15 @@ class RecordingReader:
 
         They have no columns if the experiment has no markers. If a simulation has no file, they are
         zero. In both cases the times are those of `_sample_times`.
-
-        Parameters
-        ----------
-        poses : sequence of PoseSequence
-            Poses of the grasps; only their times are used, where no marker file gives the times.
-
-        Raises
-        ------
-        InputError
-            If a marker without a file has no `reference_m`, or `_sample_times` finds too few times.
         """
         if not self.section.has_markers:
             times = self._sample_times(poses)
-            return MarkerTable(
-                times, (), positions_m=np.zeros((len(times), 0, 3))
-            )
+            return MarkerTable(times, (), positions_m=np.zeros((len(times), 0, 3)))
         if self._marker_tracks is not None:
             return self._select_tracks(self._marker_tracks)
         markers = self.section.markers
         names = tuple(markers.names or markers.reference_m)
-        names_without_position = [
-            name for name in names if name not in markers.reference_m
-        ]
+        names_without_position = [name for name in names if name not in markers.reference_m]
         if names_without_position or not names:
             message = (
                 f"there is no {markers.file or 'file'} yet and no position of "
@@ -625,9 +456,7 @@ class RecordingReader:
             raise InputError(message, where="markers.reference_m")
         times = self._sample_times(poses)
         return self._select_tracks(
-            MarkerTable(
-                times, names, positions_m=np.zeros((len(times), len(names), 3))
-            )
+            MarkerTable(times, names, positions_m=np.zeros((len(times), len(names), 3)))
         )
 
     def _sample_times(self, poses: Sequence[PoseSequence]) -> Array:
@@ -636,23 +465,13 @@ class RecordingReader:
         They are those of the first existing wrench file if there are no markers, else for
         equilibria without moving grasps those of all sensors that have times of their own, else
         those of the longest sequence of poses.
-
-        Raises
-        ------
-        InputError
-            If nothing is measured, or poses have fewer than three times (one for equilibria).
         """
         section = self.section
         wrench_sections = [
-            (k, grasp.sensor)
-            for k, grasp in enumerate(section.moved_sections)
-            if grasp.sensor
+            (k, grasp.sensor) for k, grasp in enumerate(section.moved_sections) if grasp.sensor
         ]
         if not (
-            wrench_sections
-            or section.has_markers
-            or section.reading
-            or section.measurement_tables
+            wrench_sections or section.has_markers or section.reading or section.measurement_tables
         ):
             message = (
                 "nothing is measured: expected markers, a wrench, a reading, or "
@@ -660,9 +479,7 @@ class RecordingReader:
             )
             raise InputError(message, where="markers")
         existing_wrenches = [
-            s
-            for s in wrench_sections
-            if stored_files(self.folder / str(section.file_of(s[1])))
+            s for s in wrench_sections if stored_files(self.folder / str(section.file_of(s[1])))
         ]
         if existing_wrenches and not section.has_markers:
             k, sensor = existing_wrenches[0]
@@ -678,9 +495,7 @@ class RecordingReader:
                 for k, table in enumerate(tables)
             ]
             return np.unique(np.concatenate(times_s))
-        times = max(
-            (sequence.t_s for sequence in poses), key=len, default=np.zeros(0)
-        )
+        times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
         fewest = 1 if self._is_static else 3
         if len(times) < fewest:
             message = (
@@ -695,33 +510,18 @@ class RecordingReader:
 
         They are the markers that `names` of the section has, or else all but those of grippers,
         without those of weight 0.
-
-        Raises
-        ------
-        InputError
-            If none remains, or a key names an unknown marker.
         """
         markers = self.section.markers
         for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
             if isinstance(by_name := getattr(markers, key), dict):
-                _require_known_markers(
-                    by_name, table.names, key=f"markers.{key}"
-                )
-        unweighted = [
-            name for name in table.names if markers.weights.get(name) == 0
-        ]
+                _require_known_markers(by_name, table.names, key=f"markers.{key}")
+        unweighted = [name for name in table.names if markers.weights.get(name) == 0]
         if unweighted:
-            self._add_notes(
-                f"markers excluded by a weight of 0: {', '.join(unweighted)}"
-            )
+            self._add_notes(f"markers excluded by a weight of 0: {', '.join(unweighted)}")
         # Markers that only the gripper or the template needs are read, and not fitted.
-        fitted_names = set(
-            markers.names or set(table.names) - gripper_markers(self.section)
-        )
+        fitted_names = set(markers.names or set(table.names) - gripper_markers(self.section))
         indices = [
-            k
-            for k, n in enumerate(table.names)
-            if n in fitted_names and n not in unweighted
+            k for k, n in enumerate(table.names) if n in fitted_names and n not in unweighted
         ]
         if not indices:
             message = (
@@ -730,57 +530,34 @@ class RecordingReader:
             )
             raise InputError(message, where="markers")
         names = tuple(table.names[k] for k in indices)
-        return MarkerTable(
-            table.t_s, names, positions_m=table.positions_m[:, indices]
-        )
+        return MarkerTable(table.t_s, names, positions_m=table.positions_m[:, indices])
 
     def _align(self, poses: list[PoseSequence]) -> AlignedRecording:
         """Return times, poses and tracks on one clock and time grid, and add notes.
 
         The window, `resample_hz` and `every` are applied (not `every` in a simulation, whose files
         have been thinned already).
-
-        Parameters
-        ----------
-        poses : list of PoseSequence
-            Poses of the grasps, then of the obstacles, at their own times.
-
-        Raises
-        ------
-        InputError
-            If the poses do not determine the motion between the samples, or the problem exceeds
-            this machine's memory.
         """
         section = self.section
         table = self._fitted_tracks(poses)
         static = self._is_static
         intervals = [
-            each.model_dump(include={"from_s", "until_s"})
-            for each in section.moved_sections
+            each.model_dump(include={"from_s", "until_s"}) for each in section.moved_sections
         ]
         grasp_intervals_s = [
-            (
-                -np.inf if first is None else first,
-                np.inf if last is None else last,
-            )
+            (-np.inf if first is None else first, np.inf if last is None else last)
             for first, last in (each.values() for each in intervals)
         ]
         pose_files = [
-            grasp.poses or section.file_of(grasp.displacement)
-            for grasp in section.moved_sections
+            grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved_sections
         ]
         first_s, last_s = section.window_s or (-np.inf, np.inf)
         t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]
-        for name, sequence, interval_s in zip(
-            pose_files, poses, grasp_intervals_s, strict=True
-        ):
+        for name, sequence, interval_s in zip(pose_files, poses, grasp_intervals_s, strict=True):
             if name is not None and len(t_s) and not static:
                 require_determined_motion(
-                    sequence,
-                    t_s,
-                    interval_s=interval_s,
-                    file=self.folder / name,
+                    sequence, t_s, interval_s=interval_s, file=self.folder / name
                 )
         rate_hz = section.resample_hz
         # The files that a simulation writes are thinned when they are read.
@@ -788,17 +565,13 @@ class RecordingReader:
         if self.size is not None and len(t_s):
             samples = len(t_s) // every
             if rate_hz and not static:
-                samples = (
-                    int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
-                )
+                samples = int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
             places = section.markers.reference_m
             size = replace(
                 self.size,
                 samples=samples,
                 markers=len(table.names),
-                unplaced_markers=sum(
-                    name not in places for name in table.names
-                ),
+                unplaced_markers=sum(name not in places for name in table.names),
             )
             require_feasible(size, self.say)
         try:
@@ -812,12 +585,8 @@ class RecordingReader:
                 static=static,
             )
         except InputError as error:
-            files = dict.fromkeys(
-                name for name in (*pose_files, section.markers.file) if name
-            )
-            raise InputError(
-                error.message, where=" and ".join(files)
-            ) from error
+            files = dict.fromkeys(name for name in (*pose_files, section.markers.file) if name)
+            raise InputError(error.message, where=" and ".join(files)) from error
         self._add_notes(*aligned.notes)
         if rate_hz and not static and self._marker_tracks is not None:
             note = self._resampling_note(aligned.t_s, table)
@@ -835,18 +604,6 @@ class RecordingReader:
 
         The standard deviation of a marker is its sigma_m over the square root of its weight, which
         is 1 unless stated. If the experiment has no markers, the result has none.
-
-        Parameters
-        ----------
-        t_s : (N,) array
-            Times of the samples [s].
-        table : MarkerTable
-            Tracks at these times.
-
-        Raises
-        ------
-        InputError
-            If a marker has no sigma_m.
         """
         if not self.section.has_markers:
             return Markers.none(t_s)
@@ -856,23 +613,18 @@ class RecordingReader:
         known_m = section.reference_sigma_m
         if np.isnan(sigma_m).any():
             missing_name = names[int(np.isnan(sigma_m).argmax())]
-            message = f"found no value for the marker {missing_name!r}; expected one for every marker"
+            message = (
+                f"found no value for the marker {missing_name!r}; expected one for every marker"
+            )
             raise InputError(message, where="markers.sigma_m")
-        arguments: dict[str, Any] = declared_in(
-            section, Markers, where="markers"
-        )
+        arguments: dict[str, Any] = declared_in(section, Markers, where="markers")
         return Markers(
             t_s,
             table.positions_m,
-            sigma_m=sigma_m
-            / np.sqrt(_by_marker(section.weights, names, default=1.0)),
+            sigma_m=sigma_m / np.sqrt(_by_marker(section.weights, names, default=1.0)),
             names=names,
-            places_m=np.array(
-                [section.reference_m.get(name, [np.nan] * 3) for name in names]
-            ),
-            places_sigma_m=None
-            if known_m is None
-            else _by_marker(known_m, names, default=np.nan),
+            places_m=np.array([section.reference_m.get(name, [np.nan] * 3) for name in names]),
+            places_sigma_m=None if known_m is None else _by_marker(known_m, names, default=np.nan),
             offsets_s=table.offsets_s,
             **arguments,
         )
@@ -880,13 +632,6 @@ class RecordingReader:
     def _resampling_note(self, t_s: Array, table: MarkerTable) -> str:
         """Return a note on markers whose error of interpolation to the times `t_s` (T,) [s] is
         above `LARGEST_INTERPOLATION_SIGMAS`, estimated from their curved tracks; else "".
-
-        Parameters
-        ----------
-        t_s : (T,) array
-            Times of the samples after resampling [s].
-        table : MarkerTable
-            Tracks as recorded.
         """
         stated = self.section.markers.sigma_m
         sigma_m = _by_marker(stated, table.names, default=np.nan)
@@ -903,21 +648,15 @@ class RecordingReader:
         )
 
 
-def _by_marker(
-    values: Mapping[str, float] | float, names: Sequence[str], default: float
-) -> Array:
+def _by_marker(values: Mapping[str, float] | float, names: Sequence[str], default: float) -> Array:
     """Return the values (M,) of the markers with these names: one number for all, or the number of
     each name, `default` where the mapping has none; entries of other names are ignored.
     """
-    by_name = (
-        values if isinstance(values, Mapping) else dict.fromkeys(names, values)
-    )
+    by_name = values if isinstance(values, Mapping) else dict.fromkeys(names, values)
     return np.array([by_name.get(name, default) for name in names])
 
 
-def _require_known_markers(
-    requested: Iterable[str], names: Sequence[str], key: str
-) -> None:
+def _require_known_markers(requested: Iterable[str], names: Sequence[str], key: str) -> None:
     """Raise `InputError` at `key` for the first requested name that is not among `names`; without
     requested names nothing is checked.
     """
@@ -925,16 +664,11 @@ def _require_known_markers(
     for name in requested:
         if name not in present:
             known = f"{', '.join(names)}{hint_at(name, names)}"
-            raise InputError(
-                f"found {name!r}; expected names of the markers {known}",
-                where=key,
-            )
+            raise InputError(f"found {name!r}; expected names of the markers {known}", where=key)
 
 
 def require_plausible_markers(
-    experiment: Experiment,
-    constants: Mapping[str, float],
-    frames_fault: str = "",
+    experiment: Experiment, constants: Mapping[str, float], frames_fault: str = ""
 ) -> None:
     """Raise `InputError` if the tracks cannot belong to this body, because of a wrong unit or
     frame; see `_implausible_markers`.
@@ -973,19 +707,16 @@ def _implausible_markers(experiment: Experiment) -> str | None:
     is_measured = markers.is_present[k]
     measured = markers.positions_m[k, is_measured]
     span_m = _diagonal(measured)
-    if (
-        len(measured) > 1
-        and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m
-    ):
+    if len(measured) > 1 and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m:
         return (
             f"at t = {experiment.t_s[k]:.6g} s the markers span {span_m:.3g} m, but the body "
             f"{body_m:.3g} m; check length_unit of the markers and of the object"
         )
     if not experiment.body_grasps:
         return None
-    rigid_positions = markers.predict_positions(
-        experiment.rigid_positions(experiment.t_s[[k]])
-    )[0, is_measured]
+    rigid_positions = markers.predict_positions(experiment.rigid_positions(experiment.t_s[[k]]))[
+        0, is_measured
+    ]
     miss_m = np.linalg.norm(measured - rigid_positions, axis=1)
     worst = int(miss_m.argmax())
     if miss_m[worst] > LARGEST_MISS * body_m:

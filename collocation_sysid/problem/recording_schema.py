@@ -27,12 +27,7 @@ from ..recording.placement import AttachmentRule
 from ..recording.poses import Frame
 from ..recording.solid_sections import SolidSection
 from .camera_section import DepthSection
-from .load_schema import (
-    ForceSection,
-    PointMassSection,
-    PressureSection,
-    TendonSection,
-)
+from .load_schema import ForceSection, PointMassSection, PressureSection, TendonSection
 from .measurement_section import MeasurementSection, NamedSection
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
@@ -52,12 +47,7 @@ class TransformSection(Section):
     """
 
     position_m: Vector = (0.0, 0.0, 0.0)
-    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] = (
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    )
+    quaternion_xyzw: tuple[Finite, Finite, Finite, Finite] = (0.0, 0.0, 0.0, 1.0)
 
     def to_matrix(self) -> Array:
         """Return (4, 4) matrix of the motion."""
@@ -94,9 +84,7 @@ class TableSection(Section):
         """Return the arguments with which the columns are read, by name: `columns`, `axis`, `sign`,
         and `scale`, `length_m` or `area_m2` where the section has them.
         """
-        return self.model_dump(
-            include={"columns", "axis", "sign", "scale", "length_m", "area_m2"}
-        )
+        return self.model_dump(include={"columns", "axis", "sign", "scale", "length_m", "area_m2"})
 
 
 class DisplacementSection(TableSection):
@@ -191,19 +179,14 @@ def _as_table(value: str | DisplacementSection) -> DisplacementSection:
     """Return a displacement as a table: text is the name of its file, a table is returned
     as it is.
     """
-    return (
-        DisplacementSection.model_validate({"file": value})
-        if isinstance(value, str)
-        else value
-    )
+    return DisplacementSection.model_validate({"file": value}) if isinstance(value, str) else value
 
 
 if TYPE_CHECKING:
     Displacement = DisplacementSection
 else:
     Displacement = Annotated[
-        Annotated[Text, AfterValidator(_as_table)] | DisplacementSection,
-        ByForm(str),
+        Annotated[Text, AfterValidator(_as_table)] | DisplacementSection, ByForm(str)
     ]
 
 
@@ -257,9 +240,7 @@ class MovedSection(Section):
         """
         sources = used_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
-            raise ValueError(
-                f"found {' and '.join(sources)}; expected one of them"
-            )
+            raise ValueError(f"found {' and '.join(sources)}; expected one of them")
         if self.gripper_to_body is not None and self.markers is not None:
             raise ValueError(
                 "found gripper_to_body and markers; expected no gripper_to_body, because the "
@@ -454,18 +435,14 @@ class MarkersSection(Section):
         are given together or not at all, with at least three positions and a window that does
         not end before it starts.
         """
-        present = used_keys(
-            self, "template_m", "template_window_s", "max_template_residual_m"
-        )
+        present = used_keys(self, "template_m", "template_window_s", "max_template_residual_m")
         if present and not {"template_m", "template_window_s"} <= set(present):
             raise ValueError(
                 f"found {', '.join(present)}; expected template_m and template_window_s, both "
                 "or neither"
             )
         _require_three(self.template_m, "template_m")
-        if (window := self.template_window_s) is not None and not window[
-            0
-        ] <= window[1]:
+        if (window := self.template_window_s) is not None and not window[0] <= window[1]:
             raise ValueError(
                 f"found template_window_s = {list(window)}; expected [start, end] with start <= end"
             )
@@ -594,17 +571,13 @@ class ExperimentSection(NamedSection):
     file: Text | None = None
     grasp: Grasps = Field(default_factory=list)
     obstacle: list[ObstacleSection] = Field(default_factory=list)
-    markers: MarkersSection = Field(
-        default_factory=lambda: MarkersSection.model_construct()
-    )
+    markers: MarkersSection = Field(default_factory=lambda: MarkersSection.model_construct())
     window_s: tuple[Boundless, Boundless] | None = None
     resample_hz: Positive | None = None
     every: AtLeastOne = 1
     reading: list[ReadingSection] = Field(default_factory=list)
     depth: list[DepthSection] = Field(default_factory=list)
-    nuisance: NuisanceOrNone = Field(
-        default_factory=lambda: NuisanceSection.model_construct()
-    )
+    nuisance: NuisanceOrNone = Field(default_factory=lambda: NuisanceSection.model_construct())
 
     @property
     def has_markers(self) -> bool:
@@ -624,17 +597,10 @@ class ExperimentSection(NamedSection):
         names = [
             self.markers.file,
             *(each.file for each in self.reading),
-            *(
-                each.file
-                for key in MEASUREMENT_TABLES
-                for each in getattr(self, key)
-            ),
+            *(each.file for key in MEASUREMENT_TABLES for each in getattr(self, key)),
         ]
         for grasp in self.moved_sections:
-            names += [
-                grasp.poses or self.file_of(grasp.displacement),
-                self.file_of(grasp.sensor),
-            ]
+            names += [grasp.poses or self.file_of(grasp.displacement), self.file_of(grasp.sensor)]
         return names
 
     @property
@@ -660,10 +626,7 @@ class ExperimentSection(NamedSection):
         """Return the section itself; raise `ValueError` unless the window is missing or begins
         before it ends.
         """
-        if (
-            self.window_s is not None
-            and not self.window_s[0] < self.window_s[1]
-        ):
+        if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
             raise ValueError(
                 f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
             )
@@ -679,14 +642,8 @@ class ExperimentSection(NamedSection):
         """
         if self.kind == "dynamic":
             return self
-        usual = {
-            "start": "equilibrium",
-            "start_rule": "standard",
-            "resample_hz": None,
-        }
-        moving = [
-            key for key, value in usual.items() if getattr(self, key) != value
-        ]
+        usual = {"start": "equilibrium", "start_rule": "standard", "resample_hz": None}
+        moving = [key for key, value in usual.items() if getattr(self, key) != value]
         if isinstance(getattr(self.nuisance, "time_shift", None), Section):
             moving.append("nuisance.time_shift")
         if moving:

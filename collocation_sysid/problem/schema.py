@@ -6,24 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from ..common.schema_tables import (
-    Among,
-    ByForm,
-    Section,
-    Unit,
-    Vector,
-    require_one,
-    used_keys,
-)
-from ..common.validated_types import (
-    AtLeastOne,
-    Count,
-    Finite,
-    Flag,
-    NotNegative,
-    Positive,
-    Text,
-)
+from ..common.schema_tables import Among, ByForm, Section, Unit, Vector, require_one, used_keys
+from ..common.validated_types import AtLeastOne, Count, Finite, Flag, NotNegative, Positive, Text
 from ..errors import InputError
 from ..fem.elements import ELEMENTS
 from ..fem.laws.constants import Scale
@@ -372,23 +356,15 @@ class ParameterSection(Section):
         tied_to, or for keys that do not belong to it (without any of them: to a guess).
         """
         if len(used_kinds := used_keys(self, "guess", "fixed", "tied_to")) > 1:
-            raise ValueError(
-                f"found {' and '.join(used_kinds)}; expected one of them, or none"
-            )
+            raise ValueError(f"found {' and '.join(used_kinds)}; expected one of them, or none")
         of_kind = {
             "guess": ("lower", "upper", "prior", "scale", "typical"),
             "fixed": (),
             "tied_to": ("ratio",),
         }
-        kind = next(
-            (key for key in of_kind if getattr(self, key) is not None), "guess"
-        )
-        others = {key for keys in of_kind.values() for key in keys} - set(
-            of_kind[kind]
-        )
-        if useless := used_keys(
-            self, *(n for n in type(self).model_fields if n in others)
-        ):
+        kind = next((key for key in of_kind if getattr(self, key) is not None), "guess")
+        others = {key for keys in of_kind.values() for key in keys} - set(of_kind[kind])
+        if useless := used_keys(self, *(n for n in type(self).model_fields if n in others)):
             alternative = "guess instead, or nothing, to estimate the parameter"
             raise ValueError(
                 f"found {kind} together with {', '.join(useless)}; expected {kind} alone, or "
@@ -403,19 +379,12 @@ def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
     A table with a key of `ParameterSection`, or an empty one, is a parameter; any other table is a
     region. `prefix` precedes all names. Anything but a table is returned unchanged, to be refused
     by the schema.
-
-    Raises
-    ------
-    ValueError
-        If two nested names are equal.
     """
     if not isinstance(tables, dict):
         return tables
     flattened: dict[str, Any] = {}
     for name, value in tables.items():
-        nested = isinstance(value, dict) and not set(value) & set(
-            ParameterSection.model_fields
-        )
+        nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
         full_name = f"{prefix}{name}"
         inner = (
             _flatten_parameters(value, prefix=f"{full_name}.")
@@ -428,12 +397,8 @@ def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
     return flattened
 
 
-OneParameter = Annotated[
-    ParameterSection | Finite, ByForm((dict, ParameterSection))
-]
-Parameters = Annotated[
-    dict[str, OneParameter], BeforeValidator(_flatten_parameters)
-]
+OneParameter = Annotated[ParameterSection | Finite, ByForm((dict, ParameterSection))]
+Parameters = Annotated[dict[str, OneParameter], BeforeValidator(_flatten_parameters)]
 Substeps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
 
 
@@ -485,20 +450,14 @@ class AssumptionsSection(Section, Assumptions):  # pyright: ignore[reportGeneral
 class UncertaintySection(Section, UncertaintyOptions):  # pyright: ignore[reportGeneralTypeIssues]
     """Intervals of the estimates."""
 
-    assumptions: Annotated[AssumptionsSection, ExactIfNone()] = (
-        AssumptionsSection()
-    )
+    assumptions: Annotated[AssumptionsSection, ExactIfNone()] = AssumptionsSection()
 
 
 def _kind_tag(value: Any) -> str:
     """Return the tag of an experiment's table or model, which messages omit: `SPECIMEN_TAG` for the
     kind "specimen", else "<recording>".
     """
-    kind = (
-        value.get("kind")
-        if isinstance(value, dict)
-        else getattr(value, "kind", None)
-    )
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
     return SPECIMEN_TAG if kind == "specimen" else "<recording>"
 
 
@@ -572,19 +531,11 @@ class ProblemFile(Section):
 
     def list_recordings(self) -> list[ExperimentSection]:
         """Return the experiments with the object's mesh, in the order of the file."""
-        return [
-            each
-            for each in self.experiment
-            if isinstance(each, ExperimentSection)
-        ]
+        return [each for each in self.experiment if isinstance(each, ExperimentSection)]
 
     def list_specimens(self) -> list[SpecimenSection]:
         """Return the material tests without a mesh, in the order of the file."""
-        return [
-            each
-            for each in self.experiment
-            if isinstance(each, SpecimenSection)
-        ]
+        return [each for each in self.experiment if isinstance(each, SpecimenSection)]
 
 
 def with_experiment_defaults(content: Any) -> Any:
@@ -595,44 +546,23 @@ def with_experiment_defaults(content: Any) -> Any:
     content itself is not modified, and is returned if there is nothing to insert. Content that is
     not as the schema expects is passed on.
     """
-    shared = (
-        content.get("experiment_defaults")
-        if isinstance(content, dict)
-        else None
-    )
-    experiments = (
-        content.get("experiment") if isinstance(content, dict) else None
-    )
+    shared = content.get("experiment_defaults") if isinstance(content, dict) else None
+    experiments = content.get("experiment") if isinstance(content, dict) else None
     if not (isinstance(shared, dict) and isinstance(experiments, list)):
         return content
     completed_tables = [
-        _known_defaults(shared, table) | table
-        if isinstance(table, dict)
-        else table
+        _known_defaults(shared, table) | table if isinstance(table, dict) else table
         for table in experiments
     ]
     return content | {"experiment": completed_tables}
 
 
-def _known_defaults(
-    shared: dict[str, Any], table: dict[str, Any]
-) -> dict[str, Any]:
+def _known_defaults(shared: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
     """Return the defaults for the table of an experiment.
 
     All defaults are returned, unless the table has the kind "specimen" and the defaults do not:
     then they are for recordings too, and only the keys that specimens know are returned.
-
-    Parameters
-    ----------
-    shared : dict
-        Defaults for all experiments; not changed.
-    table : dict
-        Table of one experiment, as in the file.
     """
     if table.get("kind") != "specimen" or shared.get("kind") == "specimen":
         return shared
-    return {
-        key: value
-        for key, value in shared.items()
-        if key in SpecimenSection.model_fields
-    }
+    return {key: value for key, value in shared.items() if key in SpecimenSection.model_fields}

@@ -25,10 +25,7 @@ from ..methods.method_options import MethodOptions, method_from_options
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method
 
-OPTIONS = {
-    method: [field.name for field in fields(kind)]
-    for method, kind in METHODS.items()
-}
+OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
 DEFAULT = "reduced-space"
 
 
@@ -42,9 +39,7 @@ def _require_offered(name: Any) -> Any:
     return name
 
 
-MethodName = Annotated[
-    str, Among(tuple(METHODS)), BeforeValidator(_require_offered)
-]
+MethodName = Annotated[str, Among(tuple(METHODS)), BeforeValidator(_require_offered)]
 
 
 @dataclass(frozen=True)
@@ -63,13 +58,9 @@ class OptionTable:
         """Return the schema by which pydantic converts the table of options to the method, see
         `_method_from_table`; the arguments are not used.
         """
-        return no_info_plain_validator_function(
-            partial(_method_from_table, self.kind.name)
-        )
+        return no_info_plain_validator_function(partial(_method_from_table, self.kind.name))
 
-    def __get_pydantic_json_schema__(
-        self, schema: Any, handler: Any
-    ) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
         """Return the JSON schema of the method's options for editors; the arguments are
         not used.
         """
@@ -113,24 +104,18 @@ class SolverSection(Section):
 
     method: MethodName = DEFAULT
     huber: Positive | None = None
-    interior_point: Annotated[InteriorPoint, OptionTable(InteriorPoint)] = (
-        _method_key(InteriorPoint)
+    interior_point: Annotated[InteriorPoint, OptionTable(InteriorPoint)] = _method_key(
+        InteriorPoint
     )
-    reduced_space: Annotated[ReducedSpace, OptionTable(ReducedSpace)] = (
-        _method_key(ReducedSpace)
-    )
+    reduced_space: Annotated[ReducedSpace, OptionTable(ReducedSpace)] = _method_key(ReducedSpace)
     penalty: Annotated[Penalty, OptionTable(Penalty)] = _method_key(Penalty)
-    augmented_lagrangian: Annotated[
-        AugmentedLagrangian, OptionTable(AugmentedLagrangian)
-    ] = _method_key(AugmentedLagrangian)
+    augmented_lagrangian: Annotated[AugmentedLagrangian, OptionTable(AugmentedLagrangian)] = (
+        _method_key(AugmentedLagrangian)
+    )
     shooting: Annotated[Shooting, OptionTable(Shooting)] = _method_key(Shooting)
-    casadi_sqpmethod: Annotated[SqpMethod, OptionTable(SqpMethod)] = (
-        _method_key(SqpMethod)
-    )
+    casadi_sqpmethod: Annotated[SqpMethod, OptionTable(SqpMethod)] = _method_key(SqpMethod)
     casadi_sleqp: Annotated[Sleqp, OptionTable(Sleqp)] = _method_key(Sleqp)
-    continuation: Annotated[Continuation, OptionTable(Continuation)] = (
-        _method_key(Continuation)
-    )
+    continuation: Annotated[Continuation, OptionTable(Continuation)] = _method_key(Continuation)
 
     @model_validator(mode="before")
     @classmethod
@@ -139,15 +124,11 @@ class SolverSection(Section):
         method's table.
         """
         outside = (
-            [name for name in table if _methods_with(name)]
-            if isinstance(table, Mapping)
-            else []
+            [name for name in table if _methods_with(name)] if isinstance(table, Mapping) else []
         )
         if outside:
             remedy = f"move {_advice_on_tables(outside, table.get('method', DEFAULT))}"
-            raise ValueError(
-                f"the options of a method have a table of their own: {remedy}"
-            )
+            raise ValueError(f"the options of a method have a table of their own: {remedy}")
         return table
 
     @property
@@ -163,25 +144,10 @@ class SolverSection(Section):
 
 
 def _method_from_table(method: str, table: Any) -> Any:
-    """Return the method called `method` with the options of its table, defaults elsewhere.
-
-    Parameters
-    ----------
-    method : str
-        Name of a method in the file, a key of `METHODS`; the caller has checked it.
-    table : object
-        Options by name, as they are in the file.
-
-    Raises
-    ------
-    InputError
-        If `table` is not a mapping, for options that the method does not have, or invalid values.
-    """
+    """Return the method called `method` with the options of its table, defaults elsewhere."""
     where = f"solver.{method}"
     if not isinstance(table, Mapping):
-        raise InputError(
-            f"found {table!r}; expected a table of options", None, where=where
-        )
+        raise InputError(f"found {table!r}; expected a table of options", None, where=where)
     for name in table:
         owners = _methods_with(name)
         if owners and method not in owners:
@@ -207,12 +173,9 @@ def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
     options_by_method: dict[str, list[str]] = {}
     for option in options:
         owners = _methods_with(option)
-        options_by_method.setdefault(
-            chosen if chosen in owners else owners[0], []
-        ).append(option)
+        options_by_method.setdefault(chosen if chosen in owners else owners[0], []).append(option)
     return " and ".join(
-        f"{', '.join(names)} to {table_heading(to)}"
-        for to, names in options_by_method.items()
+        f"{', '.join(names)} to {table_heading(to)}" for to, names in options_by_method.items()
     )
 
 

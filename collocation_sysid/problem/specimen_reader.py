@@ -18,11 +18,7 @@ from ..recording.specimen_checks import (
     require_plausible_specimen,
     rows_after_cycles,
 )
-from ..recording.specimen_files import (
-    SpecimenLayout,
-    SpecimenTable,
-    read_specimen,
-)
+from ..recording.specimen_files import SpecimenLayout, SpecimenTable, read_specimen
 from ..recording.specimen_hysteresis import loading_rows
 from .named_files import existing_file
 from .specimen_schema import SpecimenSection, deviation
@@ -72,9 +68,7 @@ class SpecimenReader:
         table = read_specimen(
             file,
             layout_from_section(
-                section,
-                requires_times=self.body.has_memory
-                or section.window_s is not None,
+                section, requires_times=self.body.has_memory or section.window_s is not None
             ),
         )
         if table.is_incompressible and section.stress == "true":
@@ -110,15 +104,10 @@ class SpecimenReader:
         section = self.section
         rows = self._rows(table)
         if len(rows) < len(table.t_s):
-            self._add_note(
-                f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used"
-            )
+            self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
         arguments = values_over_time(at_times(table, rows))
         if table.is_displacement and section.area_m2 is not None:
-            arguments |= {
-                "length_m": section.length_m,
-                "area_m2": section.area_m2,
-            }
+            arguments |= {"length_m": section.length_m, "area_m2": section.area_m2}
         return Specimen(
             section.test,
             **arguments,
@@ -135,11 +124,6 @@ class SpecimenReader:
         Otherwise these are the rows within `window_s`, without the first `skip_cycles` cycles of
         the strain and, with branch "loading", only those of the last cycle up to its peak; of these
         every `every`-th row, beginning with the first one.
-
-        Raises
-        ------
-        InputError
-            If no sample is within `window_s`, or there are no cycles after those to skip.
         """
         section = self.section
         rows = np.arange(len(table.t_s))
@@ -157,9 +141,7 @@ class SpecimenReader:
                 where="window_s",
             )
         if section.skip_cycles:
-            rows = rows[
-                rows_after_cycles(table.strain[rows], section.skip_cycles)
-            ]
+            rows = rows[rows_after_cycles(table.strain[rows], section.skip_cycles)]
         if section.branch == "loading":
             rows = rows[loading_rows(table.strain[rows])]
         return rows[:: section.every]

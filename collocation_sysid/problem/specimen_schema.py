@@ -7,14 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from ..common.schema_tables import Among, ByForm, require_one
-from ..common.validated_types import (
-    AtLeastOne,
-    Boundless,
-    Count,
-    Flag,
-    Positive,
-    Text,
-)
+from ..common.validated_types import AtLeastOne, Boundless, Count, Flag, Positive, Text
 from ..recording.homogeneous_deformation import TESTS
 from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
 from .measurement_section import NamedSection
@@ -113,10 +106,7 @@ class SpecimenSection(NamedSection):
                 "found sigma_n without area_m2; expected area_m2 too, because the noise of the "
                 "stress is sigma_n / area_m2, or sigma_pa instead of sigma_n"
             )
-        if (
-            self.window_s is not None
-            and not self.window_s[0] < self.window_s[1]
-        ):
+        if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
             raise ValueError(
                 f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
             )

@@ -20,10 +20,7 @@ Fault = Mapping[str, Any]
 
 
 def explain_validation_error(
-    error: ValidationError,
-    content: dict[str, Any],
-    path: Path,
-    root: type[BaseModel] = ProblemFile,
+    error: ValidationError, content: dict[str, Any], path: Path, root: type[BaseModel] = ProblemFile
 ) -> InputError:
     """Return (not raise) an `InputError` for one fault, with the number of other places with
     faults.
@@ -43,16 +40,10 @@ def explain_validation_error(
     """
     faults = error.errors(include_url=False)
     # An unknown key explains the others around it.
-    fault = next(
-        (f for f in faults if f["type"] == "extra_forbidden"), faults[0]
-    )
-    message = _fault_message(
-        fault, with_experiment_defaults(content), root=root
-    )
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    message = _fault_message(fault, with_experiment_defaults(content), root=root)
     where = _fault_location(fault, content, root=root)
-    others = {
-        _fault_location(other, content, root=root) for other in faults
-    } - {where}
+    others = {_fault_location(other, content, root=root) for other in faults} - {where}
     if others:
         message += f" (and {len(others)} more mistakes)"
     return InputError(message, path, where=where or None)
@@ -65,12 +56,8 @@ def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
     Tags of unions are left out, and so are indices at the end that refer to numbers in an array.
     """
     loc = fault["loc"]
-    own = (
-        len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)
-    )  # that is the file's
-    parts = [
-        p for k, p in enumerate(loc) if k >= own or not str(p).startswith("<")
-    ]
+    own = len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)  # that is the file's
+    parts = [p for k, p in enumerate(loc) if k >= own or not str(p).startswith("<")]
     field, part_count = _schema_field(parts, root)
     if field is not None and _table_model(field.annotation) is None:
         while len(parts) > part_count and isinstance(parts[-1], int):
@@ -78,36 +65,18 @@ def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
     return parts
 
 
-def _fault_message(
-    fault: Fault, content: dict[str, Any], root: type[BaseModel]
-) -> str:
-    """Return the message of a fault: what was found and what was expected.
-
-    Parameters
-    ----------
-    fault : mapping
-        Error of one value, as `ValidationError.errors` describes it.
-    content : dict
-        Content of the file, with [experiment_defaults] inserted.
-    root : type
-        Model of the file.
-    """
+def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
+    """Return the message of a fault: what was found and what was expected."""
     key = _fault_key(fault, root)
     field, _ = _schema_field(key, root)
     description = (field.description if field else None) or ""
-    expected = (
-        description[:1].lower() + description[1:].rstrip(".").split(";")[0]
-    )
+    expected = description[:1].lower() + description[1:].rstrip(".").split(";")[0]
     kind = fault["type"]
     model = _table_model(field.annotation) if field else None
     if kind == "extra_forbidden":
         table, _ = _schema_field(key[:-1], root)
         inside = _table_model(table.annotation) if table else None
-        if (
-            SPECIMEN_TAG in fault["loc"]
-            and inside is not None
-            and len(key) == 3
-        ):
+        if SPECIMEN_TAG in fault["loc"] and inside is not None and len(key) == 3:
             inside = SpecimenSection
         known = list(_fields_by_key(inside or root))
         hint = hint_at(str(key[-1]), known)
@@ -115,18 +84,16 @@ def _fault_message(
     if kind == "value_error":
         error = fault["ctx"]["error"]
         return error.message if isinstance(error, InputError) else str(error)
-    in_array = key[-1:] != list(fault["loc"][-1:]) and isinstance(
-        fault["loc"][-1], int
-    )
+    in_array = key[-1:] != list(fault["loc"][-1:]) and isinstance(fault["loc"][-1], int)
     if kind == "missing" and not in_array:
         return f"missing; expected {expected or ('a value' if model is None else 'a table')}"
     finding = f"found {shortened(_value_at(key, content) if in_array else fault['input'])}"
-    if expected and (
-        in_array or kind in ("tuple_type", "list_type", "too_long", "too_short")
-    ):
+    if expected and (in_array or kind in ("tuple_type", "list_type", "too_long", "too_short")):
         return f"{finding}; expected {expected}"
     if kind in ("model_type", "model_attributes_type") and model is not None:
-        return f"{finding}; expected a table with some of the keys {', '.join(_fields_by_key(model))}"
+        return (
+            f"{finding}; expected a table with some of the keys {', '.join(_fields_by_key(model))}"
+        )
     if kind == "literal_error":
         choices = fault["ctx"]["expected"]
         hint = hint_at(str(fault["input"]), re.findall("'(.*?)'", choices))
@@ -134,9 +101,7 @@ def _fault_message(
     return f"{finding}; expected {wanted(fault)}"
 
 
-def _fault_location(
-    fault: Fault, content: dict[str, Any], root: type[BaseModel]
-) -> str:
+def _fault_location(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
     """Return the location of a fault as text, as it is written in the file.
 
     An `InputError` that a validator raised contains the location within its value, which is then
@@ -158,11 +123,7 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
     defaults = _item(content, "experiment_defaults")
     if key[:1] == ["experiment"] and len(key) > 2:
         own = _value_at(key[:2], content)
-        if (
-            isinstance(own, dict)
-            and key[2] not in own
-            and _item(defaults, key[2]) is not None
-        ):
+        if isinstance(own, dict) and key[2] not in own and _item(defaults, key[2]) is not None:
             key = ["experiment_defaults", *key[2:]]
     written: list[str] = []
     experiment = ""
@@ -170,12 +131,7 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
         value = _item(value, part)
         written.append(str(part))
         name = _item(value, "name")
-        if (
-            len(written) == 2
-            and written[0] == "experiment"
-            and name
-            and isinstance(name, str)
-        ):
+        if len(written) == 2 and written[0] == "experiment" and name and isinstance(name, str):
             experiment = f"experiment {name!r}"
             written = []
     return ": ".join(text for text in (experiment, ".".join(written)) if text)
@@ -204,9 +160,7 @@ def _item(container: Any, part: Part) -> Any:
 # The schema -----------------------------------------------------------------------------------
 
 
-def _schema_field(
-    key: Sequence[Part], root: type[BaseModel]
-) -> tuple[FieldInfo | None, int]:
+def _schema_field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo | None, int]:
     """Return the deepest field of the schema on the path of a key, and the number of parts up to
     and including it.
 
@@ -220,22 +174,12 @@ def _schema_field(
     for count, part in enumerate(key, start=1):
         if isinstance(part, int):
             continue
-        if (
-            field is not None
-            and get_origin(field.annotation) is dict
-            and not named
-        ):
+        if field is not None and get_origin(field.annotation) is dict and not named:
             named = True  # a name of the user's, such as a parameter's
             continue
-        if (
-            field is not None
-            and model is not None
-            and part not in _fields_by_key(model)
-        ):
+        if field is not None and model is not None and part not in _fields_by_key(model):
             others = table_models(field.annotation)
-            model = next(
-                (each for each in others if part in _fields_by_key(each)), None
-            )
+            model = next((each for each in others if part in _fields_by_key(each)), None)
         if model is None or part not in _fields_by_key(model):
             break
         field = _fields_by_key(model)[part]
@@ -247,9 +191,7 @@ def _schema_field(
 
 def _fields_by_key(model: type[BaseModel]) -> dict[str, FieldInfo]:
     """Return the fields of a model by their keys in the file: the alias, else the name."""
-    return {
-        field.alias or name: field for name, field in model.model_fields.items()
-    }
+    return {field.alias or name: field for name, field in model.model_fields.items()}
 
 
 def _table_model(annotation: Any) -> type[BaseModel] | None:
@@ -277,8 +219,5 @@ def shortened(value: Any) -> str:
         return str(value).lower()
     try:
         return excerpt(repr(value))
-    except (
-        ValueError,
-        RecursionError,
-    ):  # beyond Python's limits of digits and of nesting
+    except (ValueError, RecursionError):  # beyond Python's limits of digits and of nesting
         return f"a {type(value).__name__} too large to show"

@@ -93,10 +93,7 @@ class Association:
             markers is self.markers
             and clock_samples == self.clock_samples
             and all(
-                new is old
-                for new, old in zip(
-                    correspondences, self.correspondences, strict=True
-                )
+                new is old for new, old in zip(correspondences, self.correspondences, strict=True)
             )
         )
         if is_same:

@@ -15,8 +15,8 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
 =================  =========================================================================
 
 History variables, reaction forces, their resultants and pressures of obstacles are eliminated. A
-subclass, `lifted.lifted_collocation.LiftedCollocation`, has them as variables at the end of z, with equations
-at the end of g.
+subclass, `lifted.lifted_collocation.LiftedCollocation`, has them as variables at the end of z, with
+equations at the end of g.
 
 Constraints g, in this order:
 
@@ -56,9 +56,7 @@ from .transcription import Transcription
 BOUND_TOLERANCE = 1e-6
 
 
-def convert_variables(
-    z: Array, source: Collocation, target: Collocation
-) -> Array:
+def convert_variables(z: Array, source: Collocation, target: Collocation) -> Array:
     """Convert the variables z of a program to those of the same program with or without lifted
     variables.
 
@@ -77,9 +75,7 @@ def convert_variables(
         Variables of `target`, z itself if both have the same number. Lifted variables of the target
         follow from positions and parameters; those of the source are dropped.
     """
-    return (
-        z if len(z) == target.variable_count else target.pack(*source.unpack(z))
-    )
+    return z if len(z) == target.variable_count else target.pack(*source.unpack(z))
 
 
 @dataclass(frozen=True)
@@ -161,9 +157,7 @@ class Collocation:
             raise InputError(f"substeps = {self.substeps}, expected at least 1")
         if self.huber is not None and not self.huber > 0:
             raise InputError(
-                f"huber = {self.huber:g}, expected a positive number",
-                None,
-                where="solver",
+                f"huber = {self.huber:g}, expected a positive number", None, where="solver"
             )
         # Building the transcriptions checks what experiments share.
         self.parameters.require_constants_of(
@@ -178,14 +172,12 @@ class Collocation:
         have none.
         """
         fitted = [each for each in self.experiments if not each.validation]
-        segments = list[Transcription]()
-        for experiment, local in zip(
-            fitted, nuisance_indices(fitted, self.nq), strict=True
-        ):
-            chart = self.associations.get(experiment.name)
-            if chart is None or not chart.matches(experiment):
-                chart = Association.from_experiment(experiment)
-            segments.append(
+        transcriptions = list[Transcription]()
+        for experiment, local in zip(fitted, nuisance_indices(fitted, self.nq), strict=True):
+            association = self.associations.get(experiment.name)
+            if association is None or not association.matches(experiment):
+                association = Association.from_experiment(experiment)
+            transcriptions.append(
                 Transcription(
                     experiment,
                     self.parameters,
@@ -193,28 +185,25 @@ class Collocation:
                     substeps=1 if experiment.is_static else self.substeps,
                     has_grasp_constraints=self.has_grasp_constraints,
                     huber=self.huber,
-                    offsets=segments[-1].next_offsets
-                    if segments
+                    offsets=transcriptions[-1].next_offsets
+                    if transcriptions
                     else SegmentOffsets(self.nq, 0),
                     nuisance_indices=local,
-                    association=chart,
+                    association=association,
                 )
             )
         return _with_shared_associations(
-            segments, [segment.association for segment in segments]
+            transcriptions, [transcription.association for transcription in transcriptions]
         )
 
     def with_parameters(self, parameters: Parameters) -> Collocation:
-        """Return the program with other shared parameters, or other guesses of them, and the present
-        associations of the measurements, which are not computed again.
+        """Return the program with other shared parameters, or other guesses of them, and the
+        present associations of the measurements, which are not computed again.
         """
         return replace(
             self,
             parameters=parameters,
-            associations={
-                each.experiment.name: each.association
-                for each in self.transcriptions
-            },
+            associations={each.experiment.name: each.association for each in self.transcriptions},
         )
 
     @property
@@ -225,11 +214,7 @@ class Collocation:
     @property
     def nphi(self) -> int:
         """Number of nuisance parameters φ of all fitted experiments; shared ones count once."""
-        return (
-            int(np.concatenate(self.parameter_indices).max(initial=self.nq - 1))
-            + 1
-            - self.nq
-        )
+        return int(np.concatenate(self.parameter_indices).max(initial=self.nq - 1)) + 1 - self.nq
 
     @property
     def variable_count(self) -> int:
@@ -245,8 +230,8 @@ class Collocation:
         """Return the number of scalar measurements that are compared, of all fitted experiments."""
         return sum(
             int(reading.is_compared.sum())
-            for segment in self.transcriptions
-            for reading in segment.residuals
+            for transcription in self.transcriptions
+            for reading in transcription.residuals
         )
 
     def count_associated(self) -> int:
@@ -256,8 +241,8 @@ class Collocation:
         """
         return self.count_measurements() + sum(
             reading.uncompared_count
-            for segment in self.transcriptions
-            for reading in segment.residuals
+            for transcription in self.transcriptions
+            for reading in transcription.residuals
         )
 
     @property
@@ -283,7 +268,7 @@ class Collocation:
             Scaled variables: q, scaled positions, φ.
         """
         pairs = zip(self.transcriptions, positions, strict=True)
-        scaled = [np.ravel(x) / segment.length_m for segment, x in pairs]
+        scaled = [np.ravel(x) / transcription.length_m for transcription, x in pairs]
         return np.concatenate([p[: self.nq], *scaled, p[self.nq :]])
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
@@ -291,9 +276,9 @@ class Collocation:
         [m] from z.
         """
         return self.parameters_from(z), [
-            z[segment.columns].reshape(segment.grid_times, segment.dof_count)
-            * segment.length_m
-            for segment in self.transcriptions
+            z[transcription.columns].reshape(transcription.grid_times, transcription.dof_count)
+            * transcription.length_m
+            for transcription in self.transcriptions
         ]
 
     def parameters_from(self, z: Array) -> Array:
@@ -313,20 +298,16 @@ class Collocation:
     @cached_property
     def parameter_indices(self) -> list[Index]:
         """Indices (nq + k,) of (q, φ) of each experiment in p."""
-        return [
-            segment.list_parameter_indices() for segment in self.transcriptions
-        ]
+        return [transcription.list_parameter_indices() for transcription in self.transcriptions]
 
     @property
     def threads(self) -> int:
         """Number of threads that every body may use: the least of the bodies' numbers."""
-        return min(segment.body.threads for segment in self.transcriptions)
+        return min(transcription.body.threads for transcription in self.transcriptions)
 
-    def iterates_at(
-        self, p: Array, positions: Sequence[Array]
-    ) -> list[ExperimentIterate]:
-        """Return every fitted experiment at parameters and positions, from which all other quantities
-        follow.
+    def iterates_at(self, p: Array, positions: Sequence[Array]) -> list[ExperimentIterate]:
+        """Return every fitted experiment at parameters and positions, from which all other
+        quantities follow.
 
         Parameters
         ----------
@@ -337,12 +318,9 @@ class Collocation:
         """
         return [
             ExperimentIterate(
-                segment,
-                p[: self.nq],
-                phi=p[segment.nuisance_indices.indices],
-                x=x,
+                transcription, p[: self.nq], phi=p[transcription.nuisance_indices.indices], x=x
             )
-            for segment, x in zip(self.transcriptions, positions, strict=True)
+            for transcription, x in zip(self.transcriptions, positions, strict=True)
         ]
 
     def list_parameter_names(self) -> tuple[str, ...]:
@@ -350,11 +328,9 @@ class Collocation:
         nuisance parameters; of a shared one, the label in the last experiment that has it.
         """
         names = [item.name for item in self.parameters.free] + [""] * self.nphi
-        for segment in self.transcriptions:
+        for transcription in self.transcriptions:
             for place, name in zip(
-                segment.nuisance_indices.indices,
-                segment.nuisance.names,
-                strict=True,
+                transcription.nuisance_indices.indices, transcription.nuisance.names, strict=True
             ):
                 names[place] = name
         return tuple(names)
@@ -378,11 +354,9 @@ class Collocation:
         """
         lower, upper = self.parameters.compute_bounds_q()
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
-        for segment in self.transcriptions:
-            indices = segment.nuisance_indices.indices - self.nq
-            least, most = segment.nuisance.bounds(
-                segment.association.clock_samples
-            )
+        for transcription in self.transcriptions:
+            indices = transcription.nuisance_indices.indices - self.nq
+            least, most = transcription.nuisance.bounds(transcription.association.clock_samples)
             low[indices] = np.maximum(low[indices], least)
             high[indices] = np.minimum(high[indices], most)
         return np.concatenate([lower, low]), np.concatenate([upper, high])
@@ -408,27 +382,21 @@ class Collocation:
             The program with the new associations, which is self if none has changed, and p in it.
         """
         rows = positions or [
-            np.zeros((0, segment.dof_count)) for segment in self.transcriptions
+            np.zeros((0, transcription.dof_count)) for transcription in self.transcriptions
         ]
         pairs = zip(self.transcriptions, rows, strict=True)
-        updates = [
-            s.follow_estimates(p[s.nuisance_indices.indices], x)
-            for s, x in pairs
-        ]
+        updates = [s.follow_estimates(p[s.nuisance_indices.indices], x) for s, x in pairs]
         if all(
-            chart is s.association
-            for (chart, _), s in zip(updates, self.transcriptions, strict=True)
+            association is s.association
+            for (association, _), s in zip(updates, self.transcriptions, strict=True)
         ):
             return self, p
         return self._with_associations(
-            [chart for chart, _ in updates], p, phis=[phi for _, phi in updates]
+            [association for association, _ in updates], p, phis=[phi for _, phi in updates]
         )
 
     def place_unknown_markers(
-        self,
-        p: Array,
-        positions: Sequence[Array],
-        only_poses: bool = False,
+        self, p: Array, positions: Sequence[Array], only_poses: bool = False
     ) -> tuple[Collocation, Array]:
         """Return the program with unknown marker places and poses of cameras initialised before
         a solve, and p in it; see `Transcription.place_unknown_markers`.
@@ -448,41 +416,32 @@ class Collocation:
             The program with the new associations, and p in it; self and p if no experiment has
             unknown places or cameras.
         """
-        if not any(
-            segment.count_rows_to_place() for segment in self.transcriptions
-        ):
+        if not any(transcription.count_rows_to_place() for transcription in self.transcriptions):
             return self, p
         updates = [
-            part.segment.place_unknown_markers(
-                part.phi, part.x, only_poses=only_poses
-            )
+            part.transcription.place_unknown_markers(part.phi, part.x, only_poses=only_poses)
             for part in self.iterates_at(p, positions)
         ]
         return self._with_associations(
-            [chart for chart, _ in updates], p, phis=[phi for _, phi in updates]
+            [association for association, _ in updates], p, phis=[phi for _, phi in updates]
         )
 
     def with_marker_places(self, places_m: Sequence[Array]) -> Collocation:
         """Return the program with associations centred at given marker places, one array (M, 3) [m]
         on the undeformed body for each fitted experiment.
         """
-        charts = [
-            s.association.centred_at(m)
-            for s, m in zip(self.transcriptions, places_m, strict=True)
+        associations = [
+            s.association.centred_at(m) for s, m in zip(self.transcriptions, places_m, strict=True)
         ]
-        segments = [
-            s.with_association(c)
-            for s, c in zip(self.transcriptions, charts, strict=True)
+        transcriptions = [
+            s.with_association(c) for s, c in zip(self.transcriptions, associations, strict=True)
         ]
         return self._with_associations(
-            charts, self.guess_p, phis=[s.compute_guess_phi() for s in segments]
+            associations, self.guess_p, phis=[s.compute_guess_phi() for s in transcriptions]
         )[0]
 
     def _with_associations(
-        self,
-        charts: Sequence[Association],
-        p: Array,
-        phis: Sequence[Array],
+        self, associations: Sequence[Association], p: Array, phis: Sequence[Array]
     ) -> tuple[Collocation, Array]:
         """Return the program with another association of each fitted experiment, and p (nq + nphi,)
         with the φ of each experiment in `phis`, which refer to these associations.
@@ -492,21 +451,19 @@ class Collocation:
         `Transcription.with_association`.
         """
         updated = self._combine_parameters(p[: self.nq], phis)
-        segments = _with_shared_associations(self.transcriptions, charts)
+        transcriptions = _with_shared_associations(self.transcriptions, associations)
         other = replace(
-            self,
-            associations={s.experiment.name: s.association for s in segments},
+            self, associations={s.experiment.name: s.association for s in transcriptions}
         )
         # The same transcriptions, with the values that they have cached.
-        vars(other)["transcriptions"] = segments
+        vars(other)["transcriptions"] = transcriptions
         return other, updated
 
     @property
     def guess_p(self) -> Array:
         """Guess of p: that of q, and φ at the centres of the associations."""
         return self._combine_parameters(
-            self.parameters.guess_q,
-            [s.compute_guess_phi() for s in self.transcriptions],
+            self.parameters.guess_q, [s.compute_guess_phi() for s in self.transcriptions]
         )
 
     def _combine_parameters(self, q: Array, phis: Sequence[Array]) -> Array:
@@ -514,10 +471,8 @@ class Collocation:
         entries, the value in the first experiment.
         """
         p = np.concatenate([q, np.zeros(self.nphi)])
-        for segment, phi in reversed(
-            [*zip(self.transcriptions, phis, strict=True)]
-        ):
-            p[segment.nuisance_indices.indices] = phi
+        for transcription, phi in reversed([*zip(self.transcriptions, phis, strict=True)]):
+            p[transcription.nuisance_indices.indices] = phi
         return p
 
     def compute_reach_p(self) -> Array:
@@ -525,8 +480,7 @@ class Collocation:
         radius one allows, which is one for q.
         """
         return self._combine_parameters(
-            np.ones(self.nq),
-            [s.nuisance.step_limits for s in self.transcriptions],
+            np.ones(self.nq), [s.nuisance.step_limits for s in self.transcriptions]
         )
 
     def bounds(self) -> tuple[Array, Array]:
@@ -535,7 +489,7 @@ class Collocation:
         """
         lower, upper = self.compute_parameter_bounds()
         lows, highs = zip(
-            *(segment.bounds() for segment in self.transcriptions), strict=True
+            *(transcription.bounds() for transcription in self.transcriptions), strict=True
         )
         # Additional variables of a subclass have bounds of their own.
         pack = partial(Collocation.pack, self)
@@ -561,15 +515,10 @@ class Collocation:
         by_x = []
         for part in parts:
             of_x, of_p = part.gradient()
-            by_x.append(of_x.ravel() * part.segment.length_m)
-            by_p[part.segment.list_parameter_indices()] += of_p
+            by_x.append(of_x.ravel() * part.transcription.length_m)
+            by_p[part.transcription.list_parameter_indices()] += of_p
         return self.loss_scale * np.concatenate(
-            [
-                by_p[: self.nq],
-                *by_x,
-                by_p[self.nq :],
-                *self._additional_gradients(parts),
-            ]
+            [by_p[: self.nq], *by_x, by_p[self.nq :], *self._additional_gradients(parts)]
         )
 
     # Constraints ------------------------------------------------------------------------------
@@ -578,9 +527,7 @@ class Collocation:
         """Return the scaled constraints g (constraints,) at z: equations of motion and grasps."""
         parts = self.iterates(z)
         rows = [
-            part.segment.constraint_values(
-                part.x, part.equations, histories=part.histories
-            )
+            part.transcription.constraint_values(part.x, part.equations, histories=part.histories)
             for part in parts
         ]
         return np.concatenate([*rows, *self._additional_equations(parts, z)])
@@ -597,20 +544,14 @@ class Collocation:
         indptr = [np.arange(self.nq + 1) * own]
         indices = [np.tile(np.arange(own), self.nq)]
         of_phi = []
-        for segment in self.transcriptions:
-            indptr.append(
-                indptr[-1][-1] + segment.motion_rows.structure.indptr[1:]
-            )
-            indices.append(
-                segment.offsets.row + segment.motion_rows.structure.indices
-            )
+        for transcription in self.transcriptions:
+            indptr.append(indptr[-1][-1] + transcription.motion_rows.structure.indptr[1:])
+            indices.append(transcription.offsets.row + transcription.motion_rows.structure.indices)
             moving = (
-                segment.nuisance_indices.indices[
-                    segment.nuisance.motion_indices
-                ]
+                transcription.nuisance_indices.indices[transcription.nuisance.motion_indices]
                 - self.nq
             )
-            rows = segment.offsets.row + np.arange(segment.constraint_count)
+            rows = transcription.offsets.row + np.arange(transcription.constraint_count)
             columns = self.phi_columns.start + np.repeat(moving, len(rows))
             of_phi.append((np.tile(rows, len(moving)), columns))
         structure = np.concatenate(indptr), np.concatenate(indices)
@@ -633,9 +574,7 @@ class Collocation:
         """
         return self.constraints_and_jacobian(z, out)[1]
 
-    def constraints_and_jacobian(
-        self, z: Array, out: Array | None = None
-    ) -> tuple[Array, Array]:
+    def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
         """Return constraints g (constraints,) and the values of ∂g/∂z, see `jacobian_values`, from
         one evaluation of the elements.
 
@@ -648,31 +587,25 @@ class Collocation:
         """
         parts = self.iterates(z)
         height = self.transcriptions[-1].next_offsets.row
-        count = self.nq * height + sum(
-            s.motion_rows.structure.nnz for s in self.transcriptions
-        )
+        count = self.nq * height + sum(s.motion_rows.structure.nnz for s in self.transcriptions)
         values, own = self._jacobian.allocate(out, count)
         columns = own[: self.nq * height].reshape(self.nq, height)
         rows = np.empty(height)
         further = []
         used = columns.size
         for part in parts:
-            segment = part.segment
-            here = own[used : used + segment.motion_rows.structure.nnz]
-            constraints, by_p = segment.constraints_and_jacobian(
+            transcription = part.transcription
+            here = own[used : used + transcription.motion_rows.structure.nnz]
+            constraints, by_p = transcription.constraints_and_jacobian(
                 part.x, part.equations, forces=part.forces, values=here
             )
-            rows[segment.rows] = constraints
-            columns[:, segment.rows] = by_p[:, : self.nq].T
+            rows[transcription.rows] = constraints
+            columns[:, transcription.rows] = by_p[:, : self.nq].T
             further.append(by_p[:, self.nq :].T.ravel())
-            used += segment.motion_rows.structure.nnz
+            used += transcription.motion_rows.structure.nnz
         added = self._additional_jacobian(parts, z)
-        self._jacobian.assemble(
-            values, own, groups=further + [entries for _, entries in added]
-        )
-        return np.concatenate(
-            [rows, *(equations for equations, _ in added)]
-        ), values
+        self._jacobian.assemble(values, own, groups=further + [entries for _, entries in added])
+        return np.concatenate([rows, *(equations for equations, _ in added)]), values
 
     def jacobian(self, z: Array) -> sp.csc_array:
         """Return ∂g/∂z (constraints, variables) as a sparse matrix; history variables that are
@@ -680,16 +613,14 @@ class Collocation:
         """
         indptr, indices = self.jacobian_structure
         shape = (self.constraint_count, self.variable_count)
-        return sp.csc_array(
-            (self.jacobian_values(z), indices, indptr), shape=shape
-        )
+        return sp.csc_array((self.jacobian_values(z), indices, indptr), shape=shape)
 
     @property
     def has_eliminated_histories(self) -> bool:
         """Whether history variables are eliminated, so that ∂g/∂z has more entries than
         `jacobian`.
         """
-        return any(segment.has_histories() for segment in self.transcriptions)
+        return any(transcription.has_histories() for transcription in self.transcriptions)
 
     def jacobian_vjp(self, z: Array, multipliers: Array) -> Array:
         """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers (variables,) at z, for
@@ -697,15 +628,11 @@ class Collocation:
         """
         slope = self.jacobian(z).T @ multipliers
         for part in self.iterates(z) if self.has_eliminated_histories else ():
-            segment = part.segment
-            weights = segment.lagrangian_weights(
-                multipliers[segment.rows]
-            ).forces
-            by_x, by_p = segment.history_vjp(
-                part.x, part.equations, weights=weights
-            )
-            slope[segment.columns] += segment.length_m * by_x.ravel()
-            slope[segment.dynamic_columns(self.phi_columns.start)] += by_p
+            transcription = part.transcription
+            weights = transcription.lagrangian_weights(multipliers[transcription.rows]).forces
+            by_x, by_p = transcription.history_vjp(part.x, part.equations, weights=weights)
+            slope[transcription.columns] += transcription.length_m * by_x.ravel()
+            slope[transcription.dynamic_columns(self.phi_columns.start)] += by_p
         return slope
 
     # Lagrangian -------------------------------------------------------------------------------
@@ -726,23 +653,17 @@ class Collocation:
         further = []
         indptr = [counts * (counts + 1) // 2]
         indices = [np.concatenate([np.arange(k) for k in counts])]
-        for segment in self.transcriptions:
-            indptr.append(indptr[-1][-1] + segment.hessian.indptr[1:])
+        for transcription in self.transcriptions:
+            indptr.append(indptr[-1][-1] + transcription.hessian.indptr[1:])
             shift = np.where(
-                segment.hessian.indices < self.nq,
-                0,
-                segment.offsets.position - self.nq,
+                transcription.hessian.indices < self.nq, 0, transcription.offsets.position - self.nq
             )
-            indices.append(segment.hessian.indices + shift)
-            further += segment.additional_hessian_entries(
-                self.phi_columns.start
-            )
+            indices.append(transcription.hessian.indices + shift)
+            further += transcription.additional_hessian_entries(self.phi_columns.start)
         further += self._additional_hessian_entries()
         structure = np.concatenate(indptr), np.concatenate(indices)
         return SparseAssembly.from_groups(
-            structure,
-            (self.variable_count, self.variable_count),
-            groups=further,
+            structure, (self.variable_count, self.variable_count), groups=further
         )
 
     @cached_property
@@ -753,17 +674,13 @@ class Collocation:
         of_q = np.cumsum(np.arange(1, self.nq + 1)) - 1
         of_x = []
         used = self.nq * (self.nq + 1) // 2
-        for segment in self.transcriptions:
-            of_x.append(used + segment.find_hessian_diagonal())
-            used += segment.hessian.nnz
+        for transcription in self.transcriptions:
+            of_x.append(used + transcription.find_hessian_diagonal())
+            used += transcription.hessian.nnz
         return of_q, self._hessian.positions_of(np.concatenate(of_x))
 
     def hessian_values(
-        self,
-        z: Array,
-        loss_weight: float,
-        multipliers: Array | None,
-        out: Array | None = None,
+        self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
         """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
 
@@ -785,30 +702,22 @@ class Collocation:
             replace(part, has_observation_curvature=uses_observation_curvature)
             for part in self.iterates(z)
         ]
-        multipliers = (
-            np.zeros(self.constraint_count)
-            if multipliers is None
-            else multipliers
-        )
+        multipliers = np.zeros(self.constraint_count) if multipliers is None else multipliers
         used = self.nq * (self.nq + 1) // 2
-        count = used + sum(
-            segment.hessian.nnz for segment in self.transcriptions
-        )
+        count = used + sum(transcription.hessian.nnz for transcription in self.transcriptions)
         values, own = self._hessian.allocate(out, count)
         by_q = np.zeros((self.nq, self.nq))
         further = list[Array]()
         weights = list[RowWeights]()
         weight = loss_weight * self.loss_scale
         for number, part in enumerate(parts):
-            segment = part.segment
-            here = own[used : used + segment.hessian.nnz]
-            of_rows, histories = self._additional_weights(
-                number, part, multipliers=multipliers
-            )
+            transcription = part.transcription
+            here = own[used : used + transcription.hessian.nnz]
+            of_rows, histories = self._additional_weights(number, part, multipliers=multipliers)
             weights.append(
-                segment.lagrangian_weights(multipliers[segment.rows], of_rows)
+                transcription.lagrangian_weights(multipliers[transcription.rows], of_rows)
             )
-            by_q_own, further_own = segment.hessian_values(
+            by_q_own, further_own = transcription.hessian_values(
                 part.x,
                 part.phi,
                 equations=part.equations,
@@ -822,11 +731,7 @@ class Collocation:
             further = further + further_own
             used = used + len(here)
         further = further + self._additional_hessian(
-            parts,
-            z,
-            loss_weight=weight,
-            multipliers=multipliers,
-            weights=weights,
+            parts, z, loss_weight=weight, multipliers=multipliers, weights=weights
         )
         _, slopes = self.parameters.prior_residuals(parts[0].q)
         by_q += np.diag(2 * weight * slopes**2)
@@ -860,13 +765,9 @@ class Collocation:
             at_upper = (upper - z)[part] < BOUND_TOLERANCE
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
-        return float(
-            max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0))
-        )
+        return float(max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0)))
 
-    def hessian(
-        self, z: Array, loss_weight: float, multipliers: Array | None
-    ) -> sp.csc_array:
+    def hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> sp.csc_array:
         """Return ∇²_z (loss_weight · objective + multipliers · g), both triangles, as a sparse
         matrix.
 
@@ -879,9 +780,7 @@ class Collocation:
 
     # Additional variables of subclasses ---------------------------------------------------------
 
-    def _additional_equations(
-        self, parts: Sequence[ExperimentIterate], z: Array
-    ) -> list[Array]:
+    def _additional_equations(self, parts: Sequence[ExperimentIterate], z: Array) -> list[Array]:
         """Return the equations of additional variables, which follow all other constraints; `parts`
         are the iterates at z.
         """
@@ -899,32 +798,14 @@ class Collocation:
         """
         return []
 
-    def _additional_gradients(
-        self, parts: Sequence[ExperimentIterate]
-    ) -> list[Array]:
+    def _additional_gradients(self, parts: Sequence[ExperimentIterate]) -> list[Array]:
         """Return the gradient of the loss by additional variables, at the iterates `parts`."""
         return []
 
     def _additional_weights(
         self, number: int, part: ExperimentIterate, multipliers: Array
     ) -> tuple[Array | float, list[WeightedHistory]]:
-        """Return what the equations of additional variables add to the Lagrangian of an experiment.
-
-        Parameters
-        ----------
-        number : int
-            Index of the experiment.
-        part : ExperimentIterate
-            The experiment at z.
-        multipliers : (constraints,) array
-            Multipliers of all constraints g.
-
-        Returns
-        -------
-        ((N, 3n) array or 0, list of WeightedHistory)
-            Weights of the residuals c, see `MotionTranscription.lagrangian_weights`, and history
-            variables that are variables of the program, with their weights.
-        """
+        """Return what the equations of additional variables add to the Lagrangian of an experiment."""
         return 0.0, []
 
     def _additional_hessian_entries(self) -> list[tuple[Index, Index]]:
@@ -941,21 +822,7 @@ class Collocation:
         multipliers: Array,
         weights: Sequence[RowWeights],
     ) -> list[Array]:
-        """Return the values of each group of `_additional_hessian_entries`.
-
-        Parameters
-        ----------
-        parts : sequence of ExperimentIterate
-            The experiments at z.
-        z : (variables,) array
-            Variables.
-        loss_weight : float
-            Factor of the loss.
-        multipliers : (constraints,) array
-            Multipliers of all constraints g.
-        weights : sequence of RowWeights
-            Weights of the constraints and forces of each experiment.
-        """
+        """Return the values of each group of `_additional_hessian_entries`."""
         return []
 
     # Reading a point --------------------------------------------------------------------------
@@ -988,25 +855,21 @@ class Collocation:
         """
         violations = []
         for part in self.iterates(z):
-            segment = part.segment
+            transcription = part.transcription
             residual = part.compute_residual_n()
             worst = np.argsort(-np.abs(residual), axis=None)[:count]
-            for t, place in zip(
-                *np.unravel_index(worst, residual.shape), strict=True
-            ):
-                node, axis = divmod(int(segment.free_dofs[place]), 3)
+            for t, place in zip(*np.unravel_index(worst, residual.shape), strict=True):
+                node, axis = divmod(int(transcription.free_dofs[place]), 3)
                 violations.append(
                     Violation(
-                        segment.experiment.name,
-                        float(segment.dynamics.t_s[t]),
+                        transcription.experiment.name,
+                        float(transcription.dynamics.t_s[t]),
                         node=node,
                         axis="xyz"[axis],
                         residual_n=float(residual[t, place]),
                     )
                 )
-        return sorted(
-            violations, key=lambda violation: -abs(violation.residual_n)
-        )[:count]
+        return sorted(violations, key=lambda violation: -abs(violation.residual_n))[:count]
 
     def rms_marker_distance_m(self, z: Array) -> float:
         """Return the root mean square distance of the markers from their measurements [m], over all
@@ -1014,9 +877,7 @@ class Collocation:
         """
         squares = samples = 0.0
         for part in self.iterates(z):
-            squares_m2 = part.segment.markers.squared_distances_m2(
-                part.x, part.phi
-            )
+            squares_m2 = part.transcription.markers.squared_distances_m2(part.x, part.phi)
             squares = squares + float(squares_m2.sum())
             samples = samples + len(squares_m2)
         return float(np.sqrt(squares / max(1.0, samples)))
@@ -1029,16 +890,15 @@ class Collocation:
 
 
 def _with_shared_associations(
-    transcriptions: Sequence[Transcription], charts: Sequence[Association]
+    transcriptions: Sequence[Transcription], associations: Sequence[Association]
 ) -> tuple[Transcription, ...]:
     """Return the transcriptions with the given associations, in which places and clocks of shared
     nuisance parameters are those of the first experiment that shares them.
     """
-    parts = zip(transcriptions, charts, strict=True)
+    parts = zip(transcriptions, associations, strict=True)
     same = shared_associations(
-        (s.nuisance_indices, s.nuisance, chart) for s, chart in parts
+        (s.nuisance_indices, s.nuisance, association) for s, association in parts
     )
     return tuple(
-        s.with_association(chart)
-        for s, chart in zip(transcriptions, same, strict=True)
+        s.with_association(association) for s, association in zip(transcriptions, same, strict=True)
     )

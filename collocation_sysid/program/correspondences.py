@@ -83,9 +83,7 @@ class CorrespondenceResidual(MeasurementResidual):
         """
 
     @abstractmethod
-    def correspondences_of(
-        self, measured: Any, x: Array, phi: Array
-    ) -> Correspondences:
+    def correspondences_of(self, measured: Any, x: Array, phi: Array) -> Correspondences:
         """Return the correspondences of other points of the same sensor and samples, such as all
         points in place of thinned ones.
 

@@ -96,14 +96,9 @@ class CustomSensorResidual(MeasurementResidual):
         """
         count = sensor.measured_values.shape[1]
         groups = -(-count // GROUP)
-        padded = np.full(
-            (len(sensor.sample_times_s), 1, GROUP * groups), np.nan
-        )
+        padded = np.full((len(sensor.sample_times_s), 1, GROUP * groups), np.nan)
         padded[:, 0, :count] = sensor.measured_values
-        is_compared = (
-            np.isfinite(padded)
-            & _is_within(sensor.sample_times_s, at_s)[:, None, None]
-        )
+        is_compared = np.isfinite(padded) & _is_within(sensor.sample_times_s, at_s)[:, None, None]
         which = [f" {k + 1}" if groups > 1 else "" for k in range(groups)]
         return cls(
             observable=observable,
@@ -114,9 +109,7 @@ class CustomSensorResidual(MeasurementResidual):
             sigmas=np.full(groups, sensor.sigma),
             measured=padded,
             is_compared=is_compared.reshape(len(padded), groups, GROUP),
-            own_parameters=nuisance.indices_of_rows(GAUGE, component=number)[
-                None
-            ],
+            own_parameters=nuisance.indices_of_rows(GAUGE, component=number)[None],
             sensor=sensor,
             observable_s=at_s,
             is_static=static,
@@ -129,11 +122,7 @@ class CustomSensorResidual(MeasurementResidual):
         in `MeasurementResidual.with_samples`.
         """
         return super().with_samples(
-            known_s,
-            t_s,
-            measurements=measurements,
-            observable_s=known_s,
-            **changes,
+            known_s, t_s, measurements=measurements, observable_s=known_s, **changes
         )
 
     @cached_property
@@ -143,20 +132,11 @@ class CustomSensorResidual(MeasurementResidual):
         Its data are the distances of the neighbouring times from the sample, and the time of the
         sample [s]. A sample beyond the known times uses the nearest ones.
         """
-        used = min(
-            STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS,
-            len(self.observable_s),
-        )
-        times = neighbouring_times(
-            self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used
-        )
+        used = min(STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS, len(self.observable_s))
+        times = neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used)
         each = np.arange(self.observable.vector_count)
-        places = (
-            times[..., None] * self.observable.vector_count + each
-        ).reshape(len(times), 1, -1)
-        data = np.column_stack(
-            [self.observable_s[times] - self.t_s[:, None], self.t_s]
-        )
+        places = (times[..., None] * self.observable.vector_count + each).reshape(len(times), 1, -1)
+        data = np.column_stack([self.observable_s[times] - self.t_s[:, None], self.t_s])
         return RowStencil(places, data.T[..., None])
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -165,9 +145,7 @@ class CustomSensorResidual(MeasurementResidual):
         """
         last = self._stencil.indices[:, 0, -1] // self.observable.vector_count
         samples = int(np.count_nonzero(last < known))
-        return RowStencil(
-            self._stencil.indices[:samples], self._stencil.data[:, :samples]
-        )
+        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     @property
     def first_needed_s(self) -> float:
@@ -176,10 +154,7 @@ class CustomSensorResidual(MeasurementResidual):
         """
         first = int(self.is_compared.any(axis=(1, 2)).argmax())
         return float(
-            self.observable_s[
-                self._stencil.indices[first, 0, -1]
-                // self.observable.vector_count
-            ]
+            self.observable_s[self._stencil.indices[first, 0, -1] // self.observable.vector_count]
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
@@ -206,13 +181,9 @@ class CustomSensorResidual(MeasurementResidual):
             weights = ca.jacobian(weights, late)
         if self.sensor.grasp is not None:
             at = ca.horzsplit(at[0])
-        unknowns = ca.vertsplit(
-            phi * self.nuisance.scales[self.own_parameters[0]][:, None]
-        )
+        unknowns = ca.vertsplit(phi * self.nuisance.scales[self.own_parameters[0]][:, None])
         predicted = self.sensor.read(t_s, at, unknowns=unknowns)
-        return ca.vertcat(
-            predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel())
-        )
+        return ca.vertcat(predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel()))
 
     @cached_property
     def observable_sigmas(self) -> Array:
@@ -220,13 +191,9 @@ class CustomSensorResidual(MeasurementResidual):
         from the derivatives at zero values, averaged over the compared numbers; infinite where the
         readings do not depend on a component.
         """
-        nothing = np.zeros(
-            (self.observable.count, self.observable.vector_count, GROUP)
-        )
+        nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
         by_u = self._evaluate(nothing, np.zeros(self.nuisance.size)).by_inputs
-        by_observables = np.nan_to_num(
-            by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]]
-        )
+        by_observables = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]])
         each = GROUP * self.observable.vector_count
         squares = np.sum(by_observables.reshape(-1, each) ** 2, axis=0) / max(
             1, self.is_compared.sum()
@@ -239,19 +206,13 @@ class CustomSensorResidual(MeasurementResidual):
         NaN for samples outside these times.
         """
         predicted = self.predict(self.observable.evaluate(motion, phi), phi)
-        return np.where(
-            _is_within(self.t_s, self.observable_s)[:, None, None],
-            predicted,
-            np.nan,
-        )
+        return np.where(_is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
 
     def without_padding(self, predicted_m: Array) -> Array:
         """Return the m numbers (S, m) of the sensor from predictions (S, G, 3), in the unit of the
         sensor.
         """
-        return predicted_m.reshape(len(predicted_m), -1)[
-            :, : self.sensor.measured_values.shape[1]
-        ]
+        return predicted_m.reshape(len(predicted_m), -1)[:, : self.sensor.measured_values.shape[1]]
 
 
 def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
@@ -260,9 +221,7 @@ def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
     """
     if not len(at_s):
         return np.zeros(len(t_s), dtype=bool)
-    return (t_s >= at_s[0] - TIME_TOLERANCE_S) & (
-        t_s <= at_s[-1] + TIME_TOLERANCE_S
-    )
+    return (t_s >= at_s[0] - TIME_TOLERANCE_S) & (t_s <= at_s[-1] + TIME_TOLERANCE_S)
 
 
 def custom_sensor_residuals(
@@ -296,12 +255,7 @@ def custom_sensor_residuals(
             grasp = experiment.grasps[gauge.grasp - 1]
             origin = np.zeros(3)
             channel = ReactionResultant.from_experiment(
-                experiment,
-                grasp,
-                frame=gauge.frame,
-                point_m=origin,
-                grid=grid,
-                nuisance=nuisance,
+                experiment, grasp, frame=gauge.frame, point_m=origin, grid=grid, nuisance=nuisance
             )
             at_s = channel.t_s
         models.append(
@@ -318,9 +272,7 @@ def custom_sensor_residuals(
     return tuple(models)
 
 
-def observed_points(
-    experiment: Experiment, sensor: Gauge, rows: int
-) -> PointPositions:
+def observed_points(experiment: Experiment, sensor: Gauge, rows: int) -> PointPositions:
     """Return the points of a custom sensor as an observable at the first `rows` grid times; their
     places are exact, without estimated coordinates.
 
@@ -331,14 +283,8 @@ def observed_points(
     """
     body = experiment.body
     points = np.asarray(sensor.points_m)
-    placement = place_markers(
-        points, body.nodes.points_m, body=body, sensor=sensor.name
-    )
-    chart = MarkerAssociation.from_exact_places(
-        body, placement, points_m=points
-    )
+    placement = place_markers(points, body.nodes.points_m, body=body, sensor=sensor.name)
+    association = MarkerAssociation.from_exact_places(body, placement, points_m=points)
     return PointPositions(
-        np.arange(rows),
-        chart,
-        coordinate_parameters=np.full((len(points), 3), -1),
+        np.arange(rows), association, coordinate_parameters=np.full((len(points), 3), -1)
     )

@@ -30,7 +30,7 @@ class ExperimentIterate:
 
     Attributes
     ----------
-    segment : Transcription
+    transcription : Transcription
         Transcription of the experiment.
     q : (nq,) array
         Shared parameters.
@@ -51,7 +51,7 @@ class ExperimentIterate:
         If false, neglect the curvature of the observations (Gauss–Newton).
     """
 
-    segment: Transcription
+    transcription: Transcription
     q: Array
     phi: Array
     x: Array
@@ -63,7 +63,7 @@ class ExperimentIterate:
     @cached_property
     def equations(self) -> EquationsAtParameters:
         """Equations of motion at q and φ, see `Transcription.equations_at`."""
-        return self.segment.equations_at(self.q, self.phi)
+        return self.transcription.equations_at(self.q, self.phi)
 
     @cached_property
     def histories(self) -> tuple[AnyHistory, ...]:
@@ -81,7 +81,7 @@ class ExperimentIterate:
         return reactions_at(
             self.equations.dynamics,
             self.x,
-            dofs=self.segment.sensed_dofs,
+            dofs=self.transcription.sensed_dofs,
             histories=self.histories,
         )
 
@@ -89,43 +89,33 @@ class ExperimentIterate:
         """Return the motion without changes; with reaction forces if the observable measures
         them.
         """
-        return ObservedMotion(
-            self.x, self.reactions if observable.measures_reactions else None
-        )
+        return ObservedMotion(self.x, self.reactions if observable.measures_reactions else None)
 
     @cached_property
     def observables(self) -> list[Array]:
         """Values (n, e, 3) of the observable of each measurement, in the order of
-        `segment.residuals`; lifted ones are the values of the variables.
+        `transcription.residuals`; lifted ones are the values of the variables.
         """
         return [
             self.lifted_observables[k]
             if k in self.lifted_observables
-            else reading.observable.evaluate(
-                self.motion_for(reading.observable), self.phi
-            )
-            for k, reading in enumerate(self.segment.residuals)
+            else reading.observable.evaluate(self.motion_for(reading.observable), self.phi)
+            for k, reading in enumerate(self.transcription.residuals)
         ]
 
     @property
     def loss(self) -> float:
         """Loss Σ ρ of all measurements of this experiment, without priors."""
-        pairs = zip(self.segment.residuals, self.observables, strict=True)
-        return sum(
-            reading.loss(observation, self.phi)
-            for reading, observation in pairs
-        )
+        pairs = zip(self.transcription.residuals, self.observables, strict=True)
+        return sum(reading.loss(observation, self.phi) for reading, observation in pairs)
 
     @cached_property
     def loss_gradients(self) -> list[tuple[Array, Array]]:
         """Gradient of the loss of each measurement by the values of its observable (n, e, 3) and,
         at constant values, by φ (k,).
         """
-        pairs = zip(self.segment.residuals, self.observables, strict=True)
-        return [
-            reading.loss_gradient(observation, self.phi)
-            for reading, observation in pairs
-        ]
+        pairs = zip(self.transcription.residuals, self.observables, strict=True)
+        return [reading.loss_gradient(observation, self.phi) for reading, observation in pairs]
 
     def gradient(self) -> tuple[Array, Array]:
         """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,), including the
@@ -134,19 +124,17 @@ class ExperimentIterate:
         Observables that are variables of the program (`lifted_observables`) are treated as
         constant; priors are not included.
         """
-        nq = self.segment.nq
+        nq = self.transcription.nq
         phi = self.phi
         by_x = np.zeros_like(self.x)
         by_p = np.zeros(nq + len(phi))
         by_reaction = None
-        pairs = zip(self.segment.residuals, self.loss_gradients, strict=True)
+        pairs = zip(self.transcription.residuals, self.loss_gradients, strict=True)
         for k, (reading, (by_observables, by_phi)) in enumerate(pairs):
             by_p[nq:] += by_phi
             if k not in self.lifted_observables:
                 products = reading.observable.vjp(
-                    self.motion_for(reading.observable),
-                    phi,
-                    by_values=by_observables,
+                    self.motion_for(reading.observable), phi, by_values=by_observables
                 )
                 by_x = by_x + products.by_x
                 by_p[nq:] = by_p[nq:] + products.by_phi
@@ -157,31 +145,21 @@ class ExperimentIterate:
         if by_reaction is not None:
             through_x, through_p = self._reaction_vjp(by_reaction)
             by_x += through_x
-            by_p[self.segment.dynamic_parameters] += through_p
+            by_p[self.transcription.dynamic_parameters] += through_p
         return by_x, by_p
 
     def _reaction_vjp(self, weights: Array) -> tuple[Array, Array]:
         """Vector–Jacobian product of the reaction forces R, including the dependence through
-        history variables. The segment's `linearisation_buffer` is overwritten.
-
-        Parameters
-        ----------
-        weights : (N, g) array
-            Weights of the reaction forces [1/N].
-
-        Returns
-        -------
-        ((N, 3n) array, (m,) array)
-            Derivatives of Σ weights · R by x [1/m] and by the parameters that change the motion.
+        history variables. The transcription's `linearisation_buffer` is overwritten.
         """
         direct = reaction_vjp(
             self.equations,
             self.x,
             weights=weights,
-            dofs=self.segment.sensed_dofs,
-            buffer=self.segment.linearisation_buffer,
+            dofs=self.transcription.sensed_dofs,
+            buffer=self.transcription.linearisation_buffer,
         )
-        through_x, through_p = self.segment.history_vjp(
+        through_x, through_p = self.transcription.history_vjp(
             self.x, self.equations, weights=direct.force_weights
         )
         return direct.by_x + through_x, direct.by_parameters + through_p
@@ -198,36 +176,26 @@ class ExperimentIterate:
         none = np.zeros(0, dtype=np.int64)
         count = len(self.phi)
         reactions = None
-        if any(r.observable.measures_reactions for r in self.segment.residuals):
+        if any(r.observable.measures_reactions for r in self.transcription.residuals):
             nothing = np.zeros((*self.reactions.reaction.shape, 0))
-            reactions = replace(
-                self.reactions, reaction_by=nothing, position_by=nothing
-            )
+            reactions = replace(self.reactions, reaction_by=nothing, position_by=nothing)
         motion = ObservedMotion(self.x, reactions)
         linearised = []
-        for reading in self.segment.residuals:
-            values_and_slopes = reading.observable.linearise(
-                motion, self.phi, none, count
-            )
-            linearised.append(
-                reading.linearise(*values_and_slopes, self.phi, count)
-            )
+        for reading in self.transcription.residuals:
+            values_and_slopes = reading.observable.linearise(motion, self.phi, none, count)
+            linearised.append(reading.linearise(*values_and_slopes, self.phi, count))
         return linearised
 
     @cached_property
     def forces(self) -> Linearisation:
-        """Forces at the evaluations with their derivatives; stored in the segment's
-        `linearisation_buffer`, hence valid until the segment linearises again.
+        """Forces at the evaluations with their derivatives; stored in the transcription's
+        `linearisation_buffer`, hence valid until the transcription linearises again.
         """
-        rows = self.segment.linearisation_buffer
-        return self.equations.dynamics.linearise(
-            self.x, rows, histories=self.histories
-        )
+        rows = self.transcription.linearisation_buffer
+        return self.equations.dynamics.linearise(self.x, rows, histories=self.histories)
 
     def compute_residual_n(self) -> Array:
         """Return the residuals of the equations of motion (N, free dofs) [N], see
         `Transcription.residual_n`.
         """
-        return self.segment.residual_n(
-            self.x, self.equations, histories=self.histories
-        )
+        return self.transcription.residual_n(self.x, self.equations, histories=self.histories)

@@ -64,12 +64,8 @@ class SquareRootInformation:
         parameters : (P,) array, optional
             Parameters of the residuals; zero by default.
         """
-        right = (
-            residual if parameters is None else residual - jacobian @ parameters
-        )
-        return self._with_augmented_rows(
-            np.column_stack([jacobian, right]), len(residual)
-        )
+        right = residual if parameters is None else residual - jacobian @ parameters
+        return self._with_augmented_rows(np.column_stack([jacobian, right]), len(residual))
 
     def with_problem(
         self, other: SquareRootInformation, indices: Index | slice = slice(None)
@@ -88,17 +84,14 @@ class SquareRootInformation:
         rows[:, -1] = other.residual
         return self._with_augmented_rows(rows, other.row_count)
 
-    def _with_augmented_rows(
-        self, rows: Array, count: int
-    ) -> SquareRootInformation:
+    def _with_augmented_rows(self, rows: Array, count: int) -> SquareRootInformation:
         """Return the problem with rows (k, P + 1) of derivatives and residuals at p = 0, which
         count as `count` rows; self if `count` is 0.
         """
         if not count:
             return self
         return SquareRootInformation(
-            _triangularise(np.concatenate([self.triangle, rows])),
-            self.row_count + count,
+            _triangularise(np.concatenate([self.triangle, rows])), self.row_count + count
         )
 
     @property
@@ -116,7 +109,9 @@ class SquareRootInformation:
         return self.jacobian.T @ self.jacobian
 
     def compute_score(self) -> Array:
-        """Return the score (P,), Sᵀ r with r at p = 0: half the gradient of the sum of squares there."""
+        """Return the score (P,), Sᵀ r with r at p = 0: half the gradient of the sum of squares
+        there.
+        """
         return self.jacobian.T @ self.residual
 
     def loss(self, p: Array) -> float:
@@ -142,18 +137,10 @@ class SquareRootInformation:
         square = self.jacobian[:size]
         right = -self.residual[:size]
         regular = len(square) == size > 0 and _trcon(square)[0] > ROUNDING
-        p = (
-            _trtrs(square, right)[0]
-            if regular
-            else np.linalg.lstsq(square, right)[0]
-        )
+        p = _trtrs(square, right)[0] if regular else np.linalg.lstsq(square, right)[0]
         if ((lower <= p) & (p <= upper)).all():
             return np.asarray(p, dtype=np.float64)
-        return np.clip(
-            lsq_linear(square, right, (lower, upper), method="bvls").x,
-            lower,
-            upper,
-        )
+        return np.clip(lsq_linear(square, right, (lower, upper), method="bvls").x, lower, upper)
 
     def marginal(self, count: int) -> SquareRootInformation:
         """Return the problem in the first `count` parameters alone, with the others eliminated at
@@ -162,9 +149,7 @@ class SquareRootInformation:
         size = self.triangle.shape[1]
         others = np.arange(count, size - 1)
         order = np.concatenate([others, np.arange(count), [size - 1]])
-        triangle = _triangularise(self.triangle[:, order])[
-            len(others) :, len(others) :
-        ]
+        triangle = _triangularise(self.triangle[:, order])[len(others) :, len(others) :]
         return SquareRootInformation(triangle, self.row_count)
 
     @cached_property
@@ -189,20 +174,14 @@ class SquareRootInformation:
         square = (self.jacobian / units)[: len(units)]
         size = len(units)
         # So that no eigenvalue is zero up to rounding; much faster.
-        if len(square) == size > 0 and _trcon(square)[0] > size * np.sqrt(
-            SINGULAR
-        ):
-            return _trtri(square)[0] / units[:, None], np.zeros(
-                size, dtype=bool
-            )
+        if len(square) == size > 0 and _trcon(square)[0] > size * np.sqrt(SINGULAR):
+            return _trtri(square)[0] / units[:, None], np.zeros(size, dtype=bool)
         _, singular_values, vectors = np.linalg.svd(square)
         values = np.zeros(len(units))
         values[: len(singular_values)] = singular_values
         is_determined = values**2 > SINGULAR
         root = vectors[is_determined].T / values[is_determined] / units[:, None]
-        return root, np.asarray(
-            (np.abs(vectors[~is_determined]) > NEGLIGIBLE).any(axis=0)
-        )
+        return root, np.asarray((np.abs(vectors[~is_determined]) > NEGLIGIBLE).any(axis=0))
 
     def covariance(self, score_covariance: Array | None = None) -> Array:
         """Return the covariance (P, P) of p.
@@ -217,11 +196,7 @@ class SquareRootInformation:
         """
         root = self.root
         is_undetermined = self.is_undetermined
-        matrix = (
-            root @ root.T
-            if score_covariance is None
-            else root @ score_covariance @ root.T
-        )
+        matrix = root @ root.T if score_covariance is None else root @ score_covariance @ root.T
         matrix[is_undetermined] = matrix[:, is_undetermined] = np.nan
         matrix[is_undetermined, is_undetermined] = np.inf
         return matrix

@@ -48,22 +48,16 @@ class LocalLoss:
         none = np.zeros(self.nuisance_count)
         codes = []
         for reading, points in self.residuals:
-            slopes = points.derivative_matrix(
-                None, none, position_count=self.position_count
-            )
+            slopes = points.derivative_matrix(None, none, position_count=self.position_count)
             codes.append(self._codes(*reading.hessian_structure(slopes)))
-        columns, rows = np.divmod(
-            unique_codes(codes), self.position_count + self.nuisance_count
-        )
+        columns, rows = np.divmod(unique_codes(codes), self.position_count + self.nuisance_count)
         return rows, columns
 
     def _codes(self, rows: Index, columns: Index) -> Index:
         """Return one number for each entry, ascending in the order of `structure`."""
         return columns * (self.position_count + self.nuisance_count) + rows
 
-    def hessian(
-        self, x: Array, phi: Array, has_observation_curvature: bool = True
-    ) -> Array:
+    def hessian(self, x: Array, phi: Array, has_observation_curvature: bool = True) -> Array:
         """Return the values of the entries of `structure`, in SI units.
 
         A loss that is quadratic is evaluated once; its Hessian contains the observation curvature,
@@ -82,46 +76,33 @@ class LocalLoss:
         return (
             self._constant
             if self._is_quadratic()
-            else self._evaluate_at(
-                x, phi, has_observation_curvature=has_observation_curvature
-            )
+            else self._evaluate_at(x, phi, has_observation_curvature=has_observation_curvature)
         )
 
     def _is_quadratic(self) -> bool:
         """Return whether the values do not depend on x and φ."""
-        return all(
-            reading.is_quadratic and points.is_linear
-            for reading, points in self.residuals
-        )
+        return all(reading.is_quadratic and points.is_linear for reading, points in self.residuals)
 
     @cached_property
     def _constant(self) -> Array:
         """Values of the entries at zero positions and parameters; valid everywhere if
         `_is_quadratic`.
         """
-        rows = max(
-            (points.rows[-1] + 1 for _, points in self.residuals), default=1
-        )
+        rows = max((points.rows[-1] + 1 for _, points in self.residuals), default=1)
         return self._evaluate_at(
             np.zeros((rows, self.dof_count)),
             np.zeros(self.nuisance_count),
             has_observation_curvature=True,
         )
 
-    def _evaluate_at(
-        self, x: Array, phi: Array, has_observation_curvature: bool
-    ) -> Array:
+    def _evaluate_at(self, x: Array, phi: Array, has_observation_curvature: bool) -> Array:
         """Return the values of the entries of `structure` at x (N, 3n) and φ (k,), with or without
         the curvature of the observations.
         """
         codes = self._codes(*self.structure)
         values = np.zeros(len(codes))
         for entries in self._entries(x, phi, has_observation_curvature):
-            np.add.at(
-                values,
-                np.searchsorted(codes, self._codes(*entries[:2])),
-                entries.values,
-            )
+            np.add.at(values, np.searchsorted(codes, self._codes(*entries[:2])), entries.values)
         return values
 
     def _entries(
@@ -135,16 +116,11 @@ class LocalLoss:
             yield reading.hessian(
                 values,
                 phi,
-                derivatives=points.derivative_matrix(
-                    x, phi, position_count=self.position_count
-                ),
+                derivatives=points.derivative_matrix(x, phi, position_count=self.position_count),
                 has_observation_curvature=has_observation_curvature,
             )
             if has_observation_curvature and not points.is_linear:
                 by_values, _ = reading.loss_gradient(values, phi)
                 yield points.curvature(
-                    x,
-                    phi,
-                    by_values=by_values,
-                    position_count=self.position_count,
+                    x, phi, by_values=by_values, position_count=self.position_count
                 )

@@ -94,9 +94,7 @@ class ResidualExpression:
         """
         return self.huber is None and self.residual.is_linear
 
-    def curvature(
-        self, u: Array, data: Array, has_observation_curvature: bool = True
-    ) -> Array:
+    def curvature(self, u: Array, data: Array, has_observation_curvature: bool = True) -> Array:
         """Return second derivatives (k, k, …) of the loss by u.
 
         Parameters
@@ -119,13 +117,9 @@ class ResidualExpression:
             groups = residual.reshape(-1, self.group_size, *residual.shape[1:])
             lengths = np.linalg.norm(groups, axis=1)
             weights *= np.repeat(
-                self.huber / np.maximum(lengths, self.huber),
-                self.group_size,
-                axis=0,
+                self.huber / np.maximum(lengths, self.huber), self.group_size, axis=0
             )
-        return np.einsum(
-            "ai...,a...,aj...->ij...", slopes, weights, slopes, optimize=True
-        )
+        return np.einsum("ai...,a...,aj...->ij...", slopes, weights, slopes, optimize=True)
 
     @property
     def _input_count(self) -> int:
@@ -139,19 +133,10 @@ class ResidualExpression:
 
     def _residual_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
         """Return the expression (m,) of the residual (y − ŷ) / σ in u = (c, φ) and the data."""
-        ends = [
-            0,
-            self.data_count,
-            self.data_count + self.measured_count,
-            self._data_count,
-        ]
+        ends = [0, self.data_count, self.data_count + self.measured_count, self._data_count]
         own, measured, weight = ca.vertsplit(data, ends)
-        vectors, phi = ca.vertsplit(
-            u, [0, GROUP * self.vector_count, self._input_count]
-        )
-        predicted = self.expression(
-            ca.reshape(vectors, GROUP, self.vector_count), phi, own
-        )
+        vectors, phi = ca.vertsplit(u, [0, GROUP * self.vector_count, self._input_count])
+        predicted = self.expression(ca.reshape(vectors, GROUP, self.vector_count), phi, own)
         return weight * (predicted - measured)
 
     def _loss_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
@@ -159,8 +144,7 @@ class ResidualExpression:
         residual = self._residual_expression(u, data)
         groups = ca.vertsplit(residual, self.group_size)
         return sum(
-            (self._robust_loss_of_square(ca.sumsqr(group)) for group in groups),
-            start=ca.SX(0),
+            (self._robust_loss_of_square(ca.sumsqr(group)) for group in groups), start=ca.SX(0)
         )
 
     def _robust_loss_of_square(self, square: ca.SX) -> ca.SX:
@@ -186,9 +170,7 @@ def huber_as_least_squares(
     beyond = np.maximum(length, huber)
     root = np.sqrt(2 * huber * beyond - huber**2)
     shrunk = residual * np.where(length > huber, root / beyond, 1.0)
-    return shrunk, derivatives * np.where(length > huber, huber / root, 1.0)[
-        ..., None
-    ]
+    return shrunk, derivatives * np.where(length > huber, huber / root, 1.0)[..., None]
 
 
 def huber_as_weights(
@@ -320,9 +302,7 @@ class MeasurementResidual(ABC):
         """Groups that statistics use: those of the measurement, without places, unless a subclass
         combines neighbours.
         """
-        return PooledResiduals(
-            self.names, self.sigmas, is_compared=self.is_compared
-        )
+        return PooledResiduals(self.names, self.sigmas, is_compared=self.is_compared)
 
     def pool_values(self, values: Array) -> Array:
         """Return residuals (S, G, g, …), or their derivatives, as values (S, M, 3, …) of the groups
@@ -369,9 +349,7 @@ class MeasurementResidual(ABC):
         """Return the indices (…, E, v) of vectors that samples may be computed from, for any φ;
         here those of the stencil at φ = 0 and all times.
         """
-        return self.stencil(
-            np.zeros(self.nuisance.size), self.observable.count
-        ).indices
+        return self.stencil(np.zeros(self.nuisance.size), self.observable.count).indices
 
     def compared_with(self, known: int) -> NDArray[np.bool_]:
         """Return the mask (S, G, g) of the numbers that can be compared if the first `known` times
@@ -414,9 +392,7 @@ class MeasurementResidual(ABC):
         """
         return {}
 
-    def with_samples(
-        self, known_s: Array, t_s: Array, measurements: Array, **changes: Any
-    ) -> Self:
+    def with_samples(self, known_s: Array, t_s: Array, measurements: Array, **changes: Any) -> Self:
         """Return the model with other samples of its only entity, sharing the generated functions.
 
         Every measurement that is not NaN is compared.
@@ -435,11 +411,7 @@ class MeasurementResidual(ABC):
         measured = np.full((len(t_s), 1, self.measured.shape[2]), np.nan)
         measured[:, 0, : measurements.shape[1]] = measurements
         is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
-        changes |= {
-            "t_s": t_s,
-            "measured": measured,
-            "is_compared": is_compared,
-        }
+        changes |= {"t_s": t_s, "measured": measured, "is_compared": is_compared}
         is_resultant = isinstance(self.observable, ReactionResultant)
         times = (
             {"reaction_grid": ReactionGrid.from_times(known_s)}
@@ -474,12 +446,8 @@ class MeasurementResidual(ABC):
         """Measurements ŷ (m, S, E), zero where missing, and 1/σ (m, S, E), zero where nothing is
         compared.
         """
-        weight = (self.is_compared / self.sigmas[:, None]).reshape(
-            self.measured.shape
-        )
-        return np.moveaxis(np.nan_to_num(self.measured), 2, 0), np.moveaxis(
-            weight, 2, 0
-        )
+        weight = (self.is_compared / self.sigmas[:, None]).reshape(self.measured.shape)
+        return np.moveaxis(np.nan_to_num(self.measured), 2, 0), np.moveaxis(weight, 2, 0)
 
     def _inputs_at(self, values: Array, phi: Array) -> _SampleInputs:
         """Return the inputs of the first s samples that can be computed from values (n, e, 3) of
@@ -493,27 +461,17 @@ class MeasurementResidual(ABC):
             samples, each, GROUP * vectors
         )
         own = np.broadcast_to(
-            phi[self.own_parameters.T][:, None],
-            (self.own_parameters.shape[1], samples, each),
+            phi[self.own_parameters.T][:, None], (self.own_parameters.shape[1], samples, each)
         )
-        measured, weight = (
-            part[:, :samples] for part in self._data_and_weights
-        )
+        measured, weight = (part[:, :samples] for part in self._data_and_weights)
         is_covered = self.is_covered(len(values))[:samples, None]
         data = np.concatenate([window.data, measured, weight * is_covered])
         u = np.concatenate([neighbouring.transpose(2, 0, 1), own])
-        return _SampleInputs(
-            self.expression_for(vectors, len(window.data)),
-            window,
-            u=u,
-            data=data,
-        )
+        return _SampleInputs(self.expression_for(vectors, len(window.data)), window, u=u, data=data)
 
     def _grouped(self, values: Array) -> Array:
         """Return values (m, s, E) as groups (s, G, g)."""
-        return values.transpose(1, 2, 0).reshape(
-            values.shape[1], len(self.names), self.group_size
-        )
+        return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), self.group_size)
 
     # All samples ------------------------------------------------------------------------------
 
@@ -546,11 +504,7 @@ class MeasurementResidual(ABC):
         return self._grouped(residual.evaluate(inputs.u, inputs.data))
 
     def linearise(
-        self,
-        values: Array,
-        observable_derivatives: ObservableDerivatives,
-        phi: Array,
-        size: int,
+        self, values: Array, observable_derivatives: ObservableDerivatives, phi: Array, size: int
     ) -> tuple[Array, Array]:
         """Return residuals (y − ŷ) / σ (s, G, g), zero where nothing is compared, and their
         derivatives (s, G, g, size) by all parameters.
@@ -570,13 +524,7 @@ class MeasurementResidual(ABC):
             Number of all parameters.
         """
         if not len(values):
-            none = np.zeros(
-                (
-                    len(self.stencil(phi, 0).indices),
-                    len(self.names),
-                    self.group_size,
-                )
-            )
+            none = np.zeros((len(self.stencil(phi, 0).indices), len(self.names), self.group_size))
             return none, np.zeros((*none.shape, size))
         samples_at = self._evaluate(values, phi)
         window = samples_at.stencil
@@ -586,9 +534,8 @@ class MeasurementResidual(ABC):
         by_own = by_u[..., GROUP * vectors :]
         derivatives = np.zeros((*by_u.shape[:3], size))
         first = size - len(phi)
-        derivatives[..., observable_derivatives.columns] = (
-            by_observables
-            @ _gather(observable_derivatives.by_common, window.indices)
+        derivatives[..., observable_derivatives.columns] = by_observables @ _gather(
+            observable_derivatives.by_common, window.indices
         )
         if len(observable_derivatives.entities):
             entities = observable_derivatives.entities
@@ -600,9 +547,7 @@ class MeasurementResidual(ABC):
                 GROUP * vectors,
                 observable_derivatives.by_own.shape[3],
             )
-            neighbouring = observable_derivatives.by_own[times, number].reshape(
-                shape
-            )
+            neighbouring = observable_derivatives.by_own[times, number].reshape(shape)
             _add_columns(
                 derivatives,
                 entities,
@@ -611,14 +556,9 @@ class MeasurementResidual(ABC):
             )
         if self.own_parameters.size:
             _add_columns(
-                derivatives,
-                np.arange(each),
-                columns=first + self.own_parameters,
-                values=by_own,
+                derivatives, np.arange(each), columns=first + self.own_parameters, values=by_own
             )
-        grouped = samples_at.residuals.reshape(
-            samples, len(self.names), self.group_size
-        )
+        grouped = samples_at.residuals.reshape(samples, len(self.names), self.group_size)
         return grouped, derivatives.reshape(*grouped.shape, size)
 
     def _evaluate(self, values: Array, phi: Array) -> _LinearisedSamples:
@@ -635,27 +575,19 @@ class MeasurementResidual(ABC):
             samples, each, GROUP * vectors
         )
         if self.own_parameters.size:
-            own = np.broadcast_to(
-                phi[self.own_parameters], (samples, *self.own_parameters.shape)
-            )
+            own = np.broadcast_to(phi[self.own_parameters], (samples, *self.own_parameters.shape))
             neighbouring = np.concatenate([neighbouring, own], axis=2)
         change = (by_u @ neighbouring[..., None])[..., 0]
-        return _LinearisedSamples(
-            window, linear.residuals + change, by_inputs=by_u
-        )
+        return _LinearisedSamples(window, linear.residuals + change, by_inputs=by_u)
 
     def _linearise_at(self, values: Array, phi: Array) -> _LinearisedSamples:
         """Return the first s samples linearised by their generated functions, also where these are
         not linear; arguments as in `_evaluate`.
         """
         inputs = self._inputs_at(values, phi)
-        residual, by_u = inputs.functions.residual.evaluate_with_jacobian(
-            inputs.u, inputs.data
-        )
+        residual, by_u = inputs.functions.residual.evaluate_with_jacobian(inputs.u, inputs.data)
         return _LinearisedSamples(
-            inputs.stencil,
-            residual.transpose(1, 2, 0),
-            by_inputs=by_u.transpose(2, 3, 0, 1),
+            inputs.stencil, residual.transpose(1, 2, 0), by_inputs=by_u.transpose(2, 3, 0, 1)
         )
 
     @cached_property
@@ -663,14 +595,9 @@ class MeasurementResidual(ABC):
         """All samples linearised at zero inputs, where derivatives are the same for all inputs;
         None if they are not constant.
         """
-        if (
-            not self.has_fixed_stencils
-            or not self._full_expression.residual.is_linear
-        ):
+        if not self.has_fixed_stencils or not self._full_expression.residual.is_linear:
             return None
-        nothing = np.zeros(
-            (self.observable.count, self.observable.vector_count, GROUP)
-        )
+        nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
         at_zero = self._linearise_at(nothing, np.zeros(self.nuisance.size))
         return _LinearisedSamples(
             at_zero.stencil,
@@ -685,9 +612,7 @@ class MeasurementResidual(ABC):
         size = by.shape[3] + len(phi)
         slopes = ObservableDerivatives.without_own(np.arange(by.shape[3]), by)
         return self.pool_values(
-            self.linearise(values, slopes, phi=phi, size=size)[1][
-                ..., : by.shape[3]
-            ]
+            self.linearise(values, slopes, phi=phi, size=size)[1][..., : by.shape[3]]
         )
 
     def loss(self, values: Array, phi: Array) -> float:
@@ -718,14 +643,10 @@ class MeasurementResidual(ABC):
         if not len(values):
             return by_values, by_phi
         inputs = self._inputs_at(values, phi)
-        by_u = inputs.functions.loss.evaluate_with_jacobian(
-            inputs.u, inputs.data
-        )[1][0]
+        by_u = inputs.functions.loss.evaluate_with_jacobian(inputs.u, inputs.data)[1][0]
         places = inputs.stencil.indices
         by_observables, by_own = np.split(by_u, [GROUP * places.shape[2]])
-        by_observables = by_observables.reshape(
-            places.shape[2], GROUP, *places.shape[:2]
-        )
+        by_observables = by_observables.reshape(places.shape[2], GROUP, *places.shape[:2])
         where = np.moveaxis(places, 2, 0).ravel()
         count = values.size // GROUP
         for axis in range(GROUP):
@@ -744,18 +665,13 @@ class MeasurementResidual(ABC):
         samples, each, vectors = places.shape
         observable_columns = GROUP * places[..., None] + np.arange(GROUP)
         first = GROUP * self.observable.count * self.observable.vector_count
-        own = np.broadcast_to(
-            first + self.own_parameters, (samples, *self.own_parameters.shape)
-        )
+        own = np.broadcast_to(first + self.own_parameters, (samples, *self.own_parameters.shape))
         columns = np.concatenate(
-            [observable_columns.reshape(samples, each, GROUP * vectors), own],
-            axis=2,
+            [observable_columns.reshape(samples, each, GROUP * vectors), own], axis=2
         )
         rows = np.arange(columns.size + 1)
         shape = columns.size, first + self.nuisance.size
-        return sp.csr_array(
-            (np.ones(columns.size), columns.ravel(), rows), shape=shape
-        )
+        return sp.csr_array((np.ones(columns.size), columns.ravel(), rows), shape=shape)
 
     @property
     def is_quadratic(self) -> bool:
@@ -767,9 +683,7 @@ class MeasurementResidual(ABC):
     @cached_property
     def _full_expression(self) -> ResidualExpression:
         """Generated functions for the stencil of all times of the observable."""
-        window = self.stencil(
-            np.zeros(self.nuisance.size), self.observable.count
-        )
+        window = self.stencil(np.zeros(self.nuisance.size), self.observable.count)
         return self.expression_for(window.indices.shape[2], len(window.data))
 
     @cached_property
@@ -777,9 +691,7 @@ class MeasurementResidual(ABC):
         """Mask (u, u) of the second derivatives that a sample may have."""
         return self._full_expression.loss.hessian_pattern
 
-    def hessian_structure(
-        self, derivatives: sp.csr_array
-    ) -> tuple[Index, Index]:
+    def hessian_structure(self, derivatives: sp.csr_array) -> tuple[Index, Index]:
         """Return rows and columns of the possible entries of ∂²loss by some variables, upper
         triangle, sorted by column.
 
@@ -791,8 +703,7 @@ class MeasurementResidual(ABC):
         places = self.all_stencils()
         instances = int(np.prod(places.shape[:2]))
         ones = np.broadcast_to(
-            self._curvature_pattern.astype(float),
-            (instances, *self._curvature_pattern.shape),
+            self._curvature_pattern.astype(float), (instances, *self._curvature_pattern.shape)
         )
         # Positive numbers cannot cancel, so that no entry is lost.
         entries = _congruence(self._gather_matrix(places) @ derivatives, ones)
@@ -825,15 +736,11 @@ class MeasurementResidual(ABC):
         """
         inputs = self._inputs_at(values, phi)
         curvature = inputs.functions.curvature(
-            inputs.u,
-            inputs.data,
-            has_observation_curvature=has_observation_curvature,
+            inputs.u, inputs.data, has_observation_curvature=has_observation_curvature
         )
         by_u = np.moveaxis(curvature, (0, 1), (2, 3))
         by_u = by_u.reshape(-1, *by_u.shape[2:])
-        return _congruence(
-            self._gather_matrix(inputs.stencil.indices) @ derivatives, by_u
-        )
+        return _congruence(self._gather_matrix(inputs.stencil.indices) @ derivatives, by_u)
 
 
 @dataclass(frozen=True, eq=False)
@@ -886,9 +793,7 @@ def _gather(by: Array, places: Index) -> Array:
     return rows.reshape(*places.shape[:2], GROUP * places.shape[2], count)
 
 
-def _add_columns(
-    slope: Array, entities: Index, columns: Index, values: Array
-) -> None:
+def _add_columns(slope: Array, entities: Index, columns: Index, values: Array) -> None:
     """Add values (s, e, m, k) to columns (e, k) of the derivatives (s, E, m, size) of
     entities (e,), in place.
     """
@@ -901,15 +806,9 @@ def _congruence(slopes: sp.csr_array, blocks: Array) -> SparseEntries:
     """
     count = np.arange(len(blocks) + 1)
     middle = sp.bsr_array((blocks, count[:-1], count))
-    upper = sp.coo_array(
-        sp.triu(slopes.T @ (middle.tocsr() @ slopes), format="coo")
-    )
-    rows, columns = (
-        np.asarray(index, dtype=np.int64) for index in upper.coords
-    )
-    return SparseEntries(
-        rows, columns, values=np.asarray(upper.data, dtype=np.float64)
-    )
+    upper = sp.coo_array(sp.triu(slopes.T @ (middle.tocsr() @ slopes), format="coo"))
+    rows, columns = (np.asarray(index, dtype=np.int64) for index in upper.coords)
+    return SparseEntries(rows, columns, values=np.asarray(upper.data, dtype=np.float64))
 
 
 def neighbouring_times(known_s: Array, at_s: Array, count: int) -> Index:
@@ -948,10 +847,6 @@ def lagrange_weights(position: T, places: Sequence[T]) -> list[Any]:
         One weight for each place; 1 for a single place.
     """
     return [
-        math.prod(
-            (position - other) / (own - other)
-            for j, other in enumerate(places)
-            if j != i
-        )
+        math.prod((position - other) / (own - other) for j, other in enumerate(places) if j != i)
         for i, own in enumerate(places)
     ]

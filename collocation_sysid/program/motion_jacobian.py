@@ -56,9 +56,7 @@ class MotionJacobian:
     def structure(self) -> BlockBand:
         """Sparsity structure of ∂c/∂x by columns."""
         return BlockBand(
-            self.dynamics.pattern.size,
-            self._compute_row_starts(),
-            blocks=self._blocks(),
+            self.dynamics.pattern.size, self._compute_row_starts(), blocks=self._blocks()
         )
 
     @cached_property
@@ -75,9 +73,7 @@ class MotionJacobian:
     def _compute_row_starts(self) -> Index:
         """Return the index of the first row of each grid time, (N,); −1 where there are no rows."""
         first_row = self.dynamics.first_row
-        starts = (np.arange(self.dynamics.row_count) - first_row) * len(
-            self.constrained_dofs
-        )
+        starts = (np.arange(self.dynamics.row_count) - first_row) * len(self.constrained_dofs)
         return np.maximum(starts, -1) if first_row else starts
 
     def _blocks(self) -> list[BandBlock]:
@@ -108,9 +104,7 @@ class MotionJacobian:
                 )
                 for j, a, b in self.dynamics.block_terms(lag)
             ]
-            is_stored = (
-                has_motion.copy() if terms else has_motion & (rows == columns)
-            )
+            is_stored = has_motion.copy() if terms else has_motion & (rows == columns)
             if lag == 0:
                 is_stored |= is_prescribed & (rows == columns)
             # Grasp rows hold constants only: they are written after the terms.
@@ -130,9 +124,7 @@ class MotionJacobian:
         """Return the indices of the grid times whose equations of motion contain inertia of the
         position `lag` times earlier.
         """
-        rows = np.arange(
-            max(self.dynamics.first_row, lag), self.dynamics.row_count
-        )
+        rows = np.arange(max(self.dynamics.first_row, lag), self.dynamics.row_count)
         return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
 
     @cached_property
@@ -145,17 +137,12 @@ class MotionJacobian:
         for lag in range(self.dynamics.largest_lag + 1):
             columns = self._inertia_rows(lag) - lag
             positions.append(
-                self.structure.positions(
-                    columns, lag, rows=place, columns=self.free_dofs
-                ).ravel()
+                self.structure.positions(columns, lag, rows=place, columns=self.free_dofs).ravel()
             )
         prescribed = np.setdiff1d(self.constrained_dofs, self.free_dofs)
         rows = np.arange(self.dynamics.first_row, self.dynamics.row_count)
         grasps = self.structure.positions(
-            rows,
-            0,
-            rows=np.searchsorted(self.constrained_dofs, prescribed),
-            columns=prescribed,
+            rows, 0, rows=np.searchsorted(self.constrained_dofs, prescribed), columns=prescribed
         )
         return np.concatenate(positions), grasps.ravel()
 
@@ -163,11 +150,7 @@ class MotionJacobian:
         """Return the scaled inertia entries of ∂c/∂x with the masses of `dynamics`, in the order of
         their positions.
         """
-        mass = (
-            dynamics.mass.inertia_kg[:, self.free_dofs]
-            * self.length_m
-            / self.force_n
-        )
+        mass = dynamics.mass.inertia_kg[:, self.free_dofs] * self.length_m / self.force_n
         values = [np.zeros(0)]
         for lag in range(self.dynamics.largest_lag + 1):
             rows = self._inertia_rows(lag)
@@ -194,11 +177,7 @@ class MotionJacobian:
         )
 
     def fill(
-        self,
-        values: Array,
-        forces: Linearisation,
-        dynamics: Dynamics,
-        has_variable_mass: bool,
+        self, values: Array, forces: Linearisation, dynamics: Dynamics, has_variable_mass: bool
     ) -> None:
         """Write the values of ∂c/∂x of the scaled rows by the scaled positions.
 
@@ -214,26 +193,15 @@ class MotionJacobian:
             Whether the mass depends on the parameters; if not, the stated mass is used.
         """
         threads = dynamics.body.threads
-        self.structure.fill(
-            values, forces.by_position, b=forces.by_velocity, threads=threads
-        )
+        self.structure.fill(values, forces.by_position, b=forces.by_velocity, threads=threads)
         positions, grasps = self._constant_positions
         values[positions] += (
-            self._inertia(dynamics)
-            if has_variable_mass
-            else self._constant_inertia
+            self._inertia(dynamics) if has_variable_mass else self._constant_inertia
         )
         skew = full_skew_values(self.dynamics.pattern, forces.by_position_skew)
-        of_rates = full_skew_values(
-            self.dynamics.pattern, forces.by_velocity_skew
-        )
+        of_rates = full_skew_values(self.dynamics.pattern, forces.by_velocity_skew)
         if skew.size:
-            self._skew.fill(
-                values,
-                skew,
-                b=of_rates if of_rates.size else skew,
-                threads=threads,
-            )
+            self._skew.fill(values, skew, b=of_rates if of_rates.size else skew, threads=threads)
         self._released_grasps.correct(
             values,
             forces.by_position,
@@ -334,29 +302,16 @@ class ReleasedGrasps:
         dofs = np.flatnonzero(is_prescribed.any(axis=0))
         is_prescribed = is_prescribed[np.ix_(times, dofs)]
         rows = row_starts[times][:, None] + place[dofs]
-        is_constant_row = np.zeros(
-            int(row_starts.max()) + len(row_dofs), dtype=bool
-        )
+        is_constant_row = np.zeros(int(row_starts.max()) + len(row_dofs), dtype=bool)
         is_constant_row[rows[is_prescribed]] = True
         diagonal = band.positions(times, 0, rows=place[dofs], columns=dofs)
-        dropped = tuple(
-            _dropped_forces(
-                dynamics, band, pattern=pattern, place=place, scale=scale
-            )
-        )
+        dropped = tuple(_dropped_forces(dynamics, band, pattern=pattern, place=place, scale=scale))
         return cls(
-            dropped,
-            np.flatnonzero(is_constant_row[band.indices]),
-            ones=diagonal[is_prescribed],
+            dropped, np.flatnonzero(is_constant_row[band.indices]), ones=diagonal[is_prescribed]
         )
 
     def correct(
-        self,
-        values: Array,
-        by_position: Array,
-        by_velocity: Array,
-        skew: Array,
-        rate_skew: Array,
+        self, values: Array, by_position: Array, by_velocity: Array, skew: Array, rate_skew: Array
     ) -> None:
         """Correct the values of ∂c/∂x in place.
 
@@ -372,56 +327,30 @@ class ReleasedGrasps:
         """
         for entry in self.dropped:
             force = entry.a * by_position[entry.evaluation, entry.source]
-            values[entry.positions] -= (
-                force + entry.b * by_velocity[entry.evaluation, entry.source]
-            )
+            values[entry.positions] -= force + entry.b * by_velocity[entry.evaluation, entry.source]
             if skew.size:
-                values[entry.positions] -= (
-                    entry.a * skew[entry.evaluation, entry.complete]
-                )
+                values[entry.positions] -= entry.a * skew[entry.evaluation, entry.complete]
             if rate_skew.size:
-                values[entry.positions] -= (
-                    entry.b * rate_skew[entry.evaluation, entry.complete]
-                )
+                values[entry.positions] -= entry.b * rate_skew[entry.evaluation, entry.complete]
         values[self.zeros] = 0.0
         values[self.ones] = 1.0
 
 
 def _dropped_forces(
-    dynamics: Dynamics,
-    band: BlockBand,
-    pattern: SymmetricPattern,
-    place: Index,
-    scale: float,
+    dynamics: Dynamics, band: BlockBand, pattern: SymmetricPattern, place: Index, scale: float
 ) -> list[_DroppedForce]:
     """Return the entries of forces that act while a dof is prescribed for a part of the time, in
     later rows where it is free.
-
-    Parameters
-    ----------
-    dynamics : Dynamics
-        Equations of motion.
-    band : BlockBand
-        Structure of the Jacobian.
-    pattern : SymmetricPattern
-        Sparsity pattern of the blocks.
-    place : (3n,) array
-        Index of each dof's row within a grid time; −1 where it has none.
-    scale : float
-        Factor of the rows, `length_m` / `force_n`.
     """
     tables = dynamics.tables
     step_s = dynamics.step_s
     dropped = []
     rows, columns, source = pattern.full
     for k in range(dynamics.first_row, dynamics.row_count):
-        for j in range(
-            1, min(dynamics.largest_lag, dynamics.row_count - 1 - k) + 1
-        ):
+        for j in range(1, min(dynamics.largest_lag, dynamics.row_count - 1 - k) + 1):
             weight = scale * tables.w[k + j, j]
             released = (
-                dynamics.is_temporarily_prescribed[k]
-                & ~dynamics.is_temporarily_prescribed[k + j]
+                dynamics.is_temporarily_prescribed[k] & ~dynamics.is_temporarily_prescribed[k + j]
             )
             if weight == 0 or not released.any():
                 continue

@@ -31,10 +31,7 @@ from ..model.nuisance_map import NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
-from .custom_sensor_residual import (
-    CustomSensorResidual,
-    custom_sensor_residuals,
-)
+from .custom_sensor_residual import CustomSensorResidual, custom_sensor_residuals
 from .linear_algebra.block_band import (
     BandBlock,
     BlockBand,
@@ -58,7 +55,7 @@ WeightedHistory = tuple[AnyHistory, Array]
 
 @dataclass(frozen=True)
 class SegmentOffsets:
-    """Offsets of a segment in the nonlinear program.
+    """Offsets of a transcription in the nonlinear program.
 
     Attributes
     ----------
@@ -74,7 +71,7 @@ class SegmentOffsets:
 
 @dataclass(frozen=True, eq=False)
 class RowWeights:
-    """Weights of the constraints and forces of one segment in a Lagrangian.
+    """Weights of the constraints and forces of one transcription in a Lagrangian.
 
     Attributes
     ----------
@@ -149,18 +146,14 @@ class MotionTranscription:
         estimate; the constants of the body are not set.
         """
         return with_inputs(
-            Dynamics.from_experiment(
-                self.experiment, self.scheme, substeps=self.substeps
-            ),
+            Dynamics.from_experiment(self.experiment, self.scheme, substeps=self.substeps),
             self.nuisance,
         )
 
     @cached_property
     def nuisance(self) -> NuisanceMap:
         """Nuisance parameters φ of the experiment."""
-        return NuisanceMap.from_experiment(
-            self.experiment, self.nuisance_indices.pivot_m
-        )
+        return NuisanceMap.from_experiment(self.experiment, self.nuisance_indices.pivot_m)
 
     @cached_property
     def sensors(self) -> tuple[WrenchResidual, ...]:
@@ -177,11 +170,7 @@ class MotionTranscription:
         """Measurement models of the custom sensors, in their order."""
         grid = ReactionGrid.from_dynamics(self.dynamics)
         return custom_sensor_residuals(
-            self.experiment,
-            grid.t_s,
-            grid=grid,
-            nuisance=self.nuisance,
-            huber=self.huber,
+            self.experiment, grid.t_s, grid=grid, nuisance=self.nuisance, huber=self.huber
         )
 
     @cached_property
@@ -223,11 +212,7 @@ class MotionTranscription:
         """Dof of each constraint of one grid time, ascending: all dofs if prescribed displacements
         are constraints, otherwise the free ones.
         """
-        return (
-            np.arange(self.dof_count)
-            if self.has_constraints_of_grasps
-            else self.free_dofs
-        )
+        return np.arange(self.dof_count) if self.has_constraints_of_grasps else self.free_dofs
 
     @property
     def has_constraints_of_grasps(self) -> bool:
@@ -270,9 +255,7 @@ class MotionTranscription:
     @property
     def columns(self) -> slice:
         """Slice of its scaled positions in z, grid time by grid time."""
-        return slice(
-            self.offsets.position, self.offsets.position + self.variable_count
-        )
+        return slice(self.offsets.position, self.offsets.position + self.variable_count)
 
     @property
     def rows(self) -> slice:
@@ -281,13 +264,11 @@ class MotionTranscription:
 
     def list_parameter_indices(self) -> Index:
         """Return the indices (nq + k,) of its (q, φ) in p."""
-        return np.concatenate(
-            [np.arange(self.nq), self.nuisance_indices.indices]
-        )
+        return np.concatenate([np.arange(self.nq), self.nuisance_indices.indices])
 
     @property
     def next_offsets(self) -> SegmentOffsets:
-        """Offsets of the segment that follows."""
+        """Offsets of the transcription that follows."""
         return SegmentOffsets(self.columns.stop, self.rows.stop)
 
     # Grasps and scales ------------------------------------------------------------------------
@@ -295,13 +276,9 @@ class MotionTranscription:
     @cached_property
     def prescribed_motion(self) -> GraspConstraint:
         """Prescribed displacements of the grasps as a function of φ."""
-        return GraspConstraint(
-            self.experiment, self.nuisance, t_s=self.dynamics.t_s
-        )
+        return GraspConstraint(self.experiment, self.nuisance, t_s=self.dynamics.t_s)
 
-    def _prescribed_positions(
-        self, prescribed: PrescribedDisplacements
-    ) -> Array:
+    def _prescribed_positions(self, prescribed: PrescribedDisplacements) -> Array:
         """Return an array (N, 3n) with the positions [m] of the dofs that `prescribed` contains,
         NaN elsewhere.
         """
@@ -327,9 +304,7 @@ class MotionTranscription:
         at_last = at_times(dynamics.forces, slice(dynamics.row_count - 1, None))
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
         last = StencilRow.from_dynamics(dynamics, dynamics.row_count - 1)
-        block = last.block(
-            forces.by_position[0], forces.by_velocity[0], pattern=pattern
-        )
+        block = last.block(forces.by_position[0], forces.by_velocity[0], pattern=pattern)
         stiffness = np.abs(block[pattern.diagonal[self.free_dofs]]).mean()
         return self.length_m * float(stiffness)
 
@@ -356,9 +331,7 @@ class MotionTranscription:
         lower = np.full((self.grid_times, self.dof_count), -np.inf)
         upper = np.full((self.grid_times, self.dof_count), np.inf)
         if not self.has_constraints_of_grasps:
-            lower[:, self.prescribed_dofs] = self.dynamics.prescribed_m[
-                :, self.prescribed_dofs
-            ]
+            lower[:, self.prescribed_dofs] = self.dynamics.prescribed_m[:, self.prescribed_dofs]
             upper[:, self.prescribed_dofs] = lower[:, self.prescribed_dofs]
         start = self.start_positions()
         if start is not None:
@@ -370,9 +343,7 @@ class MotionTranscription:
     @cached_property
     def dynamic_parameters(self) -> Index:
         """Indices in (q, φ) of the parameters that change the motion, not only the measurements."""
-        return np.concatenate(
-            [np.arange(self.nq), self.nq + self.nuisance.motion_indices]
-        )
+        return np.concatenate([np.arange(self.nq), self.nq + self.nuisance.motion_indices])
 
     def dynamic_columns(self, first_phi: int) -> Index:
         """Return the indices in z of the parameters that change the motion: all of q, then φ; in
@@ -383,11 +354,7 @@ class MotionTranscription:
         first_phi : int
             Index in z where the nuisance parameters of all experiments begin.
         """
-        phi = (
-            first_phi
-            - self.nq
-            + self.nuisance_indices.indices[self.nuisance.motion_indices]
-        )
+        phi = first_phi - self.nq + self.nuisance_indices.indices[self.nuisance.motion_indices]
         return np.concatenate([np.arange(self.nq), phi])
 
     def has_histories(self) -> bool:
@@ -405,9 +372,7 @@ class MotionTranscription:
         dynamics = self.dynamics.with_inputs(u)
         prescribed = self.prescribed_motion.evaluate_at(phi)
         if prescribed.depends_on_phi:
-            dynamics = replace(
-                dynamics, prescribed_m=self._prescribed_positions(prescribed)
-            )
+            dynamics = replace(dynamics, prescribed_m=self._prescribed_positions(prescribed))
         return EquationsAtParameters(
             self.inputs,
             p,
@@ -441,14 +406,8 @@ class MotionTranscription:
             grasps = self.nuisance.with_grasps(grasps, phi)
         drive_errors = iter(self.nuisance.actuator_calibration(phi))
         tendons, pressures = (
-            tuple(
-                actuator.with_calibration(*next(drive_errors))
-                for actuator in actuators
-            )
-            for actuators in (
-                self.experiment.tendons,
-                self.experiment.pressures,
-            )
+            tuple(actuator.with_calibration(*next(drive_errors)) for actuator in actuators)
+            for actuators in (self.experiment.tendons, self.experiment.pressures)
         )
         changed = replace(
             self.experiment,
@@ -463,18 +422,13 @@ class MotionTranscription:
         """Return a copy of positions x (N, 3n) [m] in which each dof is, while a grasp prescribes
         it, at the position to which its grasp moves at φ (k,).
         """
-        goals = self._prescribed_positions(
-            self.prescribed_motion.evaluate_at(phi)
-        )
+        goals = self._prescribed_positions(self.prescribed_motion.evaluate_at(phi))
         return np.where(np.isnan(goals), x, goals)
 
     # Values ---------------------------------------------------------------------------------
 
     def constraint_values(
-        self,
-        x: Array,
-        equations: EquationsAtParameters,
-        histories: Sequence[AnyHistory] = (),
+        self, x: Array, equations: EquationsAtParameters, histories: Sequence[AnyHistory] = ()
     ) -> Array:
         """Return the scaled constraints (constraints,).
 
@@ -497,16 +451,6 @@ class MotionTranscription:
     ) -> Array:
         """Return the scaled constraints (constraints,) from the residual of the equations of
         motion.
-
-        Parameters
-        ----------
-        x : (N, 3n) array
-            Positions [m].
-        residual : (N, 3n) array
-            Residuals c [N]; not modified.
-        equations : EquationsAtParameters
-            Provides the prescribed positions: where a grasp prescribes a dof, the constraint is the
-            distance from it, over `length_m`.
         """
         rows = residual / self.force_n
         goals = equations.dynamics.prescribed_m
@@ -530,10 +474,7 @@ class MotionTranscription:
         return self.select_rows(grasped)
 
     def residual_n(
-        self,
-        x: Array,
-        equations: EquationsAtParameters,
-        histories: Sequence[AnyHistory] = (),
+        self, x: Array, equations: EquationsAtParameters, histories: Sequence[AnyHistory] = ()
     ) -> Array:
         """Return the residuals of the equations of motion (N, free dofs) [N], zero while a grasp
         prescribes the dof; arguments as in `constraint_values`.
@@ -553,11 +494,7 @@ class MotionTranscription:
         )
 
     def constraints_and_jacobian(
-        self,
-        x: Array,
-        equations: EquationsAtParameters,
-        forces: Linearisation,
-        values: Array,
+        self, x: Array, equations: EquationsAtParameters, forces: Linearisation, values: Array
     ) -> tuple[Array, Array]:
         """Evaluate the constraints and their derivatives.
 
@@ -586,19 +523,13 @@ class MotionTranscription:
             dynamics=dynamics,
             has_variable_mass=equations.mass_depends_on_parameters,
         )
-        by_p = np.zeros(
-            (self.grid_times, self.dof_count, len(self.dynamic_parameters))
-        )
+        by_p = np.zeros((self.grid_times, self.dof_count, len(self.dynamic_parameters)))
         rows = slice(dynamics.first_row, None)
         by_p[rows] = equations.force_derivatives(rows, forces.by_theta)
-        by_p = dynamics.combine(
-            dynamics.tables.w, dynamics.zero_prescribed_forces(by_p)
-        )
+        by_p = dynamics.combine(dynamics.tables.w, dynamics.zero_prescribed_forces(by_p))
         if equations.mass_depends_on_parameters:
             all_rows = slice(None)
-            by_p -= equations.inertia_derivatives(
-                all_rows, dynamics.acceleration(x), dofs=all_rows
-            )
+            by_p -= equations.inertia_derivatives(all_rows, dynamics.acceleration(x), dofs=all_rows)
         by_p /= self.force_n
         dynamics.zero_prescribed_forces(by_p)
         by_p[:, self.prescribed_dofs] = 0
@@ -610,9 +541,7 @@ class MotionTranscription:
         rows = self._scaled_constraints(
             x, dynamics.assemble_residual(x, forces.force), equations=equations
         )
-        return rows, by_p.reshape(
-            self.constraint_count, len(self.dynamic_parameters)
-        )
+        return rows, by_p.reshape(self.constraint_count, len(self.dynamic_parameters))
 
     def lagrangian_weights(
         self, multipliers: Array, reaction_weights: Array | float = 0.0
@@ -636,17 +565,11 @@ class MotionTranscription:
         dynamics = self.dynamics
         t = self.dynamics.tables
         rows = np.zeros((self.grid_times, self.dof_count))
-        by_time = multipliers.reshape(
-            self.constraint_times, self.constraints_per_time
-        )
-        rows[dynamics.first_row :, self.constrained_dofs] = (
-            by_time / self.force_n
-        )
+        by_time = multipliers.reshape(self.constraint_times, self.constraints_per_time)
+        rows[dynamics.first_row :, self.constrained_dofs] = by_time / self.force_n
         rows[:, self.prescribed_dofs] = 0
         rows = dynamics.zero_prescribed_forces(rows)
-        forces = dynamics.zero_prescribed_forces(
-            dynamics.combine_transposed(t.w, rows)
-        )
+        forces = dynamics.zero_prescribed_forces(dynamics.combine_transposed(t.w, rows))
         if isinstance(reaction_weights, np.ndarray):
             rows = rows + reaction_weights
             forces = forces + dynamics.combine_transposed(t.w, reaction_weights)
@@ -679,13 +602,8 @@ class MotionTranscription:
             by_xi, by_nu, own = history.vector_jacobian_product(
                 weights, equations.input_derivatives
             )
-            by_x += dynamics.combine_transposed(
-                dynamics.compute_state_weights(), by_xi
-            )
-            by_x += (
-                dynamics.combine_transposed(dynamics.tables.q, by_nu)
-                / dynamics.step_s
-            )
+            by_x += dynamics.combine_transposed(dynamics.compute_state_weights(), by_xi)
+            by_x += dynamics.combine_transposed(dynamics.tables.q, by_nu) / dynamics.step_s
             by_p += own
         return by_x, by_p
 
@@ -693,12 +611,7 @@ class MotionTranscription:
     def linearisation_buffer(self) -> Array:
         """Work space (constraint_times, width) for linearisations; overwritten by each of them."""
         # Kept between calls: fresh pages would cost as much as the numbers in them.
-        return np.zeros(
-            (
-                self.constraint_times,
-                self.dynamics.forces.body.linearisation_width,
-            )
-        )
+        return np.zeros((self.constraint_times, self.dynamics.forces.body.linearisation_width))
 
     # Second derivatives -----------------------------------------------------------------------
 
@@ -710,10 +623,7 @@ class MotionTranscription:
         """
         blocks = self._hessian_blocks(_state_factors)
         return BlockBand(
-            self.dof_count,
-            self._list_hessian_starts(),
-            blocks=blocks,
-            top_rows=self.nq,
+            self.dof_count, self._list_hessian_starts(), blocks=blocks, top_rows=self.nq
         )
 
     @cached_property
@@ -721,14 +631,9 @@ class MotionTranscription:
         """Structure that adds the contribution of the skew part of ∂²φ/∂x∂v to the values of
         `hessian`.
         """
-        blocks = self._hessian_blocks(
-            lambda p, q, pp, qq: (pp * q - qq * p, 0 * q)
-        )
+        blocks = self._hessian_blocks(lambda p, q, pp, qq: (pp * q - qq * p, 0 * q))
         return skew_block_band(
-            self.dof_count,
-            self._list_hessian_starts(),
-            blocks=blocks,
-            top_rows=self.nq,
+            self.dof_count, self._list_hessian_starts(), blocks=blocks, top_rows=self.nq
         )
 
     @cached_property
@@ -736,11 +641,7 @@ class MotionTranscription:
         """Structure that adds the contribution of ∂²φ/∂v² to the values of `hessian`."""
         blocks = self._hessian_blocks(lambda p, q, pp, qq: (q * qq, 0 * q))
         return BlockBand(
-            self.dof_count,
-            self._list_hessian_starts(),
-            blocks=blocks,
-            top_rows=self.nq,
-            adds=True,
+            self.dof_count, self._list_hessian_starts(), blocks=blocks, top_rows=self.nq, adds=True
         )
 
     def _list_hessian_starts(self) -> Index:
@@ -755,26 +656,13 @@ class MotionTranscription:
 
         There is one block for each distance in time from 0 to the largest lag at which the Hessian
         may have entries; that of distance 0 has the upper triangle alone.
-
-        Parameters
-        ----------
-        factors : callable
-            ``factors(p, q, p_second, q_second)`` returns the coefficients a and b (N,) of the
-            lower-triangle values A and B in `BlockBand.fill`, from the stencil coefficients (N,) of
-            state (p) and velocity (q) of two positions in one evaluation, see `_state_factors`.
         """
         rows, columns, source = self.experiment.sparsity.full
         blocks = []
         for distance in range(self.dynamics.largest_lag + 1):
-            if distance > 0 and not self._curvature_terms(
-                distance, _state_factors
-            ):
+            if distance > 0 and not self._curvature_terms(distance, _state_factors):
                 continue
-            is_stored = (
-                rows <= columns
-                if distance == 0
-                else np.ones(len(rows), dtype=bool)
-            )
+            is_stored = rows <= columns if distance == 0 else np.ones(len(rows), dtype=bool)
             entries = np.flatnonzero(is_stored)
             terms = self._curvature_terms(distance, factors)
             blocks.append(
@@ -789,35 +677,18 @@ class MotionTranscription:
             )
         return blocks
 
-    def _curvature_terms(
-        self, distance: int, factors: Factors
-    ) -> list[BlockTerm]:
+    def _curvature_terms(self, distance: int, factors: Factors) -> list[BlockTerm]:
         """Return the terms of the Hessian's block between rows at a distance in time, a sum over
         the evaluations k = t + i; terms whose factors are all zero are left out.
-
-        Parameters
-        ----------
-        distance : int
-            Difference of the rows' indices.
-        factors : callable
-            As for `_hessian_blocks`; the first position is that of the later row.
         """
         p = self.dynamics.compute_state_weights()
         q = self.dynamics.tables.q / self.dynamics.step_s
         terms = []
         for i in range(self.dynamics.largest_lag + 1 - distance):
-            pair = factors(
-                p[:, i], q[:, i], p[:, i + distance], q[:, i + distance]
-            )
+            pair = factors(p[:, i], q[:, i], p[:, i + distance], q[:, i + distance])
             if any(each.any() for each in pair):
                 terms.append(
-                    BlockTerm(
-                        i,
-                        *(
-                            shifted_back(self.length_m**2 * each, i)
-                            for each in pair
-                        ),
-                    )
+                    BlockTerm(i, *(shifted_back(self.length_m**2 * each, i) for each in pair))
                 )
         return terms
 
@@ -831,7 +702,7 @@ class MotionTranscription:
         values: Array,
         lifted_histories: Sequence[WeightedHistory] = (),
     ) -> tuple[Array, list[Array]]:
-        """Second derivatives of multipliers · c of this segment, in scaled variables.
+        """Second derivatives of multipliers · c of this transcription, in scaled variables.
 
         The priors of φ are included, times `loss_weight`, for those φ that no earlier experiment
         has; the priors of q are not.
@@ -862,10 +733,7 @@ class MotionTranscription:
         dynamics = equations.dynamics
         band = self.hessian
         curvature = self._curvature(
-            x,
-            equations,
-            weights=weights.forces,
-            lifted_histories=lifted_histories,
+            x, equations, weights=weights.forces, lifted_histories=lifted_histories
         )
         band.fill(
             values,
@@ -875,52 +743,26 @@ class MotionTranscription:
         )
         if curvature.velocity_velocity.size:
             rates = curvature.velocity_velocity
-            self._rate_hessian.fill(
-                values, rates, b=rates, threads=self.body.threads
-            )
-        skew = full_skew_values(
-            self.experiment.sparsity, curvature.position_velocity_skew
-        )
+            self._rate_hessian.fill(values, rates, b=rates, threads=self.body.threads)
+        skew = full_skew_values(self.experiment.sparsity, curvature.position_velocity_skew)
         if skew.size:
-            self._skew_hessian.fill(
-                values, skew, b=skew, threads=self.body.threads
-            )
-        by_x, twice = equations.weighted_second_derivatives(
-            x, curvature, row_weights=weights.rows
-        )
+            self._skew_hessian.fill(values, skew, b=skew, threads=self.body.threads)
+        by_x, twice = equations.weighted_second_derivatives(x, curvature, row_weights=weights.rows)
         of_q = self.length_m * by_x[..., : self.nq]
         values[band.top_positions] = of_q.reshape(band.top_positions.shape)
-        by_phi = np.diag(
-            2 * loss_weight * self.nuisance_indices.is_first
-        )  # the prior
+        by_phi = np.diag(2 * loss_weight * self.nuisance_indices.is_first)  # the prior
         of_motion = twice[self.nq :, self.nq :]
         if equations.prescribed.depends_on_phi:
             of_goals = np.zeros((self.grid_times, self.dof_count))
-            by_time = weights.multipliers.reshape(
-                self.constraint_times, self.constraints_per_time
-            )
-            of_goals[dynamics.first_row :, self.constrained_dofs] = (
-                -by_time / self.length_m
-            )
+            by_time = weights.multipliers.reshape(self.constraint_times, self.constraints_per_time)
+            of_goals[dynamics.first_row :, self.constrained_dofs] = -by_time / self.length_m
             grasped = ~np.isnan(equations.prescribed.positions_m)
-            of_goals = np.where(
-                grasped, of_goals[:, equations.prescribed.dofs], 0.0
-            )
-            of_motion = of_motion + self.prescribed_motion.weighted_hessian(
-                phi, of_goals
-            )
-        by_phi[
-            np.ix_(self.nuisance.motion_indices, self.nuisance.motion_indices)
-        ] += of_motion
-        of_states = (
-            self.length_m * by_x[..., self.state_dependent_nuisance].ravel()
-        )
+            of_goals = np.where(grasped, of_goals[:, equations.prescribed.dofs], 0.0)
+            of_motion = of_motion + self.prescribed_motion.weighted_hessian(phi, of_goals)
+        by_phi[np.ix_(self.nuisance.motion_indices, self.nuisance.motion_indices)] += of_motion
+        of_states = self.length_m * by_x[..., self.state_dependent_nuisance].ravel()
         of_pairs = by_phi[np.triu_indices(len(by_phi))]
-        further = [
-            twice[: self.nq, self.nq :].ravel(),
-            of_states,
-            of_pairs,
-        ]
+        further = [twice[: self.nq, self.nq :].ravel(), of_states, of_pairs]
         return twice[: self.nq, : self.nq], further
 
     def _curvature(
@@ -934,26 +776,13 @@ class MotionTranscription:
         stated initial state, and of Σ μ · h of the lifted history variables.
 
         The result is overwritten by the next call.
-
-        Parameters
-        ----------
-        x : (N, 3n) array
-            Positions [m].
-        equations : EquationsAtParameters
-            Equations of motion at the parameters.
-        weights : (N, 3n) array
-            Weights of the forces [1/N].
-        lifted_histories : sequence of WeightedHistory
-            Lifted history variables, with weights of their equations.
         """
         dynamics = equations.dynamics
         forces = dynamics.forces
         xi, nu = dynamics.all_evaluation_states(x)
         for history, mu in lifted_histories:
             forces = history.with_variable_weights(forces, mu)
-        curvature = forces.weighted_hessian(
-            xi, nu, weights=weights, out=self._curvature_buffer
-        )
+        curvature = forces.weighted_hessian(xi, nu, weights=weights, out=self._curvature_buffer)
         for history, mu in lifted_histories:
             history.add_curvature(curvature, mu)
         return curvature
@@ -964,16 +793,12 @@ class MotionTranscription:
         parameters for which the equations of motion have mixed second derivatives with positions or
         velocities.
         """
-        return self.nq + np.flatnonzero(
-            self.inputs.is_coupled_to_state[self.nq :]
-        )
+        return self.nq + np.flatnonzero(self.inputs.is_coupled_to_state[self.nq :])
 
     @cached_property
     def _curvature_buffer(self) -> Array:
         """Work space (N, width) for second derivatives; overwritten by each evaluation."""
-        return np.zeros(
-            (self.grid_times, self.dynamics.forces.body.curvature_width)
-        )
+        return np.zeros((self.grid_times, self.dynamics.forces.body.curvature_width))
 
     def find_hessian_diagonal(self) -> Index:
         """Return the positions (N · 3n,) of the diagonal entries of x in the values of `hessian`."""
@@ -982,9 +807,7 @@ class MotionTranscription:
             np.arange(self.grid_times), 0, rows=dofs, columns=dofs
         ).ravel()
 
-    def constraint_hessian_entries(
-        self, first_phi: int
-    ) -> list[tuple[Index, Index]]:
+    def constraint_hessian_entries(self, first_phi: int) -> list[tuple[Index, Index]]:
         """Return rows and columns in z of the Hessian's entries besides those of `hessian` and of q
         with q, upper triangle.
 
@@ -1002,10 +825,7 @@ class MotionTranscription:
         states = moving[self.state_dependent_nuisance - self.nq]
         pairs = np.triu_indices(len(of_phi))
         entries = [
-            (
-                np.repeat(np.arange(self.nq), len(moving)),
-                np.tile(moving, self.nq),
-            ),
+            (np.repeat(np.arange(self.nq), len(moving)), np.tile(moving, self.nq)),
             (np.repeat(of_x, len(states)), np.tile(states, len(of_x))),
             (of_phi[pairs[0]], of_phi[pairs[1]]),
         ]
@@ -1013,17 +833,8 @@ class MotionTranscription:
         return [(np.minimum(*each), np.maximum(*each)) for each in entries]
 
 
-def _state_factors(
-    p: Array, q: Array, p_second: Array, q_second: Array
-) -> tuple[Array, Array]:
+def _state_factors(p: Array, q: Array, p_second: Array, q_second: Array) -> tuple[Array, Array]:
     """Return the coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions, in the second
     derivative of a potential φ of one evaluation.
-
-    Parameters
-    ----------
-    p, q : (N,) arrays
-        Stencil coefficients of state and velocity of the first position.
-    p_second, q_second : (N,) arrays
-        Stencil coefficients of the second position.
     """
     return p * p_second, p * q_second + q * p_second

@@ -44,10 +44,7 @@ class ObservableResponse:
 
     @classmethod
     def from_rows(
-        cls,
-        iterate: ExperimentIterate,
-        rows: Iterable[Array],
-        grasp_forces: GraspForces,
+        cls, iterate: ExperimentIterate, rows: Iterable[Array], grasp_forces: GraspForces
     ) -> ObservableResponse:
         """Compute the changes of the observables from changes of x, row by row, so that only
         observed rows are stored.
@@ -67,14 +64,12 @@ class ObservableResponse:
         ValueError
             If an observable is not observed at any of the rows.
         """
-        channels = [reading.observable for reading in iterate.segment.residuals]
+        channels = [reading.observable for reading in iterate.transcription.residuals]
         operators = [channel.operator(iterate.phi) for channel in channels]
         needed_rows = [frozenset(channel.rows.tolist()) for channel in channels]
         observed: list[list[Array]] = [[] for _ in channels]
         for t, row in enumerate(rows):
-            for changes, operator, times in zip(
-                observed, operators, needed_rows, strict=True
-            ):
+            for changes, operator, times in zip(observed, operators, needed_rows, strict=True):
                 if t in times:
                     changes.append(operator @ row)
         return cls(iterate, tuple(map(np.stack, observed)), grasp_forces)
@@ -102,18 +97,12 @@ class ObservableResponse:
         """
         changes = []
         _, dofs, count = changes_m.shape
-        for reading in iterate.segment.residuals:
+        for reading in iterate.transcription.residuals:
             channel = reading.observable
             rows = channel.rows[channel.rows < len(changes_m)]
-            columns = (
-                changes_m[rows]
-                .transpose(1, 0, 2)
-                .reshape(dofs, len(rows) * count)
-            )
+            columns = changes_m[rows].transpose(1, 0, 2).reshape(dofs, len(rows) * count)
             at = channel.operator(iterate.phi) @ columns
-            changes.append(
-                at.reshape(len(at), len(rows), count).transpose(1, 0, 2)
-            )
+            changes.append(at.reshape(len(at), len(rows), count).transpose(1, 0, 2))
         return cls(iterate, tuple(changes), grasp_forces, step=step)
 
     def motions(self, is_by_parameters: bool = True) -> list[ObservedMotion]:
@@ -131,7 +120,7 @@ class ObservableResponse:
         moved = x if self.step is None else x + self.step
         motions = []
         for reading, changes in zip(
-            iterate.segment.residuals, self.observed_changes, strict=True
+            iterate.transcription.residuals, self.observed_changes, strict=True
         ):
             reactions = None
             if reading.observable.measures_reactions:
@@ -140,7 +129,7 @@ class ObservableResponse:
                     x,
                     grasp_forces=self.grasp_forces,
                     position_changes=changes,
-                    dofs=iterate.segment.sensed_dofs,
+                    dofs=iterate.transcription.sensed_dofs,
                     step=self.step,
                     is_by_parameters=is_by_parameters,
                 )
@@ -158,17 +147,13 @@ class ObservableResponse:
             For each measurement, residuals (s, G, g) and derivatives (s, G, g, size) by all size =
             nq + k parameters, see `MeasurementResidual.linearise`.
         """
-        segment = self.iterate.segment
+        transcription = self.iterate.transcription
         phi = self.iterate.phi
-        size = segment.nq + len(phi)
+        size = transcription.nq + len(phi)
         linearisations = []
-        for reading, motion in zip(
-            segment.residuals, self.motions(), strict=True
-        ):
+        for reading, motion in zip(transcription.residuals, self.motions(), strict=True):
             values_and_slopes = reading.observable.linearise(
-                motion, phi, segment.dynamic_parameters, size
+                motion, phi, transcription.dynamic_parameters, size
             )
-            linearisations.append(
-                reading.linearise(*values_and_slopes, phi, size)
-            )
+            linearisations.append(reading.linearise(*values_and_slopes, phi, size))
         return linearisations

@@ -93,11 +93,7 @@ class ObservableDerivatives(NamedTuple):
         """
         none = np.zeros(0, dtype=np.int64)
         return cls(
-            columns,
-            by,
-            entities=none,
-            own_parameters=none.reshape(0, 0),
-            by_own=by[:, :0, :, :0],
+            columns, by, entities=none, own_parameters=none.reshape(0, 0), by_own=by[:, :0, :, :0]
         )
 
 
@@ -187,9 +183,7 @@ class PointPositions:
         """Return the indices of the npe nodes of each point's element (e, npe), and the shape
         functions with their derivatives at the places estimated by φ (k,).
         """
-        return self.association.shape_functions(
-            np.append(phi, 0.0)[self.coordinate_parameters]
-        )
+        return self.association.shape_functions(np.append(phi, 0.0)[self.coordinate_parameters])
 
     def operator(self, phi: Array) -> sp.csr_array:
         """Return the matrix H (3e, 3n) from positions to points at φ (k,); row 3 m + axis,
@@ -208,9 +202,7 @@ class PointPositions:
     def _operator_at(self, phi: Array) -> sp.csr_array:
         """Return the matrix `operator` at φ (k,)."""
         nodes, shape = self.shape_functions(phi)
-        return interpolation_matrix(
-            nodes, shape.weights, node_count=self.node_count
-        )
+        return interpolation_matrix(nodes, shape.weights, node_count=self.node_count)
 
     def _interpolate(self, x: Array, nodes: Index, weights: Array) -> Array:
         """Return Σ_a weights[m, a, …] x_a, (R, m, 3, …), at those R of the observable's rows that x
@@ -220,21 +212,15 @@ class PointPositions:
         at = x[rows].reshape(len(rows), -1, 3)[:, nodes]
         return np.einsum("ma...,tmai->tmi...", weights, at)
 
-    def _coordinate_derivatives(
-        self, x: Array, shape: tuple[Index, ShapeFunctions]
-    ) -> Array:
+    def _coordinate_derivatives(self, x: Array, shape: tuple[Index, ShapeFunctions]) -> Array:
         """Return the derivatives (R, estimated, 3, k) of the points with estimated places by their
         own k coordinates, at positions x (rows, 3n); `shape` is the result of `shape_functions`.
         """
         nodes, functions = shape
         estimated = self.association.estimated
         if not len(estimated):
-            return np.zeros(
-                (len(self.rows), 0, 3, self.coordinate_parameters.shape[1])
-            )
-        return self._interpolate(
-            x, nodes[estimated], weights=functions.gradients[estimated]
-        )
+            return np.zeros((len(self.rows), 0, 3, self.coordinate_parameters.shape[1]))
+        return self._interpolate(x, nodes[estimated], weights=functions.gradients[estimated])
 
     def evaluate(self, motion: ObservedMotion, phi: Array) -> Array:
         """Return the positions (R, e, 3) of the points in a motion [m] at φ (k,), at those R of the
@@ -297,9 +283,7 @@ class PointPositions:
             Derivatives of the points by these parameters through the positions x.
         """
         estimated = self.association.estimated
-        changes = changes.reshape(
-            len(changes), self.vector_count, 3, changes.shape[2]
-        )
+        changes = changes.reshape(len(changes), self.vector_count, 3, changes.shape[2])
         return ObservableDerivatives(
             columns,
             changes,
@@ -308,9 +292,7 @@ class PointPositions:
             by_own=self._coordinate_derivatives(x, shape_functions),
         )
 
-    def vjp(
-        self, motion: ObservedMotion, phi: Array, by_values: Array
-    ) -> VectorJacobianProduct:
+    def vjp(self, motion: ObservedMotion, phi: Array, by_values: Array) -> VectorJacobianProduct:
         """Vector–Jacobian product: derivatives of a scalar by x and φ from those by the values.
 
         Parameters
@@ -331,20 +313,13 @@ class PointPositions:
             own = np.einsum(
                 "tmi,tmik->mk",
                 by_values[:, here],
-                self._coordinate_derivatives(
-                    motion.x, self.shape_functions(phi)
-                ),
+                self._coordinate_derivatives(motion.x, self.shape_functions(phi)),
             )
             by_phi[self.coordinate_parameters[here]] = own
         return VectorJacobianProduct(by_x, None, by_phi=by_phi)
 
     def frame_changes(
-        self,
-        grasp: Grasp,
-        motion: ObservedMotion,
-        phi: Array,
-        shifts: Array,
-        rotations: Array,
+        self, grasp: Grasp, motion: ObservedMotion, phi: Array, shifts: Array, rotations: Array
     ) -> Array | float:
         """Return the changes of the values due to sensor frames moved by pose errors: 0 for points
         of the body.
@@ -366,18 +341,9 @@ class PointPositions:
         marker, corner = np.nonzero(reads)
         return marker, corner
 
-    def _derivative_entries(
-        self, variables: int, size: int
-    ) -> tuple[Index, Index]:
+    def _derivative_entries(self, variables: int, size: int) -> tuple[Index, Index]:
         """Return rows and columns of the entries of `derivative_matrix`, in their order; all x
         precede all φ.
-
-        Parameters
-        ----------
-        variables : int
-            Number of positions N · 3n.
-        size : int
-            Number of nuisance parameters.
         """
         nodes, _ = self.shape_functions(np.zeros(size))
         marker, corner = self._dependencies
@@ -387,38 +353,25 @@ class PointPositions:
         estimated = self.association.estimated
         row_place = np.broadcast_to(
             first[..., None] + 3 * estimated[:, None, None] + axes[:, None],
-            (
-                self.count,
-                len(estimated),
-                3,
-                self.coordinate_parameters.shape[1],
-            ),
+            (self.count, len(estimated), 3, self.coordinate_parameters.shape[1]),
         )
         pairs = (
             (
                 first + 3 * marker[:, None] + axes,
-                (self.rows * dofs)[:, None, None]
-                + 3 * nodes[marker, corner][:, None]
-                + axes,
+                (self.rows * dofs)[:, None, None] + 3 * nodes[marker, corner][:, None] + axes,
             ),
             (
                 row_place,
                 np.broadcast_to(
-                    variables + self.coordinate_parameters[estimated][:, None],
-                    row_place.shape,
+                    variables + self.coordinate_parameters[estimated][:, None], row_place.shape
                 ),
             ),
-            (
-                3 * self.vector_count * self.count + np.arange(size),
-                variables + np.arange(size),
-            ),
+            (3 * self.vector_count * self.count + np.arange(size), variables + np.arange(size)),
         )
         rows = np.concatenate([row.ravel() for row, _ in pairs])
         return rows, np.concatenate([column.ravel() for _, column in pairs])
 
-    def derivative_matrix(
-        self, x: Array | None, phi: Array, position_count: int
-    ) -> sp.csr_array:
+    def derivative_matrix(self, x: Array | None, phi: Array, position_count: int) -> sp.csr_array:
         """Return the sparse derivative of the stacked positions c of all points at all rows, and of
         φ itself, by (x, φ).
 
@@ -445,9 +398,7 @@ class PointPositions:
             own = self._coordinate_derivatives(x, (nodes, shape))
             values = np.concatenate([of_x.ravel(), own.ravel(), np.ones(size)])
         row_count = 3 * self.vector_count * self.count + size
-        return sp.csr_array(
-            (values, entries), shape=(row_count, position_count + size)
-        )
+        return sp.csr_array((values, entries), shape=(row_count, position_count + size))
 
     def curvature(
         self, x: Array, phi: Array, by_values: Array, position_count: int
@@ -475,14 +426,10 @@ class PointPositions:
         column = position_count + self.coordinate_parameters[estimated]
         value = np.einsum("tmi,mak->tmaik", weights, shape.gradients[estimated])
         rows, columns = np.broadcast_arrays(row, column[:, None, None])
-        by_coordinates = self._interpolate(
-            x, nodes[estimated], weights=shape.hessians[estimated]
-        )
+        by_coordinates = self._interpolate(x, nodes[estimated], weights=shape.hessians[estimated])
         by_coordinates = np.einsum("tmi,tmikl->mkl", weights, by_coordinates)
         upper = np.nonzero(
-            np.broadcast_to(
-                np.triu(np.ones(by_coordinates.shape[1:])), by_coordinates.shape
-            )
+            np.broadcast_to(np.triu(np.ones(by_coordinates.shape[1:])), by_coordinates.shape)
         )
         return SparseEntries(
             np.concatenate([rows.ravel(), column[upper[0], upper[1]]]),
@@ -491,16 +438,13 @@ class PointPositions:
         )
 
 
-def interpolation_matrix(
-    nodes: Index, weights: Array, node_count: int
-) -> sp.csr_array:
+def interpolation_matrix(nodes: Index, weights: Array, node_count: int) -> sp.csr_array:
     """Return the matrix (3M, 3n) of Σ_a weights[m, a] x_a for nodes (M, npe); row 3 m + axis,
     column 3 node + axis, without entries of zero weights.
     """
     marker = np.repeat(np.arange(len(nodes)), nodes.shape[1])
     per_node = sp.csr_array(
-        (weights.ravel(), (marker, nodes.ravel())),
-        shape=(len(nodes), node_count),
+        (weights.ravel(), (marker, nodes.ravel())), shape=(len(nodes), node_count)
     )
     per_node.eliminate_zeros()
     return sp.csr_array(sp.kron(per_node, sp.eye_array(3), format="csr"))

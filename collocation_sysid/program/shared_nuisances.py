@@ -51,9 +51,7 @@ class NuisanceIndices:
     pivot_m: Array | None = None
 
 
-def nuisance_indices(
-    experiments: Sequence[Experiment], first: int
-) -> list[NuisanceIndices]:
+def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[NuisanceIndices]:
     """Assign the nuisance parameters of each experiment to entries of p.
 
     A parameter gets a new entry, in the order of the experiments, unless an earlier experiment
@@ -89,45 +87,21 @@ def nuisance_indices(
             scope = scopes.get(entry.row.name)
             # What is not shared is nobody else's.
             which = (len(indices), k) if scope is None else (scope, entry.label)
-            places[k], other, of = known.setdefault(
-                which, (first, entry, experiment)
-            )
+            places[k], other, of = known.setdefault(which, (first, entry, experiment))
             first += places[k] == first
             leader = leaders.setdefault((scope, entry.row), experiment)
             if scope is not None:
                 _require_same_objects(leader, experiment, row=entry.row)
                 _require_same_prior((of, other), (experiment, entry))
-        leader = leaders.get(
-            (scopes.get(POSE_TURN.name), POSE_TURN), experiment
-        )
-        pivot_m = (
-            None
-            if leader is experiment
-            else NuisanceMap.from_experiment(leader).pivot_m
-        )
-        indices.append(
-            NuisanceIndices(places, places >= before, pivot_m=pivot_m)
-        )
+        leader = leaders.get((scopes.get(POSE_TURN.name), POSE_TURN), experiment)
+        pivot_m = None if leader is experiment else NuisanceMap.from_experiment(leader).pivot_m
+        indices.append(NuisanceIndices(places, places >= before, pivot_m=pivot_m))
     return indices
 
 
-def _require_same_objects(
-    leader: Experiment, experiment: Experiment, row: NuisanceRow
-) -> None:
+def _require_same_objects(leader: Experiment, experiment: Experiment, row: NuisanceRow) -> None:
     """Check that the objects on which a shared nuisance parameter depends are the same in two
     experiments.
-
-    Parameters
-    ----------
-    leader, experiment : Experiment
-        The first experiment with this scope, and the one that is checked; they may be the same.
-    row : NuisanceRow
-        Kind of nuisance parameter.
-
-    Raises
-    ------
-    InputError
-        If an object of `experiment` differs; it is named.
     """
     theirs = row.same(leader)
     ours = row.same(experiment)
@@ -142,40 +116,26 @@ def _require_same_objects(
 
 
 def _require_same_prior(
-    one: tuple[Experiment, NuisanceEntry],
-    other: tuple[Experiment, NuisanceEntry],
+    one: tuple[Experiment, NuisanceEntry], other: tuple[Experiment, NuisanceEntry]
 ) -> None:
     """Check that a nuisance parameter shared by two experiments has one prior, and a shared marker
     one stated place, in both or in neither.
-
-    Parameters
-    ----------
-    one, other : (Experiment, NuisanceEntry)
-        The first experiment that has the parameter, and the one that is checked.
-
-    Raises
-    ------
-    InputError
-        If they differ.
     """
     leader, first = one
     experiment, second = other
     row = second.row
     label = second.label
     if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
-        difference = (
-            f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
-        )
+        difference = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
         raise _sharing_error(
-            experiment,
-            row,
-            result=difference,
-            expected=f"the same prior as here, {second.sigma:g}",
+            experiment, row, result=difference, expected=f"the same prior as here, {second.sigma:g}"
         )
     if row == PLACE:
         places = [_declared_place(*one), _declared_place(*other)]
         if not np.allclose(*places, rtol=0, atol=1e-9, equal_nan=True):
-            difference = f"'{leader.name}', which states another {label.partition(',')[0]} on the body"
+            difference = (
+                f"'{leader.name}', which states another {label.partition(',')[0]} on the body"
+            )
             raise _sharing_error(
                 experiment,
                 row,
@@ -194,17 +154,7 @@ def _declared_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
 def _sharing_error(
     experiment: Experiment, row: NuisanceRow, result: str, expected: str
 ) -> InputError:
-    """Return the error for a parameter that cannot be shared.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment that the message names as its location.
-    row : NuisanceRow
-        Kind of nuisance parameter.
-    result, expected : str
-        What was found, and what was expected, for the message.
-    """
+    """Return the error for a parameter that cannot be shared."""
     key = row.key or row.name
     message = f"{key} is shared with {result}; expected {expected}, or a separate scope"
     return InputError(message, None, where=f"experiment '{experiment.name}'")
@@ -230,26 +180,18 @@ def shared_associations(
         replaced = []
         for k in nuisance.indices_of_rows(PLACE):
             number = nuisance.entries[k].number
-            leader = leaders.setdefault(
-                int(local.indices[k]), (own.markers, number)
-            )
+            leader = leaders.setdefault(int(local.indices[k]), (own.markers, number))
             if leader[0] is not own.markers:
                 replaced.append((number, *leader))
         for k in nuisance.clock_indices:
-            shared = samples.setdefault(
-                int(local.indices[k]), own.clock_samples
-            )
+            shared = samples.setdefault(int(local.indices[k]), own.clock_samples)
             if shared != association.clock_samples:
                 association = replace(association, clock_samples=shared)
         if replaced:
-            places = {
-                name: getattr(own.markers, name).copy() for name in OF_MARKERS
-            }
+            places = {name: getattr(own.markers, name).copy() for name in OF_MARKERS}
             for name, values in places.items():
                 for number, leader, theirs in replaced:
                     values[number] = getattr(leader, name)[theirs]
-            association = replace(
-                association, markers=replace(own.markers, **places)
-            )
+            association = replace(association, markers=replace(own.markers, **places))
         associations.append(association)
     return associations

@@ -157,9 +157,7 @@ def simulate(
         ceased to be stable the mode, see `program.find_stability_loss`.
     """
     theta = resolve_theta(experiment.body, parameters)
-    steps = _steps_per_sample(
-        experiment, integrator, timestep_s=timestep_s, substeps=substeps
-    )
+    steps = _steps_per_sample(experiment, integrator, timestep_s=timestep_s, substeps=substeps)
     if (massless := experiment.body.mass_problem(theta)) is not None:
         raise InputError(massless)
     if (unreachable := experiment.body.rest_shape_failure(theta)) is not None:
@@ -167,11 +165,7 @@ def simulate(
     try:
         if steps == "auto":
             return _with_automatic_steps(
-                experiment,
-                theta,
-                integrator=integrator,
-                options=options,
-                progress=progress,
+                experiment, theta, integrator=integrator, options=options, progress=progress
             )
         return _with_steps(
             experiment,
@@ -193,21 +187,11 @@ def _steps_per_sample(
     timestep_s: float | None,
     substeps: int | Literal["auto"],
 ) -> int | Literal["auto"]:
-    """Return the time steps between samples, 1 in a static experiment; arguments as in `simulate`.
-
-    Raises
-    ------
-    InputError
-        For a step or substeps that are not positive, or too many steps.
-    """
+    """Return the time steps between samples, 1 in a static experiment; arguments as in `simulate`."""
     if timestep_s is not None and not timestep_s > 0:
-        raise InputError(
-            f"timestep_s = {timestep_s:g}, expected a positive time"
-        )
+        raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
     if isinstance(substeps, str) and substeps != "auto":
-        raise InputError(
-            f"substeps = {substeps!r}, expected a whole number or 'auto'"
-        )
+        raise InputError(f"substeps = {substeps!r}, expected a whole number or 'auto'")
     if isinstance(substeps, int) and substeps < 1:
         raise InputError(f"substeps = {substeps}, expected at least 1")
     if experiment.is_static:
@@ -230,11 +214,6 @@ def _with_automatic_steps(
 
     A number of steps that cannot be simulated counts as inaccurate. Arguments as in `simulate`,
     with constants θ.
-
-    Raises
-    ------
-    SimulationError
-        If the largest number of steps cannot be simulated.
     """
     is_newmark = integrator == NEWMARK
     order = NEWMARK_ORDER if is_newmark else as_scheme(integrator).order
@@ -260,9 +239,7 @@ def _with_automatic_steps(
                 raise
             finer = None
         if finer is not None and coarser is not None:
-            change_m = np.linalg.norm(
-                finer.positions_m - coarser.positions_m, axis=2
-            ).max()
+            change_m = np.linalg.norm(finer.positions_m - coarser.positions_m, axis=2).max()
             error_m = float(change_m) / (2**order - 1)
             finer = replace(finer, step_error_m=error_m)
             if error_m <= _accepted_error_m(finer):
@@ -324,31 +301,21 @@ def _with_steps(
         v = motion.velocities_m_s
         forced = motion.reactions
         rows = (len(x) - 1) * steps + 1
-        at = ReactionGrid.from_times(
-            np.linspace(experiment.t_s[0], experiment.t_s[-1], rows)
-        )
+        at = ReactionGrid.from_times(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
     else:
-        dynamics = Dynamics.from_experiment(
-            experiment, integrator, substeps=steps
-        ).with_theta(theta)
-        grid = simulate_scheme(
-            experiment, dynamics, options=options, progress=progress
+        dynamics = Dynamics.from_experiment(experiment, integrator, substeps=steps).with_theta(
+            theta
         )
+        grid = simulate_scheme(experiment, dynamics, options=options, progress=progress)
         x = grid[::steps]
         zeros = np.zeros_like(grid)
-        v = (
-            zeros
-            if experiment.is_static
-            else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
-        )
+        v = zeros if experiment.is_static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
         at = ReactionGrid.from_dynamics(dynamics)
         forced = reactions_at(dynamics, grid, dofs=sensed)
     shape = (len(x), -1, 3)
     positions = x.reshape(shape)
     markers = experiment.markers.predict_positions(positions)
-    ideal = NuisanceMap.from_experiment(
-        replace(experiment, nuisance=Nuisance.none())
-    )
+    ideal = NuisanceMap.from_experiment(replace(experiment, nuisance=Nuisance.none()))
     wrenches = tuple(
         sensor.predict_reactions(forced, np.zeros(ideal.size))
         for sensor in wrench_residuals(experiment, at, nuisance=ideal)
@@ -375,35 +342,18 @@ def _custom_sensor_values(
 ) -> tuple[Array, ...]:
     """Return the predictions (S, m) of each custom sensor for a motion (T, n, 3) [m] at the
     samples, without nuisance parameters.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    positions_m : (T, n, 3) array
-        Node positions at its samples [m].
-    reactions : (ReactionGrid, ReactionForces)
-        Reaction forces of the motion, and their times.
-    ideal : NuisanceMap
-        Nuisance map without parameters.
     """
     readings = custom_sensor_residuals(
         experiment, experiment.t_s, grid=reactions[0], nuisance=ideal
     )
-    motion = ObservedMotion(
-        positions_m.reshape(len(positions_m), -1), reactions[1]
-    )
+    motion = ObservedMotion(positions_m.reshape(len(positions_m), -1), reactions[1])
     return tuple(
-        reading.without_padding(
-            reading.predict_motion(motion, np.zeros(ideal.size))
-        )
+        reading.without_padding(reading.predict_motion(motion, np.zeros(ideal.size)))
         for reading in readings
     )
 
 
-def with_wrenches(
-    experiment: Experiment, wrenches: Sequence[Array]
-) -> Experiment:
+def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
     """Return the experiment with other samples (S, 6) [N, N m] of its force–torque sensors, one
     array for each grasp that has one, in the order of the grasps.
 
@@ -412,9 +362,7 @@ def with_wrenches(
     ValueError
         If the number of arrays is not that of the sensors.
     """
-    instrumented = [
-        k for k, g in enumerate(experiment.grasps) if g.wrench is not None
-    ]
+    instrumented = [k for k, g in enumerate(experiment.grasps) if g.wrench is not None]
     grasps = [*experiment.grasps]
     for k, values in zip(instrumented, wrenches, strict=True):
         sensor = grasps[k].wrench
@@ -423,9 +371,7 @@ def with_wrenches(
     return replace(experiment, grasps=grasps)
 
 
-def with_readings(
-    experiment: Experiment, values: Sequence[ArrayLike]
-) -> Experiment:
+def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experiment:
     """Return the experiment with other samples (S, m) of its custom sensors, one array for each, in
     their order.
 
@@ -441,9 +387,7 @@ def with_readings(
             f"for each sensor: {names or 'none'}"
         )
     pairs = zip(experiment.readings, values, strict=True)
-    return replace(
-        experiment, readings=[replace(g, values=v) for g, v in pairs]
-    )
+    return replace(experiment, readings=[replace(g, values=v) for g, v in pairs])
 
 
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
@@ -457,6 +401,4 @@ def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
             f"expected {experiment.markers.positions_m.shape}"
         )
     markers = experiment.markers
-    return replace(
-        experiment, markers=markers.with_samples(markers.t_s, tracks)
-    )
+    return replace(experiment, markers=markers.with_samples(markers.t_s, tracks))

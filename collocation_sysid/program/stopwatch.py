@@ -64,9 +64,7 @@ class Stopwatch:
             with self._adding:
                 setattr(self, kind, getattr(self, kind) + self.clock() - began)
 
-    def add(
-        self, build: float, evaluations: float, linear_algebra: float
-    ) -> None:
+    def add(self, build: float, evaluations: float, linear_algebra: float) -> None:
         """Add times measured by another stopwatch [s] to the attributes of the same names, in
         place.
         """
@@ -77,11 +75,7 @@ class Stopwatch:
 
     def read_and_reset(self) -> ComputingTimes:
         """Return the accumulated times and reset all three to zero."""
-        spent = ComputingTimes(
-            self.build,
-            self.evaluations,
-            linear_algebra=self.linear_algebra,
-        )
+        spent = ComputingTimes(self.build, self.evaluations, linear_algebra=self.linear_algebra)
         self.build = self.evaluations = self.linear_algebra = 0.0
         return spent
 

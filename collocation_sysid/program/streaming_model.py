@@ -28,10 +28,7 @@ from .markers.marker_residual import NEIGHBOURS, MarkerResidual
 from .measurement_residual import MeasurementResidual
 from .observables import PointPositions
 from .reactions.grasp_reactions import DELAY_STEPS, Sensor
-from .reactions.reaction_resultant import (
-    TIMES_PER_SAMPLE,
-    ReactionResultant,
-)
+from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionResultant
 from .sweep import Sweep
 from .transcription import Transcription
 
@@ -74,11 +71,7 @@ class StreamStencil(NamedTuple):
         number, needs for every clock error; none before `first`.
         """
         begins, ends = (
-            max(
-                int(np.floor(at + off + ROW_TOLERANCE))
-                - (self.neighbours - 1) // 2,
-                self.first,
-            )
+            max(int(np.floor(at + off + ROW_TOLERANCE)) - (self.neighbours - 1) // 2, self.first)
             for off in (-self.clock_error, self.clock_error)
         )
         return range(begins, ends + self.neighbours)
@@ -144,9 +137,7 @@ class StreamingModel:
     collocation: Collocation
 
     @classmethod
-    def from_collocation(
-        cls, experiment: Experiment, collocation: Collocation
-    ) -> StreamingModel:
+    def from_collocation(cls, experiment: Experiment, collocation: Collocation) -> StreamingModel:
         """Return the model of an experiment that is fitted by a program.
 
         Parameters
@@ -157,17 +148,14 @@ class StreamingModel:
         collocation : Collocation
             Program of this experiment, in which every parameter has a guess; its options are used.
         """
-        still = replace(
-            collocation,
-            experiments=[_still_experiment(experiment, collocation)],
-        )
+        still = replace(collocation, experiments=[_still_experiment(experiment, collocation)])
         return cls(experiment, still)
 
     def at_start(self, poses: Poses) -> Experiment:
         """Return the still recording with its grasps at these poses, one (rotation, position) for
         each grasp.
         """
-        still = self.segment.experiment
+        still = self.transcription.experiment
         return replace(still, grasps=_grasps_at(still, poses))
 
     def with_marker_places(self, tracks_m: Array, x: Array) -> StreamingModel:
@@ -181,45 +169,39 @@ class StreamingModel:
         x : (3n,)
             Node positions of the start [m].
         """
-        unknown = ~self.segment.experiment.markers.located & np.isfinite(
-            tracks_m
-        ).all(axis=1)
+        unknown = ~self.transcription.experiment.markers.located & np.isfinite(tracks_m).all(axis=1)
         if not unknown.any():
             return self
-        places_m = self.segment.marker_places_m(
-            self.segment.compute_guess_phi()
-        )
+        places_m = self.transcription.marker_places_m(self.transcription.compute_guess_phi())
         nodes_m = x.reshape(-1, 3)
-        places_m[unknown] = self.segment.association.markers.places_of_points(
+        places_m[unknown] = self.transcription.association.markers.places_of_points(
             nodes_m, tracks_m[unknown]
         )
-        return replace(
-            self, collocation=self.collocation.with_marker_places([places_m])
-        )
+        return replace(self, collocation=self.collocation.with_marker_places([places_m]))
 
     @cached_property
-    def segment(self) -> Transcription:
+    def transcription(self) -> Transcription:
         """Transcription of the still recording."""
         return self.collocation.transcriptions[0]
 
     @cached_property
     def solver(self) -> Sweep:
         """Solver of the rows of the template."""
-        return Sweep(self.segment, self.template_rows)
+        return Sweep(self.transcription, self.template_rows)
 
     @cached_property
     def newton(self) -> NewtonSolver:
         """Newton solver for the start, and for rows whose grasp displacement is applied in
         parts.
         """
-        return NewtonSolver(self.segment.experiment, CAREFUL_OPTIONS)
+        return NewtonSolver(self.transcription.experiment, CAREFUL_OPTIONS)
 
     @cached_property
     def template_rows(self) -> int:
         """Number of rows of the template: those of the start, and those that are linearised
         together.
         """
-        return 2 * self.segment.dynamics.largest_lag + 2 + ROWS_PER_CHUNK
+        return 2 * self.transcription.dynamics.largest_lag + 2 + ROWS_PER_CHUNK
 
     @cached_property
     def parameter_count(self) -> int:
@@ -232,9 +214,7 @@ class StreamingModel:
         p (logarithms) at the guess.
         """
         free = self.collocation.parameters.free
-        places = np.flatnonzero(
-            [without_region(item.name) == GAMMA_M.name for item in free]
-        )
+        places = np.flatnonzero([without_region(item.name) == GAMMA_M.name for item in free])
         return places, self.collocation.guess_p[places]
 
     def transformed(self, p: Array) -> Array:
@@ -275,20 +255,13 @@ class StreamingModel:
         residual, slopes = self.collocation.prior_residuals(p)
         nq = self.collocation.nq
         transformed_values = self.transformed(p)
-        from_guess = (
-            p[:nq] - self.collocation.parameters.guess_q
-        ) / WEAK_PRIOR_DEVIATION
+        from_guess = (p[:nq] - self.collocation.parameters.guess_q) / WEAK_PRIOR_DEVIATION
         rows = np.vstack(
-            [
-                np.diag(slopes),
-                np.eye(nq, self.parameter_count) / WEAK_PRIOR_DEVIATION,
-            ]
+            [np.diag(slopes), np.eye(nq, self.parameter_count) / WEAK_PRIOR_DEVIATION]
         ) / self.transformation_derivatives(transformed_values)
         empty = SquareRootInformation.empty(self.parameter_count)
         return empty.with_rows(
-            np.concatenate([residual, from_guess]),
-            rows,
-            parameters=transformed_values,
+            np.concatenate([residual, from_guess]), rows, parameters=transformed_values
         )
 
     @cached_property
@@ -296,9 +269,7 @@ class StreamingModel:
         """Number of samples before, and after, one marker sample that its evaluation needs; 0 if no
         clock is estimated.
         """
-        return (
-            NEIGHBOURS // 2 if len(self.segment.nuisance.clock_indices) else 0
-        )
+        return NEIGHBOURS // 2 if len(self.transcription.nuisance.clock_indices) else 0
 
     @cached_property
     def marker_model(self) -> MarkerResidual:
@@ -306,18 +277,16 @@ class StreamingModel:
         the origin, with a quadratic loss.
         """
         neighbours = self.neighbouring_samples
-        markers = self.segment.experiment.markers
-        origin = markers.with_samples(
-            markers.t_s[:1], np.zeros((1, len(markers.names), 3))
-        )
+        markers = self.transcription.experiment.markers
+        origin = markers.with_samples(markers.t_s[:1], np.zeros((1, len(markers.names), 3)))
         rows = np.arange(2 * neighbours + 1)
-        segment = self.segment
+        transcription = self.transcription
         return MarkerResidual.from_markers(
             origin,
             rows,
-            nuisance=segment.nuisance,
-            association=segment.association.markers,
-            clock_samples=segment.association.clock_samples,
+            nuisance=transcription.nuisance,
+            association=transcription.association.markers,
+            clock_samples=transcription.association.clock_samples,
             preceding_times=neighbours,
         )
 
@@ -328,32 +297,24 @@ class StreamingModel:
         """
         instruments = []
         place = len(self.experiment.markers.names)
-        step_s = self.segment.dynamics.step_s
+        step_s = self.transcription.dynamics.step_s
         points = iter(self.observed_points)
-        for reading in (*self.segment.custom_sensors, *self.segment.sensors):
+        for reading in (*self.transcription.custom_sensors, *self.transcription.sensors):
             channel = reading.observable
-            is_custom = reading in self.segment.custom_sensors
+            is_custom = reading in self.transcription.custom_sensors
             stencil = StreamStencil(GAUGE_NEIGHBOURS)
             if isinstance(channel, ReactionResultant):
-                observable = [
-                    other for other, _ in self.reaction_sensors
-                ].index(channel)
-                stencil = stencil._replace(
-                    first=int(channel.known_rows[0]), delay=DELAY_STEPS
-                )
+                observable = [other for other, _ in self.reaction_sensors].index(channel)
+                stencil = stencil._replace(first=int(channel.known_rows[0]), delay=DELAY_STEPS)
                 if not is_custom:
                     clock_error = channel.compute_clock_limit_s() / step_s
-                    stencil = stencil._replace(
-                        neighbours=TIMES_PER_SAMPLE, clock_error=clock_error
-                    )
+                    stencil = stencil._replace(neighbours=TIMES_PER_SAMPLE, clock_error=clock_error)
             else:
                 points_of_sensor = next(points)
                 reading = replace(reading, observable=points_of_sensor)
                 observable = slice(place, place + points_of_sensor.vector_count)
                 place += points_of_sensor.vector_count
-            instruments.append(
-                StreamInstrument(reading, stencil, observable=observable)
-            )
+            instruments.append(StreamInstrument(reading, stencil, observable=observable))
         return tuple(instruments)
 
     @cached_property
@@ -361,10 +322,7 @@ class StreamingModel:
         """Largest number of rows that instruments need in addition to those of the markers; 0
         without instruments.
         """
-        spans = (
-            2 * each.stencil.clock_error + each.stencil.delay
-            for each in self.instruments
-        )
+        spans = (2 * each.stencil.clock_error + each.stencil.delay for each in self.instruments)
         return int(np.ceil(max(spans, default=0.0)))
 
     @cached_property
@@ -372,28 +330,19 @@ class StreamingModel:
         """Points that custom sensors observe, one entry for each custom sensor of points; those of
         grasps have none.
         """
-        still = self.segment.experiment
+        still = self.transcription.experiment
         gauges = [gauge for gauge in still.readings if gauge.grasp is None]
-        return tuple(
-            observed_points(still, gauge, rows=GAUGE_NEIGHBOURS)
-            for gauge in gauges
-        )
+        return tuple(observed_points(still, gauge, rows=GAUGE_NEIGHBOURS) for gauge in gauges)
 
     @cached_property
     def reaction_sensors(self) -> tuple[Sensor, ...]:
         """Resultants of reactions that sensors observe, each with the index of its grasp, from 0:
         those of force–torque sensors, then of custom sensors.
         """
-        channels = [reading.observable for reading in self.segment.residuals]
-        grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
-        resultants = (
-            channel
-            for channel in channels
-            if isinstance(channel, ReactionResultant)
-        )
-        return tuple(
-            (channel, grasps.index(id(channel.grasp))) for channel in resultants
-        )
+        channels = [reading.observable for reading in self.transcription.residuals]
+        grasps = [id(grasp) for grasp in self.transcription.experiment.grasps]
+        resultants = (channel for channel in channels if isinstance(channel, ReactionResultant))
+        return tuple((channel, grasps.index(id(channel.grasp))) for channel in resultants)
 
     @cached_property
     def moving_grasps(self) -> Index:
@@ -432,9 +381,7 @@ class StreamingModel:
         """Memory for the factor of a row, shared by all passes; None where factors allocate their
         own.
         """
-        return self.solver.factoriser.allocate(
-            1 + self.segment.body.is_unsymmetric
-        )
+        return self.solver.factoriser.allocate(1 + self.transcription.body.is_unsymmetric)
 
     @cached_property
     def linearisation_memory(self) -> Array:
@@ -442,23 +389,20 @@ class StreamingModel:
         each linearisation.
         """
         return np.empty(
-            (
-                ROWS_PER_CHUNK,
-                self.segment.dynamics.forces.body.linearisation_width,
-            )
+            (ROWS_PER_CHUNK, self.transcription.dynamics.forces.body.linearisation_width)
         )
 
     @cached_property
     def body_size_m(self) -> float:
         """Diagonal of the bounding box of the undeformed body [m]."""
-        return float(np.linalg.norm(np.ptp(self.segment.body.nodes_m, axis=0)))
+        return float(np.linalg.norm(np.ptp(self.transcription.body.nodes_m, axis=0)))
 
     def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
         """Return the undeformed positions H X (g, 3) [m] of the node of each of the g grasped dofs,
         H being the body's pose in the gripper, and their derivatives (g, 3, m) with respect to the
         nuisance parameters φ.
         """
-        return self.segment.prescribed_motion.displaced_nodes(phi)
+        return self.transcription.prescribed_motion.displaced_nodes(phi)
 
     def prescribed_positions(
         self, displaced_nodes: tuple[Array, Array], poses: Sequence[Poses]
@@ -473,19 +417,15 @@ class StreamingModel:
         poses : sequence of Poses
             For each of the K times, the poses of all grasps.
         """
-        rotations = np.array([[turn for turn, _ in each] for each in poses])[
-            :, *self._axes
-        ]
-        shifts = np.array([[shift for _, shift in each] for each in poses])[
-            :, *self._axes
-        ]
+        rotations = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
+        shifts = np.array([[shift for _, shift in each] for each in poses])[:, *self._axes]
         goal = np.einsum("kgj,gj->kg", rotations, displaced_nodes[0]) + shifts
         return goal, np.einsum("kgj,gjm->kgm", rotations, displaced_nodes[1])
 
     @cached_property
     def _axes(self) -> tuple[Index, Index]:
         """Index of the grasp and axis of each grasped dof, (g,) each."""
-        dofs = self.segment.prescribed_motion.dofs
+        dofs = self.transcription.prescribed_motion.dofs
         grasp = np.zeros_like(dofs)
         for k, each in enumerate(self.experiment.grasps):
             grasp[np.searchsorted(dofs, each.prescribed_dofs)] = k
@@ -494,7 +434,7 @@ class StreamingModel:
     @cached_property
     def stencils(self) -> StencilMatrices:
         """Stencil coefficients of all rows of the template."""
-        dynamics = self.segment.dynamics.truncated_to(self.template_rows)
+        dynamics = self.transcription.dynamics.truncated_to(self.template_rows)
         tables = dynamics.tables
         step_s = dynamics.step_s
         return StencilMatrices(
@@ -515,9 +455,7 @@ def _banded_matrix(table: Array) -> Array:
     return matrix
 
 
-def _still_experiment(
-    experiment: Experiment, collocation: Collocation
-) -> Experiment:
+def _still_experiment(experiment: Experiment, collocation: Collocation) -> Experiment:
     """Return the experiment as a few samples in which nothing moves: grasps at their first poses,
     markers at their first samples (zero for markers without any), and sensors at zero.
     """
@@ -529,9 +467,7 @@ def _still_experiment(
     first, _ = markers.first_samples
     tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
     gauges = [
-        replace(
-            g, t_s=t_s, values=np.zeros((count, g.measured_values.shape[1]))
-        )
+        replace(g, t_s=t_s, values=np.zeros((count, g.measured_values.shape[1])))
         for g in experiment.readings
     ]
     return replace(
@@ -561,9 +497,5 @@ def _grasps_at(experiment: Experiment, poses: Poses) -> list:
         matrix = np.eye(4)
         matrix[:3, :3] = turn
         matrix[:3, 3] = shift
-        grasps.append(
-            replace(
-                grasp, poses=PoseSequence.from_matrices([0.0], matrix[None])
-            )
-        )
+        grasps.append(replace(grasp, poses=PoseSequence.from_matrices([0.0], matrix[None])))
     return grasps

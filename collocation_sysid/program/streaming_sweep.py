@@ -28,10 +28,7 @@ from .forward.newton_solver import NewtonFailure, simulation_error
 from .forward.scheme_simulation import RowEquations, extrapolate, solve_row
 from .least_squares import SquareRootInformation
 from .measurement_residual import huber_as_least_squares, lagrange_weights
-from .observables import (
-    ObservableDerivatives,
-    ObservedMotion,
-)
+from .observables import ObservableDerivatives, ObservedMotion
 from .reactions.grasp_reactions import DELAY_STEPS, GraspReactions
 from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
 from .sweep import (
@@ -210,45 +207,33 @@ class StreamingSweep:
         self.transformed = model.transformed(p)
         self.rates = model.transformation_derivatives(self.transformed)
         collocation = model.collocation
-        segment = model.segment
-        self.segment = segment
+        transcription = model.transcription
+        self.transcription = transcription
         self.phi = p[collocation.nq :]
-        self.setting = segment.equations_at(p[: collocation.nq], self.phi)
+        self.setting = transcription.equations_at(p[: collocation.nq], self.phi)
         self.dynamics = self.setting.dynamics
         self.displaced_nodes = model.displaced_nodes(self.phi)
-        self.shape_functions = segment.markers.observable.shape_functions(
-            self.phi
-        )
+        self.shape_functions = transcription.markers.observable.shape_functions(self.phi)
         points_and_weights = [
             self.shape_functions,
-            *(
-                points.shape_functions(self.phi)
-                for points in model.observed_points
-            ),
+            *(points.shape_functions(self.phi) for points in model.observed_points),
         ]
         self._observables = tuple(
             np.concatenate(part)
-            for part in zip(
-                *((nodes, at.weights) for nodes, at in points_and_weights),
-                strict=True,
-            )
+            for part in zip(*((nodes, at.weights) for nodes, at in points_and_weights), strict=True)
         )
         self.longest_m = 0.0
-        self.grasped = segment.prescribed_motion.dofs
-        self.moving = segment.dynamic_parameters
-        self.sensed = segment.sensed_dofs
+        self.grasped = transcription.prescribed_motion.dofs
+        self.moving = transcription.dynamic_parameters
+        self.sensed = transcription.sensed_dofs
         self.count = 1 + len(self.moving)
         self.mass_kg = self.dynamics.mass.inertia_kg[0]
         # Loads are always there: what acts on one row acts on every one.
         self.forces = at_times(self.dynamics.forces, slice(1))
-        self._rows = (
-            {} if self.setting.mass_depends_on_parameters else model.cached_rows
-        )
+        self._rows = {} if self.setting.mass_depends_on_parameters else model.cached_rows
         self.information = prior_information
         state = (
-            self._initial_state()
-            if start is None or at is None
-            else self._moved_state(start, at)
+            self._initial_state() if start is None or at is None else self._moved_state(start, at)
         )
         self._resume(state)
 
@@ -259,14 +244,11 @@ class StreamingSweep:
         start.
         """
         rows = self.model.template_rows
-        dofs = self.segment.dof_count
+        dofs = self.transcription.dof_count
         empty = np.zeros((rows, dofs))
         node_loads = np.zeros((rows, len(self.grasped), self.count))
         reactions = GraspReactions.zeros(
-            rows,
-            len(self.sensed),
-            columns=self.count,
-            grasps=len(self.model.first_poses),
+            rows, len(self.sensed), columns=self.count, grasps=len(self.model.first_poses)
         )
         return SweepState(
             0,
@@ -304,42 +286,27 @@ class StreamingSweep:
         )
         memory = replace(memory, solutions=solutions, increments=increments)
         stored = [each for each, *_ in state.observed_rows]
-        columns_of_rows = np.empty(
-            (len(stored), self.segment.dof_count, self.count)
-        )
+        columns_of_rows = np.empty((len(stored), self.transcription.dof_count, self.count))
         columns_of_rows[..., 1:] = [each.columns for each in stored]
-        columns_of_rows[..., 0] = columns_of_rows[..., 1:] @ change + [
-            each.x for each in stored
-        ]
+        columns_of_rows[..., 0] = columns_of_rows[..., 1:] @ change + [each.x for each in stored]
         x = state.x.copy()
         known_rows = min(len(stored), state.end)
-        x[state.end - known_rows : state.end] = columns_of_rows[
-            len(stored) - known_rows :, :, 0
-        ]
+        x[state.end - known_rows : state.end] = columns_of_rows[len(stored) - known_rows :, :, 0]
         point_columns = self._at_points(columns_of_rows)
         point_columns[..., 1:] *= self.rates[moving]
         stored_rows = [
             StoredRow(self.transformed, w[:, 0], columns=k.columns)
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
-        all_resultants = np.array(
-            [resultants for *_, resultants in state.observed_rows]
-        )
+        all_resultants = np.array([resultants for *_, resultants in state.observed_rows])
         all_resultants[..., 0] += all_resultants[..., 1:] @ (
             (self.transformed - transformed) / old_rates
         )
         all_resultants[..., 1:] *= self.rates / old_rates
-        read = tuple(
-            zip(stored_rows, point_columns, all_resultants, strict=True)
-        )
+        read = tuple(zip(stored_rows, point_columns, all_resultants, strict=True))
         reactions = state.reactions.moved_to(step, factors)
         return replace(
-            state,
-            x=x,
-            force=force,
-            reactions=reactions,
-            last_rows=memory,
-            observed_rows=read,
+            state, x=x, force=force, reactions=reactions, last_rows=memory, observed_rows=read
         )
 
     def _resume(self, state: SweepState) -> None:
@@ -350,19 +317,14 @@ class StreamingSweep:
         self.force = state.force.copy()
         self.prescribed_columns = state.prescribed_columns.copy()
         grasped = None
-        if self.segment.nuisance.affects_grasps:
+        if self.transcription.nuisance.affects_grasps:
             grasped = PrescribedColumns.from_columns(
                 self.solver, self.grasped, columns=self.prescribed_columns
             )
-        self.columns = SweepColumns(
-            self.setting, self.count, has_step=True, prescribed=grasped
-        )
+        self.columns = SweepColumns(self.setting, self.count, has_step=True, prescribed=grasped)
         self.reactions = state.reactions.copy()
         self.forward = ForwardSubstitution(
-            self.solver,
-            self.columns,
-            last=state.last_rows,
-            grasp_forces=self.reactions.forces,
+            self.solver, self.columns, last=state.last_rows, grasp_forces=self.reactions.forces
         )
         most = (
             (2 * self.model.neighbouring_samples + LARGEST_SAMPLE_DELAY + 2)
@@ -396,9 +358,7 @@ class StreamingSweep:
 
     # Rows -------------------------------------------------------------------------------------
 
-    def advance(
-        self, poses: Sequence[Poses], guesses: Sequence[Array] = ()
-    ) -> list[StoredRow]:
+    def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> list[StoredRow]:
         """Compute further rows with given poses; return them for later passes.
 
         Fewer rows than given are computed if one is far from its initial guess: later guesses are
@@ -425,21 +385,15 @@ class StreamingSweep:
         poses = [self.model.all_poses(each) for each in poses]
         first = self._make_room(len(poses))
         count = len(poses)
-        goals, slopes = self.model.prescribed_positions(
-            self.displaced_nodes, poses
-        )
+        goals, slopes = self.model.prescribed_positions(self.displaced_nodes, poses)
         self.reactions.set_poses(first, poses)
-        self.prescribed_columns[
-            first : first + count, :, 1 + self.segment.nq :
-        ] = slopes
+        self.prescribed_columns[first : first + count, :, 1 + self.transcription.nq :] = slopes
         if first < self.dynamics.first_row:
             self.x[first] = self._start_positions(poses[0])
             self._count_rows(1)
             return self._store_rows([np.zeros(self.forward.shape)])
         for k, t in enumerate(range(first, first + count)):
-            self.x[t] = (
-                guesses[k] if guesses else self._extrapolate(t, poses[k])
-            )
+            self.x[t] = guesses[k] if guesses else self._extrapolate(t, poses[k])
             self.x[t, self.grasped] = goals[k]
         remaining = range(first, first + count)
         computed = []
@@ -466,11 +420,7 @@ class StreamingSweep:
                 is_careful = True
                 last_length = np.inf
             else:
-                self._fail(
-                    NewtonFailure(
-                        self.x[t], "Newton's steps do not get shorter"
-                    )
-                )
+                self._fail(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
             remaining = range(t, t + 1)
         return self._store_rows(computed)
 
@@ -485,12 +435,7 @@ class StreamingSweep:
         """
         surplus = self.end + count - self.model.template_rows
         if surplus > 0:
-            for each in (
-                self.x,
-                self.force,
-                self.prescribed_columns,
-                *self.reactions.arrays,
-            ):
+            for each in (self.x, self.force, self.prescribed_columns, *self.reactions.arrays):
                 each[:-surplus] = each[surplus:]
             self.end -= surplus
         return self.end
@@ -503,29 +448,19 @@ class StreamingSweep:
         if t == 0:
             return self._start_positions(poses)
         if t < 4:
-            return extrapolate(self.x[:t], np.zeros(self.segment.dof_count))
-        return (
-            4 * (self.x[t - 1] + self.x[t - 3])
-            - 6 * self.x[t - 2]
-            - self.x[t - 4]
-        )
+            return extrapolate(self.x[:t], np.zeros(self.transcription.dof_count))
+        return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
     def _start_positions(self, poses: Poses) -> Array:
         """Return the positions (3n,) of the initial state with grasps at given poses, which a
         Newton solve computes.
         """
-        goals_m = np.full(self.segment.dof_count, np.nan)
-        goals_m[self.grasped] = self.model.prescribed_positions(
-            self.displaced_nodes, [poses]
-        )[0][0]
+        goals_m = np.full(self.transcription.dof_count, np.nan)
+        goals_m[self.grasped] = self.model.prescribed_positions(self.displaced_nodes, [poses])[0][0]
         experiment = self.model.at_start(poses)
-        return initial_state(
-            experiment, self.forces, self.model.newton, prescribed_m=goals_m
-        )[0]
+        return initial_state(experiment, self.forces, self.model.newton, prescribed_m=goals_m)[0]
 
-    def _linearise(
-        self, here: range
-    ) -> tuple[Linearisation, tuple[Array, Array]]:
+    def _linearise(self, here: range) -> tuple[Linearisation, tuple[Array, Array]]:
         """Return forces with derivatives at the guessed rows `here` of the template, and the
         right-hand sides (R, F_R) of their columns, see `SweepColumns.right_hand_sides`.
 
@@ -561,9 +496,7 @@ class StreamingSweep:
             self._rows[t] = StencilRow.from_dynamics(self.dynamics, t)
         return self._rows[t]
 
-    def _solve_rows(
-        self, here: range, limit: float
-    ) -> tuple[list[Array], float | None]:
+    def _solve_rows(self, here: range, limit: float) -> tuple[list[Array], float | None]:
         """Take one Newton step in each row; return their columns (3n, 1 + m), and None if all
         corrections are accepted.
 
@@ -572,13 +505,6 @@ class StreamingSweep:
         accepted, because its correction is longer than the limit or its matrix is singular, the
         work stops; the last columns are then those of this row, its positions are unchanged, and
         the second value is the length of the correction [m], or NaN for a singular matrix.
-
-        Parameters
-        ----------
-        here : range
-            Indices of the rows in the template.
-        limit : float
-            Largest accepted correction [m].
         """
         solver = self.solver
         forward = self.forward
@@ -615,10 +541,7 @@ class StreamingSweep:
             length = float(np.abs(row_columns[:, 0]).max(initial=0.0))
             if not length <= limit:
                 self.forward = ForwardSubstitution(
-                    solver,
-                    self.columns,
-                    last=before,
-                    grasp_forces=self.reactions.forces,
+                    solver, self.columns, last=before, grasp_forces=self.reactions.forces
                 )
                 return solved, length
             self.longest_m = max(self.longest_m, length)
@@ -633,18 +556,11 @@ class StreamingSweep:
 
         The reactions are corrected, and observed quantities of these rows are appended to those
         stored, in place.
-
-        Parameters
-        ----------
-        columns : sequence of (3n, 1 + m) arrays
-            Columns of the last rows that have been counted, which `_solve_rows` returns.
         """
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
         all_columns[:, :, 0] = self.x[rows]
-        by_transformed = (
-            all_columns[:, :, 1:] / self.rates[self.moving]
-        ).astype(np.float32)
+        by_transformed = (all_columns[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
         pairs = zip(self.x[rows].copy(), by_transformed, strict=True)
         stored_rows = [StoredRow(self.transformed, *pair) for pair in pairs]
         self.reactions.apply_correction(rows, all_columns[:, self.sensed])
@@ -659,17 +575,16 @@ class StreamingSweep:
         return stored_rows
 
     def _observed_resultants(self, here: slice) -> Array:
-        """Return the reaction resultants of the sensors and their derivatives (rows, sensors, 6, 1 + P).
+        """Return the reaction resultants of the sensors and their derivatives (rows, sensors, 6, 1
+        + P).
 
         Index 0 of the last axis has the value [N, N m], the others the derivatives with respect to
-        p. At row k the resultant is that of `DELAY_STEPS` rows before. Rows before the first available
-        resultant are zero.
+        p. At row k the resultant is that of `DELAY_STEPS` rows before. Rows before the first
+        available resultant are zero.
         """
         sensors = self.model.reaction_sensors
         size = self.model.parameter_count
-        resultants = np.zeros(
-            (here.stop - here.start, len(sensors), 6, 1 + size)
-        )
+        resultants = np.zeros((here.stop - here.start, len(sensors), 6, 1 + size))
         if not sensors:
             return resultants
         first = max(here.start, int(sensors[0][0].known_rows[0]) + DELAY_STEPS)
@@ -679,17 +594,11 @@ class StreamingSweep:
         x = self.x[: here.stop, self.sensed]
         rows = np.arange(first, here.stop)
         reactions, channels = self.reactions.resultants(
-            sensors,
-            self.setting,
-            x=x,
-            weights=(stencils.w, stencils.s),
-            rows=rows,
+            sensors, self.setting, x=x, weights=(stencils.w, stencils.s), rows=rows
         )
         motion = ObservedMotion(x, reactions)
         for k, channel in enumerate(channels):
-            value, slopes = channel.linearise(
-                motion, self.phi, columns=self.moving, size=size
-            )
+            value, slopes = channel.linearise(motion, self.phi, columns=self.moving, size=size)
             sensor_resultants = resultants[first - here.start :, k]
             sensor_resultants[..., 0] = value.reshape(-1, 6)
             sensor_resultants[..., 1:] = slopes.by_common.reshape(-1, 6, size)
@@ -702,18 +611,11 @@ class StreamingSweep:
         nodes, weights = self._observables
         *rows, dofs, count = columns.shape
         at = columns.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
-        return np.einsum("ma,...maik->...mik", weights, at).reshape(
-            *rows, -1, count
-        )
+        return np.einsum("ma,...maik->...mik", weights, at).reshape(*rows, -1, count)
 
     def _solve_carefully(self, t: int, poses: Poses) -> Array:
         """Return the positions x_t (3n,) of row t by a full Newton solve, with the displacement of
         the grasp applied in parts if necessary.
-
-        Raises
-        ------
-        SimulationError
-            If the row cannot be solved.
         """
         if t == 0:
             return self._start_positions(poses)
@@ -736,18 +638,12 @@ class StreamingSweep:
         """
         model = self.model
         what = f"time step {self.row}"
-        time_s = (
-            self.row * model.experiment.timestep_s / model.collocation.substeps
-        )
-        raise simulation_error(
-            model.newton, failure, time_s=time_s, what=what
-        ) from failure
+        time_s = self.row * model.experiment.timestep_s / model.collocation.substeps
+        raise simulation_error(model.newton, failure, time_s=time_s, what=what) from failure
 
     # Readings ---------------------------------------------------------------------------------
 
-    def linearise_samples(
-        self, pairs: Sequence[tuple[Sample, int]]
-    ) -> list[LinearisedResidual]:
+    def linearise_samples(self, pairs: Sequence[tuple[Sample, int]]) -> list[LinearisedResidual]:
         """Return the linearised residuals of samples, in the order of `pairs`; the rows that they
         need must still be stored.
 
@@ -759,20 +655,14 @@ class StreamingSweep:
         """
         residuals: list[LinearisedResidual | None] = [None] * len(pairs)
         for of in {sample.instrument for sample, _ in pairs}:
-            positions = [
-                k
-                for k, (sample, _) in enumerate(pairs)
-                if sample.instrument == of
-            ]
+            positions = [k for k, (sample, _) in enumerate(pairs) if sample.instrument == of]
             samples = [pairs[k] for k in positions]
             pairs_of_instrument = (
                 self._instrument_residuals(of, samples)
                 if of
                 else (self._marker_residuals(*pair) for pair in samples)
             )
-            for k, (residual, slope) in zip(
-                positions, pairs_of_instrument, strict=True
-            ):
+            for k, (residual, slope) in zip(positions, pairs_of_instrument, strict=True):
                 slope /= self.rates
                 residuals[k] = LinearisedResidual(
                     residual - slope @ self.transformed, slope, instrument=of
@@ -786,34 +676,21 @@ class StreamingSweep:
         p.
 
         Residuals are in standard deviations, and NaN where the sample cannot be compared.
-
-        Parameters
-        ----------
-        of : int
-            Number of the instrument, counted from 1.
-        pairs : sequence of (Sample, int)
-            See `linearise_samples`.
         """
         model = self.model
         reading, stencil, observable = self.model.instruments[of - 1]
         at = [self.row - 1 - sample.rows_back - rows for sample, rows in pairs]
         needed_rows = range(
-            stencil.rows_of_sample(min(at)).start,
-            stencil.rows_of_sample(max(at)).stop,
+            stencil.rows_of_sample(min(at)).start, stencil.rows_of_sample(max(at)).stop
         )
         _, point_columns, resultants = zip(
-            *(self.read[k + stencil.delay - self.row] for k in needed_rows),
-            strict=True,
+            *(self.read[k + stencil.delay - self.row] for k in needed_rows), strict=True
         )
         step_s = model.experiment.timestep_s / model.collocation.substeps
         begins_s = float(model.experiment.t_s[0])
-        known_s, t_s = (
-            begins_s + step_s * np.array(rows) for rows in (needed_rows, at)
-        )
+        known_s, t_s = (begins_s + step_s * np.array(rows) for rows in (needed_rows, at))
         sensor = reading.with_samples(
-            known_s,
-            t_s,
-            measurements=np.array([sample.values for sample, _ in pairs]),
+            known_s, t_s, measurements=np.array([sample.values for sample, _ in pairs])
         )
         if isinstance(observable, slice):
             columns = self.moving
@@ -828,51 +705,29 @@ class StreamingSweep:
             values[..., 0], slopes, phi=self.phi, size=model.parameter_count
         )
         return zip(
-            np.where(sensor.compared_with(len(needed_rows)), residual, np.nan),
-            slope,
-            strict=True,
+            np.where(sensor.compared_with(len(needed_rows)), residual, np.nan), slope, strict=True
         )
 
-    def _marker_residuals(
-        self, reading: Sample, rows: int
-    ) -> tuple[Array, Array]:
+    def _marker_residuals(self, reading: Sample, rows: int) -> tuple[Array, Array]:
         """Return residuals (M, 3) of a marker sample, in standard deviations, and their derivatives
         (M, 3, P) with respect to p.
 
         Residuals of missing markers are NaN.
-
-        Parameters
-        ----------
-        reading : Sample
-            The sample.
-        rows : int
-            Number of rows that have been computed since the row after which it is evaluated.
         """
         model = self.model
         neighbours = self.model.neighbouring_samples
         markers = self.model.marker_model
         back = reading.rows_back + rows
-        backs = [
-            back - k * model.collocation.substeps
-            for k in range(-neighbours, neighbours + 1)
-        ]
+        backs = [back - k * model.collocation.substeps for k in range(-neighbours, neighbours + 1)]
         x, point_columns = (
-            np.array(part)
-            for part in zip(*map(self._interpolated_row, backs), strict=True)
+            np.array(part) for part in zip(*map(self._interpolated_row, backs), strict=True)
         )
         point_columns = point_columns[:, : 3 * len(self.shape_functions[0])]
         values = point_columns[..., 0].reshape(len(point_columns), -1, 3)
         slopes = markers.observable.derivatives_from(
-            x,
-            self.shape_functions,
-            columns=self.moving,
-            changes=point_columns[..., 1:],
+            x, self.shape_functions, columns=self.moving, changes=point_columns[..., 1:]
         )
-        since_s = (
-            (self.row - 1 - back)
-            / model.collocation.substeps
-            * model.experiment.timestep_s
-        )
+        since_s = (self.row - 1 - back) / model.collocation.substeps * model.experiment.timestep_s
         markers = markers.shifted(since_s)
         residual, slope = markers.linearise(
             values, slopes, phi=self.phi, size=model.parameter_count
@@ -885,26 +740,16 @@ class StreamingSweep:
 
         Column 0 of the points has the values [m], the others the derivatives. Between rows, four
         are interpolated by a cubic polynomial; times before the first stored row are extrapolated.
-
-        Parameters
-        ----------
-        back : float
-            How many rows before the last one. Within `ROW_TOLERANCE` of a whole number that row is
-            returned, or the first stored row if it is earlier.
         """
         nearest = round(back)
         last = len(self.read) - 1
         if abs(back - nearest) <= ROW_TOLERANCE or not last:
-            stored, point_columns, _ = self.read[
-                min(max(last - nearest, 0), last)
-            ]
+            stored, point_columns, _ = self.read[min(max(last - nearest, 0), last)]
             return stored.x, point_columns
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
         rows = [first + k for k in range(min(4, last + 1))]
         weights = lagrange_weights(back, rows)
-        stored, point_columns, _ = zip(
-            *(self.read[last - row] for row in rows), strict=True
-        )
+        stored, point_columns, _ = zip(*(self.read[last - row] for row in rows), strict=True)
         return np.tensordot(weights, [k.x for k in stored], 1), np.tensordot(
             weights, point_columns, 1
         )
@@ -916,9 +761,7 @@ class StreamingSweep:
         self.information = self.with_residuals(self.information, residuals)
 
     def with_residuals(
-        self,
-        known: SquareRootInformation,
-        residuals: Sequence[LinearisedResidual],
+        self, known: SquareRootInformation, residuals: Sequence[LinearisedResidual]
     ) -> SquareRootInformation:
         """Return the information `known` with linearised residuals added; missing numbers are
         skipped.
@@ -930,16 +773,8 @@ class StreamingSweep:
         at_zero = np.concatenate([each.at_zero for each in residuals])
         is_present = np.isfinite(at_zero)
         rows_present = is_present.any(axis=1)
-        slopes = np.concatenate([each.slope for each in residuals])[
-            rows_present
-        ]
+        slopes = np.concatenate([each.slope for each in residuals])[rows_present]
         is_present = is_present[rows_present]
-        residual = np.where(
-            is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0
-        )
-        rows, slopes = huber_as_least_squares(
-            residual, slopes, huber=self.model.collocation.huber
-        )
-        return known.with_rows(
-            rows[is_present], slopes[is_present], parameters=self.transformed
-        )
+        residual = np.where(is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0)
+        rows, slopes = huber_as_least_squares(residual, slopes, huber=self.model.collocation.huber)
+        return known.with_rows(rows[is_present], slopes[is_present], parameters=self.transformed)

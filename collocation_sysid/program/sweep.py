@@ -61,8 +61,8 @@ CHUNK_BYTES = 128e6
 # Largest number of time steps with skyline factors that are stored at a time. They reuse memory:
 # allocating it again costs half as much as a factorisation.
 LARGEST_CHUNK_ROWS = 16
-# Cost of a factorisation for each thread, in solutions, above which factors are reused in later time
-# steps: the reuse costs about one more solution, and the factorisations are not concurrent.
+# Cost of a factorisation for each thread, in solutions, above which factors are reused in later
+# time steps: the reuse costs about one more solution, and the factorisations are not concurrent.
 LEAST_COST_OF_FACTOR = 1.5
 # Number of earlier time steps from which the solution of the next one is extrapolated, and the
 # weights of their solutions, latest first, by the number of those that exist.
@@ -192,9 +192,7 @@ class PrescribedColumns:
     is_prescribed: NDArray[np.bool_]
 
     @classmethod
-    def from_columns(
-        cls, sweep: Sweep, dofs: Index, columns: Array
-    ) -> PrescribedColumns:
+    def from_columns(cls, sweep: Sweep, dofs: Index, columns: Array) -> PrescribedColumns:
         """Build the prescribed rows of dofs (g,) that change by `columns` (N, g, c) [m].
 
         A dof counts as prescribed at the times at which a grasp of `sweep` holds it; `columns` is
@@ -218,9 +216,7 @@ class PrescribedColumns:
         """Return the contribution (p_0 G + q_0 C) U_t (free, c) [N] of the prescribed changes U_t
         at a time step to the changes of the force on the free dofs; 0 if nothing changes.
         """
-        now = np.where(
-            self.is_prescribed[step.t, :, None], self.columns[step.t], 0.0
-        )
+        now = np.where(self.is_prescribed[step.t, :, None], self.columns[step.t], 0.0)
         # Columns of parameters that do not move grasps are zero.
         changed = np.flatnonzero(now.any(axis=0))
         if not len(changed):
@@ -229,9 +225,7 @@ class PrescribedColumns:
         q = step.row.q[0]
         force = np.zeros((len(sweep.free), self.columns.shape[-1]))
         skew = step.row.skew(0, step.skew, by_velocity_skew=step.rate_skew)
-        matrix = sweep.prescribed_block.extract(
-            p * step.by_position + q * step.by_velocity, skew
-        )
+        matrix = sweep.prescribed_block.extract(p * step.by_position + q * step.by_velocity, skew)
         force[:, changed] = matrix @ now[:, changed]
         return force
 
@@ -263,10 +257,7 @@ class SweepColumns:
 
     @classmethod
     def by_parameters(
-        cls,
-        sweep: Sweep,
-        equations: EquationsAtParameters,
-        x: Array | None = None,
+        cls, sweep: Sweep, equations: EquationsAtParameters, x: Array | None = None
     ) -> SweepColumns:
         """Build the columns of all parameters that change the motion
         (`Transcription.dynamic_parameters`), with the changes of grasps that depend on φ.
@@ -281,23 +272,17 @@ class SweepColumns:
             Positions [m]. If given, the feasibility step from x is prepended as column 0.
         """
         first = int(x is not None)
-        count = len(sweep.segment.dynamic_parameters)
+        count = len(sweep.transcription.dynamic_parameters)
         grasped = None
         if equations.prescribed.depends_on_phi:
             prescribed = equations.prescribed
             goals = prescribed.positions_m[: sweep.dynamics.row_count]
             columns = np.zeros((*goals.shape, first + count))
-            columns[..., first + sweep.segment.nq :] = prescribed.by_phi[
-                : len(goals)
-            ]
+            columns[..., first + sweep.transcription.nq :] = prescribed.by_phi[: len(goals)]
             if x is not None:
                 columns[..., 0] = np.nan_to_num(goals - x[:, prescribed.dofs])
-            grasped = PrescribedColumns.from_columns(
-                sweep, prescribed.dofs, columns=columns
-            )
-        return cls(
-            equations, first + count, has_step=x is not None, prescribed=grasped
-        )
+            grasped = PrescribedColumns.from_columns(sweep, prescribed.dofs, columns=columns)
+        return cls(equations, first + count, has_step=x is not None, prescribed=grasped)
 
     @classmethod
     def from_prescribed(
@@ -309,12 +294,7 @@ class SweepColumns:
         grasped = PrescribedColumns.from_columns(
             sweep, equations.prescribed.dofs, columns=changes_m
         )
-        return cls(
-            equations,
-            grasped.columns.shape[-1],
-            has_parameters=False,
-            prescribed=grasped,
-        )
+        return cls(equations, grasped.columns.shape[-1], has_parameters=False, prescribed=grasped)
 
     def right_hand_sides(
         self,
@@ -332,16 +312,12 @@ class SweepColumns:
             F_R: ∂F/∂p in the columns of parameters, otherwise zero.
         """
         count, size = acceleration.shape
-        right, force = (
-            np.zeros((count, k, self.count)) for k in (len(free), size)
-        )
+        right, force = (np.zeros((count, k, self.count)) for k in (len(free), size))
         if residual is not None:
             right[..., 0] = residual
         if self.has_parameters:
             first = int(self.has_step)
-            force[..., first:] = self.equations.force_derivatives(
-                rows, linearisation.by_theta
-            )
+            force[..., first:] = self.equations.force_derivatives(rows, linearisation.by_theta)
             right[..., first:] -= self.equations.inertia_derivatives(
                 rows, acceleration[:, free], dofs=free
             )
@@ -384,37 +360,22 @@ class Sweep:
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
         self.factorisation: Choice = factorisation
-        self.dynamics = transcription.dynamics.truncated_to(
-            rows or transcription.grid_times
-        )
-        self.segment = transcription
+        self.dynamics = transcription.dynamics.truncated_to(rows or transcription.grid_times)
+        self.transcription = transcription
         self.body = transcription.body
         self.pattern = transcription.experiment.sparsity
         self.free = transcription.free_dofs
         self.sensed = transcription.sensed_dofs
-        self.factoriser = Factoriser.cached(
-            self.pattern, self.free, choice=factorisation
-        )
+        self.factoriser = Factoriser.cached(self.pattern, self.free, choice=factorisation)
         self.matrix = Submatrix(self.pattern, self.free)
         self.prescribed_block = Submatrix(
-            self.pattern,
-            self.free,
-            columns=transcription.prescribed_motion.dofs,
+            self.pattern, self.free, columns=transcription.prescribed_motion.dofs
         )
         self.of_sensed = Submatrix(self.pattern, self.sensed)
-        self._has_temporary_grasps = bool(
-            self.dynamics.is_temporarily_prescribed.any()
-        )
+        self._has_temporary_grasps = bool(self.dynamics.is_temporarily_prescribed.any())
 
-    def __reduce__(
-        self,
-    ) -> tuple[type[Sweep], tuple[Transcription, int, None, Choice]]:
-        return Sweep, (
-            self.segment,
-            self.dynamics.row_count,
-            None,
-            self.factorisation,
-        )
+    def __reduce__(self) -> tuple[type[Sweep], tuple[Transcription, int, None, Choice]]:
+        return Sweep, (self.transcription, self.dynamics.row_count, None, self.factorisation)
 
     @one_blas_thread()
     def forward(
@@ -450,9 +411,7 @@ class Sweep:
         """
         sweep_columns = SweepColumns.by_parameters(self, equations, x=x)
         columns = np.zeros((*x.shape, sweep_columns.count))
-        grasp_forces = GraspForces.zeros(
-            len(x), len(self.sensed), columns=sweep_columns.count
-        )
+        grasp_forces = GraspForces.zeros(len(x), len(self.sensed), columns=sweep_columns.count)
         march = ForwardSubstitution(
             self,
             sweep_columns,
@@ -468,9 +427,7 @@ class Sweep:
             march.violation_n = known.violation_n
             march.indefinite = known.indefinite_count
             grasp_forces.copy_first_rows(known.grasp_forces)
-        for _ in march.iterate_rows(
-            x, 0 if known is None else len(known.step), out=columns
-        ):
+        for _ in march.iterate_rows(x, 0 if known is None else len(known.step), out=columns):
             pass
         return SweepResult(
             x,
@@ -483,10 +440,7 @@ class Sweep:
         )
 
     def sensitivities(
-        self,
-        x: Array,
-        equations: EquationsAtParameters,
-        grasp_forces: GraspForces | None = None,
+        self, x: Array, equations: EquationsAtParameters, grasp_forces: GraspForces | None = None
     ) -> Iterator[Array]:
         """Iterate over the sensitivities Z_t (3n, m) row by row, keeping only the last few rows in
         memory.
@@ -509,15 +463,11 @@ class Sweep:
             During the iteration, if the equations of a time step are singular or not finite.
         """
         return ForwardSubstitution(
-            self,
-            SweepColumns.by_parameters(self, equations),
-            grasp_forces=grasp_forces,
+            self, SweepColumns.by_parameters(self, equations), grasp_forces=grasp_forces
         ).iterate_rows(x)
 
     @one_blas_thread()
-    def backward(
-        self, x: Array, equations: EquationsAtParameters, gradient: Array
-    ) -> Array:
+    def backward(self, x: Array, equations: EquationsAtParameters, gradient: Array) -> Array:
         """Solve the adjoint equations c_xᵀ y = −`gradient` backward in time.
 
         Parameters
@@ -543,15 +493,11 @@ class Sweep:
         reach = self.dynamics.largest_lag
         free = self.free
         y = np.zeros_like(x)
-        remaining = -gradient[
-            :, free
-        ]  # what is left for the rows that are still to come
+        remaining = -gradient[:, free]  # what is left for the rows that are still to come
         histories = self.dynamics_at(equations).histories(x)
         later = deque[StencilRow](maxlen=reach)
         adjoints = [history.adjoint() for history in histories]
-        for chunk in self.chunks(
-            x, equations, backward=True, histories=histories
-        ):
+        for chunk in self.chunks(x, equations, backward=True, histories=histories):
             for step in reversed(chunk.steps):
                 t = step.t
                 row = step.row
@@ -568,28 +514,18 @@ class Sweep:
                 known[self.dynamics.is_temporarily_prescribed[t]] = 0
                 remaining[t] -= p[0] * by_state + q[0] * by_rate
                 if known.any():
-                    by_position = (
-                        self.matrix.extract(step.by_position, -step.skew)
-                        @ known
-                    )
+                    by_position = self.matrix.extract(step.by_position, -step.skew) @ known
                     remaining[t] -= p[0] * by_position
                     remaining[t] -= q[0] * (
-                        self.matrix.extract(step.by_velocity, -step.rate_skew)
-                        @ known
+                        self.matrix.extract(step.by_velocity, -step.rate_skew) @ known
                     )
                 # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left; the factor is of its negative.
                 right = self.without_prescribed(t, remaining[t])
                 y[t, free] = -self.solve(step, right, transposed=True)
                 force_weight = known + row.w[0] * y[t]
-                by_position = (
-                    self.matrix.extract(step.by_position, -step.skew)
-                    @ force_weight
-                )
+                by_position = self.matrix.extract(step.by_position, -step.skew) @ force_weight
                 by_position += by_state
-                by_velocity = (
-                    self.matrix.extract(step.by_velocity, -step.rate_skew)
-                    @ force_weight
-                )
+                by_velocity = self.matrix.extract(step.by_velocity, -step.rate_skew) @ force_weight
                 by_velocity += by_rate
                 for each in adjoints:
                     each.step_back(force_weight)
@@ -621,13 +557,8 @@ class Sweep:
 
     def estimate_chunk_bytes(self) -> int:
         """Return the memory of one chunk [bytes]."""
-        factor_bytes = (
-            self._estimate_factor_bytes() if self.reuses_factors else 0
-        )
-        return (
-            self.choose_chunk_rows() * self._estimate_step_bytes()
-            + factor_bytes
-        )
+        factor_bytes = self._estimate_factor_bytes() if self.reuses_factors else 0
+        return self.choose_chunk_rows() * self._estimate_step_bytes() + factor_bytes
 
     def _estimate_step_bytes(self) -> int:
         """Return the memory of one time step [bytes]: element results, and its factor or, where
@@ -657,9 +588,7 @@ class Sweep:
         """Whether factors have single precision and solutions are refined: those of large bodies in
         motion, whose masses make the matrices well conditioned.
         """
-        return (
-            not self.dynamics.is_static and self.factoriser.has_single_precision
-        )
+        return not self.dynamics.is_static and self.factoriser.has_single_precision
 
     @property
     def reuses_factors(self) -> bool:
@@ -679,8 +608,8 @@ class Sweep:
         transposed: bool = False,
         guess: Array | None = None,
     ) -> Array:
-        """Return the solution of the system of a time step for right-hand sides (free,) or (free, c),
-        in the same shape.
+        """Return the solution of the system of a time step for right-hand sides (free,) or (free,
+        c), in the same shape.
 
         Parameters
         ----------
@@ -748,16 +677,10 @@ class Sweep:
         """
         dynamics = self.dynamics_at(equations)
         xi, nu = dynamics.evaluation_states(x)
-        starts = range(
-            max(first, dynamics.first_row),
-            dynamics.row_count,
-            self.choose_chunk_rows(),
-        )
+        starts = range(max(first, dynamics.first_row), dynamics.row_count, self.choose_chunk_rows())
         sequence = (
             FactorSequence(
-                self.factoriser,
-                NodeRotation(self.free, self.pattern.size // 3),
-                accuracy=accuracy,
+                self.factoriser, NodeRotation(self.free, self.pattern.size // 3), accuracy=accuracy
             )
             if self.reuses_factors
             else None
@@ -767,21 +690,14 @@ class Sweep:
             for _ in range(self.choose_chunk_rows())
         ]
         for start in reversed(starts) if backward else starts:
-            here = slice(
-                start, min(start + self.choose_chunk_rows(), dynamics.row_count)
-            )
-            evaluations = slice(
-                start - dynamics.first_row, here.stop - dynamics.first_row
-            )
+            here = slice(start, min(start + self.choose_chunk_rows(), dynamics.row_count))
+            evaluations = slice(start - dynamics.first_row, here.stop - dynamics.first_row)
             with self.stopwatch.evaluating():
                 at = dynamics.forces_with_histories(histories, here).linearise(
                     xi[evaluations], nu[evaluations]
                 )
             with self.stopwatch.solving():
-                rows = [
-                    StencilRow.from_dynamics(dynamics, t)
-                    for t in range(start, here.stop)
-                ]
+                rows = [StencilRow.from_dynamics(dynamics, t) for t in range(start, here.stop)]
                 matrix = partial(
                     self._matrix,
                     rows=rows,
@@ -798,11 +714,7 @@ class Sweep:
                     )
                     if sequence is None
                     else [
-                        ReusedFactor(
-                            sequence,
-                            Matrix(*matrix(k)),
-                            points_m=points_m.reshape(-1, 3),
-                        )
+                        ReusedFactor(sequence, Matrix(*matrix(k)), points_m=points_m.reshape(-1, 3))
                         for k, points_m in enumerate(xi[evaluations])
                     ]
                 )
@@ -827,26 +739,7 @@ class Sweep:
         buffers: Sequence[FactorMemory | None] = (),
         accuracy: float = ACCURACY,
     ) -> list[Factor]:
-        """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads.
-
-        Parameters
-        ----------
-        matrix : callable
-            Matrix of row k of them, see `_matrix`.
-        count : int
-            Number of rows.
-        time_s : float
-            Time of the first row, for the error [s].
-        buffers : sequence of FactorMemory or None
-            Memory that the factors reuse, see `Factoriser.factorise_each`.
-        accuracy : float
-            Relative accuracy of solutions that are refined.
-
-        Raises
-        ------
-        SimulationError
-            If a matrix is singular or not finite.
-        """
+        """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads."""
         try:
             return self.factoriser.factorise_each(
                 matrix,
@@ -859,12 +752,10 @@ class Sweep:
         except np.linalg.LinAlgError as error:
             raise self._singular(error, time_s) from error
 
-    def _singular(
-        self, error: np.linalg.LinAlgError, time_s: float
-    ) -> SimulationError:
+    def _singular(self, error: np.linalg.LinAlgError, time_s: float) -> SimulationError:
         """Return the error for the user that the equations at a time [s] cannot be solved."""
         return SimulationError(
-            f"experiment '{self.segment.experiment.name}': the linearised equations of motion "
+            f"experiment '{self.transcription.experiment.name}': the linearised equations of motion "
             f"cannot be solved ({error}); check mass, units and grasps, or give other guesses",
             time_s,
         )
@@ -876,39 +767,22 @@ class Sweep:
         linearisation: Linearisation,
         is_prescribed: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
-        """Return the lower triangles (m,) of the symmetric and of the skew part of −∂c_t/∂x_t of row
-        k of some rows; the latter is empty if there is no such part.
+        """Return the lower triangles (m,) of the symmetric and of the skew part of −∂c_t/∂x_t of
+        row k of some rows; the latter is empty if there is no such part.
 
         A dof that a grasp prescribes for a part of the time has, at these times, only a diagonal
         entry of the mean size of the diagonal.
-
-        Parameters
-        ----------
-        k : int
-            Index of the row among them.
-        rows : list of StencilRow
-            Coefficients of each row.
-        linearisation : Linearisation
-            Derivatives of the forces at these rows alone.
-        is_prescribed : (rows, 3n) array of bool
-            Dofs that are prescribed for a part of the time, at each row.
         """
         pattern = self.pattern
         values = rows[k].block(
-            linearisation.by_position[k],
-            linearisation.by_velocity[k],
-            pattern=pattern,
+            linearisation.by_position[k], linearisation.by_velocity[k], pattern=pattern
         )
         skew = rows[k].skew_block(
-            linearisation.by_position_skew[k],
-            linearisation.by_velocity_skew[k],
+            linearisation.by_position_skew[k], linearisation.by_velocity_skew[k]
         )
         if is_prescribed[k].any():
             size = np.abs(values[pattern.diagonal]).mean()
-            removed = (
-                is_prescribed[k][pattern.rows]
-                | is_prescribed[k][pattern.columns]
-            )
+            removed = is_prescribed[k][pattern.rows] | is_prescribed[k][pattern.columns]
             values[removed] = 0
             values[pattern.diagonal[is_prescribed[k]]] = size
             if skew.size:
@@ -964,20 +838,15 @@ class ForwardSubstitution:
         reach = solver.dynamics.largest_lag
         self.shape = (size, columns.count)
         self._of_free = (len(solver.free), columns.count)
-        nothing = (
-            np.zeros(shape)
-            for shape in (self.shape, self._of_free, len(solver.free))
-        )
+        nothing = (np.zeros(shape) for shape in (self.shape, self._of_free, len(solver.free)))
         solutions, increments, forces = ((each,) * reach for each in nothing)
         last = last or ForwardState(solutions, increments, forces=forces)
         self.past = deque(last.solutions, maxlen=reach)
         self.past_increments = deque(last.increments, maxlen=reach)
         self.past_forces = deque(last.forces, maxlen=reach)
         # Also where these rows do not: they may be continued.
-        self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
-        self.internal_states: list[
-            MemoryForwardColumns | ForceForwardColumns
-        ] = []
+        self.weighs_past = bool(solver.transcription.dynamics.tables.w[:, 1:].any())
+        self.internal_states: list[MemoryForwardColumns | ForceForwardColumns] = []
         self._known = last.history_columns
 
     def copy_state(self) -> ForwardState:
@@ -986,14 +855,10 @@ class ForwardSubstitution:
             solutions=tuple(self.past),
             increments=tuple(self.past_increments),
             forces=tuple(self.past_forces),
-            history_columns=tuple(
-                each.columns for each in self.internal_states
-            ),
+            history_columns=tuple(each.columns for each in self.internal_states),
         )
 
-    def iterate_rows(
-        self, x: Array, done: int = 0, out: Array | None = None
-    ) -> Iterator[Array]:
+    def iterate_rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
         """Iterate over the solutions Y_t (3n, c) from row `done` on; the state is advanced in
         place.
 
@@ -1022,34 +887,23 @@ class ForwardSubstitution:
         known = self._known or [None] * len(histories)
         pairs = zip(histories, known, strict=True)
         self.internal_states = [
-            each.forward_columns(columns.input_derivatives, done, known=own)
-            for each, own in pairs
+            each.forward_columns(columns.input_derivatives, done, known=own) for each, own in pairs
         ]
         for t in range(done, first):  # the start is given
             for each in self.internal_states:
-                each.advance(
-                    partial(np.zeros, self.shape), partial(np.zeros, self.shape)
-                )
+                each.advance(partial(np.zeros, self.shape), partial(np.zeros, self.shape))
             start = np.zeros(self.shape)
             if columns.prescribed is not None:
                 columns.prescribed.write_into(t, start)
             self.past.appendleft(start)
             yield np.zeros(self.shape)
         for chunk in solver.chunks(
-            x,
-            setting,
-            first=done,
-            histories=histories,
-            accuracy=self.accuracy,
+            x, setting, first=done, histories=histories, accuracy=self.accuracy
         ):
             residual = None
             if columns.has_step:
-                residual = np.stack(
-                    [self._residual(s, acceleration[s.t]) for s in chunk.steps]
-                )
-                self.violation_n = max(
-                    self.violation_n, float(np.abs(residual).max(initial=0.0))
-                )
+                residual = np.stack([self._residual(s, acceleration[s.t]) for s in chunk.steps])
+                self.violation_n = max(self.violation_n, float(np.abs(residual).max(initial=0.0)))
             sides = columns.right_hand_sides(
                 chunk.rows,
                 chunk.linearisation,
@@ -1076,15 +930,11 @@ class ForwardSubstitution:
         force = solver.without_prescribed(step.t, step.force[solver.free])
         total = row.w[0] * force - (row.mass_kg * acceleration)[solver.free]
         if self.weighs_past:
-            total += weighted_sum_of_past(
-                row.w, self.past_forces, shape=force.shape
-            )
+            total += weighted_sum_of_past(row.w, self.past_forces, shape=force.shape)
             self.past_forces.appendleft(force)
         return solver.without_prescribed(step.t, total)
 
-    def solve_step(
-        self, step: FactorisedStep, right: Array, force: Array, out: Array
-    ) -> None:
+    def solve_step(self, step: FactorisedStep, right: Array, force: Array, out: Array) -> None:
         """Solve one row, store Y_t in `out`, and advance the state to the next row.
 
         Parameters
@@ -1107,12 +957,8 @@ class ForwardSubstitution:
         s = row.s
         mass = row.mass_kg.take(free)[:, None]
         if self.weighs_past:
-            right += weighted_sum_of_past(
-                w, self.past_increments, shape=self._of_free
-            )
-        right -= mass * weighted_sum_of_past(
-            s, self.past, shape=self.shape
-        ).take(free, axis=0)
+            right += weighted_sum_of_past(w, self.past_increments, shape=self._of_free)
+        right -= mass * weighted_sum_of_past(s, self.past, shape=self.shape).take(free, axis=0)
         for each in self.internal_states:
             force = force + each.force_columns()
         forced = force.take(free, axis=0)
@@ -1122,27 +968,20 @@ class ForwardSubstitution:
         solver.without_prescribed(t, right)
         solver.without_prescribed(t, forced)
         similar = self._similar_solution(step)
-        solution = solver.solve(
-            step, right + w[0] * forced, guess=self._guess(similar)
-        )
+        solution = solver.solve(step, right + w[0] * forced, guess=self._guess(similar))
         if isinstance(step.factor, ReusedFactor):
             self._deviations.appendleft(solution - similar)
         if self.weighs_past:
-            self.past_increments.appendleft(
-                (s[0] * mass * solution - right) / w[0]
-            )
+            self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
         out[free] = solution
         if prescribed is not None:
             prescribed.write_into(t, out)
         for each in self.internal_states:
             each.advance(
-                partial(self._stencil_sum, row.p, out),
-                partial(self._stencil_sum, row.q, out),
+                partial(self._stencil_sum, row.p, out), partial(self._stencil_sum, row.q, out)
             )
         if self.grasp_forces is not None:
-            self._store_grasp_forces(
-                self.grasp_forces, step, force=force, solution=out
-            )
+            self._store_grasp_forces(self.grasp_forces, step, force=force, solution=out)
         self.past.appendleft(out)
 
     def _similar_solution(self, step: FactorisedStep) -> Array | float:
@@ -1157,49 +996,29 @@ class ForwardSubstitution:
         return similar
 
     def _guess(self, similar: Array | float) -> Array | None:
-        """Return a guess (free, c) of the solution of the next row: the similar one, (free, c) or 0,
-        with the extrapolated deviations of the last rows from theirs; None if there are neither.
+        """Return a guess (free, c) of the solution of the next row: the similar one, (free, c) or
+        0, with the extrapolated deviations of the last rows from theirs; None if there are neither.
         """
         weights = EXTRAPOLATION[len(self._deviations)]
         terms = [
-            weight * deviation
-            for weight, deviation in zip(weights, self._deviations, strict=True)
+            weight * deviation for weight, deviation in zip(weights, self._deviations, strict=True)
         ]
         if isinstance(similar, float) and not terms:
             return None
         return np.asarray(sum(terms, start=similar))
 
     def _store_grasp_forces(
-        self,
-        grasp_forces: GraspForces,
-        step: FactorisedStep,
-        force: Array,
-        solution: Array,
+        self, grasp_forces: GraspForces, step: FactorisedStep, force: Array, solution: Array
     ) -> None:
         """Store the force F_t and its changes on the dofs of instrumented grasps in `grasp_forces`,
         in place.
-
-        Parameters
-        ----------
-        grasp_forces : GraspForces
-            Row t is overwritten.
-        step : FactorisedStep
-            Row t.
-        force : (3n, c) array
-            Changes of the force at fixed positions [N].
-        solution : (3n, c) array
-            Changes of x_t [m].
         """
         row = step.row
         dofs = self.solver.sensed
         matrix = self.solver.of_sensed
         grasp_forces.force[step.t] = step.force[dofs]
-        state, rate = (
-            self._stencil_sum(weights, solution) for weights in (row.p, row.q)
-        )
-        slopes = (
-            force[dofs] + matrix.extract(step.by_position, step.skew) @ state
-        )
+        state, rate = (self._stencil_sum(weights, solution) for weights in (row.p, row.q))
+        slopes = force[dofs] + matrix.extract(step.by_position, step.skew) @ state
         grasp_forces.changes[step.t] = (
             slopes + matrix.extract(step.by_velocity, step.rate_skew) @ rate
         )
@@ -1208,13 +1027,9 @@ class ForwardSubstitution:
         """Return Σ_i weights[i] Y_{t−i} (3n, c) with Y_t = `solution`: the change of ξ or ν of row
         t for the weights p or q.
         """
-        return weights[0] * solution + weighted_sum_of_past(
-            weights, self.past, shape=self.shape
-        )
+        return weights[0] * solution + weighted_sum_of_past(weights, self.past, shape=self.shape)
 
-    def _past_force(
-        self, step: FactorisedStep, row: StencilRow
-    ) -> Array | float:
+    def _past_force(self, step: FactorisedStep, row: StencilRow) -> Array | float:
         """Return the change of force G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i} of earlier rows, i ≥ 1,
         (free, c) [N], with as few products as possible; 0 if the row has no such lag.
         """
@@ -1226,10 +1041,7 @@ class ForwardSubstitution:
             block = row.p[i] * step.by_position
             block += row.q[i] * step.by_velocity
             return (
-                matrix.extract(
-                    block,
-                    row.skew(i, step.skew, by_velocity_skew=step.rate_skew),
-                )
+                matrix.extract(block, row.skew(i, step.skew, by_velocity_skew=step.rate_skew))
                 @ self.past[i - 1]
             )
         past = weighted_sum_of_past(row.q, self.past, shape=self.shape)

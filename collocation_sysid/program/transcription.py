@@ -1,7 +1,7 @@
 """Transcription of one experiment with its measurements at one association.
 
 A `Transcription` is a `MotionTranscription` with the measurement models, which depend on the
-association of the measurements with the body. `Collocation` concatenates the segments of all
+association of the measurements with the body. `Collocation` concatenates the transcriptions of all
 experiments; use a `Transcription` where one experiment is treated alone.
 """
 
@@ -22,11 +22,7 @@ from .correspondences import CorrespondenceResidual
 from .local_loss import LocalLoss
 from .markers.marker_residual import MarkerResidual
 from .measurement_residual import MeasurementResidual
-from .motion_transcription import (
-    MotionTranscription,
-    RowWeights,
-    WeightedHistory,
-)
+from .motion_transcription import MotionTranscription, RowWeights, WeightedHistory
 from .unlabelled_points import residuals_of_points
 
 
@@ -78,40 +74,27 @@ class Transcription(MotionTranscription):
         """All measurement models: markers, force–torque sensors, custom sensors, unlabelled
         points.
         """
-        return (
-            self.markers,
-            *self.sensors,
-            *self.custom_sensors,
-            *self.unlabelled,
-        )
+        return (self.markers, *self.sensors, *self.custom_sensors, *self.unlabelled)
 
     @cached_property
     def local_loss(self) -> LocalLoss:
         """Second derivatives of the loss by x and φ of those measurements that depend on few
-        positions (`local` observables with at least one point); resultants of reactions are not among them.
+        positions (`local` observables with at least one point); resultants of reactions are not
+        among them.
         """
-        pairs = (
-            (reading, reading.observable.local) for reading in self.residuals
-        )
+        pairs = ((reading, reading.observable.local) for reading in self.residuals)
         local = tuple(
-            (reading, points)
-            for reading, points in pairs
-            if points and points.vector_count
+            (reading, points) for reading, points in pairs if points and points.vector_count
         )
         return LocalLoss(
-            local,
-            self.variable_count,
-            nuisance_count=self.nuisance.size,
-            dof_count=self.dof_count,
+            local, self.variable_count, nuisance_count=self.nuisance.size, dof_count=self.dof_count
         )
 
     @cached_property
     def _loss_scale(self) -> Array:
         """Factor from SI units to scaled variables of each entry of the loss's Hessian."""
         rows, columns = self.local_loss.structure
-        powers = (rows < self.variable_count).astype(float) + (
-            columns < self.variable_count
-        )
+        powers = (rows < self.variable_count).astype(float) + (columns < self.variable_count)
         return self.length_m**powers
 
     # The association of the measurements ----------------------------------------------------
@@ -127,9 +110,7 @@ class Transcription(MotionTranscription):
         vars(other).update(cached_values(self, MotionTranscription))
         return other
 
-    def follow_estimates(
-        self, phi: Array, x: Array
-    ) -> tuple[Association, Array]:
+    def follow_estimates(self, phi: Array, x: Array) -> tuple[Association, Array]:
         """Return the association that belongs to the estimates, and φ relative to it.
 
         Markers get the elements that contain their estimated places, clocks the nearest samples,
@@ -153,8 +134,7 @@ class Transcription(MotionTranscription):
         nuisance = self.nuisance
         places = self.markers.observable.coordinate_parameters
         shifts_s = (
-            phi[nuisance.indices_of_rows(TIME)]
-            * nuisance.scales[nuisance.indices_of_rows(TIME)]
+            phi[nuisance.indices_of_rows(TIME)] * nuisance.scales[nuisance.indices_of_rows(TIME)]
         )
         markers, place_coordinates = self.association.markers.follow_estimates(
             np.append(phi, 0.0)[places]
@@ -168,9 +148,7 @@ class Transcription(MotionTranscription):
             is_same = updated is residual.correspondences
             correspondences.append(present if is_same else updated)
         association = self.association.updated(
-            markers,
-            float(shifts_s.sum()) / self.experiment.timestep_s,
-            correspondences,
+            markers, float(shifts_s.sum()) / self.experiment.timestep_s, correspondences
         )
         return association, self._with_marker_places(phi, place_coordinates)
 
@@ -203,15 +181,12 @@ class Transcription(MotionTranscription):
         """
         phi = phi.copy()
         aligned = tuple(
-            each.aligned_correspondences(x, phi, only_pose=only_poses)
-            for each in self.reassociable
+            each.aligned_correspondences(x, phi, only_pose=only_poses) for each in self.reassociable
         )
         for correspondences in aligned:
             phi = correspondences.with_start_values(phi)
-        chart, phi = self._place_markers(phi, x)
-        return (
-            replace(chart, correspondences=aligned) if aligned else chart
-        ), phi
+        association, phi = self._place_markers(phi, x)
+        return (replace(association, correspondences=aligned) if aligned else association), phi
 
     def _place_markers(self, phi: Array, x: Array) -> tuple[Association, Array]:
         """Return the association and φ (k,) with unknown marker places initialised from rows x
@@ -227,9 +202,7 @@ class Transcription(MotionTranscription):
         points_m, _ = markers.first_samples
         first = rows[markers.is_present.argmax(axis=0)]
         places_m = self.marker_places_m(phi)
-        unknown = (
-            ~markers.located & (first < len(x)) & markers.is_present.any(axis=0)
-        )
+        unknown = ~markers.located & (first < len(x)) & markers.is_present.any(axis=0)
         for row in np.unique(first[unknown]):
             starting = np.flatnonzero(unknown & (first == row))
             places_m[starting] = self.association.markers.places_of_points(
@@ -237,10 +210,8 @@ class Transcription(MotionTranscription):
             )
         if not unknown.any():
             return self.association, phi
-        chart = self.association.centred_at(places_m)
-        return chart, self._with_marker_places(
-            phi, chart.markers.centre_coordinates
-        )
+        association = self.association.centred_at(places_m)
+        return association, self._with_marker_places(phi, association.markers.centre_coordinates)
 
     def count_rows_to_place(self) -> int:
         """Return the number of rows of x that `place_unknown_markers` needs; 0 if all places are
@@ -248,18 +219,12 @@ class Transcription(MotionTranscription):
         """
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.is_present[:, unknown].argmax(axis=0)
-        rows = (
-            [int(self.markers.observable.rows[first].max())]
-            if len(first)
-            else []
-        )
-        return 1 + max(
-            rows + [each.first_row for each in self.reassociable], default=-1
-        )
+        rows = [int(self.markers.observable.rows[first].max())] if len(first) else []
+        return 1 + max(rows + [each.first_row for each in self.reassociable], default=-1)
 
     def count_rows_to_follow(self) -> int:
-        """Return the number of rows of x that `follow_estimates` needs: all grid times, or 0 without
-        unlabelled points.
+        """Return the number of rows of x that `follow_estimates` needs: all grid times, or 0
+        without unlabelled points.
         """
         return self.grid_times if self.reassociable else 0
 
@@ -282,21 +247,17 @@ class Transcription(MotionTranscription):
         )
         for each in self.reassociable:
             phi = each.correspondences.with_start_values(phi)
-        return self._with_marker_places(
-            phi, self.association.markers.centre_coordinates
-        )
+        return self._with_marker_places(phi, self.association.markers.centre_coordinates)
 
-    def _with_marker_places(
-        self, phi: Array, place_coordinates: Array
-    ) -> Array:
+    def _with_marker_places(self, phi: Array, place_coordinates: Array) -> Array:
         """Return a copy of φ (k,) with other coordinates of the estimated marker places, from
         `place_coordinates` (M, k') of all markers.
         """
         updated = phi.copy()
         estimated = self.association.markers.estimated
-        updated[self.markers.observable.coordinate_parameters[estimated]] = (
-            place_coordinates[estimated]
-        )
+        updated[self.markers.observable.coordinate_parameters[estimated]] = place_coordinates[
+            estimated
+        ]
         return updated
 
     # Second derivatives -----------------------------------------------------------------------
@@ -312,8 +273,8 @@ class Transcription(MotionTranscription):
         lifted_histories: Sequence[WeightedHistory] = (),
         has_observation_curvature: bool = True,
     ) -> tuple[Array, list[Array]]:
-        """Second derivatives of loss_weight · loss + multipliers · c of this segment, in scaled
-        variables.
+        """Second derivatives of loss_weight · loss + multipliers · c of this transcription, in
+        scaled variables.
 
         The priors of φ are included for those φ that no earlier experiment has, and the priors of q
         are not.
@@ -357,15 +318,11 @@ class Transcription(MotionTranscription):
         of_loss = (
             loss_weight
             * self._loss_scale
-            * self.local_loss.hessian(
-                x, phi, has_observation_curvature=has_observation_curvature
-            )
+            * self.local_loss.hessian(x, phi, has_observation_curvature=has_observation_curvature)
         )
         return by_q, [of_loss, *of_constraints]
 
-    def additional_hessian_entries(
-        self, first_phi: int
-    ) -> list[tuple[Index, Index]]:
+    def additional_hessian_entries(self, first_phi: int) -> list[tuple[Index, Index]]:
         """Return rows and columns in z of the Hessian's entries besides those of `hessian` and of q
         with q, upper triangle.
 

@@ -25,9 +25,7 @@ from .depth.visible_surface import VisibleSurface
 SensorModels = tuple[DepthCameraModel, ...]
 
 
-def sensor_models(
-    experiment: Experiment, nuisance: NuisanceMap
-) -> SensorModels:
+def sensor_models(experiment: Experiment, nuisance: NuisanceMap) -> SensorModels:
     """Return the models of all sensors that measure unlabelled points, in the order of their
     correspondences; they do not depend on these.
 
@@ -50,9 +48,7 @@ def declared_points(experiment: Experiment) -> list[object]:
     return [*experiment.depths]
 
 
-def initial_correspondences(
-    experiment: Experiment,
-) -> tuple[Correspondences, ...]:
+def initial_correspondences(experiment: Experiment) -> tuple[Correspondences, ...]:
     """Return the correspondences of each sensor with the undeformed body in its grasps, after an
     alignment of the sensor; empty without unlabelled measurements.
     """
@@ -65,10 +61,7 @@ def initial_correspondences(
         shapes_m = experiment.rigid_positions(camera.depth.sample_times_s)
         correspondences.append(
             SurfaceCorrespondences.from_alignment(
-                camera,
-                experiment.body,
-                shapes_m=shapes_m[:, nodes],
-                phi=np.zeros(nuisance.size),
+                camera, experiment.body, shapes_m=shapes_m[:, nodes], phi=np.zeros(nuisance.size)
             )
         )
     return tuple(correspondences)
@@ -102,10 +95,7 @@ def residuals_of_points(
         assert isinstance(each, SurfaceCorrespondences)
         points.append(
             DepthResidual.from_correspondences(
-                each.with_camera(camera),
-                at_s,
-                nuisance=nuisance,
-                huber=huber,
+                each.with_camera(camera), at_s, nuisance=nuisance, huber=huber
             )
         )
     outlines = [

@@ -30,11 +30,7 @@ from .measurement_residual import (
     neighbouring_times,
 )
 from .observables import ObservedMotion, ReactionForces
-from .reactions.reaction_resultant import (
-    TIMES_PER_SAMPLE,
-    ReactionGrid,
-    ReactionResultant,
-)
+from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionGrid, ReactionResultant
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +78,7 @@ class WrenchResidual(MeasurementResidual):
         rows = (SENSOR_TIME, TARE)
         is_compared = (
             wrench.is_measured
-            & _is_covered(observable, wrench.t_s, known=observable.count)[
-                :, None
-            ]
+            & _is_covered(observable, wrench.t_s, known=observable.count)[:, None]
         )
         return cls(
             observable=observable,
@@ -95,9 +89,9 @@ class WrenchResidual(MeasurementResidual):
             sigmas=wrench.stack_sigmas()[[0, 3]],
             measured=wrench.values[:, None],
             is_compared=is_compared.reshape(-1, 2, 3),
-            own_parameters=np.concatenate(
-                [observable.parameter_indices(row) for row in rows]
-            )[None],
+            own_parameters=np.concatenate([observable.parameter_indices(row) for row in rows])[
+                None
+            ],
             wrench=wrench,
         )
 
@@ -118,10 +112,7 @@ class WrenchResidual(MeasurementResidual):
         """Return the number of grid times from which a sample is interpolated, if `known` are
         known: at most four, and two for equilibria.
         """
-        return min(
-            2 if self.observable.reaction_grid.is_static else TIMES_PER_SAMPLE,
-            known,
-        )
+        return min(2 if self.observable.reaction_grid.is_static else TIMES_PER_SAMPLE, known)
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
         """Return the stencil of all samples: the grid times around each, among the first `known`
@@ -142,8 +133,7 @@ class WrenchResidual(MeasurementResidual):
         """
         used = self._neighbour_count(self.observable.count)
         return _vector_indices(
-            np.arange(self.observable.count - used + 1)[:, None]
-            + np.arange(used)
+            np.arange(self.observable.count - used + 1)[:, None] + np.arange(used)
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
@@ -174,9 +164,7 @@ class WrenchResidual(MeasurementResidual):
 
     # Of reactions -----------------------------------------------------------------------------
 
-    def predict_reactions(
-        self, known_reactions: ReactionForces, phi: Array
-    ) -> Array:
+    def predict_reactions(self, known_reactions: ReactionForces, phi: Array) -> Array:
         """Return the prediction (S, 6) [N, N m] at φ (k,) from reaction forces at the observable's
         times; NaN for samples outside these times.
         """
@@ -185,31 +173,23 @@ class WrenchResidual(MeasurementResidual):
         if not len(values):
             return np.full(self.wrench.values.shape, np.nan)
         predicted = self.predict(values, phi).reshape(-1, 6)
-        return np.where(
-            self.is_covered(len(values))[:, None], predicted, np.nan
-        )
+        return np.where(self.is_covered(len(values))[:, None], predicted, np.nan)
 
     def on_grid(self, grid: ReactionGrid) -> WrenchResidual:
         """Return the model with reaction forces at the times of another grid, with a quadratic loss
         and names without suffix.
         """
-        return WrenchResidual.from_sensor(
-            replace(self.observable, reaction_grid=grid), self.wrench
-        )
+        return WrenchResidual.from_sensor(replace(self.observable, reaction_grid=grid), self.wrench)
 
     def with_wrench(self, wrench: Wrench) -> WrenchResidual:
         """Return the model of other samples, in their own frame and about their own point, with a
         quadratic loss and names without suffix.
         """
-        observable = replace(
-            self.observable, frame=wrench.frame, point_m=wrench.point_m
-        )
+        observable = replace(self.observable, frame=wrench.frame, point_m=wrench.point_m)
         return WrenchResidual.from_sensor(observable, wrench)
 
 
-def _is_covered(
-    observable: ReactionResultant, t_s: Array, known: int
-) -> NDArray[np.bool_]:
+def _is_covered(observable: ReactionResultant, t_s: Array, known: int) -> NDArray[np.bool_]:
     """Return the mask (S,) of the samples at times `t_s` (S,) [s] that lie within the first `known`
     times of the observable for any admissible shift of the clock; all false if none are known.
     """
@@ -218,9 +198,7 @@ def _is_covered(
     first, last = observable.t_s[[0, known - 1]]
     rounding = 1e-6 * observable.reaction_grid.step_s + TIME_TOLERANCE_S
     limit_s = observable.compute_clock_limit_s()
-    return (t_s >= first + limit_s - rounding) & (
-        t_s <= last - limit_s + rounding
-    )
+    return (t_s >= first + limit_s - rounding) & (t_s <= last - limit_s + rounding)
 
 
 def _vector_indices(times: Index) -> Index:
@@ -229,10 +207,7 @@ def _vector_indices(times: Index) -> Index:
 
 
 def wrench_residuals(
-    experiment: Experiment,
-    grid: ReactionGrid,
-    nuisance: NuisanceMap,
-    huber: float | None = None,
+    experiment: Experiment, grid: ReactionGrid, nuisance: NuisanceMap, huber: float | None = None
 ) -> tuple[WrenchResidual, ...]:
     """Build the measurement models of all grasps of an experiment that have a force–torque sensor,
     in the order of the grasps.
@@ -261,11 +236,7 @@ def wrench_residuals(
             nuisance=nuisance,
             number=number,
         )
-        models.append(
-            WrenchResidual.from_sensor(
-                channel, wrench, label=label, huber=huber
-            )
-        )
+        models.append(WrenchResidual.from_sensor(channel, wrench, label=label, huber=huber))
     return tuple(models)
 
 

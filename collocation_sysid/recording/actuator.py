@@ -9,15 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    ClassVar,
-    Generic,
-    NamedTuple,
-    Self,
-    TypeVar,
-)
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import casadi as ca
 
@@ -102,16 +94,16 @@ class Actuator(ABC, Generic[S]):
         """
         if self.body_measure is not None and self.body_measure.body is body:
             return self
-        return replace(
-            self, body_measure=BodyMeasure(body, self._measure_on(body))
-        )
+        return replace(self, body_measure=BodyMeasure(body, self._measure_on(body)))
 
     @abstractmethod
     def _measure_on(self, body: Body) -> S:
         """Return the scalar S of a body."""
 
     def require_measure(self) -> S:
-        """Return the scalar S of the body's shape; an `InputError` if the actuator is on no body yet."""
+        """Return the scalar S of the body's shape; an `InputError` if the actuator is on no body
+        yet.
+        """
         if self.body_measure is None:
             raise InputError(
                 f"{self.name} has not been placed on a body; use the one in the tendons or "
@@ -123,15 +115,9 @@ class Actuator(ABC, Generic[S]):
         """Return the stated calibration: factor and offset of the actuator, and zero for the
         logarithm of the ratio of its lag to the stated one.
         """
-        return Calibration(
-            self.factor,
-            offset=getattr(self, self.offset_field),
-            log_lag_ratio=0.0,
-        )
+        return Calibration(self.factor, offset=getattr(self, self.offset_field), log_lag_ratio=0.0)
 
-    def with_calibration(
-        self, factor: float, offset: float, log_lag_ratio: float
-    ) -> Self:
+    def with_calibration(self, factor: float, offset: float, log_lag_ratio: float) -> Self:
         """Return a copy of the actuator with another factor and offset; `log_lag_ratio` has no
         effect on an actuator without a lag.
         """
@@ -153,9 +139,7 @@ class Actuator(ABC, Generic[S]):
         return self.energy_amplitude(data, factor, offset=offset)
 
     @abstractmethod
-    def energy_amplitude(
-        self, declared_value: Any, factor: Any, offset: Any
-    ) -> Any:
+    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
         """Return the amplitude c for a stated tension or pressure `declared_value`, a factor on it
         and an offset that is lost: numbers, arrays or CasADi expressions.
         """
@@ -166,7 +150,5 @@ class Actuator(ABC, Generic[S]):
         """
         calibration = self.make_calibration()
         return self.energy_amplitude(
-            self.declared_values.values_at(t_s),
-            calibration.factor,
-            offset=calibration.offset,
+            self.declared_values.values_at(t_s), calibration.factor, offset=calibration.offset
         )

@@ -11,18 +11,10 @@ from ..common.array_types import Array
 from ..common.time_dependence import at_times
 from ..errors import InputError
 from .frame_times import evenly_sampled
-from .gap_interpolation import (
-    SAME_TIME_INTERVALS,
-    interpolate_without_gaps,
-    is_gap,
-)
+from .gap_interpolation import SAME_TIME_INTERVALS, interpolate_without_gaps, is_gap
 from .marker_files import MarkerTable
 from .poses import PoseSequence
-from .sample_times import (
-    STEP_TOLERANCE,
-    printed_rounding_s,
-    unrounded_s,
-)
+from .sample_times import STEP_TOLERANCE, printed_rounding_s, unrounded_s
 
 # Fewest samples of a motion: an acceleration needs three.
 _FEWEST_SAMPLES = 3
@@ -97,10 +89,7 @@ def align(
     table = table if window_s is None else _cut_to_window(table, window_s)
     grasp_intervals_s = grasp_intervals_s or [(-np.inf, np.inf)] * len(poses)
     table, notes = _cut_to_poses(
-        table,
-        poses,
-        grasp_intervals_s=grasp_intervals_s,
-        fewest=1 if static else _FEWEST_SAMPLES,
+        table, poses, grasp_intervals_s=grasp_intervals_s, fewest=1 if static else _FEWEST_SAMPLES
     )
     t_s = table.t_s
     if resample_hz is None and not static:
@@ -117,9 +106,7 @@ def align(
         table = MarkerTable(
             grid,
             table.names,
-            positions_m=interpolate_without_gaps(
-                grid, table.t_s, table.positions_m
-            ),
+            positions_m=interpolate_without_gaps(grid, table.t_s, table.positions_m),
         )
     moved = []
     for k, sequence in enumerate(poses):
@@ -141,21 +128,6 @@ def _cut_to_poses(
 ) -> tuple[MarkerTable, list[str]]:
     """Return the markers at times for which every active grasp has a pose, and notes on the cuts:
     an empty list, and the same table, if nothing is cut.
-
-    Parameters
-    ----------
-    table : MarkerTable
-    poses : sequence of PoseSequence
-        Poses of each grasp; a single pose holds for all time.
-    grasp_intervals_s : sequence of (float, float)
-        Time window of each grasp [s].
-    fewest : int
-        Smallest number of samples that must remain.
-
-    Raises
-    ------
-    InputError
-        If fewer samples remain after a cut; without a cut their number is not checked.
     """
     t_s = table.t_s
     is_inside = np.ones(len(t_s), dtype=bool)
@@ -178,16 +150,12 @@ def _cut_to_poses(
         raise InputError(
             f"poses run {spans}, markers {_span_text(t_s)}: they share {is_inside.sum()} marker "
             f"samples; expected at least {fewest}: check that both belong to the same recording "
-            "and use the same clock, and check window_s"
-            + _clock_remedy(moving[0][0].t_s, t_s)
+            "and use the same clock, and check window_s" + _clock_remedy(moving[0][0].t_s, t_s)
         )
     cut = t_s[is_inside]
     ends = [
         f"{length_s:.6g} s at the {end}"
-        for length_s, end in (
-            (cut[0] - t_s[0], "start"),
-            (t_s[-1] - cut[-1], "end"),
-        )
+        for length_s, end in ((cut[0] - t_s[0], "start"), (t_s[-1] - cut[-1], "end"))
         if length_s > 0
     ]
     note = (
@@ -200,24 +168,15 @@ def _cut_to_poses(
     return at_times(table, is_inside), [note]
 
 
-def _cut_to_window(
-    table: MarkerTable, window_s: tuple[float, float]
-) -> MarkerTable:
+def _cut_to_window(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
     """Return the samples of a table within a window, its first and last time [s] included.
 
     Times count as inside up to `STEP_TOLERANCE` median intervals beyond it.
-
-    Raises
-    ------
-    InputError
-        If there are none.
     """
     first_s, last_s = window_s
     steps = np.diff(table.t_s)
     slack_s = STEP_TOLERANCE * float(np.median(steps)) if steps.size else 0.0
-    is_inside = (table.t_s >= first_s - slack_s) & (
-        table.t_s <= last_s + slack_s
-    )
+    is_inside = (table.t_s >= first_s - slack_s) & (table.t_s <= last_s + slack_s)
     if not is_inside.any():
         raise InputError(
             f"window_s = [{first_s:g}, {last_s:g}] contains no marker sample; expected a window "
@@ -227,18 +186,10 @@ def _cut_to_window(
 
 
 def _even_grid(t_s: Array, rate_hz: float) -> Array:
-    """Return evenly spaced times at a rate [Hz] from the first time on, up to the last of `t_s`.
-
-    Raises
-    ------
-    InputError
-        If the rate is not positive, or leaves fewer than two times.
-    """
+    """Return evenly spaced times at a rate [Hz] from the first time on, up to the last of `t_s`."""
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise InputError(f"resample_hz is {rate_hz:g}; expected a rate above 0")
-    count = (
-        int(np.floor((t_s[-1] - t_s[0]) * rate_hz + SAME_TIME_INTERVALS)) + 1
-    )
+    count = int(np.floor((t_s[-1] - t_s[0]) * rate_hz + SAME_TIME_INTERVALS)) + 1
     if count < 2:
         raise InputError(
             f"resample_hz = {rate_hz:g} leaves one sample between {t_s[0]:.9g} s and "
@@ -247,23 +198,13 @@ def _even_grid(t_s: Array, rate_hz: float) -> Array:
     return t_s[0] + np.arange(count) / rate_hz
 
 
-def _poses_on_grid(
-    poses: PoseSequence, t_s: Array, grid: Array
-) -> PoseSequence | None:
+def _poses_on_grid(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | None:
     """Return poses whose samples at the marker times are moved onto the grid.
 
     Samples between these are moved by the interpolated shift. Samples before the first marker time
     are left out if a pose exists at that time, and samples after the last one likewise. Positions
     and rotations stay. A single pose, and poses with fewer than two marker times within their span,
     are returned unchanged; None if a marker time within the span has no pose within `_tolerance_s`.
-
-    Parameters
-    ----------
-    poses : PoseSequence
-    t_s : (T,) array
-        Marker times as recorded [s].
-    grid : (T,) array
-        The same times without rounding [s].
     """
     if len(poses.t_s) == 1:
         return poses
@@ -276,13 +217,9 @@ def _poses_on_grid(
     nearest = later - (times - poses.t_s[later - 1] < poses.t_s[later] - times)
     if (np.abs(poses.t_s[nearest] - times) > slack_s).any():
         return None
-    moved = poses.t_s + np.interp(
-        poses.t_s, times, grid[within] - poses.t_s[nearest]
-    )
+    moved = poses.t_s + np.interp(poses.t_s, times, grid[within] - poses.t_s[nearest])
     moved[nearest] = grid[within]
-    samples = slice(
-        nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None
-    )
+    samples = slice(nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None)
     return replace(
         poses,
         t_s=moved[samples],
@@ -299,9 +236,7 @@ def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
     for a single one, plus half the `printed_rounding_s` of the markers' and of the poses' times.
     """
     step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
-    return STEP_TOLERANCE * step_s + 0.5 * (
-        printed_rounding_s(t_s) + printed_rounding_s(poses.t_s)
-    )
+    return STEP_TOLERANCE * step_s + 0.5 * (printed_rounding_s(t_s) + printed_rounding_s(poses.t_s))
 
 
 def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
@@ -309,16 +244,8 @@ def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
     on gaps of the poses within the grid (see `gap_interpolation`); the caller adds the
     subject.
     """
-    how = (
-        "held"
-        if poses.interpolation == "hold"
-        else f"interpolated ({poses.interpolation})"
-    )
-    at = (
-        f"{_rate_hz(grid):.6g} Hz {_span_text(grid)}"
-        if len(grid) > 1
-        else _span_text(grid)
-    )
+    how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
+    at = f"{_rate_hz(grid):.6g} Hz {_span_text(grid)}" if len(grid) > 1 else _span_text(grid)
     note = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
     in_grid = (poses.t_s[1:] > grid[0]) & (poses.t_s[:-1] < grid[-1])
     gaps = np.flatnonzero(is_gap(poses.t_s) & in_grid)
@@ -338,9 +265,7 @@ def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
     """
     if poses.interpolation != "smooth":
         return []
-    at_s = poses.jumps_s[
-        (poses.jumps_s >= grid[0]) & (poses.jumps_s < grid[-1])
-    ]
+    at_s = poses.jumps_s[(poses.jumps_s >= grid[0]) & (poses.jumps_s < grid[-1])]
     if not at_s.size:
         return []
     others = f" and {at_s.size - 1} more times" if at_s.size > 1 else ""
@@ -359,9 +284,7 @@ def _clock_remedy(pose_times_s: Array, marker_times_s: Array) -> str:
     """Return the end of a message on poses and markers without a common time: the difference of
     their starts, for clocks with different zero points; "" if they overlap.
     """
-    overlap_s = min(pose_times_s[-1], marker_times_s[-1]) - max(
-        pose_times_s[0], marker_times_s[0]
-    )
+    overlap_s = min(pose_times_s[-1], marker_times_s[-1]) - max(pose_times_s[0], marker_times_s[0])
     if overlap_s > 0:
         return ""
     later_s = pose_times_s[0] - marker_times_s[0]

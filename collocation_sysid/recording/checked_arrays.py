@@ -13,10 +13,7 @@ from ..errors import InputError
 
 
 def read_only_floats(
-    values: ArrayLike,
-    shape: tuple[int | None, ...],
-    name: str,
-    finite: bool = True,
+    values: ArrayLike, shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Array:
     """Return a read-only float copy of an array whose shape has been checked.
 
@@ -42,9 +39,7 @@ def read_only_floats(
     _require_shape(array.shape, shape, name=name)
     if finite and not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise InputError(
-            f"{name}{list(index)} is {array[index]}; it must be a finite number"
-        )
+        raise InputError(f"{name}{list(index)} is {array[index]}; it must be a finite number")
     array.setflags(write=False)
     return array
 
@@ -75,9 +70,7 @@ def unconverted_or_none(values: ArrayLike | None) -> Array | None:
     return cast("Array | None", values)
 
 
-def read_only_tracks(
-    values: ArrayLike, shape: tuple[int | None, ...], name: str
-) -> Array:
+def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
     """Return a read-only copy of marker positions (T, M, 3).
 
     A sample with a coordinate that is not finite is missing: all three of its coordinates become
@@ -103,9 +96,7 @@ def read_only_tracks(
     return tracks
 
 
-def read_only_nodes(
-    values: ArrayLike, shape: tuple[int | None, ...], name: str
-) -> Index:
+def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Index:
     """Return a read-only int64 copy of node indices, whose shape must match `shape` (None: any
     length). Order and repeats are kept, and an empty array of any type is accepted.
 
@@ -123,9 +114,7 @@ def read_only_nodes(
     _require_shape(indices.shape, shape, name=name)
     nodes = indices.astype(np.int64)
     if nodes.size and nodes.min() < 0:
-        raise InputError(
-            f"{name} must hold node indices from 0 upwards, not {nodes.min()}"
-        )
+        raise InputError(f"{name} must hold node indices from 0 upwards, not {nodes.min()}")
     nodes.setflags(write=False)
     return nodes
 
@@ -135,20 +124,13 @@ def point_text(point: ArrayLike) -> str:
     return f"({', '.join(f'{x:.4g}' for x in np.asarray(point))})"
 
 
-def _require_shape(
-    shape: tuple[int, ...], expected: tuple[int | None, ...], name: str
-) -> None:
+def _require_shape(shape: tuple[int, ...], expected: tuple[int | None, ...], name: str) -> None:
     """Raise an `InputError` about `name` unless `shape` matches `expected`, in which None allows
     any length.
     """
     matches = len(shape) == len(expected) and all(
-        want is None or have == want
-        for have, want in zip(shape, expected, strict=True)
+        want is None or have == want for have, want in zip(shape, expected, strict=True)
     )
     if not matches:
-        expected_text = ", ".join(
-            "any" if want is None else str(want) for want in expected
-        )
-        raise InputError(
-            f"{name} has the shape {shape}; expected ({expected_text})"
-        )
+        expected_text = ", ".join("any" if want is None else str(want) for want in expected)
+        raise InputError(f"{name} has the shape {shape}; expected ({expected_text})")

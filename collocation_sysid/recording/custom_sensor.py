@@ -127,17 +127,15 @@ class Gauge(SeparateSensor):
     values: Array | None = key(converter=unconverted_or_none)
     sigma: float = key(Positive)
     points_m: Array = key(list[Vector], converter=unconverted, default=())
-    unknowns: Mapping[str, float] = key(
-        dict[str, Positive], default_factory=dict
-    )
+    unknowns: Mapping[str, float] = key(dict[str, Positive], default_factory=dict)
     grasp: int | None = key(AtLeastOne | None, converter=identity, default=None)
     frame: Frame = key(Frame, default="grasp")
     columns: Sequence[str] = key(list[Text], converter=identity, default=())
     unit: str = key(str, default="")
 
     def __post_init__(self) -> None:
-        """Check the sensor and complete it in place: `values` become (S, m) unless they are None, and
-        `columns` the name of the sensor, with _1, _2, … if m > 1, where none are given.
+        """Check the sensor and complete it in place: `values` become (S, m) unless they are None,
+        and `columns` the name of the sensor, with _1, _2, … if m > 1, where none are given.
         """
         where = f"the reading '{self.name}'"
         vars(self)["unknowns"] = self.unknowns or {}
@@ -149,62 +147,31 @@ class Gauge(SeparateSensor):
         )
         vars(self).update(t_s=times, points_m=points)
         if fault := first_unordered_time(times):
-            raise InputError(
-                f"{fault[1]} in t_s of {where}", where=f"row {fault[0] + 1}"
-            )
+            raise InputError(f"{fault[1]} in t_s of {where}", where=f"row {fault[0] + 1}")
         if (self.grasp is None) == (not len(points)):
-            both = (
-                "both points_m and grasp"
-                if len(points)
-                else "neither points_m nor grasp"
-            )
+            both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
             raise InputError(
                 f"{where} has {both}; expected exactly one of them, as the measured quantity"
             )
         count = self._count_of_values()
-        names = (
-            [f"{self.name}_{k + 1}" for k in range(count)]
-            if count > 1
-            else [self.name]
-        )
+        names = [f"{self.name}_{k + 1}" for k in range(count)] if count > 1 else [self.name]
         vars(self).update(
-            values=None
-            if self.values is None
-            else self._checked_values(self.values, count),
+            values=None if self.values is None else self._checked_values(self.values, count),
             columns=tuple(self.columns or names),
             _value_count=count,
         )
 
     def _checked_values(self, measured: ArrayLike, count: int) -> Array:
-        """Return the measured values as a read-only array (S, m), NaN where missing.
-
-        Parameters
-        ----------
-        measured : (S,) or (S, m) array
-            Measured values; NaN where missing.
-        count : int
-            Number m of values that the expression gives.
-
-        Raises
-        ------
-        InputError
-            If the values do not have S rows and m columns, or are infinite or all missing.
-        """
+        """Return the measured values as a read-only array (S, m), NaN where missing."""
         where = f"the reading '{self.name}'"
         samples = len(self.sample_times_s)
         columns = np.array(measured, dtype=float)
         columns = columns[:, None] if columns.ndim == 1 else columns
-        values = read_only_floats(
-            columns, (samples, None), name=f"values of {where}", finite=False
-        )
+        values = read_only_floats(columns, (samples, None), name=f"values of {where}", finite=False)
         if np.isinf(values).any():
-            raise InputError(
-                f"{where} holds an infinite value; expected numbers, NaN if missing"
-            )
+            raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
         if not np.isfinite(values).any():
-            raise InputError(
-                f"all values of {where} are missing; remove it, or check its file"
-            )
+            raise InputError(f"all values of {where} are missing; remove it, or check its file")
         if values.shape[1] != count:
             raise InputError(
                 f"the expression of {where} gives {count} numbers; expected {values.shape[1]}, as "
@@ -226,9 +193,7 @@ class Gauge(SeparateSensor):
     def measured_values(self) -> Array:
         """(S, m) measured values, NaN where missing; zeros if none were given."""
         if self.values is None:
-            return np.zeros(
-                (len(self.sample_times_s), vars(self)["_value_count"])
-            )
+            return np.zeros((len(self.sample_times_s), vars(self)["_value_count"]))
         return np.asarray(self.values)
 
     @property
@@ -240,12 +205,8 @@ class Gauge(SeparateSensor):
         """Return a copy with measurements after `end_s` [s] replaced by NaN; self if none would
         remain.
         """
-        values = np.where(
-            (self.sample_times_s > end_s)[:, None], np.nan, self.measured_values
-        )
-        return (
-            replace(self, values=values) if np.isfinite(values).any() else self
-        )
+        values = np.where((self.sample_times_s > end_s)[:, None], np.nan, self.measured_values)
+        return replace(self, values=values) if np.isfinite(values).any() else self
 
     # The expression ---------------------------------------------------------------------------
 
@@ -254,9 +215,7 @@ class Gauge(SeparateSensor):
         """Class of the quantities of which the expression is a function."""
         return PointQuantities if self.grasp is None else GraspQuantities
 
-    def read(
-        self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]
-    ) -> ca.SX:
+    def read(self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
         """Evaluate the expression of the sensor.
 
         Parameters
@@ -275,8 +234,7 @@ class Gauge(SeparateSensor):
             Predicted numbers.
         """
         read = self.expression(
-            self.quantities(t_s, *inputs),
-            **dict(zip(self.unknowns, unknowns, strict=True)),
+            self.quantities(t_s, *inputs), **dict(zip(self.unknowns, unknowns, strict=True))
         )
         if read is None:
             raise TypeError("the function returns None")
@@ -288,29 +246,17 @@ class Gauge(SeparateSensor):
         Rest means the undeformed places of the points without velocity and acceleration, or force
         and torque with all components one; unknowns are zero, and the time is that of the first
         sample.
-
-        Raises
-        ------
-        InputError
-            If the expression cannot be evaluated, or it or its Jacobian is not finite at rest.
         """
         points = np.asarray(self.points_m).T
         zero_rates = np.zeros_like(points)
         of_points = [points, zero_rates, zero_rates]
         rest = of_points if self.grasp is None else [np.ones(3), np.ones(3)]
-        observables = [
-            ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape)
-            for each in rest
-        ]
+        observables = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
         t_s = ca.SX.sym("t_s")
         own = ca.SX.sym("own", len(self.unknowns))
         names = [each.name for each in fields(self.quantities)]
         try:
-            read = self.read(
-                t_s,
-                observables,
-                unknowns=ca.vertsplit(own) if self.unknowns else [],
-            )
+            read = self.read(t_s, observables, unknowns=ca.vertsplit(own) if self.unknowns else [])
         except (Exception, SystemExit) as error:
             raise InputError(
                 f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
@@ -320,13 +266,8 @@ class Gauge(SeparateSensor):
             ) from error
         u = ca.veccat(*observables, own)
         slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
-        at_rest = np.concatenate(
-            [*(each.ravel("F") for each in rest), np.zeros(own.numel())]
-        )
-        if not all(
-            np.isfinite(e.full()).all()
-            for e in slopes(self.sample_times_s[0], at_rest)
-        ):
+        at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
+        if not all(np.isfinite(e.full()).all() for e in slopes(self.sample_times_s[0], at_rest)):
             raise InputError(
                 f"the reading '{self.name}' or its derivative is not finite for the body at rest; "
                 "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"

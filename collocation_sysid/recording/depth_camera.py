@@ -49,9 +49,7 @@ Background = Literal["auto", "empty", "unknown"]
 def _require_poses(poses: PoseSequence) -> PoseSequence:
     """Return `poses` unchanged; an `InputError` if it is no `PoseSequence`."""
     if not isinstance(poses, PoseSequence):
-        raise InputError(
-            f"poses of a camera is {type(poses).__name__}; expected a PoseSequence"
-        )
+        raise InputError(f"poses of a camera is {type(poses).__name__}; expected a PoseSequence")
     return poses
 
 
@@ -80,9 +78,7 @@ class DepthCamera:
     """
 
     matrix: Array | None = key(
-        tuple[Vector, Vector, Vector] | None,
-        converter=unconverted_or_none,
-        default=None,
+        tuple[Vector, Vector, Vector] | None, converter=unconverted_or_none, default=None
     )
     distortion: Array = key(list[Finite], converter=unconverted, default=())
     pose: Array = key(PoseMatrix | None, converter=unconverted, default=None)
@@ -92,35 +88,24 @@ class DepthCamera:
         """Check the camera, and store matrix, distortion and pose as read-only arrays, in place;
         the pose is the identity by default.
         """
-        pose = read_only_floats(
-            np.eye(4) if self.pose is None else self.pose, (4, 4), name="pose"
-        )
+        pose = read_only_floats(np.eye(4) if self.pose is None else self.pose, (4, 4), name="pose")
         turn = pose[:3, :3]
-        rigid = (
-            np.allclose(turn @ turn.T, np.eye(3), atol=1e-4)
-            and np.linalg.det(turn) > 0
-        )
+        rigid = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0
         if not rigid or not np.allclose(pose[3], [0, 0, 0, 1]):
             raise InputError(
                 f"pose of a camera is {pose.tolist()}; expected a rigid motion "
                 "[[R, p], [0, 0, 0, 1]] from its frame to the world, in metres"
             )
-        distortion = read_only_floats(
-            self.distortion, (None,), name="distortion of a camera"
-        )
+        distortion = read_only_floats(self.distortion, (None,), name="distortion of a camera")
         if len(distortion) > 5:
             raise InputError(
                 f"distortion has {len(distortion)} numbers; expected k1, k2, p1, p2, k3"
             )
         vars(self).update(pose=pose, distortion=distortion)
         if self.matrix is not None:
-            matrix = read_only_floats(
-                self.matrix, (3, 3), name="matrix of a camera"
-            )
+            matrix = read_only_floats(self.matrix, (3, 3), name="matrix of a camera")
             lower = matrix[[1, 2, 2, 2], [0, 0, 1, 2]]
-            if not (np.diag(matrix) > 0).all() or not np.allclose(
-                lower, [0, 0, 0, 1]
-            ):
+            if not (np.diag(matrix) > 0).all() or not np.allclose(lower, [0, 0, 0, 1]):
                 raise InputError(
                     f"matrix of a camera is {matrix.tolist()}; expected "
                     "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
@@ -145,9 +130,7 @@ class DepthCamera:
         rotation = self.pose[:3, :3]
         translation = self.pose[:3, 3]
         if self.poses is None:
-            return np.tile(rotation, (len(times), 1, 1)), np.tile(
-                translation, (len(times), 1)
-            )
+            return np.tile(rotation, (len(times), 1, 1)), np.tile(translation, (len(times), 1))
         rotations, translations = self.poses.at(times)
         return rotations @ rotation, rotations @ translation + translations
 
@@ -159,12 +142,8 @@ class DepthCamera:
         without a check of convergence. The camera must have a matrix.
         """
         rows = np.column_stack([pixels, np.ones(len(pixels))])
-        distorted = np.asarray(
-            np.linalg.solve(self.require_matrix(), rows.T).T, dtype=np.float64
-        )
-        k1, k2, p1, p2, k3 = np.append(
-            self.distortion, np.zeros(5 - len(self.distortion))
-        )
+        distorted = np.asarray(np.linalg.solve(self.require_matrix(), rows.T).T, dtype=np.float64)
+        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
         undistorted = distorted[:, :2].copy()
         for _ in range(UNDISTORTION_ITERATIONS if len(self.distortion) else 0):
             x, y = undistorted.T
@@ -172,9 +151,7 @@ class DepthCamera:
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
             across = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
             down = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-            undistorted = (
-                distorted[:, :2] - np.column_stack([across, down])
-            ) / radial[:, None]
+            undistorted = (distorted[:, :2] - np.column_stack([across, down])) / radial[:, None]
         return np.column_stack([undistorted, np.ones(len(undistorted))])
 
     def distorted_pixels(self, points_m: Array) -> Array:
@@ -185,9 +162,7 @@ class DepthCamera:
         camera, z > 0, and the camera must have a matrix.
         """
         x, y = (points_m[:, :2] / points_m[:, 2:]).T
-        k1, k2, p1, p2, k3 = np.append(
-            self.distortion, np.zeros(5 - len(self.distortion))
-        )
+        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
         r2 = x**2 + y**2
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         distorted = np.stack(
@@ -221,9 +196,7 @@ def _unconverted_clouds(clouds: Sequence[ArrayLike]) -> tuple[Array, ...]:
     return cast(tuple[Array, ...], clouds)
 
 
-def _unconverted_images(
-    images_m: Sequence[ArrayLike | None],
-) -> tuple[Array | None, ...]:
+def _unconverted_images(images_m: Sequence[ArrayLike | None]) -> tuple[Array | None, ...]:
     """Return the images unchanged, which `Depth` checks and converts."""
     return cast(tuple[Array | None, ...], images_m)
 
@@ -286,63 +259,31 @@ class Depth(SeparateSensor):
     spacing_m: float = key(Positive, default=SPACING_M)
     gate_m: float = key(Positive, default=GATE_M)
     faces: Selection | None = key(
-        Nodes | None,
-        converter=_require_selection,
-        read=selection_from_section,
-        default=None,
+        Nodes | None, converter=_require_selection, read=selection_from_section, default=None
     )
     background: Background = key(Background, default="auto")
     outline_sigma_px: float = key(Positive, default=OUTLINE_SIGMA_PX)
-    images_m: tuple[Array | None, ...] = key(
-        converter=_unconverted_images, default=()
-    )
+    images_m: tuple[Array | None, ...] = key(converter=_unconverted_images, default=())
 
     def __post_init__(self) -> None:
-        """Check the times, and thin the clouds in place, see `_thin_cloud`.
-
-        Raises
-        ------
-        InputError
-            If times do not increase, their number differs from that of the clouds, no cloud has a
-            point, or images are not usable, see `_check_images`.
-        """
+        """Check the times, and thin the clouds in place, see `_thin_cloud`."""
         where = f"the depth camera '{self.name}'"
         times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
         if fault := first_unordered_time(times):
-            raise InputError(
-                f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}"
-            )
+            raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
         if len(times) != len(self.clouds):
             raise InputError(
                 f"{where} has {len(times)} times and {len(self.clouds)} images or clouds; expected one "
                 "image or cloud for each time"
             )
-        clouds = tuple(
-            self._thin_cloud(np.asarray(cloud, dtype=float))
-            for cloud in self.clouds
-        )
+        clouds = tuple(self._thin_cloud(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
         if not any(len(cloud) for cloud in clouds):
-            raise InputError(
-                f"{where} has no points; check its file and the unit of its depth"
-            )
-        vars(self).update(
-            t_s=times, clouds=clouds, images_m=self._check_images(len(times))
-        )
+            raise InputError(f"{where} has no points; check its file and the unit of its depth")
+        vars(self).update(t_s=times, clouds=clouds, images_m=self._check_images(len(times)))
 
     def _check_images(self, count: int) -> tuple[Array | None, ...]:
         """Return `images_m` in single precision, with NaN for pixels without a positive depth, and
         None where an image is None; an empty tuple if there are no images.
-
-        Parameters
-        ----------
-        count : int
-            Number of sample times.
-
-        Raises
-        ------
-        InputError
-            If the number of images is neither zero nor `count`, one is not two-dimensional, or the
-            camera has no matrix.
         """
         where = f"the depth camera '{self.name}'"
         if not len(self.images_m):
@@ -422,10 +363,7 @@ class Depth(SeparateSensor):
             faces=faces,
             background=background,
             outline_sigma_px=outline_sigma_px,
-            images_m=[
-                image if k in outlined else None
-                for k, image in enumerate(images)
-            ],
+            images_m=[image if k in outlined else None for k, image in enumerate(images)],
         )
 
     def _thin_cloud(self, cloud: Array) -> Array:
@@ -434,11 +372,6 @@ class Depth(SeparateSensor):
 
         Of the points in a cube the one nearest to the cube's centre across the optical axis is
         selected; the depth has no influence.
-
-        Raises
-        ------
-        InputError
-            For another shape.
         """
         if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
             raise InputError(
@@ -448,9 +381,7 @@ class Depth(SeparateSensor):
         cloud = cloud[np.isfinite(cloud).all(axis=1)]
         cubes = np.floor(cloud[:, :3] / self.spacing_m)
         # Across the view only: noise of the depth must not choose.
-        away = np.linalg.norm(
-            (cloud[:, :3] / self.spacing_m - cubes - 0.5)[:, :2], axis=1
-        )
+        away = np.linalg.norm((cloud[:, :3] / self.spacing_m - cubes - 0.5)[:, :2], axis=1)
         order = np.lexsort((away, *cubes.T))
         first = np.ones(len(order), dtype=bool)
         first[1:] = (np.diff(cubes[order], axis=0) != 0).any(axis=1)
@@ -481,10 +412,7 @@ class Depth(SeparateSensor):
             return None
         images_m = self.images_m[:count]
         return replace(
-            self,
-            t_s=self.sample_times_s[:count],
-            clouds=self.clouds[:count],
-            images_m=images_m,
+            self, t_s=self.sample_times_s[:count], clouds=self.clouds[:count], images_m=images_m
         )
 
     def needed_until_s(self, fewest: int) -> float:
@@ -492,9 +420,7 @@ class Depth(SeparateSensor):
         to the number `fewest`.
         """
         last = max(fewest - 1, self.find_first_sample_with_points())
-        return float(
-            self.sample_times_s[min(last, len(self.sample_times_s) - 1)]
-        )
+        return float(self.sample_times_s[min(last, len(self.sample_times_s) - 1)])
 
     @property
     def point_counts(self) -> list[int]:
@@ -524,11 +450,7 @@ def samples_with_outlines(count: int) -> set[int]:
     outlines: all, or `MOST_OUTLINE_IMAGES` of them, evenly spread with the first and the last.
     """
     return set(
-        np.unique(
-            np.linspace(0, count - 1, min(count, MOST_OUTLINE_IMAGES)).astype(
-                int
-            )
-        ).tolist()
+        np.unique(np.linspace(0, count - 1, min(count, MOST_OUTLINE_IMAGES)).astype(int)).tolist()
     )
 
 
@@ -559,15 +481,10 @@ def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
             ) < LARGEST_RELATIVE_JUMP * np.nan_to_num(depth)
     is_inner[[0, -1]] = is_inner[:, [0, -1]] = False
     v, u = np.nonzero(is_inner)
-    return (
-        camera.points_at_unit_depth(np.column_stack([u, v]).astype(float))
-        * depth[v, u][:, None]
-    )
+    return camera.points_at_unit_depth(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
 
 
-def depth_image(
-    camera: DepthCamera, shape: tuple[int, int], triangles_m: Array
-) -> Array:
+def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array) -> Array:
     """Render a depth image [m] of opaque triangles, both sides of which are visible.
 
     Parameters
@@ -589,25 +506,15 @@ def depth_image(
     for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:
         pixels = camera.undistorted_pixels(corners)
         low = np.maximum(np.ceil(pixels.min(axis=0)), 0).astype(int)
-        high = np.minimum(
-            np.floor(pixels.max(axis=0)), [shape[1] - 1, shape[0] - 1]
-        ).astype(int)
+        high = np.minimum(np.floor(pixels.max(axis=0)), [shape[1] - 1, shape[0] - 1]).astype(int)
         sides = (pixels[1:] - pixels[0]).T
         if (high < low).any() or abs(np.linalg.det(sides)) < 1e-12:
             continue
-        u, v = np.meshgrid(
-            np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
-        )
-        share = np.linalg.solve(
-            sides, np.stack([u.ravel(), v.ravel()]) - pixels[0][:, None]
-        )
+        u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+        share = np.linalg.solve(sides, np.stack([u.ravel(), v.ravel()]) - pixels[0][:, None])
         share = np.vstack([1 - share.sum(axis=0), share])
         # What is linear over a triangle in the image is one over the depth.
-        depth = np.where(
-            (share >= -1e-9).all(axis=0),
-            1 / (share.T @ (1 / corners[:, 2])),
-            np.inf,
-        )
+        depth = np.where((share >= -1e-9).all(axis=0), 1 / (share.T @ (1 / corners[:, 2])), np.inf)
         window = image[low[1] : high[1] + 1, low[0] : high[0] + 1]
         np.minimum(window, depth.reshape(window.shape), out=window)
     return np.where(np.isfinite(image), image, np.nan)

@@ -32,9 +32,7 @@ def air_density(value: float | Literal["none"]) -> float:
     """
     if isinstance(value, str) and value == VACUUM:
         return 0.0
-    is_number = isinstance(value, (int, float, np.number)) and not isinstance(
-        value, bool
-    )
+    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     density_kg_m3 = float(value) if is_number else np.nan
     if not 0 <= density_kg_m3 < np.inf:
         raise InputError(

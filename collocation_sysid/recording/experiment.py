@@ -28,12 +28,7 @@ from .measured_wrench import Wrench
 from .nuisance import Nuisance
 from .obstacle import Obstacle, with_obstacle_frames
 from .pressure import Pressure
-from .sample_times import (
-    STEP_TOLERANCE,
-    TIME_TOLERANCE_S,
-    first_unordered_time,
-    sample_interval_s,
-)
+from .sample_times import STEP_TOLERANCE, TIME_TOLERANCE_S, first_unordered_time, sample_interval_s
 from .separate_sensor import SENSORS, SeparateSensor, sensor_fields
 from .tendon import Tendon
 from .time_tables import is_within_experiment
@@ -130,21 +125,15 @@ class Experiment:
     grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
     markers: Markers = key(converter=identity_or_none, default=None)
     gravity_m_s2: Array = key(
-        Vector,
-        converter=float_converter((3,), "gravity_m_s2"),
-        default=EARTH_M_S2,
+        Vector, converter=float_converter((3,), "gravity_m_s2"), default=EARTH_M_S2
     )
     name: str = "experiment"
     _: KW_ONLY
     kind: Kind = key(Kind, default="dynamic")
     start: Start = key(Start, default="equilibrium")
     start_rule: StartRule = key(StartRule, default="standard")
-    start_positions_m: Array | None = key(
-        converter=_state("positions_m"), default=None
-    )
-    start_velocities_m_s: Array | None = key(
-        converter=_state("velocities_m_s"), default=None
-    )
+    start_positions_m: Array | None = key(converter=_state("positions_m"), default=None)
+    start_velocities_m_s: Array | None = key(converter=_state("velocities_m_s"), default=None)
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
     frames_fault: str = ""
@@ -152,16 +141,10 @@ class Experiment:
     forces: tuple[Force, ...] = key(converter=tuple, default=())
     tendons: tuple[Tendon, ...] = key(converter=tuple, default=())
     pressures: tuple[Pressure, ...] = key(converter=tuple, default=())
-    readings: tuple[Gauge, ...] = key(
-        converter=tuple[Gauge, ...], default=(), metadata=SENSORS
-    )
-    depths: tuple[Depth, ...] = key(
-        converter=tuple[Depth, ...], default=(), metadata=SENSORS
-    )
+    readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=(), metadata=SENSORS)
+    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=(), metadata=SENSORS)
     nuisance: Nuisance = DEFAULT_NUISANCE
-    air_density_kg_m3: float = key(
-        converter=air_density, default_factory=usual_air_density
-    )
+    air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
     specimen: HomogeneousDeformation | None = None
 
     def __post_init__(self) -> None:
@@ -178,30 +161,18 @@ class Experiment:
         framed = zip(self.obstacles, self.body.frames, strict=True)
         vars(self).update(
             grasps=(
-                *(
-                    grasp.on_body(self.body, self.t_s)
-                    for grasp in self.body_grasps
-                ),
-                *(
-                    obstacle.with_frame_nodes(frame, self.t_s)
-                    for obstacle, frame in framed
-                ),
+                *(grasp.on_body(self.body, self.t_s) for grasp in self.body_grasps),
+                *(obstacle.with_frame_nodes(frame, self.t_s) for obstacle, frame in framed),
             ),
-            markers=Markers.none(self.t_s)
-            if self.markers is None
-            else self.markers,
+            markers=Markers.none(self.t_s) if self.markers is None else self.markers,
             **{
-                name: tuple(
-                    load.on_body(self.body) for load in getattr(self, name)
-                )
+                name: tuple(load.on_body(self.body) for load in getattr(self, name))
                 for name in loads
             },
         )
         self._check_kind()
         self._check_time()
-        vars(self)["markers"] = self.markers.on_body(
-            self.body, self._undeformed_places
-        )
+        vars(self)["markers"] = self.markers.on_body(self.body, self._undeformed_places)
         self._check_nodes()
         self._check_start()
         self._check_actuators()
@@ -224,9 +195,7 @@ class Experiment:
     @property
     def body_grasps(self) -> tuple[Grasp, ...]:
         """Grasps that hold nodes of the body: all `grasps` but the obstacles."""
-        return tuple(
-            grasp for grasp in self.grasps if not isinstance(grasp, Obstacle)
-        )
+        return tuple(grasp for grasp in self.grasps if not isinstance(grasp, Obstacle))
 
     @property
     def wrenches(self) -> tuple[Wrench, ...]:
@@ -238,11 +207,7 @@ class Experiment:
     @property
     def separate_sensors(self) -> list[SeparateSensor]:
         """Sensors with times of their own, besides markers and those of grasps."""
-        return [
-            each
-            for name in sensor_fields(Experiment)
-            for each in getattr(self, name)
-        ]
+        return [each for name in sensor_fields(Experiment) for each in getattr(self, name)]
 
     @property
     def camera_names(self) -> list[str]:
@@ -270,9 +235,7 @@ class Experiment:
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Rigid obstacles that the body may touch; they come last in `grasps`."""
-        return tuple(
-            grasp for grasp in self.grasps if isinstance(grasp, Obstacle)
-        )
+        return tuple(grasp for grasp in self.grasps if isinstance(grasp, Obstacle))
 
     def with_obstacles(self, obstacles: Iterable[Obstacle]) -> Experiment:
         """Return a copy of the experiment with these obstacles in place of its own; all checks are
@@ -288,9 +251,7 @@ class Experiment:
     @property
     def timestep_s(self) -> float:
         """Mean time between samples [s]; 1 s if there is only one sample."""
-        return (
-            self.duration_s / (len(self.t_s) - 1) if len(self.t_s) > 1 else 1.0
-        )
+        return self.duration_s / (len(self.t_s) - 1) if len(self.t_s) > 1 else 1.0
 
     @property
     def duration_s(self) -> float:
@@ -310,13 +271,9 @@ class Experiment:
         """Sorted dofs that are not in `prescribed_dofs`; grasps with a time window may hold some of
         them for a while.
         """
-        return np.setdiff1d(
-            np.arange(self.body.nodes_m.size), self.prescribed_dofs
-        )
+        return np.setdiff1d(np.arange(self.body.nodes_m.size), self.prescribed_dofs)
 
-    def prescribed_displacements(
-        self, t_s: ArrayLike
-    ) -> tuple[NDArray[np.bool_], Array]:
+    def prescribed_displacements(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], Array]:
         """Return which nodal coordinates are prescribed at the times `t_s` (T,), and their values.
 
         The n nodes include those of the obstacles' frames.
@@ -339,9 +296,9 @@ class Experiment:
         for grasp in self.grasps:
             holding = np.flatnonzero(grasp.is_active(times))
             moved_m = grasp.positions_at(self.body.nodes_m, times[holding])
-            positions[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = (
-                moved_m[..., grasp.axis_indices]
-            )
+            positions[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = moved_m[
+                ..., grasp.axis_indices
+            ]
         return is_prescribed, positions
 
     def is_prescribed(self, t_s: ArrayLike) -> NDArray[np.bool_]:
@@ -349,14 +306,10 @@ class Experiment:
         n, 3) bool; the nodes include those of the obstacles' frames.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        is_prescribed = np.zeros(
-            (len(times), *self.body.nodes_m.shape), dtype=bool
-        )
+        is_prescribed = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
         for grasp in self.grasps:
             holding = np.flatnonzero(grasp.is_active(times))
-            is_prescribed[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = (
-                True
-            )
+            is_prescribed[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = True
         return is_prescribed
 
     def prescribed_positions(self, t_s: ArrayLike) -> Array:
@@ -383,9 +336,7 @@ class Experiment:
         times = np.atleast_1d(t_s)
         mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
-            mass = mass + np.outer(
-                self.share(point, times), point.node_mass_kg(n)
-            )
+            mass = mass + np.outer(self.share(point, times), point.node_mass_kg(n))
         return mass
 
     def share(self, load: PointMass | Force, t_s: ArrayLike) -> Array:
@@ -397,14 +348,11 @@ class Experiment:
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         first_share, last_share = (
-            self._share_since(load, change, times=times)
-            for change in get_args(LoadTime)
+            self._share_since(load, change, times=times) for change in get_args(LoadTime)
         )
         return first_share - last_share
 
-    def _share_since(
-        self, load: PointMass | Force, change: LoadTime, times: Array
-    ) -> Array:
+    def _share_since(self, load: PointMass | Force, change: LoadTime, times: Array) -> Array:
         """Return the share (T,), from 0 to 1, of a load whose time `change` ("from_s" or "until_s")
         has passed at the given times, see `share`.
 
@@ -433,24 +381,16 @@ class Experiment:
         times = np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
         for force in self.forces:
-            total = total + self.share(force, times)[
-                :, None, None
-            ] * force.node_forces_n(times, n)
+            total = total + self.share(force, times)[:, None, None] * force.node_forces_n(times, n)
         return total
 
     def find_instrumented_grasps(self) -> tuple[int, ...]:
         """Return the indices in `grasps`, counted from 0, of the grasps and obstacles whose force
         or torque is measured by a wrench or a custom sensor.
         """
-        grasps_of_gauges = {
-            gauge.grasp - 1
-            for gauge in self.readings
-            if gauge.grasp is not None
-        }
+        grasps_of_gauges = {gauge.grasp - 1 for gauge in self.readings if gauge.grasp is not None}
         sensed = (
-            k
-            for k, g in enumerate(self.grasps)
-            if g.wrench is not None or k in grasps_of_gauges
+            k for k, g in enumerate(self.grasps) if g.wrench is not None or k in grasps_of_gauges
         )
         return tuple(sensed)
 
@@ -463,17 +403,11 @@ class Experiment:
         """
         if self.find_instrumented_grasps():
             return True
-        if any(
-            actuator.energy_amplitude_at(self.t_s).any()
-            for actuator in self.actuators
-        ):
+        if any(actuator.energy_amplitude_at(self.t_s).any() for actuator in self.actuators):
             return True
         tied = np.repeat(self.point_mass_at_nodes_kg(self.t_s), 3, axis=1)
         forces = self.declared_node_forces_n(self.t_s).reshape(tied.shape)
-        return bool(
-            (tied != 0)[:, self.free_dofs].any()
-            or forces[:, self.free_dofs].any()
-        )
+        return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
 
     @property
     def has_air_drag(self) -> bool:
@@ -489,13 +423,9 @@ class Experiment:
         """Return the mesh graph of the body with the couplings of its actuators, obstacles and,
         where it acts, air drag; computed anew at each access.
         """
-        couplings = [
-            each.require_measure().couplings for each in self.actuators
-        ]
+        couplings = [each.require_measure().couplings for each in self.actuators]
         couplings += [each.couplings_with(self.body) for each in self.obstacles]
-        couplings += [
-            self.body.unit_air_drag.points.couplings
-        ] * self.has_air_drag
+        couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag
         return self.body.joint_pattern_with(couplings)
 
     @property
@@ -520,22 +450,15 @@ class Experiment:
             at every sample are repeated beyond their ends instead.
         """
         rotations, translations = self.rigid_motion(t_s)
-        places = (
-            np.einsum("tij,kj->tki", rotations, self.body.nodes_m)
-            + translations[:, None]
-        )
+        places = np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
         for obstacle in self.obstacles:
-            places[:, obstacle.nodes] = obstacle.positions_at(
-                self.body.nodes_m, np.atleast_1d(t_s)
-            )
+            places[:, obstacle.nodes] = obstacle.positions_at(self.body.nodes_m, np.atleast_1d(t_s))
         return places
 
     def compute_upward_direction(self) -> Array:
         """Return the unit vector (3,) against gravity; the z axis if there is no gravity."""
         pull = np.linalg.norm(self.gravity_m_s2)
-        return (
-            -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
-        )
+        return -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
 
     def rigid_motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return rotations R (T, 3, 3) and translations p (T, 3) [m] of `rigid_positions`, x = R X
@@ -543,14 +466,8 @@ class Experiment:
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if not self.body_grasps:
-            return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros(
-                (len(times), 3)
-            )
-        throughout = [
-            grasp
-            for grasp in self.body_grasps
-            if grasp.is_active(self.t_s).all()
-        ]
+            return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))
+        throughout = [grasp for grasp in self.body_grasps if grasp.is_active(self.t_s).all()]
         throughout.sort(key=lambda grasp: grasp.axes != "xyz")
         poses = (throughout or self.body_grasps)[0].poses
         if len(poses.t_s) > 1 and not throughout:
@@ -586,10 +503,7 @@ class Experiment:
         """
         if not self.is_static:
             return
-        for name, usual in (
-            ("start", "equilibrium"),
-            ("start_rule", "standard"),
-        ):
+        for name, usual in (("start", "equilibrium"), ("start_rule", "standard")):
             if getattr(self, name) != usual:
                 raise InputError(
                     f"{name} is {getattr(self, name)!r}, but the experiment is static: each sample "
@@ -612,15 +526,7 @@ class Experiment:
         )
 
     def _check_time(self) -> None:
-        """Check the sample times against each other and against those of all measurements.
-
-        Raises
-        ------
-        InputError
-            If there are fewer than three samples (static: one), times are uneven (static: not
-            ascending) or differ from the markers' times, nothing is measured, or as
-            `_check_grasp_times`, `_check_custom_sensors` and `_check_depth_cameras`.
-        """
+        """Check the sample times against each other and against those of all measurements."""
         fewest = 1 if self.is_static else 3
         if len(self.t_s) < fewest:
             raise InputError(
@@ -628,9 +534,7 @@ class Experiment:
                 "the marker file"
             )
         if not self.is_static:
-            step_s = sample_interval_s(
-                self.t_s, f"t_s of experiment '{self.name}'"
-            )
+            step_s = sample_interval_s(self.t_s, f"t_s of experiment '{self.name}'")
         elif fault := first_unordered_time(self.t_s):
             raise InputError(f"t_s: {fault[1]}", where=f"row {fault[0] + 1}")
         else:
@@ -674,14 +578,9 @@ class Experiment:
                     f"two readings are called {gauge.name!r}; expected different names"
                 )
             is_within_experiment(
-                gauge.sample_times_s,
-                self.t_s,
-                name=what,
-                is_static=self.is_static,
+                gauge.sample_times_s, self.t_s, name=what, is_static=self.is_static
             )
-            if gauge.grasp is not None and not 1 <= gauge.grasp <= len(
-                self.grasps
-            ):
+            if gauge.grasp is not None and not 1 <= gauge.grasp <= len(self.grasps):
                 raise InputError(
                     f"{what} refers to grasp {gauge.grasp}; expected the number of a grasp, 1 to "
                     f"{len(self.grasps)}"
@@ -698,14 +597,9 @@ class Experiment:
                     f"two depth cameras are called {depth.name!r}; expected different names"
                 )
             is_within_experiment(
-                depth.sample_times_s,
-                self.t_s,
-                name=what,
-                is_static=self.is_static,
+                depth.sample_times_s, self.t_s, name=what, is_static=self.is_static
             )
-            distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(
-                axis=1
-            )
+            distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(axis=1)
             if self.is_static and distance_s.max() > TIME_TOLERANCE_S:
                 raise InputError(
                     f"{what} has an image at {depth.sample_times_s[distance_s.argmax()]:g} s, but "
@@ -713,8 +607,8 @@ class Experiment:
                 )
 
     def _require_measurements(self) -> None:
-        """Raise an `InputError` if, besides markers, nothing is measured either: by no sensor of its
-        own times and no wrench.
+        """Raise an `InputError` if, besides markers, nothing is measured either: by no sensor of
+        its own times and no wrench.
         """
         if self.separate_sensors or self.find_instrumented_grasps():
             return
@@ -724,9 +618,7 @@ class Experiment:
                 "sensor and no depth camera"
             )
             raise InputError(f"{message}; expected at least one of them")
-        raise InputError(
-            "there is no marker sample; check the marker file and window_s"
-        )
+        raise InputError("there is no marker sample; check the marker file and window_s")
 
     def require_measured_values(self) -> None:
         """Raise an `InputError` if a custom sensor has no measured values, as before a simulation."""
@@ -770,19 +662,10 @@ class Experiment:
         """Raise an `InputError` if two obstacles have the same name."""
         names = [obstacle.name for obstacle in self.obstacles]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
-            raise InputError(
-                f"two obstacles are called {twice[0]!r}; expected different names"
-            )
+            raise InputError(f"two obstacles are called {twice[0]!r}; expected different names")
 
     def _check_actuators(self) -> None:
-        """Check names and times of the actuators, and fix the rims of the pressures, in place.
-
-        Raises
-        ------
-        InputError
-            If two actuators have the same name, a stated course does not cover the recording, or a
-            pressure has a rim that is not held.
-        """
+        """Check names and times of the actuators, and fix the rims of the pressures, in place."""
         names = [actuator.name for actuator in self.actuators]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
             raise InputError(
@@ -795,21 +678,13 @@ class Experiment:
         is_prescribed, places_m = self.prescribed_displacements(self.t_s)
         throughout = np.asarray(is_prescribed.all(axis=0))
         bounded = tuple(
-            pressure.with_fixed_rim(throughout, places_m)
-            for pressure in self.pressures
+            pressure.with_fixed_rim(throughout, places_m) for pressure in self.pressures
         )
         vars(self)["pressures"] = bounded
 
     def _check_start(self) -> None:
         """Check the start, and complete a given state in place: velocities are zero by default, and
         the frames of the obstacles are appended.
-
-        Raises
-        ------
-        InputError
-            If `loaded_since_s` is given for a start other than an equilibrium, a state is missing,
-            has another shape or is given although `start` is not "given", or the equilibrium is not
-            unique.
         """
         if np.isfinite(self.loaded_since_s) and self.start != "equilibrium":
             raise InputError(
@@ -817,21 +692,16 @@ class Experiment:
                 "time for which a body that starts in equilibrium has been loaded"
             )
         has_initial_state = (
-            self.start_positions_m is not None
-            or self.start_velocities_m_s is not None
+            self.start_positions_m is not None or self.start_velocities_m_s is not None
         )
         if self.start == "given":
             if self.start_positions_m is None:
                 raise InputError("start = 'given' needs start_positions_m")
             if self.start_velocities_m_s is None:
-                vars(self)["start_velocities_m_s"] = np.zeros_like(
-                    self.start_positions_m
-                )
+                vars(self)["start_velocities_m_s"] = np.zeros_like(self.start_positions_m)
             self._append_obstacle_frames(len(self.start_positions_m))
             for name in ("start_positions_m", "start_velocities_m_s"):
-                read_only_floats(
-                    getattr(self, name), self.body.nodes_m.shape, name=name
-                )
+                read_only_floats(getattr(self, name), self.body.nodes_m.shape, name=name)
         elif has_initial_state:
             raise InputError(
                 f"start_positions_m or start_velocities_m_s is given, but start is '{self.start}'; "
@@ -845,11 +715,6 @@ class Experiment:
         them, in place; a state that has them is unchanged.
 
         Velocities are differences over a thousandth of the time between samples.
-
-        Parameters
-        ----------
-        node_count : int
-            Number of nodes of the given state.
         """
         frames = self.body.frames.ravel()
         if node_count == len(self.body.nodes_m):
@@ -857,10 +722,7 @@ class Experiment:
         at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
         places = self.rigid_positions(at_s)[:, frames]
         rates = np.diff(places, axis=0)[0] / np.diff(at_s)
-        for name, own in (
-            ("start_positions_m", places[0]),
-            ("start_velocities_m_s", rates),
-        ):
+        for name, own in (("start_positions_m", places[0]), ("start_velocities_m_s", rates)):
             vars(self)[name] = np.vstack([getattr(self, name), own])
 
     def _require_unique_equilibrium(self) -> None:

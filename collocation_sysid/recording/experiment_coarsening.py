@@ -15,26 +15,17 @@ if TYPE_CHECKING:
 
 
 def node_sets(experiment: Experiment) -> list[Index]:
-    """Return the node sets of the experiment that a coarse mesh must preserve: those of grasps, point
-    masses and forces, and the corners of the faces of pressures.
+    """Return the node sets of the experiment that a coarse mesh must preserve: those of grasps,
+    point masses and forces, and the corners of the faces of pressures.
     """
-    loads = (
-        *experiment.body_grasps,
-        *experiment.masses,
-        *experiment.forces,
-    )
+    loads = (*experiment.body_grasps, *experiment.masses, *experiment.forces)
     return [
         *(load.nodes for load in loads),
-        *(
-            each.require_measure().faces[:, :3].ravel()
-            for each in experiment.pressures
-        ),
+        *(each.require_measure().faces[:, :3].ravel() for each in experiment.pressures),
     ]
 
 
-def coarse_experiment(
-    experiment: Experiment, relation: CoarseBody
-) -> Experiment:
+def coarse_experiment(experiment: Experiment, relation: CoarseBody) -> Experiment:
     """Return the experiment on the coarse body of a relation.
 
     Grasps and loads act on the corresponding nodes and faces. Markers, the points of tendons and
@@ -71,6 +62,4 @@ def _coarse_pressure(pressure: Pressure, relation: CoarseBody) -> Pressure:
     as the coarse mesh has no arrays and face sets.
     """
     corners = pressure.require_measure().faces[:, :3]
-    return replace(
-        pressure, faces=relation.coarse_faces(corners), body_measure=None
-    )
+    return replace(pressure, faces=relation.coarse_faces(corners), body_measure=None)

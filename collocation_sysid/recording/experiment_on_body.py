@@ -62,10 +62,7 @@ def experiment_on_body(
     return replace(
         experiment,
         body=body,
-        grasps=(
-            *map(move_load, experiment.body_grasps),
-            *experiment.obstacles,
-        ),
+        grasps=(*map(move_load, experiment.body_grasps), *experiment.obstacles),
         masses=tuple(map(move_load, experiment.masses)),
         forces=tuple(map(move_load, experiment.forces)),
         pressures=tuple(map(move_pressure, experiment.pressures)),

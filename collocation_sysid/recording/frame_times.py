@@ -99,9 +99,7 @@ def assign_frames(t_s: Array) -> FrameAssignment | None:
         return None
     indices = samples.astype(np.int64)
     grid_s = np.linspace(t_s[0], t_s[-1], count)
-    return FrameAssignment(
-        grid_s, indices, offsets_s=t_s - grid_s[indices], jitter_s=jitter_s
-    )
+    return FrameAssignment(grid_s, indices, offsets_s=t_s - grid_s[indices], jitter_s=jitter_s)
 
 
 def evenly_sampled(table: MarkerTable) -> tuple[MarkerTable, list[str]]:
@@ -142,15 +140,11 @@ def evenly_sampled(table: MarkerTable) -> tuple[MarkerTable, list[str]]:
         notes=table.notes,
         offsets_s=offsets_s,
     )
-    note = _assignment_note(
-        assignment, is_jittered=is_jittered, has_markers=bool(table.names)
-    )
+    note = _assignment_note(assignment, is_jittered=is_jittered, has_markers=bool(table.names))
     return even, [note]
 
 
-def _assignment_note(
-    assignment: FrameAssignment, is_jittered: bool, has_markers: bool
-) -> str:
+def _assignment_note(assignment: FrameAssignment, is_jittered: bool, has_markers: bool) -> str:
     """Return a note on lost frames, and on the jitter if `is_jittered`; without markers, the frames
     are only times, and the model is not compared there.
     """

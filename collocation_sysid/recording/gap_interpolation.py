@@ -50,18 +50,14 @@ def interpolate_without_gaps(at_s: Array, t_s: Array, values: Array) -> Array:
     if len(t_s) < 2:
         is_sample = _along_values(at_s == t_s[0], values)
         return np.where(is_sample, values[0], np.nan)
-    earlier = np.clip(
-        np.searchsorted(t_s, at_s, side="right") - 1, 0, len(t_s) - 2
-    )
+    earlier = np.clip(np.searchsorted(t_s, at_s, side="right") - 1, 0, len(t_s) - 2)
     fraction = (at_s - t_s[earlier]) / np.diff(t_s)[earlier]
     is_between = (fraction >= 0.0) & (fraction <= 1.0) & ~is_gap(t_s)[earlier]
     share = _along_values(fraction, values)
     before = values[earlier]
     after = values[earlier + 1]
     between = np.where(
-        _along_values(is_between, values),
-        (1.0 - share) * before + share * after,
-        np.nan,
+        _along_values(is_between, values), (1.0 - share) * before + share * after, np.nan
     )
     # At a sample its neighbour does not matter, even if that one is missing.
     between = np.where(np.abs(share) <= SAME_TIME_INTERVALS, before, between)
@@ -99,10 +95,7 @@ def interpolation_error(at_s: Array, t_s: Array, values: Array) -> Array:
     # A sample after a gap is no neighbour of the one before.
     known = np.where(_along_values(lost, values), np.nan, values)
     second = _mean_squares(np.diff(known, n=2, axis=0))
-    noise = (
-        _mean_squares(np.diff(known, n=FOURTH_DIFFERENCE, axis=0))
-        / FOURTH_DIFFERENCE_VARIANCE
-    )
+    noise = _mean_squares(np.diff(known, n=FOURTH_DIFFERENCE, axis=0)) / FOURTH_DIFFERENCE_VARIANCE
     curvature = np.maximum(second - SECOND_DIFFERENCE_VARIANCE * noise, 0.0)
     error: Array = np.sqrt(weight * curvature)
     return error

@@ -18,12 +18,7 @@ from ..common.validated_types import Finite, NotNegative
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
 from .measured_wrench import Wrench
-from .node_selection import (
-    Nodes,
-    node_converter,
-    select_on_body,
-    selection_from_section,
-)
+from .node_selection import Nodes, node_converter, select_on_body, selection_from_section
 from .poses import PoseSequence
 from .sample_times import TIME_TOLERANCE_S
 
@@ -81,11 +76,7 @@ class Grasp:
         height of the specimen is modelled; the deformation of the bench counts by this share.
     """
 
-    nodes: Index = key(
-        Nodes,
-        converter=node_converter("the grasp"),
-        read=selection_from_section,
-    )
+    nodes: Index = key(Nodes, converter=node_converter("the grasp"), read=selection_from_section)
     poses: PoseSequence = key(converter=_unconverted_poses)
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
@@ -104,11 +95,6 @@ class Grasp:
     def _check_times_and_axes(self) -> None:
         """Check the time window and the uncertain axes, in place: `zero` loses the axes that the
         grasp does not hold, and nodes given as a selection are stored as `selection`, too.
-
-        Raises
-        ------
-        InputError
-            If `from_s` is after `until_s`, or `zero` is not a combination of axes.
         """
         if not self.from_s <= self.until_s:
             raise InputError(
@@ -117,12 +103,8 @@ class Grasp:
             )
         if self.zero not in ("", *get_args(Axes)):
             expected = ", ".join(get_args(Axes))
-            raise InputError(
-                f"zero of a grasp is {self.zero!r}; expected one of {expected}"
-            )
-        vars(self)["zero"] = "".join(
-            axis for axis in self.zero if axis in self.axes
-        )
+            raise InputError(f"zero of a grasp is {self.zero!r}; expected one of {expected}")
+        vars(self)["zero"] = "".join(axis for axis in self.zero if axis in self.axes)
         if isinstance(self.nodes, Selection):
             vars(self)["selection"] = self.nodes
 
@@ -204,9 +186,7 @@ class Grasp:
         """
         if self.wrench is None:
             raise ValueError("the grasp has no force–torque sensor")
-        return replace(
-            self, wrench=replace(self.wrench, t_s=t_s, values=values)
-        )
+        return replace(self, wrench=replace(self.wrench, t_s=t_s, values=values))
 
     def has_sensor(self) -> bool:
         """Return whether a force–torque sensor measures the grasp."""
@@ -242,9 +222,7 @@ class Grasp:
         """Return the grasp with zeros at the times `t_s` (S,) [s] as placeholders of its measured
         loads, NaN for components that are not measured; a copy if it has no sensor.
         """
-        return replace(
-            self, wrench=self.wrench and self.wrench.with_zeros_at(t_s)
-        )
+        return replace(self, wrench=self.wrench and self.wrench.with_zeros_at(t_s))
 
 
 def prescribed_nodes(grasps: Sequence[Grasp]) -> Index:
@@ -266,33 +244,23 @@ def prescribed_dofs(grasps: Sequence[Grasp]) -> Index:
     """
     for (i, first), (j, second) in combinations(enumerate(grasps, start=1), 2):
         shared = np.intersect1d(first.prescribed_dofs, second.prescribed_dofs)
-        if shared.size and max(first.from_s, second.from_s) <= min(
-            first.until_s, second.until_s
-        ):
+        if shared.size and max(first.from_s, second.from_s) <= min(first.until_s, second.until_s):
             node, axis = divmod(int(shared[0]), 3)
-            on_axis = (
-                ""
-                if first.axes == second.axes == "xyz"
-                else f" along {'xyz'[axis]}"
-            )
+            on_axis = "" if first.axes == second.axes == "xyz" else f" along {'xyz'[axis]}"
             raise InputError(
                 f"node {node} is held by the grasps {i} and {j} at the same time{on_axis}; select "
                 "the nodes so that each is held by one grasp, or the axes so that each axis of a node "
                 'is (axes = "z" for both platens, if the body slides on them)'
             )
     return np.unique(
-        np.concatenate(
-            [np.zeros(0, dtype=np.int64), *(g.prescribed_dofs for g in grasps)]
-        )
+        np.concatenate([np.zeros(0, dtype=np.int64), *(g.prescribed_dofs for g in grasps)])
     )
 
 
 # Free rigid motions -------------------------------------------------------------------------------
 
 
-def free_rigid_motions(
-    points_m: Array, is_prescribed: NDArray[np.bool_]
-) -> list[str]:
+def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> list[str]:
     """Return the rigid motions that these prescribed coordinates leave free, in words; empty if
     none, and one entry for all motions together if nothing is prescribed.
 
@@ -314,14 +282,8 @@ def free_rigid_motions(
     shifts = _null_space(free[:, 3:].T) @ free[:, :3]
     rotations = free[:, 3:]
     return [
-        *(
-            f"translate along {_direction_text(d)}"
-            for d in _axis_aligned_basis(shifts)
-        ),
-        *(
-            f"rotate about {_direction_text(d)}"
-            for d in _axis_aligned_basis(rotations)
-        ),
+        *(f"translate along {_direction_text(d)}" for d in _axis_aligned_basis(shifts)),
+        *(f"rotate about {_direction_text(d)}" for d in _axis_aligned_basis(rotations)),
     ]
 
 
@@ -342,9 +304,7 @@ class FreeRigidModes:
     displacements: Array
 
 
-def free_rigid_modes(
-    points_m: Array, is_prescribed: NDArray[np.bool_]
-) -> FreeRigidModes:
+def free_rigid_modes(points_m: Array, is_prescribed: NDArray[np.bool_]) -> FreeRigidModes:
     """Return the rigid motions that prescribed coordinates leave free, to first order.
 
     Parameters
@@ -357,9 +317,7 @@ def free_rigid_modes(
     held = is_prescribed.any(axis=1)
     arms_m = points_m - points_m[held].mean(axis=0)
     size_m = float(np.linalg.norm(arms_m[held], axis=1).max()) or 1.0
-    rotations = np.stack(
-        [np.cross(axis, arms_m / size_m) for axis in np.eye(3)], axis=2
-    )
+    rotations = np.stack([np.cross(axis, arms_m / size_m) for axis in np.eye(3)], axis=2)
     translations = np.broadcast_to(np.eye(3), rotations.shape)
     modes = np.concatenate([translations, rotations], axis=2).astype(float)
     # The triangular factor has the same singular values and at most six rows.
@@ -382,9 +340,7 @@ def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
     """Yield the unit vectors (3,) of an orthonormal basis of the span of vectors (k, 3), along
     coordinate axes where possible; nothing if all are zero.
     """
-    _, values, directions = np.linalg.svd(
-        vectors.reshape(-1, 3), full_matrices=False
-    )
+    _, values, directions = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
     space = directions[values > SMALLEST_SINGULAR_VALUE]
     while len(space):
         projected = space.T @ space

@@ -83,10 +83,6 @@ def fastest_rotation(experiment: Experiment, substeps: int) -> GraspRotation:
     needed = max(1, ceil(substeps * largest / TARGET_ANGLE_RAD))
     # A pose that is held turns by as much at a sample, however many steps there are between.
     remedy = (
-        'set interpolation = "smooth" in the grasp'
-        if is_rigid_grasp
-        else f"set {_KEY} = {needed}"
+        'set interpolation = "smooth" in the grasp' if is_rigid_grasp else f"set {_KEY} = {needed}"
     )
-    return GraspRotation(
-        experiment.name, largest, time_s=time_s, step_s=step_s, remedy=remedy
-    )
+    return GraspRotation(experiment.name, largest, time_s=time_s, step_s=step_s, remedy=remedy)

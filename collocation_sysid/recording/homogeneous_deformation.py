@@ -74,38 +74,25 @@ class HomogeneousDeformation:
         directions = np.zeros((2, 4, 3))
         for k, components in enumerate((self.first, self.second)):
             for direction, node in components:
-                directions[k, 1 + AXES.index(node), AXES.index(direction)] = (
-                    CELL_SIZE_M
-                )
+                directions[k, 1 + AXES.index(node), AXES.index(direction)] = CELL_SIZE_M
         moving = np.flatnonzero(np.abs(directions).max(axis=(0, 2)))
-        return {
-            int(node): (directions[0, node], directions[1, node])
-            for node in moving
-        }
+        return {int(node): (directions[0, node], directions[1, node]) for node in moving}
 
     def prescribed_axes(self, node: int) -> Axes:
         """Return the axes along which a node of the cell is prescribed, by its index from 0: all
         but the own axis of a node on an axis of `free`.
         """
         own = AXES[node - 1] if node else ""
-        prescribed = "".join(
-            axis for axis in AXES if not (axis == own and axis in self.free)
-        )
+        prescribed = "".join(axis for axis in AXES if not (axis == own and axis in self.free))
         return cast(Axes, prescribed)
 
 
 DEFORMATIONS = {
     each.test: each
     for each in (
+        HomogeneousDeformation("uniaxial", first=("zz",), free="xy", lateral="x"),
         HomogeneousDeformation(
-            "uniaxial", first=("zz",), free="xy", lateral="x"
-        ),
-        HomogeneousDeformation(
-            "equibiaxial",
-            first=("zz", "xx"),
-            free="y",
-            lateral="y",
-            young_ratio=2.0,
+            "equibiaxial", first=("zz", "xx"), free="y", lateral="y", young_ratio=2.0
         ),
         HomogeneousDeformation(
             "biaxial",
@@ -125,15 +112,10 @@ DEFORMATIONS = {
             young_ratio=4.0 / 3.0,
         ),
         HomogeneousDeformation(
-            "simple-shear",
-            first=("xz",),
-            first_stress="xz",
-            young_ratio=1.0 / 3.0,
+            "simple-shear", first=("xz",), first_stress="xz", young_ratio=1.0 / 3.0
         ),
         HomogeneousDeformation("confined", first=("zz",), young_ratio=np.nan),
-        HomogeneousDeformation(
-            "volumetric", first=("xx", "yy", "zz"), young_ratio=np.nan
-        ),
+        HomogeneousDeformation("volumetric", first=("xx", "yy", "zz"), young_ratio=np.nan),
     )
 }
 TESTS = tuple(DEFORMATIONS)
@@ -150,7 +132,5 @@ def cell_mesh(*, with_inner_node: bool) -> TetMesh:
     tetrahedra = np.array([[0, 1, 2, 3]])
     if with_inner_node:
         points_m = np.vstack([points_m, points_m.mean(axis=0)])
-        tetrahedra = np.array(
-            [[4, 1, 2, 3], [0, 4, 2, 3], [0, 1, 4, 3], [0, 1, 2, 4]]
-        )
+        tetrahedra = np.array([[4, 1, 2, 3], [0, 4, 2, 3], [0, 1, 4, 3], [0, 1, 2, 4]])
     return TetMesh(points_m, tetrahedra)

@@ -15,12 +15,7 @@ from ..common.validated_types import Finite, Positive, Text
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
 from .checked_arrays import read_only_floats
-from .node_selection import (
-    Nodes,
-    node_converter,
-    select_on_body,
-    selection_from_section,
-)
+from .node_selection import Nodes, node_converter, select_on_body, selection_from_section
 from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 from .time_tables import read_forces
 
@@ -57,28 +52,16 @@ class TimeSeries:
     t_s: Array | None
 
     def __init__(
-        self,
-        values: ArrayLike,
-        t_s: ArrayLike | None,
-        what: str,
-        shape: tuple[int, ...] = (),
+        self, values: ArrayLike, t_s: ArrayLike | None, what: str, shape: tuple[int, ...] = ()
     ) -> None:
-        rows = (
-            np.reshape(values, (-1, *shape))
-            if np.ndim(values) <= len(shape)
-            else values
-        )
+        rows = np.reshape(values, (-1, *shape)) if np.ndim(values) <= len(shape) else values
         rows = read_only_floats(rows, (None, *shape), name=what)
         if t_s is None and len(rows) != 1:
-            raise InputError(
-                f"{len(rows)} rows of {what} without times; expected t_s"
-            )
+            raise InputError(f"{len(rows)} rows of {what} without times; expected t_s")
         if t_s is not None:
             t_s = read_only_floats(t_s, (len(rows),), name=f"t_s of {what}")
             if fault := first_unordered_time(t_s):
-                raise InputError(
-                    f"{what}: {fault[1]}", where=f"row {fault[0] + 1}"
-                )
+                raise InputError(f"{what}: {fault[1]}", where=f"row {fault[0] + 1}")
         vars(self).update(values=rows, t_s=t_s)
 
     def values_at(self, t_s: ArrayLike) -> Array:
@@ -120,9 +103,9 @@ def smooth_ramp(time_steps: Any) -> Any:
     The derivative is a hat function, so that the sum over an even grid with unit spacing is the
     remaining length after u = 0, wherever u = 0 lies between grid points.
     """
-    return (abs(time_steps) < 1) * (
-        0.5 + time_steps - 0.5 * time_steps * abs(time_steps)
-    ) + (time_steps >= 1)
+    return (abs(time_steps) < 1) * (0.5 + time_steps - 0.5 * time_steps * abs(time_steps)) + (
+        time_steps >= 1
+    )
 
 
 class Load:
@@ -187,9 +170,7 @@ class PointMass(Load):
     """
 
     nodes: Index = key(
-        Nodes,
-        converter=node_converter("the point mass"),
-        read=selection_from_section,
+        Nodes, converter=node_converter("the point mass"), read=selection_from_section
     )
     mass_kg: float = key(Positive)
     from_s: float = key(Finite | None, default=-np.inf)
@@ -235,11 +216,7 @@ class Force(Load):
         recording.
     """
 
-    nodes: Index = key(
-        Nodes,
-        converter=node_converter("the force"),
-        read=selection_from_section,
-    )
+    nodes: Index = key(Nodes, converter=node_converter("the force"), read=selection_from_section)
     force_n: Array = key(Vector | None, converter=np.atleast_2d)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
     selection: Selection | None = None
@@ -264,10 +241,7 @@ class Force(Load):
         total = np.repeat(self.force_n[:1], len(times), axis=0)
         if self.t_s is not None:
             total = np.column_stack(
-                [
-                    np.interp(times, self.t_s, f, left=0.0, right=0.0)
-                    for f in self.force_n.T
-                ]
+                [np.interp(times, self.t_s, f, left=0.0, right=0.0) for f in self.force_n.T]
             )
         force = np.zeros((len(times), node_count, 3))
         force[:, self.nodes] = total[:, None] / len(self.nodes)

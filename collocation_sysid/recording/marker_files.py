@@ -48,16 +48,11 @@ class MarkerTable:
         Time of each measured frame less `t_s` [s]; None if they are the same.
     """
 
-    t_s: Array = key(
-        converter=float_converter((None,), "t_s of the markers"),
-        metadata=over_time(),
-    )
+    t_s: Array = key(converter=float_converter((None,), "t_s of the markers"), metadata=over_time())
     names: tuple[str, ...] = key(converter=tuple[str, ...])
     positions_m: Array = key(converter=np.asarray, metadata=over_time())
     notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
-    offsets_s: Array | None = key(
-        converter=np.asarray, default=None, metadata=over_time()
-    )
+    offsets_s: Array | None = key(converter=np.asarray, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
         """Check times and shapes, and mark incomplete samples as missing, in place; an `InputError`
@@ -66,9 +61,7 @@ class MarkerTable:
         if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         shape = (len(self.t_s), len(self.names), 3)
-        tracks = read_only_tracks(
-            self.positions_m, shape, name="marker positions"
-        )
+        tracks = read_only_tracks(self.positions_m, shape, name="marker positions")
         vars(self)["positions_m"] = tracks
 
 
@@ -118,10 +111,7 @@ def read_markers(
     used_names = [labels.get(label, label) for label in raw.labels]
     coordinates, notes = _mark_missing(raw, used_names)
     return MarkerTable(
-        t_s,
-        tuple(used_names),
-        positions_m=coordinates * metres,
-        notes=(*raw.notes, *notes),
+        t_s, tuple(used_names), positions_m=coordinates * metres, notes=(*raw.notes, *notes)
     )
 
 
@@ -129,46 +119,26 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
     """Return the tracks of the markers that `choose` selects from a file of any known format;
     `choose` returns their indices from the labels. A text without a known beginning is read as
     plain CSV.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is of no known format.
     """
     content = read_bytes(path)
     if c3d.is_c3d(content):
         return c3d.read(path, content, choose=choose)
     text = decode(content)
     start = text.lstrip().lstrip('"')
-    known = (
-        read
-        for beginning, read in _TEXT_FORMATS.items()
-        if start.startswith(beginning)
-    )
+    known = (read for beginning, read in _TEXT_FORMATS.items() if start.startswith(beginning))
     return next(known, plain_csv.read)(text, choose)
 
 
-def _label_chooser(
-    names: Sequence[str] | None, renamed: Mapping[str, str]
-) -> LabelChooser:
+def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:
     """Return the function that picks the requested markers from the labels in a file.
 
     It returns their indices: in the order of the file if `names` is None, else in that of `names`.
     Labels that the file excludes, such as unlabelled markers, are picked only if they are renamed
     or requested by name. It raises an `InputError` if labels or names repeat, if a label of
     `renamed` or a name is not there, or if nothing is chosen.
-
-    Parameters
-    ----------
-    names : sequence of str or None
-        Names after renaming, in the order of the result; None for all but the excluded labels.
-    renamed : mapping of str to str
-        From labels in the file to names.
     """
 
-    def choose(
-        labels: Sequence[str], excluded: Collection[str] = ()
-    ) -> list[int]:
+    def choose(labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
         """Return the indices of the chosen labels, see `LabelChooser`."""
         _require_distinct(labels, "two markers are labelled")
         for label in renamed:
@@ -177,26 +147,16 @@ def _label_chooser(
         _require_distinct(known, "after renaming two markers are named")
         if names is None:
             chosen = [
-                k
-                for k, label in enumerate(labels)
-                if label not in excluded or label in renamed
+                k for k, label in enumerate(labels) if label not in excluded or label in renamed
             ]
             if not labels:
-                raise InputError(
-                    "the file contains no markers; expected at least one"
-                )
+                raise InputError("the file contains no markers; expected at least one")
             if not chosen:
-                remedy = (
-                    f"label them, or rename with labels: {', '.join(labels)}"
-                )
-                raise InputError(
-                    f"all markers of the file are unlabelled; {remedy}"
-                )
+                remedy = f"label them, or rename with labels: {', '.join(labels)}"
+                raise InputError(f"all markers of the file are unlabelled; {remedy}")
             return chosen
         if not names:
-            raise InputError(
-                "no markers are requested; omit the names to use all markers"
-            )
+            raise InputError("no markers are requested; omit the names to use all markers")
         for name in names:
             _require_one_of(name, known, what="marker")
         _require_distinct(names, "requested more than once: marker")
@@ -219,19 +179,12 @@ def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
     """
     if name not in known:
         hint = hint_at(name, known)
-        raise InputError(
-            f"no {what} '{name}'; the file has {', '.join(known)}{hint}"
-        )
+        raise InputError(f"no {what} '{name}'; the file has {', '.join(known)}{hint}")
 
 
 def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
     """Return the unit of length by the user, `length_unit`, or by the file, else the default of the
     format.
-
-    Raises
-    ------
-    InputError
-        If file and user state different units, or neither does and the format has no default.
     """
     if length_unit and raw.unit and length_unit != raw.unit:
         raise InputError(
@@ -250,11 +203,6 @@ def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
 def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
     """Return the times (T,) of the frames [s]: as in the file, else from the frame rate of the file
     or the user, `rate_hz`.
-
-    Raises
-    ------
-    InputError
-        If neither times nor a rate are known, or a rate disagrees with the times or with the other.
     """
     t_s = raw.t_s
     rates = {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
@@ -289,20 +237,16 @@ def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
     steps = np.diff(t_s)
     mean_hz = 1 / steps.mean()
     median_hz = 1 / np.median(steps)
-    if (
-        min(abs(mean_hz / rate_hz - 1), abs(median_hz / rate_hz - 1))
-        > _RATE_TOLERANCE
-    ):
+    if min(abs(mean_hz / rate_hz - 1), abs(median_hz / rate_hz - 1)) > _RATE_TOLERANCE:
         raise InputError(
             f"{key} is {rate_hz:g} Hz, but the times are {1 / mean_hz:.6g} s apart, "
             f"{mean_hz:.6g} Hz; expected the same rate: correct {key} or the times"
         )
 
 
-def _mark_missing(
-    raw: RawTracks, names: Iterable[str]
-) -> tuple[Array, list[str]]:
-    """Return coordinates (T, M, 3) with NaN for missing samples, and a note on how many are missing.
+def _mark_missing(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
+    """Return coordinates (T, M, 3) with NaN for missing samples, and a note on how many are
+    missing.
 
     A sample is missing if a coordinate is NaN, or all are 0 in a format in which zeros mean that.
     The note lists all markers, those with the same losses together; without losses there is none.
@@ -314,9 +258,7 @@ def _mark_missing(
     for k, name in enumerate(names):
         counts = {"blank": blank[:, k].sum(), "zeros": zero[:, k].sum()}
         if missing := sum(counts.values()):
-            kinds = ", ".join(
-                f"{count} {kind}" for kind, count in counts.items() if count
-            )
+            kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
             loss = f"{missing} of {len(x)} samples missing ({kinds})"
             markers_by_loss.setdefault(loss, []).append(name)
     losses = [

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
-from ..common.declarations import (
-    Key,
-    declaration,
-    identity,
-    identity_or_none,
-    key,
-)
+from ..common.declarations import Key, declaration, identity, identity_or_none, key
 from ..common.time_dependence import over_time
 from ..common.validated_types import Positive
 from ..errors import InputError
@@ -84,10 +78,7 @@ class Markers:
         given.
     """
 
-    t_s: Array = key(
-        converter=float_converter((None,), "t_s of the markers"),
-        metadata=over_time(),
-    )
+    t_s: Array = key(converter=float_converter((None,), "t_s of the markers"), metadata=over_time())
     positions_m: Array = key(converter=np.asarray, metadata=over_time())
     sigma_m: Array = key(converter=np.asarray)
     names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
@@ -97,49 +88,33 @@ class Markers:
     on_surface: bool = key(_PLACES, converter=bool, default=False)
     located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
     attach: AttachmentRule = key(AttachmentRule, default="auto")
-    max_distance_m: float | None = key(
-        Positive | None, converter=identity, default=None
-    )
-    offsets_s: Array | None = key(
-        converter=np.asarray, default=None, metadata=over_time()
-    )
+    max_distance_m: float | None = key(Positive | None, converter=identity, default=None)
+    offsets_s: Array | None = key(converter=np.asarray, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
         """Check the markers and complete the fields, in place: names m1, m2, … by default, and
         `sigma_m` as an array (M,).
         """
         shape = len(self.t_s), None, 3
-        tracks = read_only_tracks(
-            self.positions_m, shape, name="marker positions"
-        )
+        tracks = read_only_tracks(self.positions_m, shape, name="marker positions")
         m = tracks.shape[1]
         if self.names is None:
             vars(self)["names"] = tuple(f"m{k}" for k in range(1, m + 1))
         if len(self.names) != m:
             message = f"{len(self.names)} marker names for {m} tracks; expected one for each"
             raise InputError(message)
-        if repeated := [
-            name for name, count in Counter(self.names).items() if count > 1
-        ]:
+        if repeated := [name for name, count in Counter(self.names).items() if count > 1]:
             raise InputError(
                 f"the marker name '{repeated[0]}' is given more than once; expected different names"
             )
-        each = (
-            np.broadcast_to(self.sigma_m, m)
-            if self.sigma_m.ndim == 0
-            else self.sigma_m
-        )
+        each = np.broadcast_to(self.sigma_m, m) if self.sigma_m.ndim == 0 else self.sigma_m
         sigma_m = read_only_floats(each, (m,), name="sigma_m")
         for name, sigma in zip(self.names, sigma_m, strict=True):
             if not sigma > 0:
-                raise InputError(
-                    f"sigma_m of marker '{name}' is {sigma:g}; expected > 0"
-                )
+                raise InputError(f"sigma_m of marker '{name}' is {sigma:g}; expected > 0")
         vars(self).update(positions_m=tracks, sigma_m=sigma_m)
         if self.offsets_s is not None:
-            offsets_s = read_only_floats(
-                self.offsets_s, (len(self.t_s),), name="offsets_s"
-            )
+            offsets_s = read_only_floats(self.offsets_s, (len(self.t_s),), name="offsets_s")
             vars(self)["offsets_s"] = offsets_s
         self._check_places(m)
 
@@ -148,11 +123,6 @@ class Markers:
         `places_m` (m, 3), NaN where unknown, and `located` (m,); `places_sigma_m` as an array (m,).
 
         With a placement all markers are located unless `located` is given.
-
-        Raises
-        ------
-        InputError
-            If both places and a placement are given, or their number is not m.
         """
         places_m = self.places_m
         placement = self.placement
@@ -169,20 +139,13 @@ class Markers:
             )
         if placement is None:
             places_m = np.full((m, 3), np.nan) if places_m is None else places_m
-            places_m = read_only_floats(
-                places_m, (m, 3), name="places_m", finite=False
-            )
+            places_m = read_only_floats(places_m, (m, 3), name="places_m", finite=False)
             known = np.isfinite(places_m).all(axis=1)
-        vars(self).update(
-            places_m=places_m,
-            located=np.ones(m, bool) if known is None else known,
-        )
+        vars(self).update(places_m=places_m, located=np.ones(m, bool) if known is None else known)
         if self.places_sigma_m is not None:
             each = self.places_sigma_m
             each = np.broadcast_to(each, m) if each.ndim == 0 else each
-            sigma_m = read_only_floats(
-                each, (m,), name="places_sigma_m", finite=False
-            )
+            sigma_m = read_only_floats(each, (m,), name="places_sigma_m", finite=False)
             vars(self)["places_sigma_m"] = sigma_m
 
     def __repr__(self) -> str:
@@ -195,13 +158,9 @@ class Markers:
         )
         missing = int(self.count_missing().sum())
         gaps = f", {missing} missing" if missing else ""
-        return (
-            f"Markers({', '.join(shown)}: {self.count_samples()} samples{gaps})"
-        )
+        return f"Markers({', '.join(shown)}: {self.count_samples()} samples{gaps})"
 
-    def on_body(
-        self, body: Body, undeformed_places: UndeformedPlaces | None = None
-    ) -> Markers:
+    def on_body(self, body: Body, undeformed_places: UndeformedPlaces | None = None) -> Markers:
         """Return the markers with their placement on a body, without `places_m`; self if they have
         a placement already.
 
@@ -227,11 +186,7 @@ class Markers:
         places = self.places_m.copy()
         if not known.all():
             points_m, times_s = self.first_samples
-            back = (
-                points_m
-                if undeformed_places is None
-                else undeformed_places(points_m, times_s)
-            )
+            back = points_m if undeformed_places is None else undeformed_places(points_m, times_s)
             for m in np.flatnonzero(~known).tolist():
                 if not self.is_present[:, m].any():
                     raise InputError(
@@ -274,9 +229,7 @@ class Markers:
         [s], then that of the first sample.
         """
         rows = self.is_present.argmax(axis=0)
-        return self.positions_m[rows, np.arange(len(self.names))], self.t_s[
-            rows
-        ]
+        return self.positions_m[rows, np.arange(len(self.names))], self.t_s[rows]
 
     @cached_property
     def is_present(self) -> NDArray[np.bool_]:
@@ -317,6 +270,4 @@ class Markers:
         """
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
         element_nodes_m = nodes_m[..., self.placement.nodes, :]
-        return np.einsum(
-            "mk,...mkd->...md", self.placement.weights, element_nodes_m
-        )
+        return np.einsum("mk,...mkd->...md", self.placement.weights, element_nodes_m)

@@ -36,9 +36,7 @@ def _with_torques(values: ArrayLike) -> Array:
     """
     rows = np.array(values, dtype=float)
     forces_alone = rows.ndim == 2 and rows.shape[1] == 3
-    return (
-        np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows
-    )
+    return np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows
 
 
 @declaration
@@ -71,31 +69,22 @@ class Wrench:
         If shapes disagree, time does not increase, nothing is measured, or a sigma is missing.
     """
 
-    t_s: Array = key(
-        converter=float_converter((None,), "t_s of the wrench"),
-        metadata=over_time(),
-    )
+    t_s: Array = key(converter=float_converter((None,), "t_s of the wrench"), metadata=over_time())
     values: Array = key(converter=_with_torques, metadata=over_time())
     sigma_n: float = key(Positive)
     sigma_nm: float | None = key(Positive | None, default=None)
     frame: Frame = key(Frame, default="world")
     point_m: Array = key(
-        Vector,
-        converter=float_converter((3,), "point_m of the wrench"),
-        default=(0.0,) * 3,
+        Vector, converter=float_converter((3,), "point_m of the wrench"), default=(0.0,) * 3
     )
     symmetry: int = key(AtLeastOne, default=1)
 
     def __post_init__(self) -> None:
         """Check the measurements and store them as read-only floats (S, 6), in place."""
         if not len(self.t_s):
-            raise InputError(
-                "the measured wrench has no samples; expected at least one"
-            )
+            raise InputError("the measured wrench has no samples; expected at least one")
         shape = len(self.t_s), 6
-        values = read_only_floats(
-            self.values, shape, name="values of the wrench", finite=False
-        )
+        values = read_only_floats(self.values, shape, name="values of the wrench", finite=False)
         vars(self)["values"] = values
         if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
@@ -122,9 +111,7 @@ class Wrench:
         """Return a copy with zeros at the times `t_s` (S,) [s], as placeholders; NaN for components
         that are not measured.
         """
-        values = np.where(
-            self.measured_components, np.zeros((len(t_s), 1)), np.nan
-        )
+        values = np.where(self.measured_components, np.zeros((len(t_s), 1)), np.nan)
         return replace(self, t_s=t_s, values=values)
 
     @property
@@ -141,9 +128,7 @@ class Wrench:
         """Return the names of the components that are measured at any sample, such as "fz", in the
         order of `COMPONENTS`.
         """
-        return tuple(
-            COMPONENTS[k] for k in np.flatnonzero(self.measured_components)
-        )
+        return tuple(COMPONENTS[k] for k in np.flatnonzero(self.measured_components))
 
     def component_noises(self) -> list[tuple[int, str, str, float]]:
         """Return index, name, unit and σ of each component that is measured at any sample."""
@@ -202,11 +187,7 @@ def read_wrench(
     """
     quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
     table = read_columns(
-        path,
-        quantities,
-        column_names=columns,
-        blank_allowed=True,
-        requires_times=timed,
+        path, quantities, column_names=columns, blank_allowed=True, requires_times=timed
     )
     factor = sign * (area_m2 or 1.0) / symmetry
     return without_rounding(table.t_s), factor * axis_components(
@@ -214,9 +195,7 @@ def read_wrench(
     )
 
 
-def write_wrench_csv(
-    path: str | Path, t_s: ArrayLike, values: ArrayLike
-) -> None:
+def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> None:
     """Write wrenches (S, 3) or (S, 6) [N, N m] at times (S,) [s] as `read_wrench` reads them; NaN
     becomes a blank cell.
 

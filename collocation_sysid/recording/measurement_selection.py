@@ -46,8 +46,9 @@ def shortened_experiment(
         recording.
     shortens_sensors : bool
         Whether later samples of force sensors are removed, and those sensors with fewer than three
-        samples (one if static) or no measured component; and zeros are put in the place of markers of which
-        no sample remains. By default force sensors keep their samples after the end, which are ignored.
+        samples (one if static) or no measured component; and zeros are put in the place of markers
+        of which no sample remains. By default force sensors keep their samples after the end, which
+        are ignored.
     """
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
     for sensor in experiment.separate_sensors:
@@ -60,12 +61,8 @@ def shortened_experiment(
     if shortens_sensors:
         if not np.isfinite(markers.positions_m[:count]).any():
             # At least one sample has to be present.
-            markers = replace(
-                markers, positions_m=np.nan_to_num(markers.positions_m)
-            )
-        grasps = tuple(
-            grasp.with_loads_within(t_s, fewest=fewest) for grasp in grasps
-        )
+            markers = replace(markers, positions_m=np.nan_to_num(markers.positions_m))
+        grasps = tuple(grasp.with_loads_within(t_s, fewest=fewest) for grasp in grasps)
     return replace(
         experiment,
         t_s=t_s,
@@ -76,25 +73,20 @@ def shortened_experiment(
 
 
 def _replaced_sensors(
-    experiment: Experiment,
-    change: Callable[[SeparateSensor], SeparateSensor | None],
+    experiment: Experiment, change: Callable[[SeparateSensor], SeparateSensor | None]
 ) -> dict[str, Any]:
     """Return the separate sensors of an experiment by the name of the field, each replaced by what
     `change` returns for it; None leaves the sensor out.
     """
     return {
         name: [
-            changed
-            for each in getattr(experiment, name)
-            if (changed := change(each)) is not None
+            changed for each in getattr(experiment, name) if (changed := change(each)) is not None
         ]
         for name in sensor_fields(Experiment)
     }
 
 
-def without_later_measurements(
-    experiment: Experiment, end_s: float
-) -> Experiment:
+def without_later_measurements(experiment: Experiment, end_s: float) -> Experiment:
     """Return the experiment without the measurements after `end_s` [s]; its times stay.
 
     Markers and measured forces become NaN, and other sensors do as they declare, see
@@ -106,18 +98,12 @@ def without_later_measurements(
     return replace(
         experiment,
         markers=replace(markers, positions_m=positions_m),
-        grasps=tuple(
-            grasp.without_loads_after(end_s) for grasp in experiment.grasps
-        ),
-        **_replaced_sensors(
-            experiment, lambda each: each.without_later_values(end_s)
-        ),
+        grasps=tuple(grasp.without_loads_after(end_s) for grasp in experiment.grasps),
+        **_replaced_sensors(experiment, lambda each: each.without_later_values(end_s)),
     )
 
 
-def thinned_experiment(
-    experiment: Experiment, *, many: int, most: int
-) -> Experiment:
+def thinned_experiment(experiment: Experiment, *, many: int, most: int) -> Experiment:
     """Return the experiment with at most `most` unlabelled points in each sample of those sensors
     that have more than `many` in one; itself if there is no such sensor.
     """
@@ -130,9 +116,7 @@ def thinned_experiment(
     if all(
         new is old
         for name in sensors
-        for new, old in zip(
-            sensors[name], getattr(experiment, name), strict=True
-        )
+        for new, old in zip(sensors[name], getattr(experiment, name), strict=True)
     ):
         return experiment
     return replace(experiment, **sensors)
@@ -167,9 +151,7 @@ def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
     """
     if any(each.markers.count_samples() for each in experiments):
         return "markers", "sigma_m"
-    sensors = [
-        sensor for each in experiments for sensor in each.separate_sensors
-    ]
+    sensors = [sensor for each in experiments for sensor in each.separate_sensors]
     for sensor in sensors:
         if sensor.measures_shape:
             return sensor.measurement_text, sensor.noise_key

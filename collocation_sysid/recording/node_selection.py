@@ -13,15 +13,7 @@ from ..common.array_types import Index
 from ..common.schema_tables import ByForm, Corner, Section, Vector, require_one
 from ..common.validated_types import Positive, StrictInteger, Text
 from ..errors import InputError
-from ..fem.meshes.selection import (
-    Ball,
-    Box,
-    Face,
-    FaceName,
-    Indices,
-    Named,
-    Selection,
-)
+from ..fem.meshes.selection import Ball, Box, Face, FaceName, Indices, Named, Selection
 from .checked_arrays import read_only_nodes
 
 if TYPE_CHECKING:
@@ -78,9 +70,7 @@ def selection_from_section(section: NodesSection | str) -> Selection:
     """
     if isinstance(section, str):
         return Named(section)
-    ((kind, value),) = (
-        (KINDS[key], value) for key, value in section if value is not None
-    )
+    ((kind, value),) = ((KINDS[key], value) for key, value in section if value is not None)
     return kind(*value) if kind in (Box, Ball) else kind(value)
 
 
@@ -102,13 +92,9 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
         """Return sorted distinct read-only node indices, or a `Selection` unchanged."""
         if isinstance(selection, Selection):
             return cast(Index, selection)
-        nodes = np.unique(
-            read_only_nodes(selection, (None,), name=f"nodes of {what}")
-        )
+        nodes = np.unique(read_only_nodes(selection, (None,), name=f"nodes of {what}"))
         if nodes.size == 0:
-            raise InputError(
-                f"{what} has an empty list of nodes; expected at least one node index"
-            )
+            raise InputError(f"{what} has an empty list of nodes; expected at least one node index")
         nodes.setflags(write=False)
         return nodes
 

@@ -40,21 +40,10 @@ Component = Literal[
     "camera",
     "gauge",
 ]
-ModelPart = Literal[
-    "reading",
-    "clock",
-    "sensor",
-    "gravity",
-    "grasps",
-    "loads",
-    "drives",
-    "depth",
-]
+ModelPart = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth"]
 # Scope of parameters that recordings share, as a pattern and in words for messages.
 SCOPE = r"shared( \S+)?"
-SCOPE_TEXT = (
-    '"shared", or "shared" followed by the name of a group of recordings'
-)
+SCOPE_TEXT = '"shared", or "shared" followed by the name of a group of recordings'
 # Readable units: factor and text by SI unit.
 READABLE_UNITS = {
     "m": (1e3, " mm"),
@@ -173,9 +162,7 @@ class NuisanceRow:
     sentence: str = ""
     by: Literal["length", "worst", "each"] = "each"
     same: Callable[..., dict[str, object]] = lambda experiment: {}
-    reading: (
-        Callable[[ca.SX, ca.SX, ca.SX, RecordingQuantities], ca.SX] | None
-    ) = None
+    reading: Callable[[ca.SX, ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
     clock: Callable[[ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
     considered: float | None = None
 
@@ -194,9 +181,7 @@ class NuisanceRow:
 
         It is "prior" for the unit "1", "prior_sigmas" for "σ" and "prior_1_m2" for "1/m²".
         """
-        unit = {"1": "", "σ": "_sigmas", "1/m²": "_1_m2"}.get(
-            self.unit, f"_{self.unit.lower()}"
-        )
+        unit = {"1": "", "σ": "_sigmas", "1/m²": "_1_m2"}.get(self.unit, f"_{self.unit.lower()}")
         return f"prior{unit}"
 
     @property
@@ -215,9 +200,7 @@ def cayley_rotation(rotation_vector: ca.SX) -> ca.SX:
     Its angle is that of the rotation vector (3,) [rad] up to third order.
     """
     half = ca.skew(rotation_vector / 2)
-    return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(rotation_vector) / 4) * (
-        half + half @ half
-    )
+    return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(rotation_vector) / 4) * (half + half @ half)
 
 
 def in_readable_unit(value: float, unit: str) -> tuple[float, str]:
@@ -230,9 +213,7 @@ def in_readable_unit(value: float, unit: str) -> tuple[float, str]:
     return factor * value, shown
 
 
-def _rotate_position(
-    y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities
-) -> ca.SX:
+def _rotate_position(y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities) -> ca.SX:
     """Return a marker's predicted position y (3,) [m], rotated by the rotation vector `values` (3,)
     [rad] about the pivot of `data`; the time is not used.
     """
@@ -240,18 +221,14 @@ def _rotate_position(
     return cayley_rotation(values) @ (y - pivot) + pivot
 
 
-def _shift_position(
-    y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities
-) -> ca.SX:
+def _shift_position(y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities) -> ca.SX:
     """Return a marker's predicted position y (3,) [m] plus `values` (3,) [m]; time and data are not
     used.
     """
     return y + values
 
 
-def _distort_position(
-    y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities
-) -> ca.SX:
+def _distort_position(y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities) -> ca.SX:
     """Return a marker's predicted position y (3,) [m] with radial distortion of first order, with
     the coefficient `values` [1/m²], about the pivot of `data`; the time is not used.
     """
@@ -326,9 +303,7 @@ def _hand_eye_sharing_key(experiment: Any) -> dict[str, object]:
     """Return what must agree in recordings that share the hand–eye transform: the body (the same
     object), and the set of nodes in its grasps without obstacles.
     """
-    nodes = {
-        int(node) for grasp in experiment.body_grasps for node in grasp.nodes
-    }
+    nodes = {int(node) for grasp in experiment.body_grasps for node in grasp.nodes}
     return {"body": id(experiment.body), "set of nodes in its grasps": nodes}
 
 
@@ -409,9 +384,7 @@ CLOCK_RATE = NuisanceRow(
     key="clock_rate",
     considered=1e-4,
     changes=("clock",),
-    applies=lambda experiment: (
-        _is_motion(experiment) and _has_markers(experiment)
-    ),
+    applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
     label="rate of the markers' clock",
     sentence="the markers' clock is slow by {signed}",
     description="how much slower the clock of the markers runs than the clock of the grasps",
@@ -537,9 +510,7 @@ OBSTACLE_TILT = NuisanceRow(
     changes=("grasps",),
     by="length",
     considered=0.2 * DEGREE,
-    applies=lambda experiment: any(
-        each.shape.has_tilt for each in experiment.obstacles
-    ),
+    applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
     applies_to=_has_tilt,
     label="tilt of {which}, {axis}",
     sentence="tilt of an obstacle: {size}",
@@ -555,12 +526,8 @@ OBSTACLE_TIME = NuisanceRow(
     changes=("grasps",),
     by="worst",
     considered=1e-3,
-    applies=lambda experiment: any(
-        len(each.poses.t_s) > 1 for each in experiment.obstacles
-    ),
-    applies_to=lambda experiment, index: (
-        len(experiment.grasps[index].poses.t_s) > 1
-    ),
+    applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
+    applies_to=lambda experiment, index: len(experiment.grasps[index].poses.t_s) > 1,
     label="delay of {which}",
     sentence="delay of an obstacle: up to {size}",
     description="delay of each obstacle's motion, to first order",
@@ -619,8 +586,7 @@ PRESSURE_LAG = NuisanceRow(
     applies=lambda experiment: any(each.lag_s for each in experiment.pressures),
     label="{which}, log of lag over stated lag",
     sentence="{which}: log of lag over stated lag {signed}",
-    description="logarithm of the ratio of the true lag of each pressure to the stated "
-    "lag_s",
+    description="logarithm of the ratio of the true lag of each pressure to the stated lag_s",
 )
 JOINING = NuisanceRow(
     "joining_s",
@@ -788,9 +754,7 @@ DEPTH_TIME = NuisanceRow(
     key="depth_time",
     of="camera",
     changes=("depth",),
-    applies=lambda experiment: (
-        _is_motion(experiment) and _has_depth_cameras(experiment)
-    ),
+    applies=lambda experiment: _is_motion(experiment) and _has_depth_cameras(experiment),
     low=-3.0,
     high=3.0,
     by="worst",
@@ -954,15 +918,7 @@ class Nuisance:
     own: Sequence[NuisanceRow] = field(default=(), hash=False)
 
     def __post_init__(self) -> None:
-        """Check custom kinds, deviations and scopes.
-
-        Raises
-        ------
-        InputError
-            If a custom kind is not usable (see `_check_custom_kind`) or has the name of another
-            kind, a standard deviation is not above zero, or `scope` names an unknown kind or has a
-            text other than `SCOPE_TEXT` describes.
-        """
+        """Check custom kinds, deviations and scopes."""
         for row in self.own:
             _check_custom_kind(row)
             if [each.name for each in self.list_kinds()].count(row.name) > 1:
@@ -985,9 +941,7 @@ class Nuisance:
                     f"{listed(names)}"
                 )
             if not re.fullmatch(SCOPE, word):
-                raise InputError(
-                    f"the scope of {name} is {word!r}; expected {SCOPE_TEXT}"
-                )
+                raise InputError(f"the scope of {name} is {word!r}; expected {SCOPE_TEXT}")
 
     def list_kinds(self) -> tuple[NuisanceRow, ...]:
         """Return all kinds of nuisance parameters that may be estimated: `KINDS`, then custom ones."""

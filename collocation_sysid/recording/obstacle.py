@@ -34,9 +34,7 @@ def _require_solid(shape: Solid) -> Solid:
     """Return `shape` unchanged; an `InputError` if it is no `Solid`."""
     if not isinstance(shape, Solid):
         kinds = ", ".join(kind.__name__ for kind in KINDS.values())
-        raise InputError(
-            f"shape of an obstacle is {shape!r}; expected one of {kinds}"
-        )
+        raise InputError(f"shape of an obstacle is {shape!r}; expected one of {kinds}")
     return shape
 
 
@@ -71,7 +69,9 @@ class ObstacleForces:
     frame_poses: PoseSequence | None
 
     def rotate_to_world_n(self) -> Array:
-        """Return the forces (S, 3) along the axes of the world [N], NaN where a component is missing."""
+        """Return the forces (S, 3) along the axes of the world [N], NaN where a component is
+        missing.
+        """
         if self.frame_poses is None:
             return np.array(self.forces_n)
         rotations, _ = self.frame_poses.at(self.t_s)
@@ -124,10 +124,7 @@ class Obstacle(Grasp):
     nodes: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     poses: PoseSequence = field(default_factory=PoseSequence.fixed)
     shape: Solid = key(
-        SolidSection,
-        read=solid_from_section,
-        converter=_require_solid,
-        kw_only=True,
+        SolidSection, read=solid_from_section, converter=_require_solid, kw_only=True
     )
     name: str = key(Text | None, default="obstacle", kw_only=True)
     friction: float | str = key(NotNegative | Text, default=0.0, kw_only=True)
@@ -138,9 +135,7 @@ class Obstacle(Grasp):
         default=None,
         kw_only=True,
     )
-    stiffness_pa_m: float | None = key(
-        Positive | None, default=None, kw_only=True
-    )
+    stiffness_pa_m: float | None = key(Positive | None, default=None, kw_only=True)
     width_m: float | None = key(Positive | None, default=None, kw_only=True)
     slip: float | None = key(Positive | None, default=None, kw_only=True)
     relaxed: float | None = field(default=None, kw_only=True)
@@ -159,9 +154,7 @@ class Obstacle(Grasp):
             raise InputError(
                 f"friction of {self.name} is {self.friction:g}; expected {least:g} to {largest:g}"
             )
-        if (named := self.friction_constant) and not named.name.endswith(
-            FRICTION.name
-        ):
+        if (named := self.friction_constant) and not named.name.endswith(FRICTION.name):
             raise InputError(
                 f"friction of {self.name} is {named.name!r}; expected a number, or the name of a "
                 f"parameter that ends with {FRICTION.name}, such as table_friction"
@@ -203,11 +196,7 @@ class Obstacle(Grasp):
         axes in `zero`, not normalised; if there are none, the unit vector that its shape states.
         """
         uncertain_axes = np.array([float(axis in self.zero) for axis in "xyz"])
-        return (
-            uncertain_axes
-            if uncertain_axes.any()
-            else self.shape.offset_direction
-        )
+        return uncertain_axes if uncertain_axes.any() else self.shape.offset_direction
 
     @property
     def tilt_axes(self) -> Array:
@@ -216,9 +205,7 @@ class Obstacle(Grasp):
         """
         return orthogonal_axes(self.shape.offset_direction)
 
-    def displaced(
-        self, offset_m: float, tilt_rad: Array, delay_s: float
-    ) -> Obstacle:
+    def displaced(self, offset_m: float, tilt_rad: Array, delay_s: float) -> Obstacle:
         """Return a copy of the obstacle, shifted and tilted in its own frame, and delayed.
 
         Parameters
@@ -232,12 +219,8 @@ class Obstacle(Grasp):
         """
         motion = np.eye(4)
         middle = self.shape.tilt_centre_m
-        motion[:3, :3] = Rotation.from_rotvec(
-            tilt_rad @ self.tilt_axes
-        ).as_matrix()
-        motion[:3, 3] = (
-            middle - motion[:3, :3] @ middle + offset_m * self.offset_direction
-        )
+        motion[:3, :3] = Rotation.from_rotvec(tilt_rad @ self.tilt_axes).as_matrix()
+        motion[:3, 3] = middle - motion[:3, :3] @ middle + offset_m * self.offset_direction
         poses = self.poses.after(motion)
         return replace(self, poses=replace(poses, t_s=poses.t_s + delay_s))
 
@@ -251,11 +234,7 @@ class Obstacle(Grasp):
     @cached_property
     def friction_constant(self) -> Constant | None:
         """Parameter that is the coefficient of friction; None if the coefficient is a number."""
-        return (
-            constant_named(self.friction)
-            if isinstance(self.friction, str)
-            else None
-        )
+        return constant_named(self.friction) if isinstance(self.friction, str) else None
 
 
 @lru_cache(maxsize=32)
@@ -264,9 +243,7 @@ def _contact_surface(body: Body, obstacle: Obstacle) -> ContactSurface:
     return ContactSurface.from_body(body, obstacle.nodes, chosen=obstacle.faces)
 
 
-def with_obstacle_frames(
-    body: Body, obstacles: Sequence[Obstacle], *, is_static: bool
-) -> Body:
+def with_obstacle_frames(body: Body, obstacles: Sequence[Obstacle], *, is_static: bool) -> Body:
     """Return the body with four nodes for the frame of each obstacle, and the coefficients of
     friction that are parameters among its constants; self if it has these already. Frames of other
     obstacles are replaced.
@@ -275,13 +252,8 @@ def with_obstacle_frames(
     if pressures are averaged over time steps, which happens in motions without `relaxed` contact.
     """
     named = (each.friction_constant for each in obstacles)
-    frictions = tuple(
-        dict.fromkeys(constant for constant in named if constant is not None)
-    )
+    frictions = tuple(dict.fromkeys(constant for constant in named if constant is not None))
     unsymmetric = any(
-        each.has_friction or (each.relaxed is None and not is_static)
-        for each in obstacles
+        each.has_friction or (each.relaxed is None and not is_static) for each in obstacles
     )
-    return body.with_frames(
-        len(obstacles), has_skew_frame_forces=unsymmetric, frictions=frictions
-    )
+    return body.with_frames(len(obstacles), has_skew_frame_forces=unsymmetric, frictions=frictions)

@@ -98,14 +98,10 @@ class Plane(Solid):
     has_tilt: ClassVar[bool] = True
 
     normal: Array = key(
-        Vector,
-        converter=_unit_vector_converter("normal of a plane"),
-        default=(0.0, 0.0, 1.0),
+        Vector, converter=_unit_vector_converter("normal of a plane"), default=(0.0, 0.0, 1.0)
     )
     point_m: Array = key(
-        Vector,
-        converter=float_converter((3,), "point_m of a plane"),
-        default=(0.0,) * 3,
+        Vector, converter=float_converter((3,), "point_m of a plane"), default=(0.0,) * 3
     )
 
     @property
@@ -124,10 +120,7 @@ class Plane(Solid):
         """
         middle = about_m - (about_m - self.point_m) @ self.normal * self.normal
         u, v = orthogonal_axes(self.normal) * size_m / 2
-        corners = [
-            middle + a * u + b * v
-            for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))
-        ]
+        corners = [middle + a * u + b * v for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))]
         return [np.array(corners)]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
@@ -148,16 +141,11 @@ class Sphere(Solid):
     """
 
     radius_m: float = key(Positive)
-    centre_m: Array = key(
-        Vector, converter=float_converter((3,), "centre_m"), default=(0.0,) * 3
-    )
+    centre_m: Array = key(Vector, converter=float_converter((3,), "centre_m"), default=(0.0,) * 3)
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
         """Return three closed circles (33, 3), one across each axis; both arguments are ignored."""
-        return [
-            _circle(self.centre_m, axis, radius_m=self.radius_m)
-            for axis in np.eye(3)
-        ]
+        return [_circle(self.centre_m, axis, radius_m=self.radius_m) for axis in np.eye(3)]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
         """Return the signed distance of a point (3,) from the sphere [m]; negative inside."""
@@ -165,13 +153,7 @@ class Sphere(Solid):
 
 
 def _checked_ends(value: ArrayLike) -> Array:
-    """Return the two ends (2, 3) of an axis [m] as a read-only array.
-
-    Raises
-    ------
-    InputError
-        If they coincide, or have another shape.
-    """
+    """Return the two ends (2, 3) of an axis [m] as a read-only array."""
     ends = float_converter((2, 3), "ends_m")(value)
     if (ends[0] == ends[1]).all():
         raise InputError(
@@ -210,9 +192,7 @@ class _AxialSolid(Solid):
         ignored.
         """
         axis = np.diff(self.ends_m, axis=0)[0]
-        first, last = (
-            _circle(end, axis, radius_m=self.radius_m) for end in self.ends_m
-        )
+        first, last = (_circle(end, axis, radius_m=self.radius_m) for end in self.ends_m)
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
@@ -248,8 +228,7 @@ class Cylinder(_AxialSolid):
         """
         place = self._cylindrical_coordinates(point)
         beyond = ca.vertcat(
-            place.radial_m - self.radius_m,
-            ca.fabs(place.axial_m) - place.half_length_m,
+            place.radial_m - self.radius_m, ca.fabs(place.axial_m) - place.half_length_m
         )
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
@@ -286,9 +265,7 @@ class Cuboid(Solid):
 
     has_tilt: ClassVar[bool] = True
 
-    corners_m: Array = key(
-        tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m")
-    )
+    corners_m: Array = key(tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m"))
     rounding_m: float = key(NotNegative, default=0.0)
 
     def __post_init__(self) -> None:
@@ -308,16 +285,12 @@ class Cuboid(Solid):
         """Return the twelve edges, (2, 3) each; both arguments are ignored."""
         corners = np.array(list(product(*self.corners_m.T)))
         differences = (corners[:, None] != corners).sum(axis=2)
-        return [
-            corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j
-        ]
+        return [corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
         """Return the signed distance of a point (3,) from the box [m]; negative inside."""
         low, high = self.corners_m
-        beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM(
-            (high - low) / 2
-        )
+        beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM((high - low) / 2)
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
 
@@ -333,9 +306,7 @@ def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
     (3,), across an axis (3,) of any length.
     """
     angle = np.linspace(0, 2 * np.pi, 33)
-    round_m = np.stack(
-        [np.cos(angle), np.sin(angle)], axis=1
-    ) @ orthogonal_axes(axis)
+    round_m = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ orthogonal_axes(axis)
     return centre_m + radius_m * round_m
 
 

@@ -56,17 +56,13 @@ class Placement:
         """Store read-only copies, in place; an `InputError` if shapes disagree or a node is not
         below `node_count`.
         """
-        nodes = read_only_nodes(
-            self.nodes, (None, None), name="nodes of the placement"
-        )
+        nodes = read_only_nodes(self.nodes, (None, None), name="nodes of the placement")
         if nodes.size and nodes.max() >= self.node_count:
             raise InputError(
                 f"the placement refers to node {nodes.max()}; expected node indices from 0 to "
                 f"{self.node_count - 1}"
             )
-        weights = read_only_floats(
-            self.weights, nodes.shape, name="weights of the placement"
-        )
+        weights = read_only_floats(self.weights, nodes.shape, name="weights of the placement")
         distance = read_only_floats(
             self.distance_m, (len(nodes),), name="distance_m of the placement"
         )
@@ -111,15 +107,9 @@ def place_markers(
         If a marker has a position that is not finite or is too far from the body, the rule is
         unknown, or names and positions differ in number.
     """
-    points = read_only_floats(
-        points_m, (None, 3), name="marker positions", finite=False
-    )
-    nodes_m = read_only_floats(
-        node_positions_m, (None, 3), name="node positions"
-    )
-    labels = (
-        [str(k) for k in range(len(points))] if names is None else list(names)
-    )
+    points = read_only_floats(points_m, (None, 3), name="marker positions", finite=False)
+    nodes_m = read_only_floats(node_positions_m, (None, 3), name="node positions")
+    labels = [str(k) for k in range(len(points))] if names is None else list(names)
     if len(labels) != len(points):
         raise InputError(
             f"found {len(labels)} marker names for {len(points)} marker positions; expected one "
@@ -136,11 +126,9 @@ def place_markers(
             "could be determined; give its reference_m"
         )
     shape = LocatedBody(nodes_m, body)
-    snap_m = {
-        "auto": VERTEX_SNAP_EDGES * shape.mean_edge_m,
-        "vertex": np.inf,
-        "embedded": -1.0,
-    }[attach]
+    snap_m = {"auto": VERTEX_SNAP_EDGES * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[
+        attach
+    ]
     limit_m = shape.mean_edge_m if max_distance_m is None else max_distance_m
 
     nodes = np.empty((len(points), body.cells.shape[1]), dtype=np.int64)
@@ -173,9 +161,7 @@ def place_markers(
                 f"{what} at {point_text(point)} m is {distance[k]:.4g} m away from the body, more "
                 f"than the {limit_m:.4g} m allowed; {remedy}"
             )
-    return Placement(
-        nodes, weights, distance_m=distance, node_count=len(nodes_m)
-    )
+    return Placement(nodes, weights, distance_m=distance, node_count=len(nodes_m))
 
 
 class LocatedPoint(NamedTuple):
@@ -222,9 +208,7 @@ class LocatedBody:
         self.body = body
         corners = body.cells[:, :4]
         ends = nodes_m[body.mesh.edges]
-        self.mean_edge_m = float(
-            np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean()
-        )
+        self.mean_edge_m = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.origin = nodes_m[corners[:, 0]]
         edges = nodes_m[corners[:, 1:]] - self.origin[:, None]
         self.inverse = np.linalg.inv(edges)  # L1..L3 = (x − origin) @ inverse
@@ -244,9 +228,7 @@ class LocatedBody:
         """
         cell, distance = self.nearest_cell(point)
         return LocatedPoint(
-            self.body.cells[cell],
-            self._shape_functions_at(point, cell),
-            distance_m=distance,
+            self.body.cells[cell], self._shape_functions_at(point, cell), distance_m=distance
         )
 
     def nearest_cell(self, point: Array) -> tuple[int, float]:
@@ -265,9 +247,7 @@ class LocatedBody:
         )
         distance = float(to_faces.min())
         # Where an edge or corner is nearest, extrapolate from the element that must the least.
-        nearest = self.body.mesh.surface_cells[
-            to_faces <= distance + 1e-9 * self.mean_edge_m
-        ]
+        nearest = self.body.mesh.surface_cells[to_faces <= distance + 1e-9 * self.mean_edge_m]
         return int(nearest[np.argmax(least_coordinate[nearest])]), distance
 
     def weights_at_nearest_point(self, point: Array) -> tuple[Index, Array]:
@@ -281,11 +261,11 @@ class LocatedBody:
         return located.nodes, located.weights
 
     def places_of_points(self, points_m: Array) -> Array:
-        """Return the places (M, 3) on the undeformed body [m] of points (M, 3) [m] that are measured
-        in the configuration of these nodes.
+        """Return the places (M, 3) on the undeformed body [m] of points (M, 3) [m] that are
+        measured in the configuration of these nodes.
 
-        A point outside the body gets the place of the nearest point of its surface, and a point that
-        is not finite NaN.
+        A point outside the body gets the place of the nearest point of its surface, and a point
+        that is not finite NaN.
         """
         places_m = np.full(points_m.shape, np.nan)
         for m in np.flatnonzero(np.isfinite(points_m).all(axis=1)).tolist():
@@ -300,26 +280,20 @@ class LocatedBody:
         nearest = nearest_points_of_triangles(point, self.triangles)
         face = int(np.linalg.norm(point - nearest, axis=1).argmin())
         sides = self.triangles[face, 1:] - self.triangles[face, 0]
-        return nearest[face], np.asarray(
-            np.linalg.qr(sides.T)[0], dtype=np.float64
-        )
+        return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
         """Return barycentric coordinates (k, 4) of points (k, 3), or of one point (3,), in the
         cells with the indices (k,), as of straight edges; negative outside a cell.
         """
-        rest = np.einsum(
-            "ei,eij->ej", points - self.origin[cells], self.inverse[cells]
-        )
+        rest = np.einsum("ei,eij->ej", points - self.origin[cells], self.inverse[cells])
         return np.column_stack([1.0 - rest.sum(axis=1), rest])
 
     def barycentric_gradients(self, cells: Index) -> Array:
         """Return the derivatives (k, 4, 3) of the barycentric coordinates by the point [1/m], in
         the cells with the indices (k,).
         """
-        rest = np.asarray(
-            np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64
-        )
+        rest = np.asarray(np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64)
         return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
 
     def _shape_functions_at(self, point: Array, cell: int) -> Array:
@@ -356,9 +330,7 @@ def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
     ends = np.roll(triangles, -1, axis=1)
     sides = ends - triangles
     away = point - triangles
-    share = np.einsum("fci,fci->fc", away, sides) / np.einsum(
-        "fci,fci->fc", sides, sides
-    )
+    share = np.einsum("fci,fci->fc", away, sides) / np.einsum("fci,fci->fc", sides, sides)
     on_sides = triangles + np.clip(share, 0.0, 1.0)[:, :, None] * sides
     best = np.linalg.norm(point - on_sides, axis=2).argmin(axis=1)
     ab = sides[:, 0]
@@ -370,6 +342,4 @@ def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
     in_b = np.einsum("fi,fi->f", np.cross(ap, ac), normal) / squared
     above = (in_b >= 0.0) & (in_c >= 0.0) & (in_b + in_c <= 1.0)
     within = triangles[:, 0] + in_b[:, None] * ab + in_c[:, None] * ac
-    return np.where(
-        above[:, None], within, on_sides[np.arange(len(best)), best]
-    )
+    return np.where(above[:, None], within, on_sides[np.arange(len(best)), best])

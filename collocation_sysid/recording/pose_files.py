@@ -30,18 +30,14 @@ from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
 POSE_COLUMNS = ("t_s", *POSE)
 
-_MATRIX_COLUMNS = tuple(
-    f"m{row}{column}" for row in range(4) for column in range(4)
-)
+_MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 _ORDERS = ("xyzw", "wxyz")
 _ZIP = b"PK\x03\x04"
 
 
 @names_file_in_errors
 def read_poses(
-    path: str | Path,
-    quaternion: str | None = None,
-    length_unit: str | None = None,
+    path: str | Path, quaternion: str | None = None, length_unit: str | None = None
 ) -> PoseSequence:
     """Read poses of a grasp, which map undeformed to current positions.
 
@@ -69,16 +65,12 @@ def read_poses(
     """
     require_length_unit(length_unit)
     if quaternion not in (None, *_ORDERS):
-        raise InputError(
-            f"quaternion is {quaternion!r}; expected one of {', '.join(_ORDERS)}"
-        )
+        raise InputError(f"quaternion is {quaternion!r}; expected one of {', '.join(_ORDERS)}")
     content = read_bytes(path)
     if content.startswith(_ZIP):
         t_s, matrices = _read_archive(path)
         places = [f"index {k}" for k in range(len(t_s))]
-        return _from_matrices(
-            t_s, matrices, length_unit=length_unit, row_names=places
-        )
+        return _from_matrices(t_s, matrices, length_unit=length_unit, row_names=places)
     grid = _with_column_names(read_table(decode(content)))
     lines = [f"line {row.line}" for row in grid.rows]
     time = find_column(grid, TIME)
@@ -87,22 +79,13 @@ def read_poses(
     t_s = times_in_column(grid, *time)
     others = [k for k in range(len(grid.columns)) if k != time[0]]
     if sorted(grid.columns[k] for k in others) == sorted(_MATRIX_COLUMNS):
-        matrices = _read_columns(
-            grid, map(grid.columns.index, _MATRIX_COLUMNS)
-        ).reshape(-1, 4, 4)
-        return _from_matrices(
-            t_s, matrices, length_unit=length_unit, row_names=lines
-        )
+        matrices = _read_columns(grid, map(grid.columns.index, _MATRIX_COLUMNS)).reshape(-1, 4, 4)
+        return _from_matrices(t_s, matrices, length_unit=length_unit, row_names=lines)
     axes, metres = _position_columns(grid, length_unit)
-    components = _quaternion_columns(
-        grid, quaternion, columns=[k for k in others if k not in axes]
-    )
+    components = _quaternion_columns(grid, quaternion, columns=[k for k in others if k not in axes])
     positions_m = _read_columns(grid, axes) * metres
     return _checked_sequence(
-        t_s,
-        positions_m,
-        quaternions=_read_columns(grid, components),
-        row_names=lines,
+        t_s, positions_m, quaternions=_read_columns(grid, components), row_names=lines
     )
 
 
@@ -111,15 +94,8 @@ def _checked_sequence(
 ) -> PoseSequence:
     """Return a smooth pose sequence from times (T,) [s], positions (T, 3) [m] and quaternions (T,
     4), ordered x, y, z, w.
-
-    Raises
-    ------
-    InputError
-        If a pose is faulty; the message names its entry of `row_names` (T,).
     """
-    if fault := first_pose_fault(
-        t_s, positions_m, quaternions_xyzw=quaternions
-    ):
+    if fault := first_pose_fault(t_s, positions_m, quaternions_xyzw=quaternions):
         raise InputError(fault[1], where=row_names[fault[0]])
     return PoseSequence(t_s, positions_m, quaternions_xyzw=quaternions)
 
@@ -155,31 +131,12 @@ def _column_error(grid: TextTable) -> InputError:
     )
 
 
-def _position_columns(
-    grid: TextTable, length_unit: str | None
-) -> tuple[list[int], float]:
+def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[int], float]:
     """Return the indices of the columns named x, y, z (in capitals, too), and the factor from their
     unit to metres.
-
-    Parameters
-    ----------
-    grid : TextTable
-    length_unit : str or None
-        Unit of columns whose names state none; None if it is not given.
-
-    Raises
-    ------
-    InputError
-        If they are not three columns of one unit, or the unit is stated nowhere or twice
-        differently.
     """
     parts = [name_and_unit(column) for column in grid.columns]
-    axes = [
-        k
-        for axis in "xyz"
-        for k, (name, _) in enumerate(parts)
-        if name.lower() == axis
-    ]
+    axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
     units = [parts[k][1] for k in axes]
     metres = [si_factor(unit or length_unit or "m", "length") for unit in units]
     if len(axes) != 3 or None in metres or len(set(metres)) > 1:
@@ -191,8 +148,7 @@ def _position_columns(
             f"{', '.join(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m"
         )
     if length_unit and any(
-        unit and si_factor(unit, "length") != METRES_PER_UNIT[length_unit]
-        for unit in units
+        unit and si_factor(unit, "length") != METRES_PER_UNIT[length_unit] for unit in units
     ):
         raise grid.error_at(
             f"length_unit is '{length_unit}', but the columns are {named}; expected the same "
@@ -201,26 +157,8 @@ def _position_columns(
     return axes, float(metres[0] or 1.0)
 
 
-def _quaternion_columns(
-    grid: TextTable, order: str | None, columns: list[int]
-) -> list[int]:
-    """Return the indices of the columns of the quaternion in the order x, y, z, w.
-
-    Parameters
-    ----------
-    grid : TextTable
-    order : {"xyzw", "wxyz"} or None
-        Stated order of the columns; needed if the columns are numbered, q0 to q3 or q1 to q4. For
-        columns qx, qy, qz, qw it has to be None or their order in the file.
-    columns : list of int
-        Columns that hold neither time nor position.
-
-    Raises
-    ------
-    InputError
-        If the columns are neither named nor numbered as those of a quaternion, the order is needed
-        and missing, or the names contradict it.
-    """
+def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) -> list[int]:
+    """Return the indices of the columns of the quaternion in the order x, y, z, w."""
     place = {grid.columns[k]: k for k in columns}
     if sorted(place) == ["qw", "qx", "qy", "qz"]:
         named = "".join(name[1] for name in place)
@@ -231,10 +169,7 @@ def _quaternion_columns(
             )
         return [place[f"q{axis}"] for axis in "xyzw"]
     numbered = sorted(place)
-    if len(columns) != 4 or numbered not in (
-        ["q0", "q1", "q2", "q3"],
-        ["q1", "q2", "q3", "q4"],
-    ):
+    if len(columns) != 4 or numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
         raise _column_error(grid)
     if order is None:
         raise grid.error_at(
@@ -250,67 +185,35 @@ def _quaternion_columns(
 def _read_archive(path: str | Path) -> tuple[Array, Array]:
     """Return `t_s` (T,) [s] and `matrices` (T, 4, 4) of a NumPy archive, in the file's unit of
     length.
-
-    Raises
-    ------
-    InputError
-        If the file is no such archive, or its arrays have other shapes.
     """
     try:
         arrays = load_arrays(path)
     except InputError:
         raise
     except (*DAMAGE, OSError) as error:
-        raise InputError(
-            f"this is not a NumPy archive of numbers: {error}"
-        ) from error
+        raise InputError(f"this is not a NumPy archive of numbers: {error}") from error
     shapes = {key: array.shape for key, array in arrays.items()}
     shape = shapes.get("t_s", ())
-    if (
-        len(shape) != 1
-        or shapes.get("matrices") != (*shape, 4, 4)
-        or not shape[0]
-    ):
+    if len(shape) != 1 or shapes.get("matrices") != (*shape, 4, 4) or not shape[0]:
         raise InputError(
             "the archive contains "
             f"{', '.join(f'{key} {size}' for key, size in shapes.items()) or 'nothing'}; expected "
             "t_s (T,) and matrices (T, 4, 4)"
         )
     try:
-        return arrays["t_s"].astype(np.float64), arrays["matrices"].astype(
-            np.float64
-        )
+        return arrays["t_s"].astype(np.float64), arrays["matrices"].astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"t_s and matrices must hold numbers: {error}"
-        ) from error
+        raise InputError(f"t_s and matrices must hold numbers: {error}") from error
 
 
 def _from_matrices(
     t_s: Array, matrices: Array, length_unit: str | None, row_names: list[str]
 ) -> PoseSequence:
-    """Return the poses of matrices (T, 4, 4) at times (T,) [s].
-
-    Parameters
-    ----------
-    t_s, matrices : arrays
-    length_unit : str or None
-        Unit of the translations, a key of `METRES_PER_UNIT`; None for metres.
-    row_names : list of str
-        Name of each matrix, for messages.
-
-    Raises
-    ------
-    InputError
-        If a matrix is no rigid motion, or times do not increase.
-    """
+    """Return the poses of matrices (T, 4, 4) at times (T,) [s]."""
     if fault := first_matrix_fault(t_s, matrices):
         raise InputError(fault[1], where=row_names[fault[0]])
     metres = METRES_PER_UNIT[length_unit or "m"]
     quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
     return _checked_sequence(
-        t_s,
-        matrices[:, :3, 3] * metres,
-        quaternions=quaternions,
-        row_names=row_names,
+        t_s, matrices[:, :3, 3] * metres, quaternions=quaternions, row_names=row_names
     )

@@ -76,9 +76,7 @@ class PoseSequence:
         unit norm; the first bad row is named, counting from 1.
     """
 
-    t_s: Array = key(
-        converter=float_converter((None,), "t_s of the poses", finite=False)
-    )
+    t_s: Array = key(converter=float_converter((None,), "t_s of the poses", finite=False))
     positions_m: Array = key(converter=np.asarray)
     quaternions_xyzw: Array = key(converter=np.asarray)
     interpolation: Interpolation = key(Interpolation, default="smooth")
@@ -93,18 +91,12 @@ class PoseSequence:
         m = len(self.t_s)
         if not m:
             raise InputError("a pose sequence needs at least one pose")
-        positions_m = read_only_floats(
-            self.positions_m, (m, 3), name="positions_m", finite=False
-        )
+        positions_m = read_only_floats(self.positions_m, (m, 3), name="positions_m", finite=False)
         quaternions = read_only_floats(
             self.quaternions_xyzw, (m, 4), name="quaternions_xyzw", finite=False
         )
-        if fault := first_pose_fault(
-            t_s, positions_m, quaternions_xyzw=quaternions
-        ):
-            raise InputError(
-                fault[1], where=f"row {fault[0] + 1}" if m > 1 else None
-            )
+        if fault := first_pose_fault(t_s, positions_m, quaternions_xyzw=quaternions):
+            raise InputError(fault[1], where=f"row {fault[0] + 1}" if m > 1 else None)
         continuous = _unit_and_continuous(quaternions)
         vars(self).update(positions_m=positions_m, quaternions_xyzw=continuous)
 
@@ -114,17 +106,12 @@ class PoseSequence:
         where they are undeformed.
         """
         return cls(
-            np.array([t0_s]),
-            np.zeros((1, 3)),
-            quaternions_xyzw=np.array([[0.0, 0.0, 0.0, 1.0]]),
+            np.array([t0_s]), np.zeros((1, 3)), quaternions_xyzw=np.array([[0.0, 0.0, 0.0, 1.0]])
         )
 
     @classmethod
     def from_matrices(
-        cls,
-        t_s: ArrayLike,
-        matrices: ArrayLike,
-        interpolation: Interpolation = "smooth",
+        cls, t_s: ArrayLike, matrices: ArrayLike, interpolation: Interpolation = "smooth"
     ) -> PoseSequence:
         """Return the poses of 4×4 matrices [[R, p], [0, 1]], (m, 4, 4) [m], at the times `t_s`
         (m,); `interpolation` as of the class.
@@ -135,23 +122,15 @@ class PoseSequence:
             If shapes disagree, or a matrix is no rigid motion; the first such matrix is named,
             counting from 1.
         """
-        times = read_only_floats(
-            t_s, (None,), name="t_s of the poses", finite=False
-        )
+        times = read_only_floats(t_s, (None,), name="t_s of the poses", finite=False)
         motions = read_only_floats(
-            matrices,
-            (len(times), 4, 4),
-            name="matrices of the poses",
-            finite=False,
+            matrices, (len(times), 4, 4), name="matrices of the poses", finite=False
         )
         if fault := first_matrix_fault(times, motions):
             raise InputError(fault[1], where=f"matrix {fault[0] + 1}")
         quaternions = Rotation.from_matrix(motions[:, :3, :3]).as_quat()
         return cls(
-            times,
-            motions[:, :3, 3],
-            quaternions_xyzw=quaternions,
-            interpolation=interpolation,
+            times, motions[:, :3, 3], quaternions_xyzw=quaternions, interpolation=interpolation
         )
 
     def after(self, first: ArrayLike | PoseSequence) -> PoseSequence:
@@ -179,8 +158,7 @@ class PoseSequence:
         motion[:3, 3] = first.positions_m[0]
         return replace(
             self,
-            positions_m=positions_m
-            + rotations.as_matrix() @ first.positions_m[0],
+            positions_m=positions_m + rotations.as_matrix() @ first.positions_m[0],
             quaternions_xyzw=(rotations * first._rotations[0]).as_quat(),
             first_motion=self.first_motion @ motion,
         )
@@ -220,13 +198,8 @@ class PoseSequence:
             return self._rotations.as_matrix()[first], self.positions_m[first]
         self._require_times_covered(times)
         if self.interpolation == "hold":
-            snap_s = (
-                _INTERVAL_SNAP_STEPS * np.diff(self.t_s).min()
-                + TIME_TOLERANCE_S
-            )
-            k = np.maximum(
-                np.searchsorted(self.t_s, times + snap_s, side="right") - 1, 0
-            )
+            snap_s = _INTERVAL_SNAP_STEPS * np.diff(self.t_s).min() + TIME_TOLERANCE_S
+            k = np.maximum(np.searchsorted(self.t_s, times + snap_s, side="right") - 1, 0)
             return self._rotations.as_matrix()[k], self.positions_m[k]
         if self.interpolation == "smooth" and len(self.t_s) > 2:
             turned = Rotation.from_quat(self._quaternion_spline(times))
@@ -237,19 +210,11 @@ class PoseSequence:
         """Return rotations (k, 3, 3) (SLERP) and translations (k, 3) at times (k,), linear between
         samples and continued linearly beyond them; at least two samples.
         """
-        k = np.clip(
-            np.searchsorted(self.t_s, times, side="right") - 1,
-            0,
-            len(self.t_s) - 2,
-        )
-        fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[
-            :, None
-        ]
+        k = np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 2)
+        fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[:, None]
         step_m = self.positions_m[k + 1] - self.positions_m[k]
         turn = Rotation.from_rotvec(fraction * self.rotation_steps[k])
-        rotations = (
-            Rotation.from_quat(self.quaternions_xyzw[k]) * turn
-        ).as_matrix()
+        rotations = (Rotation.from_quat(self.quaternions_xyzw[k]) * turn).as_matrix()
         return rotations, self.positions_m[k] + fraction * step_m
 
     def moved_positions(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
@@ -258,10 +223,7 @@ class PoseSequence:
         """
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
-        return (
-            np.einsum("tij,kj->tki", rotations, points)
-            + translations[:, None, :]
-        )
+        return np.einsum("tij,kj->tki", rotations, points) + translations[:, None, :]
 
     @cached_property
     def jumps_s(self) -> Array:
@@ -320,13 +282,9 @@ def first_pose_fault(
     Values that are not finite are reported first, then times that do not increase, then quaternions
     whose norm differs from 1 by more than `QUATERNION_NORM_TOLERANCE`.
     """
-    finite = np.isfinite(
-        np.column_stack([t_s, positions_m, quaternions_xyzw])
-    ).all(axis=1)
+    finite = np.isfinite(np.column_stack([t_s, positions_m, quaternions_xyzw])).all(axis=1)
     if not finite.all():
-        return int(
-            np.argmin(finite)
-        ), "the pose holds a value that is not a finite number"
+        return int(np.argmin(finite)), "the pose holds a value that is not a finite number"
     if fault := first_unordered_time(t_s):
         return fault
     norms = np.linalg.norm(quaternions_xyzw, axis=1)
@@ -351,9 +309,7 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
     """
     rotations = matrices[:, :3, :3]
     with np.errstate(invalid="ignore"):
-        gram = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max(
-            axis=(1, 2)
-        )
+        gram = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max(axis=(1, 2))
         last = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
         last_column = np.abs(matrices[:, :3, 3]).max(axis=1)
     for k, time_s in enumerate(t_s):
@@ -363,9 +319,7 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
         if last[k] > _LAST_ROW_TOLERANCE:
             row = ", ".join(f"{value:.4g}" for value in matrices[k, 3])
             hint = (
-                "; is it stored column by column?"
-                if last_column[k] <= _LAST_ROW_TOLERANCE
-                else ""
+                "; is it stored column by column?" if last_column[k] <= _LAST_ROW_TOLERANCE else ""
             )
             return k, f"{at} has the last row {row}; expected 0, 0, 0, 1{hint}"
         if gram[k] > _ORTHONORMALITY_TOLERANCE:
@@ -374,10 +328,7 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
                 f"expected at most {_ORTHONORMALITY_TOLERANCE:g}"
             )
         if np.linalg.det(rotations[k]) < 0:
-            return (
-                k,
-                f"{at} is a reflection (determinant −1); expected a rotation",
-            )
+            return (k, f"{at} is a reflection (determinant −1); expected a rotation")
     return None
 
 
@@ -408,9 +359,7 @@ def jump_intervals(t_s: Array, values: Array) -> Index:
     rate = change / np.diff(t_s)
     large = change > _LEAST_JUMP_SHARE * np.linalg.norm(np.ptp(values, axis=0))
     neighbour_rate = np.maximum(rate[:-2], rate[2:])
-    return 1 + np.flatnonzero(
-        large[1:-1] & (rate[1:-1] > _LEAST_JUMP_RATIO * neighbour_rate)
-    )
+    return 1 + np.flatnonzero(large[1:-1] & (rate[1:-1] > _LEAST_JUMP_RATIO * neighbour_rate))
 
 
 def smooth_spline(t_s: Array, values: Array) -> PPoly:
@@ -436,10 +385,7 @@ def smooth_spline(t_s: Array, values: Array) -> PPoly:
 
 
 def require_determined_motion(
-    poses: PoseSequence,
-    t_s: Array,
-    interval_s: tuple[float, float],
-    file: str | Path,
+    poses: PoseSequence, t_s: Array, interval_s: tuple[float, float], file: str | Path
 ) -> None:
     """Raise an `InputError` if poses do not determine the motion of a grasp while it holds.
 
@@ -479,9 +425,7 @@ def require_determined_motion(
         )
     start_s, end_s = poses.t_s[[0, -1]]
     slack_s = 1.01 * float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
-    shared = np.count_nonzero(
-        (t_s >= start_s) & (t_s <= end_s)
-    )  # none if of two recordings
+    shared = np.count_nonzero((t_s >= start_s) & (t_s <= end_s))  # none if of two recordings
     if shared > 2 and (start_s > first_s + slack_s or end_s < last_s - slack_s):
         window = f"[{max(start_s, t_s[0]):.6g}, {min(end_s, t_s[-1]):.6g}]"
         raise InputError(
@@ -491,16 +435,12 @@ def require_determined_motion(
         )
 
 
-def _typical_step_s(
-    poses: PoseSequence, first_s: float, last_s: float
-) -> float:
+def _typical_step_s(poses: PoseSequence, first_s: float, last_s: float) -> float:
     """Return the median time [s] between consecutive poses from `first_s` to `last_s` between which
     the grasp moves by more than `LARGEST_REST_DIFFERENCE`; 0 if it rests.
     """
     shift_m = np.abs(np.diff(poses.positions_m, axis=0)).max(axis=1)
     turn = np.abs(np.diff(poses.quaternions_xyzw, axis=0)).max(axis=1)
     within = (poses.t_s[1:] > first_s) & (poses.t_s[:-1] < last_s)
-    steps_s = np.diff(poses.t_s)[
-        within & (np.maximum(shift_m, turn) > LARGEST_REST_DIFFERENCE)
-    ]
+    steps_s = np.diff(poses.t_s)[within & (np.maximum(shift_m, turn) > LARGEST_REST_DIFFERENCE)]
     return float(np.median(steps_s)) if len(steps_s) else 0.0

@@ -43,9 +43,7 @@ def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
     return faces
 
 
-_TABLE = Key(
-    "pressure", Text | None, read=read_pressure, constant="pressure_pa"
-)
+_TABLE = Key("pressure", Text | None, read=read_pressure, constant="pressure_pa")
 
 
 @declaration
@@ -75,9 +73,7 @@ class Pressure(Actuator[EnclosedVolume]):
         Pressure in the body: factor · stated pressure − loss_pa.
     """
 
-    faces: Selection | Index = key(
-        Nodes, converter=_checked_faces, read=selection_from_section
-    )
+    faces: Selection | Index = key(Nodes, converter=_checked_faces, read=selection_from_section)
     pressure_pa: Array = key(Finite | None, converter=np.asarray)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
     name: str = key(Text | None, default="pressure")
@@ -94,14 +90,8 @@ class Pressure(Actuator[EnclosedVolume]):
         """Check the stated pressures and store them as `declared_values`, in place; an `InputError`
         for a constant pressure with a lag.
         """
-        pressure = TimeSeries(
-            self.pressure_pa, self.t_s, what=f"pressure_pa of {self.name}"
-        )
-        vars(self).update(
-            pressure_pa=pressure.values,
-            t_s=pressure.t_s,
-            declared_values=pressure,
-        )
+        pressure = TimeSeries(self.pressure_pa, self.t_s, what=f"pressure_pa of {self.name}")
+        vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, declared_values=pressure)
         if self.lag_s and self.t_s is None:
             raise InputError(
                 f"{self.name} is constant and has a lag_s of {self.lag_s:g} s; expected a table of "
@@ -111,12 +101,6 @@ class Pressure(Actuator[EnclosedVolume]):
     def _measure_on(self, body: Body) -> EnclosedVolume:
         """Return the volume on the pressure's side of the faces of a body, positive for a cavity;
         the faces may also be an open patch.
-
-        Raises
-        ------
-        InputError
-            If a selection has no faces, a face given by node indices is not on the boundary, or
-            closed faces enclose the body instead of a cavity.
         """
         mesh = body.mesh
         if isinstance(self.faces, Selection):
@@ -131,10 +115,7 @@ class Pressure(Actuator[EnclosedVolume]):
         # Seen from the cavity, the outside of the material is the inside.
         wall = body.nodes.nodes_of_faces(mesh.surface[rows][:, ::-1])
         volume = EnclosedVolume(wall, len(body.nodes_m))
-        if (
-            not volume.rim.size
-            and volume.evaluate(body.nodes_m.reshape(1, -1))[0] <= 0
-        ):
+        if not volume.rim.size and volume.evaluate(body.nodes_m.reshape(1, -1))[0] <= 0:
             raise InputError(
                 f"{self.name}: the faces are the outer surface of the body; expected the wall of "
                 "a cavity in it, or an open patch whose rim is held"
@@ -153,28 +134,18 @@ class Pressure(Actuator[EnclosedVolume]):
         InputError
             If such faces do not fit `body`, see `_measure_on`.
         """
-        if isinstance(self.faces, Selection) and not isinstance(
-            self.faces, Indices
-        ):
+        if isinstance(self.faces, Selection) and not isinstance(self.faces, Indices):
             return replace(self, body_measure=None)
         corners = self.on_body(body).require_measure().faces[:, :3]
-        return replace(
-            self,
-            faces=split_faces_in_four(corners, body.mesh),
-            body_measure=None,
-        )
+        return replace(self, faces=split_faces_in_four(corners, body.mesh), body_measure=None)
 
-    def energy_amplitude(
-        self, declared_value: Any, factor: Any, offset: Any
-    ) -> Any:
+    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
         """Return the amplitude of the energy, minus the pressure in the body: `offset` − `factor` ·
         `declared_value` [Pa].
         """
         return offset - factor * declared_value
 
-    def with_calibration(
-        self, factor: float, offset: float, log_lag_ratio: float
-    ) -> Self:
+    def with_calibration(self, factor: float, offset: float, log_lag_ratio: float) -> Self:
         """Return the pressure with another factor and offset [Pa], and its own lag times
         exp(`log_lag_ratio`).
         """
@@ -195,9 +166,7 @@ class Pressure(Actuator[EnclosedVolume]):
         """
         if not self.lag_s:
             return self.energy_amplitude(data, factor, offset=offset)
-        pressure_pa = self._lagging_pressure(
-            data, self.lag_s * ca.exp(log_lag_ratio)
-        )
+        pressure_pa = self._lagging_pressure(data, self.lag_s * ca.exp(log_lag_ratio))
         return self.energy_amplitude(pressure_pa, factor, offset=offset)
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
@@ -206,12 +175,8 @@ class Pressure(Actuator[EnclosedVolume]):
         """
         if not self.lag_s:
             return super().energy_amplitude_at(t_s)
-        pressure_pa = (
-            self._lagging_pressure(ca.DM(t_s), ca.DM(self.lag_s)).full().ravel()
-        )
-        return self.energy_amplitude(
-            pressure_pa, self.factor, offset=self.loss_pa
-        )
+        pressure_pa = self._lagging_pressure(ca.DM(t_s), ca.DM(self.lag_s)).full().ravel()
+        return self.energy_amplitude(pressure_pa, self.factor, offset=self.loss_pa)
 
     def _lagging_pressure(self, t_s: Any, lag_s: Any) -> Any:
         """Return the solution p [Pa] of τ dp/dt = stated pressure − p at the times `t_s`, for τ =
@@ -232,9 +197,7 @@ class Pressure(Actuator[EnclosedVolume]):
                 pressure_pa = pressure_pa + change * response
         return pressure_pa
 
-    def with_fixed_rim(
-        self, is_prescribed: NDArray[np.bool_], prescribed_m: Array
-    ) -> Pressure:
+    def with_fixed_rim(self, is_prescribed: NDArray[np.bool_], prescribed_m: Array) -> Pressure:
         """Return the pressure with a volume that does not depend on the motion of a held rim; self
         if the faces are closed.
 
@@ -259,9 +222,7 @@ class Pressure(Actuator[EnclosedVolume]):
         if placed is None or not volume.rim.size:
             return self
         moving_rim = volume.rim[~is_prescribed[volume.rim].all(axis=(1, 2))]
-        is_sliding = np.asarray(
-            np.logical_and.reduce(is_prescribed[moving_rim], axis=1)
-        )  # (k, 3)
+        is_sliding = np.asarray(np.logical_and.reduce(is_prescribed[moving_rim], axis=1))  # (k, 3)
         free = int((~is_sliding.any(axis=1)).sum())
         apex = np.zeros(3)
         size_m = np.nanmax(np.abs(prescribed_m), initial=0.0)
@@ -278,6 +239,4 @@ class Pressure(Actuator[EnclosedVolume]):
                 "is held or slides in a plane perpendicular to an axis: the pressure on other "
                 "patches has no potential energy"
             )
-        return replace(
-            self, body_measure=BodyMeasure(placed.body, volume.with_apex(apex))
-        )
+        return replace(self, body_measure=BodyMeasure(placed.body, volume.with_apex(apex)))

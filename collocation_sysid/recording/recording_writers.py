@@ -23,17 +23,12 @@ def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
     """Write poses as `read_poses` reads them, without their interpolation; the file is replaced
     only when it is complete.
     """
-    values = np.column_stack(
-        [poses.t_s, poses.positions_m, poses.quaternions_xyzw]
-    )
+    values = np.column_stack([poses.t_s, poses.positions_m, poses.quaternions_xyzw])
     _write_csv(path, POSE_COLUMNS, values=values)
 
 
 def write_markers_csv(
-    path: str | Path,
-    t_s: ArrayLike,
-    names: Sequence[str],
-    positions_m: ArrayLike,
+    path: str | Path, t_s: ArrayLike, names: Sequence[str], positions_m: ArrayLike
 ) -> None:
     """Write marker tracks (T, M, 3) [m] as `read_markers` reads them; a sample with a coordinate
     that is not finite becomes three blank cells.
@@ -43,27 +38,18 @@ def write_markers_csv(
     InputError
         If shapes disagree or time does not increase.
     """
-    table = MarkerTable(
-        np.asarray(t_s), tuple(names), positions_m=np.asarray(positions_m)
-    )
-    header = [
-        "t_s",
-        *(f"{name}_{axis}" for name in table.names for axis in "xyz"),
-    ]
+    table = MarkerTable(np.asarray(t_s), tuple(names), positions_m=np.asarray(positions_m))
+    header = ["t_s", *(f"{name}_{axis}" for name in table.names for axis in "xyz")]
     tracks = table.positions_m.reshape(len(table.t_s), -1)
     _write_csv(path, header, values=np.column_stack([table.t_s, tracks]))
 
 
-def write_columns_csv(
-    path: str | Path, columns: Mapping[str, ArrayLike]
-) -> None:
+def write_columns_csv(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
     """Write columns (T,) under their names, blank for NaN; the file is replaced only when it is
     complete.
     """
     _write_csv(
-        path,
-        [*columns],
-        values=np.column_stack([np.asarray(each) for each in columns.values()]),
+        path, [*columns], values=np.column_stack([np.asarray(each) for each in columns.values()])
     )
 
 
@@ -73,24 +59,15 @@ def write_gauge_csv(
     """Write values (S, m) of a custom sensor at times (S,) [s], with one name per column, as
     `read_custom_sensor` reads them; NaN becomes a blank cell.
     """
-    _write_csv(
-        path,
-        ["t_s", *names],
-        values=np.column_stack([np.asarray(t_s), np.asarray(values)]),
-    )
+    _write_csv(path, ["t_s", *names], values=np.column_stack([np.asarray(t_s), np.asarray(values)]))
 
 
 def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
     """Write a header and rows of numbers (rows, columns) with 12 digits; NaN becomes a blank cell.
     The file is replaced only when it is complete.
     """
-    with (
-        replaced_file(path) as draft,
-        open(draft, "w", newline="", encoding="utf-8") as file,
-    ):
+    with replaced_file(path) as draft, open(draft, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         for row in values + 0.0:  # without the sign of a zero
-            writer.writerow(
-                "" if math.isnan(value) else _DIGITS % value for value in row
-            )
+            writer.writerow("" if math.isnan(value) else _DIGITS % value for value in row)

@@ -70,25 +70,19 @@ class RigidFit:
                 "least one such frame: check the names of these markers and their missing samples"
             )
         known = PoseSequence(
-            times[there],
-            self.positions_m[there],
-            quaternions_xyzw=self.quaternions_xyzw[there],
+            times[there], self.positions_m[there], quaternions_xyzw=self.quaternions_xyzw[there]
         )
         if len(there) == 1:
             return known
         within = times[there[0] : there[-1] + 1]
         rotations, positions = known.at(within)
         return PoseSequence(
-            within,
-            positions,
-            quaternions_xyzw=Rotation.from_matrix(rotations).as_quat(),
+            within, positions, quaternions_xyzw=Rotation.from_matrix(rotations).as_quat()
         )
 
 
 def fit_poses(
-    reference_m: ArrayLike,
-    tracks_m: ArrayLike,
-    weights: ArrayLike | None = None,
+    reference_m: ArrayLike, tracks_m: ArrayLike, weights: ArrayLike | None = None
 ) -> RigidFit:
     """Fit the rigid motion x = R X + p of markers at every frame, by weighted least squares.
 
@@ -127,9 +121,7 @@ def fit_poses(
     repeated = np.broadcast_to(reference, tracks.shape)
     missing = ~_fixes_rotation(repeated, weight)
     rotations, translations = _best_motions(repeated, tracks, weight=weight)
-    fitted = (
-        np.einsum("tij,bj->tbi", rotations, reference) + translations[:, None]
-    )
+    fitted = np.einsum("tij,bj->tbi", rotations, reference) + translations[:, None]
     distance = np.linalg.norm(tracks - fitted, axis=2)
     distance[missing] = np.nan
     total = np.where(missing, np.nan, weight.sum(axis=1))
@@ -166,15 +158,11 @@ class TemplateFit(NamedTuple):
         table is unchanged.
         """
         positions_m = table.positions_m @ self.rotation.T + self.translation_m
-        return MarkerTable(
-            table.t_s, table.names, positions_m=positions_m, notes=table.notes
-        )
+        return MarkerTable(table.t_s, table.names, positions_m=positions_m, notes=table.notes)
 
 
 def align_to_template(
-    table: MarkerTable,
-    template: Mapping[str, Sequence[float]],
-    window_s: tuple[float, float],
+    table: MarkerTable, template: Mapping[str, Sequence[float]], window_s: tuple[float, float]
 ) -> TemplateFit:
     """Fit the change from the camera's frame to the body's, from mean marker positions in a window.
 
@@ -201,14 +189,8 @@ def align_to_template(
             raise InputError(
                 f"no marker '{name}' for the template; there are {', '.join(table.names)}"
             )
-    slack_s = (
-        STEP_TOLERANCE * float(np.median(np.diff(table.t_s)))
-        if len(table.t_s) > 1
-        else 0.0
-    )
-    inside = (table.t_s >= window_s[0] - slack_s) & (
-        table.t_s <= window_s[1] + slack_s
-    )
+    slack_s = STEP_TOLERANCE * float(np.median(np.diff(table.t_s))) if len(table.t_s) > 1 else 0.0
+    inside = (table.t_s >= window_s[0] - slack_s) & (table.t_s <= window_s[1] + slack_s)
     if not inside.any():
         raise InputError(
             f"the window [{window_s[0]:g}, {window_s[1]:g}] s of the template contains no sample; "
@@ -220,9 +202,7 @@ def align_to_template(
     samples = table.positions_m[inside][:, chosen]
     count = np.isfinite(samples[:, :, 0]).sum(axis=0)
     means = np.where(
-        count[:, None] > 0,
-        np.nansum(samples, axis=0) / np.maximum(count, 1)[:, None],
-        np.nan,
+        count[:, None] > 0, np.nansum(samples, axis=0) / np.maximum(count, 1)[:, None], np.nan
     )
     weight = (count > 0).astype(np.float64)[None]
     if not _fixes_rotation(places[None], weight)[0]:
@@ -230,14 +210,10 @@ def align_to_template(
             f"{np.count_nonzero(count)} of the template's markers have samples in the window, "
             "which do not determine a rotation; expected at least three that are not on one line"
         )
-    rotations, translations = _best_motions(
-        means[None], places[None], weight=weight
-    )
+    rotations, translations = _best_motions(means[None], places[None], weight=weight)
     moved = means @ rotations[0].T + translations[0]
     return TemplateFit(
-        rotations[0],
-        translations[0],
-        residual_m=np.linalg.norm(moved - places, axis=1),
+        rotations[0], translations[0], residual_m=np.linalg.norm(moved - places, axis=1)
     )
 
 
@@ -262,19 +238,11 @@ def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
     """Return whether the points (B, 3) of each frame determine a rotation, as (T,) bool: at least
     two of them, whose second singular value about the mean exceeds `_LEAST_RELATIVE_SPREAD` times
     the first.
-
-    Parameters
-    ----------
-    points : (T, B, 3) array
-    weight : (T, B) array
-        Points with a weight above 0 are used, all alike.
     """
     used = (weight > 0).astype(np.float64)
     centred = (points - _mean(points, used)[:, None]) * used[:, :, None]
     spread = (
-        np.linalg.svd(centred, compute_uv=False)
-        if points.shape[1]
-        else np.zeros((len(points), 1))
+        np.linalg.svd(centred, compute_uv=False) if points.shape[1] else np.zeros((len(points), 1))
     )
     if spread.shape[1] < 2:
         return np.zeros(len(points), dtype=bool)
@@ -290,9 +258,7 @@ def _mean(points: Array, weight: Array) -> Array:
     return np.einsum("tb,tbi->ti", weight, present) / total[:, None]
 
 
-def _best_motions(
-    source: Array, target: Array, weight: Array
-) -> tuple[Array, Array]:
+def _best_motions(source: Array, target: Array, weight: Array) -> tuple[Array, Array]:
     """Return rotations (T, 3, 3) and translations (T, 3) that map source to target points (T, B, 3)
     with the least squared distances, weighted by `weight` (T, B).
 
@@ -306,6 +272,4 @@ def _best_motions(
     u, _, vt = np.linalg.svd(np.einsum("tb,tbi,tbj->tij", weight, b, a))
     u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
     rotations = u @ vt
-    return rotations, target_mean - np.einsum(
-        "tij,tj->ti", rotations, source_mean
-    )
+    return rotations, target_mean - np.einsum("tij,tj->ti", rotations, source_mean)

@@ -21,9 +21,7 @@ SHORTEST_STEP_S = 1e-12
 _PRINTED_DECIMALS = range(10)
 
 
-def sample_interval_s(
-    t_s: ArrayLike, what: str, source: str | Path | None = None
-) -> float:
+def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = None) -> float:
     """Return the mean time between samples, which must be the same throughout.
 
     Steps may differ from the mean by `STEP_TOLERANCE` of it, and by the rounding of times to the
@@ -52,9 +50,7 @@ def sample_interval_s(
             source,
         )
     if fault := first_unordered_time(times):
-        raise InputError(
-            f"{what}: {fault[1]}", source, where=f"row {fault[0] + 1}"
-        )
+        raise InputError(f"{what}: {fault[1]}", source, where=f"row {fault[0] + 1}")
     steps = np.diff(times)
     if not has_even_steps(times):
         # A lost frame also shifts the mean, and with it every other step: name the worst.
@@ -88,10 +84,7 @@ def first_unordered_time(t_s: Array) -> tuple[int, str] | None:
     if not faulty.size:
         return None
     row = int(faulty[0]) + 1
-    return (
-        row,
-        f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase",
-    )
+    return (row, f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase")
 
 
 def evenly_spaced_s(t_s: Array) -> Array:

@@ -101,23 +101,17 @@ class Specimen:
 
     test: str
     strain: Array = key(converter=float_converter((None,), "strain"))
-    stress_pa: Array = key(
-        converter=float_converter((None,), "stress_pa", finite=False)
-    )
+    stress_pa: Array = key(converter=float_converter((None,), "stress_pa", finite=False))
     sigma_pa: float = key(Positive)
-    t_s: Array | None = key(
-        converter=float_converter((None,), "t_s"), default=None
-    )
+    t_s: Array | None = key(converter=float_converter((None,), "t_s"), default=None)
     second_strain: Array | None = key(
         converter=float_converter((None,), "second_strain"), default=None
     )
     second_stress_pa: Array | None = key(
-        converter=float_converter((None,), "second_stress_pa", finite=False),
-        default=None,
+        converter=float_converter((None,), "second_stress_pa", finite=False), default=None
     )
     lateral_stretch: Array | None = key(
-        converter=float_converter((None,), "lateral_stretch", finite=False),
-        default=None,
+        converter=float_converter((None,), "lateral_stretch", finite=False), default=None
     )
     lateral_sigma: float = key(Positive, default=LATERAL_SIGMA)
     strain_zero: float = key(NotNegative, default=STRAIN_ZERO)
@@ -132,13 +126,9 @@ class Specimen:
         """
         if self.test not in DEFORMATIONS:
             raise InputError(
-                f"found {self.test!r}; expected one of {', '.join(TESTS)}",
-                None,
-                where="test",
+                f"found {self.test!r}; expected one of {', '.join(TESTS)}", None, where="test"
             )
-        times = (
-            np.arange(float(len(self.strain))) if self.t_s is None else self.t_s
-        )
+        times = np.arange(float(len(self.strain))) if self.t_s is None else self.t_s
         vars(self)["t_s"] = times
         self._require_measurements_of_test()
         if (self.length_m is None) != (self.area_m2 is None):
@@ -148,13 +138,7 @@ class Specimen:
                 None,
                 where="length_m",
             )
-        for name in (
-            "stress_pa",
-            "t_s",
-            "second_strain",
-            "second_stress_pa",
-            "lateral_stretch",
-        ):
+        for name in ("stress_pa", "t_s", "second_strain", "second_stress_pa", "lateral_stretch"):
             values = getattr(self, name)
             if values is not None and len(values) != len(self.strain):
                 raise InputError(
@@ -188,19 +172,11 @@ class Specimen:
                 else f"{of} does not have a second strain; leave it out"
             )
             raise InputError(fault, None, where="second_strain")
-        if (
-            self.second_stress_pa is not None
-            and not self.find_deformation().second_stress
-        ):
+        if self.second_stress_pa is not None and not self.find_deformation().second_stress:
             raise InputError(
-                f"{of} does not have a second stress; leave it out",
-                None,
-                where="second_stress_pa",
+                f"{of} does not have a second stress; leave it out", None, where="second_stress_pa"
             )
-        if (
-            self.lateral_stretch is not None
-            and not self.find_deformation().lateral
-        ):
+        if self.lateral_stretch is not None and not self.find_deformation().lateral:
             raise InputError(
                 f"{of} has no direction in which the specimen is free to contract; leave the lateral "
                 "stretch out",
@@ -217,9 +193,7 @@ class Specimen:
         deformation = DEFORMATIONS[self.test]
         if self.length_m is None or self.area_m2 is None:
             return deformation
-        return replace(
-            deformation, area_over_length_m=self.area_m2 / self.length_m
-        )
+        return replace(deformation, area_over_length_m=self.area_m2 / self.length_m)
 
     def __repr__(self) -> str:
         return f"Specimen({self.test!r}: {len(self.strain)} samples)"
@@ -254,18 +228,9 @@ class Specimen:
         InputError
             If the law cannot be evaluated at the largest strains, see `require_evaluable_law`.
         """
-        cell = (
-            cell_body(self.test, material, prony=prony)
-            if body is None
-            else body
-        )
+        cell = cell_body(self.test, material, prony=prony) if body is None else body
         assert self.t_s is not None
-        require_evaluable_law(
-            cell,
-            self.test,
-            strain=self.strain,
-            second_strain=self.second_strain,
-        )
+        require_evaluable_law(cell, self.test, strain=self.strain, second_strain=self.second_strain)
         nuisance = Nuisance.none(strain_zero=self.strain_zero or None)
         return Experiment(
             cell,
@@ -287,25 +252,16 @@ class Specimen:
         """
         assert self.t_s is not None
         moving = self.find_deformation().displaced_nodes()
-        second = (
-            np.zeros_like(self.strain)
-            if self.second_strain is None
-            else self.second_strain
-        )
+        second = np.zeros_like(self.strain) if self.second_strain is None else self.second_strain
         grasps = []
         for node in range(1 + len(AXES)):
             poses = PoseSequence.fixed()
             if node in moving:
                 by_first, by_second = moving[node]
-                shifts_m = np.outer(self.strain, by_first) + np.outer(
-                    second, by_second
-                )
+                shifts_m = np.outer(self.strain, by_first) + np.outer(second, by_second)
                 no_rotation = np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
                 poses = PoseSequence(
-                    self.t_s,
-                    shifts_m,
-                    quaternions_xyzw=no_rotation,
-                    interpolation="linear",
+                    self.t_s, shifts_m, quaternions_xyzw=no_rotation, interpolation="linear"
                 )
             axes = self.find_deformation().prescribed_axes(node)
             grasps.append(Grasp(np.array([node]), poses, axes=axes))
@@ -319,16 +275,10 @@ class Specimen:
         sensors = []
         for name, component, values in (
             (STRESS_NAME, self.find_deformation().first_stress, self.stress_pa),
-            (
-                SECOND_STRESS_NAME,
-                self.find_deformation().second_stress,
-                self.second_stress_pa,
-            ),
+            (SECOND_STRESS_NAME, self.find_deformation().second_stress, self.second_stress_pa),
         ):
             if values is not None and np.isfinite(values).any():
-                sensors.append(
-                    self._stress_sensor(name, component, values=values)
-                )
+                sensors.append(self._stress_sensor(name, component, values=values))
         if self.lateral_stretch is not None:
             axis = AXES.index(self.find_deformation().lateral)
             point_m = np.zeros(3)
@@ -347,20 +297,8 @@ class Specimen:
         return sensors
 
     def _stress_sensor(self, name: str, component: str, values: Array) -> Gauge:
-        """Return the sensor of one component of the nominal stress.
-
-        Parameters
-        ----------
-        name : str
-        component : str
-            Axis of the stress, then axis of the normal, such as "xz".
-        values : (T,) array
-            Measured stresses [Pa]; NaN where missing.
-        """
-        deviations = {
-            "area_error": self.area_error,
-            "stress_zero_pa": self.stress_zero_pa,
-        }
+        """Return the sensor of one component of the nominal stress."""
+        deviations = {"area_error": self.area_error, "stress_zero_pa": self.stress_zero_pa}
         direction, normal = (AXES.index(axis) for axis in component)
         assert self.t_s is not None
         return Gauge(
@@ -371,9 +309,7 @@ class Specimen:
             sigma=self.sigma_pa,
             grasp=2 + normal,
             frame="world",
-            unknowns={
-                unknown: sigma for unknown, sigma in deviations.items() if sigma
-            },
+            unknowns={unknown: sigma for unknown, sigma in deviations.items() if sigma},
             unit=STRESS_UNIT,
         )
 
@@ -398,15 +334,6 @@ class NominalStress:
     ) -> ca.SX:
         """Return the measured stress P (1 + `area_error`) + `stress_zero_pa` [Pa], with the nominal
         stress P from the force on a node of the cell.
-
-        Parameters
-        ----------
-        at : GraspQuantities
-            Force of the grasp [N].
-        area_error : SX or float
-            Relative error of the area: stated smaller than it is by this share.
-        stress_zero_pa : SX or float
-            Offset of the measured stresses [Pa].
         """
         stress_pa = STRESS_PER_FORCE * at.force_n[self.direction]
         return stress_pa * (1 + area_error) + stress_zero_pa

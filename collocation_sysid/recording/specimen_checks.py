@@ -66,9 +66,7 @@ def require_plausible_specimen(specimen: Specimen) -> None:
         return
     if not np.ptp(stress_pa[is_measured]):
         return
-    correlation = float(
-        np.corrcoef(strain[is_measured], stress_pa[is_measured])[0, 1]
-    )
+    correlation = float(np.corrcoef(strain[is_measured], stress_pa[is_measured])[0, 1])
     if correlation < AGAINST:
         raise InputError(
             f"strain and stress have opposite signs (correlation {correlation:.2f}); expected "
@@ -118,9 +116,7 @@ def initial_young_pa(specimen: Specimen) -> float:
     square = float(np.sum(strain[is_small] ** 2))
     if not np.isfinite(ratio) or not square:
         return np.nan
-    slope = (
-        float(np.sum(strain[is_small] * specimen.stress_pa[is_small])) / square
-    )
+    slope = float(np.sum(strain[is_small] * specimen.stress_pa[is_small])) / square
     return slope / ratio
 
 

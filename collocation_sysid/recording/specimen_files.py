@@ -94,9 +94,7 @@ class SpecimenLayout:
         axis of "biaxial" and "planar" tests and a lateral stretch or strain are added where the
         test has them, true stress if `stress` is "true".
         """
-        stresses = (
-            (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
-        )
+        stresses = (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
         if self.test == "volumetric":
             return VOLUME_RATIO, STRETCH, STRAIN, PRESSURE, *stresses
         quantities = [STRAIN, *stresses, DISPLACEMENT, FORCE]
@@ -191,9 +189,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     strain = _strain(table, layout)
     second_strain = _second_strain(table, layout)
     lateral = _lateral_stretch(table, layout)
-    areas = _area_ratios(
-        layout, strain, second_strain=second_strain, lateral=lateral
-    )
+    areas = _area_ratios(layout, strain, second_strain=second_strain, lateral=lateral)
     stress_pa = _stress_pa(table, layout)
     second_pa = table.values.get(SECOND_STRESS.key)
     if layout.test == "volumetric":
@@ -202,9 +198,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         stress_pa = stress_pa * areas[0]
     if second_pa is not None:
         second_pa = layout.stress_sign * second_pa
-        second_pa = (
-            second_pa * areas[1] if layout.stress == "true" else second_pa
-        )
+        second_pa = second_pa * areas[1] if layout.stress == "true" else second_pa
     return SpecimenTable(
         table.t_s,
         strain,
@@ -235,18 +229,11 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
     layout : SpecimenLayout
         Meaning of the columns.
     """
-    deformations = _column_choices(
-        grid, layout.list_deformations(), stated=layout.columns
-    )
+    deformations = _column_choices(grid, layout.list_deformations(), stated=layout.columns)
     groups = [deformations]
     if second := layout.list_second_deformations():
         groups.append(
-            _column_choices(
-                grid,
-                second,
-                stated=layout.columns,
-                taken=_names_of(deformations),
-            )
+            _column_choices(grid, second, stated=layout.columns, taken=_names_of(deformations))
         )
     groups.append(_column_choices(grid, layout.loads, stated=layout.columns))
     required = {*layout.list_deformations(), *layout.list_second_deformations()}
@@ -256,9 +243,7 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
         for quantity in (TIME, *layout.list_quantities())
         if quantity not in required
         and len(
-            choices := _column_choices(
-                grid, (quantity,), stated=layout.columns, is_optional=True
-            )
+            choices := _column_choices(grid, (quantity,), stated=layout.columns, is_optional=True)
         )
         == 1
         and (quantity != TIME or TIME.key in layout.columns)
@@ -275,9 +260,7 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
         other[SECOND_STRESS.key] = loads[1][STRESS.key]
     statements = []
     for combination in product(*groups):
-        names = {
-            key: name for each in combination for key, name in each.items()
-        }
+        names = {key: name for each in combination for key, name in each.items()}
         sizes = [
             size
             for quantity, size, value in (
@@ -308,9 +291,7 @@ def _column_choices(
     or fit, and an empty list without any.
     """
     choices = [
-        {quantity.key: stated[quantity.key]}
-        for quantity in quantities
-        if quantity.key in stated
+        {quantity.key: stated[quantity.key]} for quantity in quantities if quantity.key in stated
     ]
     searches = [fitting_column_names]
     if not is_optional:
@@ -334,31 +315,10 @@ def _names_of(choices: Iterable[Mapping[str, str]]) -> set[str]:
 
 
 def _one_of(
-    table: QuantityTable,
-    quantities: tuple[Quantity, ...],
-    what: str,
-    layout: SpecimenLayout,
+    table: QuantityTable, quantities: tuple[Quantity, ...], what: str, layout: SpecimenLayout
 ) -> Quantity:
-    """Return the only one of several quantities that a table has.
-
-    Parameters
-    ----------
-    table : QuantityTable
-    quantities : tuple of Quantity
-        Alternatives.
-    what : str
-        Common name of the alternatives, for the message.
-    layout : SpecimenLayout
-        Meaning of the columns, for the remedy.
-
-    Raises
-    ------
-    InputError
-        If the table has none or more than one; the remedy is that of `column_advice`.
-    """
-    there = [
-        quantity for quantity in quantities if quantity.key in table.values
-    ]
+    """Return the only one of several quantities that a table has."""
+    there = [quantity for quantity in quantities if quantity.key in table.values]
     if len(there) != 1:
         present = " and ".join(quantity.key for quantity in there)
         expected = ", ".join(quantity.column for quantity in quantities)
@@ -378,8 +338,7 @@ def _complete(table: QuantityTable, quantity: Quantity) -> Array:
     values = table.values[quantity.key]
     if (blank := np.isnan(values)).any():
         raise table.grid.error_at(
-            f"the {quantity.key} is blank; expected a number in every row",
-            int(blank.argmax()),
+            f"the {quantity.key} is blank; expected a number in every row", int(blank.argmax())
         )
     return values
 
@@ -389,26 +348,14 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
 
     `strain_sign` applies to strains and displacements, not to stretches and volume ratios. A strain
     of a volumetric test is that of the volume, J − 1.
-
-    Raises
-    ------
-    InputError
-        If not exactly one kind of deformation is there, a cell is blank, a displacement has no
-        `length_m`, or a size is not positive (not tested in simple shear).
     """
-    quantity = _one_of(
-        table, layout.list_deformations(), what="deformation", layout=layout
-    )
+    quantity = _one_of(table, layout.list_deformations(), what="deformation", layout=layout)
     values = _complete(table, quantity)
     if quantity == STRETCH:
         _require_positive(table, quantity, ratio=values)
         return values - 1
     if layout.test == "volumetric":
-        ratio = (
-            values
-            if quantity == VOLUME_RATIO
-            else 1 + layout.strain_sign * values
-        )
+        ratio = values if quantity == VOLUME_RATIO else 1 + layout.strain_sign * values
         _require_positive(table, quantity, ratio=ratio)
         return np.cbrt(ratio) - 1
     if quantity == DISPLACEMENT:
@@ -424,9 +371,7 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
     return strain
 
 
-def _require_positive(
-    table: QuantityTable, quantity: Quantity, ratio: Array
-) -> None:
+def _require_positive(table: QuantityTable, quantity: Quantity, ratio: Array) -> None:
     """Raise an `InputError` if a ratio (T,) of deformed to undeformed size is not positive
     everywhere; it names the first such row and the likely cause for `quantity`.
     """
@@ -448,17 +393,8 @@ def _require_positive(
     )
 
 
-def _second_strain(
-    table: QuantityTable, layout: SpecimenLayout
-) -> Array | None:
-    """Return the strain (T,) along the second axis; None unless the test is biaxial.
-
-    Raises
-    ------
-    InputError
-        If there is not exactly one of second stretch and second strain, a cell is blank, or a
-        stretch is not positive.
-    """
+def _second_strain(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
+    """Return the strain (T,) along the second axis; None unless the test is biaxial."""
     if layout.test != "biaxial":
         return None
     quantity = _one_of(
@@ -476,9 +412,7 @@ def _second_strain(
     return strain
 
 
-def _lateral_stretch(
-    table: QuantityTable, layout: SpecimenLayout
-) -> Array | None:
+def _lateral_stretch(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
     """Return the lateral stretch (T,), from the stretch or else from 1 plus the signed strain, NaN
     where blank; None if the table has neither.
     """
@@ -494,12 +428,6 @@ def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
     force over `area_m2`, or minus the pressure; NaN where blank.
 
     `stress_sign` applies to all but pressures.
-
-    Raises
-    ------
-    InputError
-        If not exactly one kind of load is there, or a force has no area or is stated as true
-        stress.
     """
     quantity = _one_of(table, layout.loads, what="load", layout=layout)
     values = table.values[quantity.key]
@@ -521,10 +449,7 @@ def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
 
 
 def _area_ratios(
-    layout: SpecimenLayout,
-    strain: Array,
-    second_strain: Array | None,
-    lateral: Array | None,
+    layout: SpecimenLayout, strain: Array, second_strain: Array | None, lateral: Array | None
 ) -> tuple[Array, Array]:
     """Return the deformed over the undeformed area (T,) of the faces of the first and of the second
     stress.
@@ -604,13 +529,7 @@ def _usual_quantities(layout: SpecimenLayout) -> tuple[Quantity, ...]:
     if layout.test == "volumetric":
         return VOLUME_RATIO, PRESSURE
     deformation = STRAIN if layout.test == "simple-shear" else STRETCH
-    return (
-        deformation,
-        SECOND_STRETCH,
-        STRESS,
-        SECOND_STRESS,
-        LATERAL_STRETCH,
-    )
+    return (deformation, SECOND_STRETCH, STRESS, SECOND_STRESS, LATERAL_STRETCH)
 
 
 def _specimen_quantities(
@@ -622,9 +541,7 @@ def _specimen_quantities(
     strain, second_strain = specimen_strains(experiment)
     stretch = 1 + strain
     lateral = values.get(LATERAL_NAME)
-    areas = _area_ratios(
-        layout, strain, second_strain=second_strain, lateral=lateral
-    )
+    areas = _area_ratios(layout, strain, second_strain=second_strain, lateral=lateral)
     is_true = layout.stress == "true"
     is_volumetric = layout.test == "volumetric"
     table_strain = stretch**3 - 1 if is_volumetric else strain

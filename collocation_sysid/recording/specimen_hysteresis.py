@@ -73,8 +73,6 @@ def unloading_difference(experiment: Experiment) -> float | None:
     difference_pa = float(np.mean(stress_pa[unloading] - loading_pa))
     mean_pa = float(np.mean(loading_pa))
     error_pa = float(np.max(sensors[0].sigma)) * np.sqrt(2 / len(unloading))
-    if abs(difference_pa) <= max(
-        CLEAR_SHARE * abs(mean_pa), CLEAR_ERRORS * error_pa
-    ):
+    if abs(difference_pa) <= max(CLEAR_SHARE * abs(mean_pa), CLEAR_ERRORS * error_pa):
         return None
     return difference_pa / mean_pa if mean_pa else None

@@ -33,11 +33,7 @@ def require_evaluable_law(
     second_strain : (T,) array or None
         Strain along the second axis of a "biaxial" test; None for other tests.
     """
-    laws = [
-        part.material.name
-        for part in body.parts
-        if is_power_law(part.material.name)
-    ]
+    laws = [part.material.name for part in body.parts if is_power_law(part.material.name)]
     if not laws or not len(strain):
         return
     stretches = isochoric_stretches(test, strain, second_strain=second_strain)
@@ -52,9 +48,7 @@ def require_evaluable_law(
         )
 
 
-def isochoric_stretches(
-    test: str, strain: Array, second_strain: Array | None
-) -> Array:
+def isochoric_stretches(test: str, strain: Array, second_strain: Array | None) -> Array:
     """Return the principal stretches (T, 3) without their change of volume, so that their product
     is 1, not sorted.
 

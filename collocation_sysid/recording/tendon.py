@@ -68,14 +68,7 @@ class Tendon(Actuator[PolylineLength]):
     offset_field: ClassVar[str] = "loss_n"
 
     def __post_init__(self) -> None:
-        """Check points and tension, and store the tension as `declared_values`, in place.
-
-        Raises
-        ------
-        InputError
-            If there are fewer than two points, two successive points coincide, or a tension is
-            negative.
-        """
+        """Check points and tension, and store the tension as `declared_values`, in place."""
         points = self.points_m
         name = self.name
         if len(points) < 2:
@@ -88,27 +81,17 @@ class Tendon(Actuator[PolylineLength]):
                 f"{name}: the points {same[0] + 1} and {same[0] + 2} are at the same place; "
                 "expected different ones, in their order from base to end"
             )
-        tension = TimeSeries(
-            self.tension_n, self.t_s, what=f"tension_n of {name}"
-        )
+        tension = TimeSeries(self.tension_n, self.t_s, what=f"tension_n of {name}")
         if (tension.values < 0).any():
             row = int(np.argmax(tension.values < 0))
             raise InputError(
                 f"{name}: tension_n is {tension.values[row]:g} N in row {row + 1}; expected 0 or "
                 "more: a tendon only pulls"
             )
-        vars(self).update(
-            tension_n=tension.values, t_s=tension.t_s, declared_values=tension
-        )
+        vars(self).update(tension_n=tension.values, t_s=tension.t_s, declared_values=tension)
 
     def _measure_on(self, body: Body) -> PolylineLength:
-        """Return the length of the polyline in a body.
-
-        Raises
-        ------
-        InputError
-            If a point is too far outside the body.
-        """
+        """Return the length of the polyline in a body."""
         shape = LocatedBody(body.nodes_m, body)
         embedded = [shape.weights_at_point(point) for point in self.points_m]
         nodes = np.array([each.nodes for each in embedded])
@@ -123,9 +106,7 @@ class Tendon(Actuator[PolylineLength]):
             )
         return PolylineLength(nodes, weights, node_count=len(body.nodes_m))
 
-    def energy_amplitude(
-        self, declared_value: Any, factor: Any, offset: Any
-    ) -> Any:
+    def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
         """Return the tension at the body, max(0, factor · stated − lost) [N]; 0 if the stated
         tension is 0.
 

@@ -56,9 +56,7 @@ def read_forces(path: str | Path) -> tuple[Array, Array]:
         line is named.
     """
     table = read_columns(path, FORCES, requires_all=True)
-    return table.t_s, np.column_stack(
-        [table.values[quantity.key] for quantity in FORCES]
-    )
+    return table.t_s, np.column_stack([table.values[quantity.key] for quantity in FORCES])
 
 
 def read_tension(path: str | Path) -> tuple[Array, Array]:
@@ -88,23 +86,12 @@ def read_pressure(path: str | Path) -> tuple[Array, Array]:
 
 @names_file_in_errors
 def _read_limited(
-    path: str | Path,
-    quantity: Quantity,
-    largest: float,
-    at_least: float = -np.inf,
+    path: str | Path, quantity: Quantity, largest: float, at_least: float = -np.inf
 ) -> tuple[Array, Array]:
-    """Return times (T,) and values (T,) of one quantity, with limits on the values.
-
-    Raises
-    ------
-    InputError
-        As `read_columns`, or if a value is below `at_least` or larger in magnitude than `largest`.
-    """
+    """Return times (T,) and values (T,) of one quantity, with limits on the values."""
     table = read_columns(path, [quantity])
     values = table.values[quantity.key]
-    for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[
-        0
-    ]:
+    for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[0]:
         is_so = f"{quantity.column} is {values[row]:g}"
         if abs(values[row]) > largest:
             why = f", too large for a soft body; expected at most {largest:g}: check the unit of the column"
@@ -167,9 +154,7 @@ def read_displacement(
         * np.nan_to_num(axis_components(table, DISPLACEMENTS, axis=axis))
     )
     return PoseSequence(
-        table.t_s,
-        shifts_m,
-        quaternions_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1)),
+        table.t_s, shifts_m, quaternions_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
     )
 
 
@@ -185,50 +170,23 @@ def displaced_axes(
     Arguments and errors are those of `read_displacement`; times are not required.
     """
     shifts = axis_components(
-        _read_displacements(path, columns, length_m=length_m, timed=False),
-        DISPLACEMENTS,
-        axis=axis,
+        _read_displacements(path, columns, length_m=length_m, timed=False), DISPLACEMENTS, axis=axis
     )
     is_present = np.asarray(np.isfinite(shifts).any(axis=0))
-    return "".join(
-        each for each, there in zip("xyz", is_present, strict=True) if there
-    )
+    return "".join(each for each, there in zip("xyz", is_present, strict=True) if there)
 
 
 def _read_displacements(
-    path: str | Path,
-    columns: Mapping[str, str] | None,
-    length_m: float | None,
-    timed: bool,
+    path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
 ) -> QuantityTable:
     """Read the columns of a displacement, or of a strain if the undeformed length `length_m` [m] is
     given.
-
-    Parameters
-    ----------
-    path : str or Path
-    columns : mapping or None
-        Names of columns by quantity; None to recognise them.
-    length_m : float or None
-    timed : bool
-        Whether a column of times is required.
-
-    Raises
-    ------
-    InputError
-        As `read_columns`.
     """
-    quantities = (
-        (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
-    )
-    return read_columns(
-        path, quantities, column_names=columns, requires_times=timed
-    )
+    quantities = (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    return read_columns(path, quantities, column_names=columns, requires_times=timed)
 
 
-def axis_components(
-    table: QuantityTable, quantities: Sequence[Quantity], axis: str
-) -> Array:
+def axis_components(table: QuantityTable, quantities: Sequence[Quantity], axis: str) -> Array:
     """Return the values (T, n) of n quantities of a table, one for each axis, in the order of
     `quantities`; NaN where missing.
 
@@ -269,9 +227,7 @@ class CustomSensorTable(NamedTuple):
 
 
 @names_file_in_errors
-def read_custom_sensor(
-    path: str | Path, columns: Sequence[str] = ()
-) -> CustomSensorTable:
+def read_custom_sensor(path: str | Path, columns: Sequence[str] = ()) -> CustomSensorTable:
     """Read the values of a custom sensor over time.
 
     Parameters
@@ -290,21 +246,13 @@ def read_custom_sensor(
     names = list(columns) or [name for name in grid.columns if name != "t_s"]
     for name in ("t_s", *names):
         if (count := grid.columns.count(name)) != 1:
-            there = (
-                f"{count} columns are called" if count else "there is no column"
-            )
+            there = f"{count} columns are called" if count else "there is no column"
             hint = "" if count else hint_at(name, grid.columns)
             among = ", ".join(grid.columns)
-            raise grid.error_at(
-                f"{there} {name!r}; expected one among {among}{hint}"
-            )
+            raise grid.error_at(f"{there} {name!r}; expected one among {among}{hint}")
     t_s = times_in_column(grid, grid.columns.index("t_s"))
-    values = numeric_cells(
-        grid, [grid.columns.index(name) for name in names], blank_allowed=True
-    )
-    return CustomSensorTable(
-        without_rounding(t_s), np.asarray(values), columns=names
-    )
+    values = numeric_cells(grid, [grid.columns.index(name) for name in names], blank_allowed=True)
+    return CustomSensorTable(without_rounding(t_s), np.asarray(values), columns=names)
 
 
 def is_within_experiment(

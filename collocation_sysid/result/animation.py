@@ -25,15 +25,7 @@ from ..common.array_types import Array
 from ..common.files import replaced_file, safe_name
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, require_among
-from .figure_style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    LINE_PT,
-    TEXT_PT,
-    add_legend_above,
-    style_axes,
-)
+from .figure_style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, add_legend_above, style_axes
 from .pictures.camera_pictures import LEGEND_ENTRY
 from .pictures.over_time import rms_over_markers
 from .pictures.projection import ParallelCamera
@@ -111,31 +103,17 @@ def animate(
     """
     for name, value in (("--fps", fps), ("--slow", slowdown)):
         if not 0 < value < np.inf:
-            raise InputError(
-                f"found {value:g}; expected a number above 0", None, where=name
-            )
+            raise InputError(f"found {value:g}; expected a number above 0", None, where=name)
     result, replays = read_run(run)
     replay = experiment_named(replays, experiment, run=run)
     with damaged_run_refused(Path(run)):
         text = run_headline(result)
-    file = (
-        Path(file)
-        if file is not None
-        else Path(run) / f"{safe_name(replay.name)}.gif"
-    )
+    file = Path(file) if file is not None else Path(run) / f"{safe_name(replay.name)}.gif"
     if file.suffix.lower() not in PIXELS_WIDE:
         raise InputError(
-            f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}",
-            file,
-            where="--to",
+            f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, where="--to"
         )
-    return film(
-        replay,
-        file,
-        fps=fps,
-        slowdown=slowdown,
-        headline=text,
-    )
+    return film(replay, file, fps=fps, slowdown=slowdown, headline=text)
 
 
 def film(
@@ -192,9 +170,7 @@ def film(
 
 
 def experiment_named(
-    replays: Sequence[MotionRecord],
-    experiment: str | None,
-    run: str | Path | None = None,
+    replays: Sequence[MotionRecord], experiment: str | None, run: str | Path | None = None
 ) -> MotionRecord:
     """Return the experiment called `experiment`, or the first one if that is None.
 
@@ -212,9 +188,7 @@ def experiment_named(
     InputError
         If there is no experiment of that name with a trajectory, or none with a trajectory at all.
     """
-    available = {
-        replay.name: replay for replay in replays if replay.has_shapes()
-    }
+    available = {replay.name: replay for replay in replays if replay.has_shapes()}
     if not available:
         raise InputError(
             "no experiment of this run has a stored motion of a body with a mesh; expected a run "
@@ -223,12 +197,7 @@ def experiment_named(
         )
     if experiment is None:
         return next(iter(available.values()))
-    require_among(
-        experiment,
-        available,
-        source=run,
-        where=None if run is None else "--experiment",
-    )
+    require_among(experiment, available, source=run, where=None if run is None else "--experiment")
     return available[experiment]
 
 
@@ -261,9 +230,7 @@ def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
         )
     times_s = np.arange(count) / (slowdown * fps)
     share = times_s / max(duration, np.finfo(float).tiny)
-    return np.minimum(np.rint(share * (len(t_s) - 1)), len(t_s) - 1).astype(
-        np.int64
-    )
+    return np.minimum(np.rint(share * (len(t_s) - 1)), len(t_s) - 1).astype(np.int64)
 
 
 class _DrawnTrajectory(NamedTuple):
@@ -312,21 +279,14 @@ class FilmFigure:
     figure: Figure
 
     def __init__(
-        self,
-        replay: MotionRecord,
-        names: tuple[str, str] = TRAJECTORY_NAMES,
-        headline: str = "",
+        self, replay: MotionRecord, names: tuple[str, str] = TRAJECTORY_NAMES, headline: str = ""
     ) -> None:
         self.replay = replay
         trajectories = (
             (names[0], replay.positions_m, replay.markers_m),
             (names[1], replay.rolled_out_positions_m, replay.rolled_out_m),
         )
-        shown = [
-            (n, x, m)
-            for n, x, m in trajectories
-            if x is not None and m is not None
-        ]
+        shown = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
         # A forward simulation that goes astray may leave the picture; fit and markers may not.
         surface_m = shown[0][1][:, np.unique(replay.surface)]
         is_finite = np.asarray(np.isfinite(surface_m).all(axis=(1, 2)))
@@ -334,57 +294,31 @@ class FilmFigure:
         camera = ParallelCamera.facing_motion(surface_m, replay.up)
         everything = _points_to_show_m(replay, surface_m, samples=is_finite)
         compared = [
-            (n, m)
-            for n, _, m in shown
-            if m.size and np.isfinite(m - replay.measured_m).any()
+            (n, m) for n, _, m in shown if m.size and np.isfinite(m - replay.measured_m).any()
         ]
         width = FILM_WIDTH_MM - (ERROR_PANEL_WIDTH_MM if compared else 0.0)
         aspect = aspect_ratio(camera, everything)
-        height = float(
-            np.clip(
-                (width - 8) / aspect, MIN_BODY_HEIGHT_MM, MAX_BODY_HEIGHT_MM
-            )
-        )
+        height = float(np.clip((width - 8) / aspect, MIN_BODY_HEIGHT_MM, MAX_BODY_HEIGHT_MM))
         head = HEAD_HEIGHT_MM + (HEADLINE_HEIGHT_MM if headline else 0.0)
         total = _with_even_pixels(head + height + FOOT_HEIGHT_MM)
         self.figure, axes = sheet(FILM_WIDTH_MM, total)
         self.figure.set_facecolor("white")
-        axes.text(
-            FILM_WIDTH_MM / 2,
-            total - 3,
-            headline,
-            ha="center",
-            va="top",
-            fontsize=TEXT_PT,
-        )
+        axes.text(FILM_WIDTH_MM / 2, total - 3, headline, ha="center", va="top", fontsize=TEXT_PT)
         self.drawings: list[_DrawnTrajectory] = []
         view = SheetView.fit_points(
-            camera,
-            everything,
-            room_mm=(width - 8, height),
-            corner_mm=(4, FOOT_HEIGHT_MM),
+            camera, everything, room_mm=(width - 8, height), corner_mm=(4, FOOT_HEIGHT_MM)
         )
         self._draw_bodies(
-            axes,
-            view,
-            trajectories=shown,
-            top_mm=total - 3 - (head - HEAD_HEIGHT_MM),
+            axes, view, trajectories=shown, top_mm=total - 3 - (head - HEAD_HEIGHT_MM)
         )
         self._draw_annotations(axes, camera, mm_per_m=view.mm_per_m)
         self.cursor = (
-            self._draw_errors(
-                compared, width, height_mm=height, figure_height_mm=total
-            )
+            self._draw_errors(compared, width, height_mm=height, figure_height_mm=total)
             if compared
             else None
         )
         self.time_label = axes.text(
-            FILM_WIDTH_MM - 4,
-            4.0,
-            "",
-            ha="right",
-            va="center",
-            fontsize=TEXT_PT,
+            FILM_WIDTH_MM - 4, 4.0, "", ha="right", va="center", fontsize=TEXT_PT
         )
 
     def _draw_bodies(
@@ -396,26 +330,10 @@ class FilmFigure:
     ) -> None:
         """Draw the paths of the measured markers, and add a body without shape yet and its title to
         `drawings` for each trajectory; the first body is shaded, further ones are wire frames.
-
-        Parameters
-        ----------
-        axes : Axes
-            Axes of the sheet.
-        view : SheetView
-            Projection onto the sheet.
-        trajectories : sequence of (str, (T, n, 3), (T, M, 3))
-            Label, node positions and marker positions [m] of each trajectory.
-        top_mm : float
-            Upper edge of the titles on the sheet [mm].
         """
         replay = self.replay
         for path_m in np.moveaxis(replay.measured_m, 1, 0):
-            axes.plot(
-                *view.to_sheet_mm(path_m).T,
-                color=MARKER_PATH_COLOUR,
-                lw=0.6,
-                zorder=0.2,
-            )
+            axes.plot(*view.to_sheet_mm(path_m).T, color=MARKER_PATH_COLOUR, lw=0.6, zorder=0.2)
         for k, (name, positions, markers) in enumerate(trajectories):
             wire = GREEN if k else None
             title = axes.text(
@@ -431,13 +349,7 @@ class FilmFigure:
                 edge_colour=wire,
             )
             self.drawings.append(
-                _DrawnTrajectory(
-                    name,
-                    positions,
-                    markers_m=markers,
-                    body=body,
-                    title=title,
-                )
+                _DrawnTrajectory(name, positions, markers_m=markers, body=body, title=title)
             )
 
     def _draw_errors(
@@ -449,13 +361,6 @@ class FilmFigure:
     ) -> Line2D:
         """Draw the panel of marker errors over time, since the first sample, and return the
         vertical line that marks the current time.
-
-        Parameters
-        ----------
-        trajectories : sequence of (str, (T, M, 3))
-            Label and marker positions [m] of each trajectory, one or two.
-        left_mm, height_mm, figure_height_mm : float
-            Left edge of the panel, height of the body's picture, and height of the figure [mm].
         """
         t_s = self.replay.t_s - self.replay.t_s[0]
         place = (
@@ -472,42 +377,17 @@ class FilmFigure:
                 place[3] / figure_height_mm,
             )
         )
-        for (name, markers), colour in zip(
-            trajectories, (BLUE, GREEN), strict=False
-        ):
+        for (name, markers), colour in zip(trajectories, (BLUE, GREEN), strict=False):
             squares = np.sum((markers - self.replay.measured_m) ** 2, axis=2)
-            style = {
-                "color": colour,
-                "lw": LINE_PT,
-                "ls": "-" if colour == BLUE else (0, (4, 2)),
-            }
-            panel.plot(
-                t_s, 1e3 * rms_over_markers(squares), label=name, **style
-            )
-        style_axes(
-            panel, "", xlabel="time [s]", ylabel="marker error, RMS [mm]"
-        )
+            style = {"color": colour, "lw": LINE_PT, "ls": "-" if colour == BLUE else (0, (4, 2))}
+            panel.plot(t_s, 1e3 * rms_over_markers(squares), label=name, **style)
+        style_axes(panel, "", xlabel="time [s]", ylabel="marker error, RMS [mm]")
         panel.set_ylim(bottom=0.0)
         add_legend_above(panel, columns=1)
         return panel.axvline(0.0, color=BLACK, lw=0.8)
 
-    def _draw_annotations(
-        self,
-        axes: Axes,
-        camera: ParallelCamera,
-        mm_per_m: float,
-    ) -> None:
-        """Draw the axis directions, the scale bar and the legend below the body into `axes`.
-
-        Parameters
-        ----------
-        axes : Axes
-            Axes of the complete figure, in mm.
-        camera : ParallelCamera
-            View of the body, whose directions are drawn.
-        mm_per_m : float
-            Scale of the drawing: millimetres in the figure for each metre of the body.
-        """
+    def _draw_annotations(self, axes: Axes, camera: ParallelCamera, mm_per_m: float) -> None:
+        """Draw the axis directions, the scale bar and the legend below the body into `axes`."""
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))
         named = ["grasped", "measured", "behind the body"]
@@ -518,12 +398,7 @@ class FilmFigure:
             camera_points = LEGEND_ENTRY
         handles = legend_handles(*named, camera_points=camera_points)
         draw_legend(
-            axes,
-            handles,
-            corner_mm=(
-                FILM_WIDTH_MM * (0.42 if len(handles) < 4 else 0.35),
-                5.5,
-            ),
+            axes, handles, corner_mm=(FILM_WIDTH_MM * (0.42 if len(handles) < 4 else 0.35), 5.5)
         )
 
     def show_sample(self, sample: int) -> None:
@@ -533,11 +408,7 @@ class FilmFigure:
         replay = self.replay
         measured = replay.measured_m[sample]
         for drawn in self.drawings:
-            outlines_m = (
-                None
-                if replay.obstacles_m is None
-                else replay.obstacles_m[sample]
-            )
+            outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[sample]
             drawn.body.update(
                 drawn.positions_m[sample],
                 replay.is_prescribed[sample],
@@ -545,19 +416,11 @@ class FilmFigure:
                 outlines_m=outlines_m,
                 camera_points_m=replay.camera_points_m(sample),
             )
-            distances = np.linalg.norm(
-                drawn.markers_m[sample] - measured, axis=1
-            )
+            distances = np.linalg.norm(drawn.markers_m[sample] - measured, axis=1)
             present = distances[np.isfinite(distances)]
-            off = (
-                f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm"
-                if len(present)
-                else "no markers"
-            )
+            off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
             drawn.title.set_text(
-                drawn.name
-                if drawn.markers_m is replay.measured_m
-                else f"{drawn.name}: {off}"
+                drawn.name if drawn.markers_m is replay.measured_m else f"{drawn.name}: {off}"
             )
         if self.cursor is not None:
             now_s = replay.t_s[sample] - replay.t_s[0]
@@ -565,35 +428,17 @@ class FilmFigure:
         self.time_label.set_text(f"{replay.t_s[sample] - replay.t_s[0]:.2f} s")
 
 
-def _points_to_show_m(
-    replay: MotionRecord, surface_m: Array, samples: NDArray[np.bool_]
-) -> Array:
+def _points_to_show_m(replay: MotionRecord, surface_m: Array, samples: NDArray[np.bool_]) -> Array:
     """Return all points (p, 3) [m] that a film has to show: the surface of the body, obstacles near
     it, measured markers (NaN where missing) and compared points of cameras.
-
-    Parameters
-    ----------
-    replay : MotionRecord
-        Experiment.
-    surface_m : (t, s, 3)
-        Surface nodes at the samples that are shown.
-    samples : (T,)
-        Mask of these t samples.
     """
     outlines_m = replay.obstacles_m
     surroundings_m = with_nearby_outlines(
         surface_m, None if outlines_m is None else outlines_m[samples]
     )
-    camera_points_m = [
-        rows[np.isfinite(rows[:, 4]), 5:]
-        for rows in replay.visible_points.values()
-    ]
+    camera_points_m = [rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.visible_points.values()]
     return np.vstack(
-        [
-            surroundings_m.reshape(-1, 3),
-            replay.measured_m.reshape(-1, 3),
-            *camera_points_m,
-        ]
+        [surroundings_m.reshape(-1, 3), replay.measured_m.reshape(-1, 3), *camera_points_m]
     )
 
 
@@ -620,13 +465,7 @@ def _frame_writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
 
 
 def _find_ffmpeg(file: Path) -> str:
-    """Return the path of ffmpeg, of the system or else of imageio-ffmpeg.
-
-    Raises
-    ------
-    InputError
-        Naming the film's `file`, if neither is installed.
-    """
+    """Return the path of ffmpeg, of the system or else of imageio-ffmpeg."""
     if program := shutil.which("ffmpeg"):
         return program
     if find_spec("imageio_ffmpeg") is not None:

@@ -60,12 +60,7 @@ class DepthProjection:
 
     @classmethod
     def facing_shape(
-        cls,
-        view: DepthCameraModel,
-        skin: VisibleSurface,
-        phi: Array,
-        shape_m: Array,
-        up: Array,
+        cls, view: DepthCameraModel, skin: VisibleSurface, phi: Array, shape_m: Array, up: Array
     ) -> DepthProjection:
         """Return the projection whose parallel view faces the broad side of the body.
 
@@ -80,10 +75,7 @@ class DepthProjection:
             Unit vector against gravity.
         """
         return cls(
-            view,
-            skin,
-            phi=phi,
-            parallel_camera=ParallelCamera.facing_motion(shape_m[None], up),
+            view, skin, phi=phi, parallel_camera=ParallelCamera.facing_motion(shape_m[None], up)
         )
 
     def image_points(self, camera_m: Array, world_m: Array) -> Array:
@@ -103,15 +95,10 @@ class DepthProjection:
         """
         camera = self.view.depth.camera
         if camera.matrix is not None:
-            return np.column_stack(
-                [camera.undistorted_pixels(camera_m), camera_m[:, 2]]
-            )
+            return np.column_stack([camera.undistorted_pixels(camera_m), camera_m[:, 2]])
         right_top_mm = 1e3 * self.parallel_camera.project(world_m)
         return np.column_stack(
-            [
-                right_top_mm * [1, -1],
-                -self.parallel_camera.coordinates_to_viewer_m(world_m),
-            ]
+            [right_top_mm * [1, -1], -self.parallel_camera.coordinates_to_viewer_m(world_m)]
         )
 
     def outlines(self, shape_m: Array, sample: int) -> Array:
@@ -132,28 +119,19 @@ class DepthProjection:
         if eye_m is None:
             size_m = float(np.linalg.norm(np.ptp(shape_m, axis=0)))
             eye_m = (
-                shape_m.mean(axis=0)
-                + VIEWER_DISTANCE_RATIO * size_m * self.parallel_camera.axes[2]
+                shape_m.mean(axis=0) + VIEWER_DISTANCE_RATIO * size_m * self.parallel_camera.axes[2]
             )
-        corners = shape_m[
-            self.skin.plane_triangles[self.skin.is_facing(shape_m, eye_m)]
-        ]
+        corners = shape_m[self.skin.plane_triangles[self.skin.is_facing(shape_m, eye_m)]]
         closed = corners[:, [0, 1, 2, 0]].reshape(-1, 3)
         own_m = self.view.to_camera_m(self.phi, closed, sample=sample)
         if self.view.depth.camera.matrix is not None:
-            is_in_front = np.repeat(
-                (own_m[:, 2].reshape(-1, 4) > 0).all(axis=1), 4
-            )
+            is_in_front = np.repeat((own_m[:, 2].reshape(-1, 4) > 0).all(axis=1), 4)
             closed = closed[is_in_front]
             own_m = own_m[is_in_front]
         image = self.image_points(own_m, closed)[:, :2].reshape(-1, 4, 2)
-        return np.pad(
-            image, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan
-        ).reshape(-1, 2)
+        return np.pad(image, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
 
-    def point_rows(
-        self, sample: int, points_m: Array, rays: Array, distances_m: Array
-    ) -> Array:
+    def point_rows(self, sample: int, points_m: Array, rays: Array, distances_m: Array) -> Array:
         """Return the rows (P, 8) of `MotionRecord.visible_points` for all P given points of one
         sample.
 
@@ -169,9 +147,7 @@ class DepthProjection:
         """
         world = self.view.to_world(self.phi, points_m, rays=rays, image=sample)
         t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
-        return np.column_stack(
-            [t_s, self.image_points(points_m, world), distances_m, world]
-        )
+        return np.column_stack([t_s, self.image_points(points_m, world), distances_m, world])
 
     def outline_rows(self, sample: int, shape_m: Array) -> Array:
         """Return rows (k, 8) of `MotionRecord.visible_points` with the outlines of a shape.
@@ -185,9 +161,7 @@ class DepthProjection:
         shape_m : (n, 3)
             Node positions [m].
         """
-        drawn = np.vstack(
-            [self.outlines(shape_m, sample), np.full((1, 2), np.nan)]
-        )
+        drawn = np.vstack([self.outlines(shape_m, sample), np.full((1, 2), np.nan)])
         rows = np.full((len(drawn), 8), np.nan)
         rows[:, 0] = self.view.depth.sample_times_s[sample]
         rows[:, 1:3] = drawn
@@ -220,40 +194,20 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     shapes_m = surface.shapes_m
     phi = surface.phi
     shown = DepthProjection.facing_shape(
-        correspondences.camera,
-        correspondences.surface,
-        phi=phi,
-        shape_m=shapes_m[0],
-        up=up,
+        correspondences.camera, correspondences.surface, phi=phi, shape_m=shapes_m[0], up=up
     )
-    samples = np.flatnonzero(
-        correspondences.is_compared[: len(shapes_m)].any(axis=1)
-    ).tolist()
+    samples = np.flatnonzero(correspondences.is_compared[: len(shapes_m)].any(axis=1)).tolist()
     rows = [np.zeros((0, 8))]
     for k in samples:
         within = correspondences.weights[k].any(axis=1)
-        sights = (
-            correspondences.points[k],
-            correspondences.rays[k],
-            surface.signed_distances_m[k],
-        )
+        sights = (correspondences.points[k], correspondences.rays[k], surface.signed_distances_m[k])
         rows.append(shown.point_rows(k, *(each[within] for each in sights)))
-    few = np.unique(
-        np.linspace(0, len(samples) - 1, MAX_OUTLINED_SAMPLES)
-        .round()
-        .astype(int)
-    )
-    rows += [
-        shown.outline_rows(samples[k], shapes_m[samples[k]])
-        for k in few
-        if samples
-    ]
+    few = np.unique(np.linspace(0, len(samples) - 1, MAX_OUTLINED_SAMPLES).round().astype(int))
+    rows += [shown.outline_rows(samples[k], shapes_m[samples[k]]) for k in few if samples]
     return np.vstack(rows)
 
 
-def visible_points(
-    finished: SolvedProblem, experiment: Experiment
-) -> dict[str, Array]:
+def visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return the points of each depth camera on the fitted surface, or else on the simulated one.
 
     The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`. The
@@ -283,9 +237,7 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
     nuisance = NuisanceMap.from_experiment(experiment)
     by_camera = {}
     for number, depth in enumerate(experiment.depths):
-        view = DepthCameraModel.from_experiment(
-            experiment, number, nuisance=nuisance
-        )
+        view = DepthCameraModel.from_experiment(experiment, number, nuisance=nuisance)
         skin = VisibleSurface.from_body(experiment.body, depth)
         shape_m = skin.initial_positions_m(experiment, depth)
         shown = DepthProjection.facing_shape(
@@ -303,19 +255,12 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
             distances_m=np.full(len(points_m), np.nan),
         )
         by_camera[depth.name] = np.vstack(
-            [
-                rows,
-                shown.outline_rows(
-                    depth.find_first_sample_with_points(), shape_m
-                ),
-            ]
+            [rows, shown.outline_rows(depth.find_first_sample_with_points(), shape_m)]
         )
     return by_camera
 
 
-def save_overlays(
-    experiments: Iterable[Experiment], folder: Path
-) -> list[Path]:
+def save_overlays(experiments: Iterable[Experiment], folder: Path) -> list[Path]:
     """Draw the first image of each depth camera with the outlines of the undeformed body, see
     `undeformed_rows`, and return the files; empty without depth cameras.
 

@@ -12,13 +12,7 @@ import numpy as np
 
 from ..common.display import Line, Shown, Table, duration, labelled
 from ..fem.laws.constants import symbol_of, unit_of
-from ..runs.check import (
-    BodyCheck,
-    CheckResult,
-    GraspCheck,
-    QuickCheck,
-    RecordingCheck,
-)
+from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
 from ..runs.check.body_check import grasp_sentence
 from .run_sections import remedy_command
 
@@ -32,10 +26,7 @@ def quick_check_tables(quick_check: QuickCheck) -> list[Shown]:
     """Return the tables of a quick check, which need no simulation: one for each body, also that of
     specimens without a mesh, then one of the measurements.
     """
-    return [
-        *map(_body_section, quick_check.bodies),
-        _measurements_section(quick_check),
-    ]
+    return [*map(_body_section, quick_check.bodies), _measurements_section(quick_check)]
 
 
 def full_check_tables(findings: CheckResult) -> list[Shown]:
@@ -50,21 +41,14 @@ def full_check_tables(findings: CheckResult) -> list[Shown]:
     findings : CheckResult
         Result of the check.
     """
-    messages = {
-        "note": (findings.notes, ""),
-        "warning": (findings.warnings, "check"),
-    }
+    messages = {"note": (findings.notes, ""), "warning": (findings.warnings, "check")}
     return [
         *_motion_section(findings),
         _solve_section(findings),
         "",
         *(
             Table(
-                "",
-                (),
-                rows=tuple((f"{kind}:", each) for each in sentences),
-                texts=1,
-                style=style,
+                "", (), rows=tuple((f"{kind}:", each) for each in sentences), texts=1, style=style
             )
             for kind, (sentences, style) in messages.items()
             if sentences
@@ -89,10 +73,7 @@ def _check_verdict(findings: CheckResult) -> Line:
             f"{likeliest}"
         )
         return Line(sentence, "doubtful")
-    return Line(
-        "The problem is valid and its derivatives agree with finite differences.",
-        "good",
-    )
+    return Line("The problem is valid and its derivatives agree with finite differences.", "good")
 
 
 def _point_masses(body: BodyCheck) -> str:
@@ -108,9 +89,7 @@ def _point_masses(body: BodyCheck) -> str:
         added_kg = next(iter(masses.values()))
         total_g = 1e3 * (body.mass_kg + added_kg)
         return f", with point masses of {1e3 * added_kg:.4g} g {total_g:.4g} g"
-    stated = ", ".join(
-        f"{1e3 * mass_kg:.4g} g in '{name}'" for name, mass_kg in masses.items()
-    )
+    stated = ", ".join(f"{1e3 * mass_kg:.4g} g in '{name}'" for name, mass_kg in masses.items())
     return f", and point masses: {stated}"
 
 
@@ -123,14 +102,10 @@ def _body_section(body: BodyCheck) -> Table:
     """
     if body.is_homogeneous:
         names = ", ".join(f"'{name}'" for name in body.experiments)
-        return labelled(
-            "Specimens", {"homogeneous": f"{names}; exact, without a mesh"}
-        )
+        return labelled("Specimens", {"homogeneous": f"{names}; exact, without a mesh"})
     size = " × ".join(f"{1e3 * x:.4g}" for x in body.size_m)
     low, mean, high = (1e3 * x for x in body.edges_m)
-    worst = ", ".join(
-        f"{e.element} ({e.quality:.2f})" for e in body.worst_elements
-    )
+    worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in body.worst_elements)
     return labelled(
         "Body",
         {
@@ -140,11 +115,7 @@ def _body_section(body: BodyCheck) -> Table:
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
             "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
         }
-        | (
-            {}
-            if body.rest_shape == "stress_free"
-            else {"rest shape": _rest_shape(body)}
-        )
+        | ({} if body.rest_shape == "stress_free" else {"rest shape": _rest_shape(body)})
         | {
             f"field of {symbol_of(name)}": f"{each.modes} shapes with {each.share:.0%} of the "
             f"prior variance, correlation length {1e3 * each.length_m:.3g} mm; resolved details: "
@@ -166,7 +137,9 @@ def _rest_shape(body: BodyCheck) -> str:
             "stiffer guesses"
         )
     change = f"{1e3 * body.rest_shape_change_m:.3g} mm"
-    return f"the mesh was made under gravity; the stress-free shape differs from it by up to {change}"
+    return (
+        f"the mesh was made under gravity; the stress-free shape differs from it by up to {change}"
+    )
 
 
 def _motion_section(findings: CheckResult) -> list[Shown]:
@@ -200,19 +173,10 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
         for mode in motion.modes[:SHOWN_MODES]
     )
     firsts = [
-        f"'{m.experiment}' {m.first_mode.frequency_hz:.3g} Hz"
-        for m in others
-        if m.first_mode
+        f"'{m.experiment}' {m.first_mode.frequency_hz:.3g} Hz" for m in others if m.first_mode
     ]
-    firsts = [
-        *firsts[:SHOWN_RECORDINGS],
-        *["…"] * (len(firsts) > SHOWN_RECORDINGS),
-    ]
-    more = (
-        [f"  first modes of the other recordings: {', '.join(firsts)}"]
-        if firsts
-        else []
-    )
+    firsts = [*firsts[:SHOWN_RECORDINGS], *["…"] * (len(firsts) > SHOWN_RECORDINGS)]
+    more = [f"  first modes of the other recordings: {', '.join(firsts)}"] if firsts else []
     return [Table(title, heads, rows=rows, names=0), *more]
 
 
@@ -229,9 +193,7 @@ def _measurements_section(findings: QuickCheck) -> Table:
             f"{kind_text}: {recording.frames} × {_marker_summary(recording)}{kind}"
         )
     if len(findings.recordings) > SHOWN_RECORDINGS:
-        rows["…"] = (
-            f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
-        )
+        rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
     densities = {r.air_density_kg_m3 for r in findings.recordings if not r.test}
     if densities:
         rows["air"] = ", ".join(map(_air_description, sorted(densities)))
@@ -243,25 +205,11 @@ def _measurements_section(findings: QuickCheck) -> Table:
 def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
     """Return table rows with a sentence on each grasp of an experiment, by label; several grasps
     are numbered from 1. Empty without grasps.
-
-    Parameters
-    ----------
-    experiment : str
-        Name of the experiment.
-    holds : iterable of GraspCheck
-        Grasps of all experiments, of which those of this one are used.
     """
-    own = [
-        grasp_sentence(grasp)
-        for grasp in holds
-        if grasp.experiment == experiment
-    ]
+    own = [grasp_sentence(grasp) for grasp in holds if grasp.experiment == experiment]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}
-    return {
-        f"grasp {k} of '{experiment}'": sentence
-        for k, sentence in enumerate(own, start=1)
-    }
+    return {f"grasp {k} of '{experiment}'": sentence for k, sentence in enumerate(own, start=1)}
 
 
 def _air_description(density_kg_m3: float) -> str:
@@ -295,8 +243,7 @@ def _marker_summary(recording: RecordingCheck) -> str:
         place = f"no place stated, each {nearest}"
     else:
         place = (
-            f"farthest from the body '{farthest.name}', "
-            f"{round(1e3 * farthest.distance_m, 2):g} mm"
+            f"farthest from the body '{farthest.name}', {round(1e3 * farthest.distance_m, 2):g} mm"
         )
         if recording.unplaced:
             place += f"; {recording.unplaced} without a stated place, {nearest}"
@@ -308,9 +255,7 @@ def _solve_section(findings: CheckResult) -> Table:
     errors.
     """
     rows = {
-        "guess"
-        if len(findings.bodies) == 1
-        else f"guess of '{body.experiments[0]}'": ", ".join(
+        "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
             f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
             for name, value in body.guess.items()
         )
@@ -329,17 +274,12 @@ def _solve_section(findings: CheckResult) -> Table:
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
         memory = (
-            f"{cost.memory_mb:.0f} MB"
-            if cost.memory_mb < 1e3
-            else f"{cost.memory_mb / 1e3:.2g} GB"
+            f"{cost.memory_mb:.0f} MB" if cost.memory_mb < 1e3 else f"{cost.memory_mb / 1e3:.2g} GB"
         )
-        rows[cost.method] = (
-            f"about {duration(cost.time_s)} and {memory}{chosen}"
-        )
+        rows[cost.method] = f"about {duration(cost.time_s)} and {memory}{chosen}"
     if findings.costs:
         rows["times"] = (
-            f"rough estimates for {findings.timesteps:,} time steps or equilibria, "
-            "without checks"
+            f"rough estimates for {findings.timesteps:,} time steps or equilibria, without checks"
         )
     rows["derivatives"] = (
         f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "

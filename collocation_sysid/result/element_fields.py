@@ -55,9 +55,7 @@ class ElementFields:
         for number, part in enumerate(body.parts):
             kernel = field_kernel(body.element, body.law(number))
             # Every element has a place of its own, where its points add up.
-            places = len(FIELD_NAMES) * part.cells[:, None] + np.arange(
-                len(FIELD_NAMES)
-            )
+            places = len(FIELD_NAMES) * part.cells[:, None] + np.arange(len(FIELD_NAMES))
             width = len(FIELD_NAMES) * len(body.cells)
             cells = body.cells[part.cells]
             geometry = body.geometry[part.cells]
@@ -94,17 +92,11 @@ class ElementFields:
             where ln J does not exist, the values that need it are NaN.
         """
         body = self.body
-        x = np.ascontiguousarray(positions_m, dtype=float).reshape(
-            -1, body.nodes_m.size
-        )
+        x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)
         sums = np.empty((len(x), len(FIELD_NAMES) * len(self._volumes)))
         shares = body.split_theta(self.theta)
-        for k, (part, evaluate) in enumerate(
-            zip(body.parts, self._evaluators, strict=True)
-        ):
-            constants = np.array(
-                shares[k][: part.law_constant_count], dtype=float
-            )
+        for k, (part, evaluate) in enumerate(zip(body.parts, self._evaluators, strict=True)):
+            constants = np.array(shares[k][: part.law_constant_count], dtype=float)
             if body.inverse_equilibrium is not None:
                 constants = body.point_constants(k, self.theta)
             evaluate(
@@ -115,9 +107,7 @@ class ElementFields:
                 add=k > 0,
                 data_of_points=body.point_data(k, self.theta),
             )
-        means = (
-            sums.reshape(len(x), -1, len(FIELD_NAMES)) / self._volumes[:, None]
-        )
+        means = sums.reshape(len(x), -1, len(FIELD_NAMES)) / self._volumes[:, None]
         return {name: means[:, :, k] for k, name in enumerate(FIELD_NAMES)}
 
 
@@ -138,11 +128,7 @@ def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
         fields, _DEFORMATION_GRADIENT, ca.vec(point.compute_material_gradient())
     )
     return kernel_from_outputs(
-        "fields",
-        point,
-        outputs={
-            "fields": (Derivative(point.compute_volume() * evaluated, ()),)
-        },
+        "fields", point, outputs={"fields": (Derivative(point.compute_volume() * evaluated, ()),)}
     )
 
 

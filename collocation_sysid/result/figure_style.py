@@ -14,12 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
-from matplotlib.ticker import (
-    FuncFormatter,
-    LogFormatterSciNotation,
-    LogLocator,
-    NullLocator,
-)
+from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullLocator
 
 from ..fem.laws.constants import symbol_of
 
@@ -66,9 +61,7 @@ class NotebookFigure(Figure):
         name.
         """
         with warnings.catch_warnings():
-            warnings.filterwarnings(
-                "ignore", message=r"Glyph \d+ .* missing from"
-            )
+            warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
             super().draw(renderer)
 
 
@@ -84,9 +77,7 @@ def symbol_as_mathtext(name: str) -> str:
 
 def new_figure(width_mm: float, height_mm: float) -> Figure:
     """Return an empty figure of a size [mm] that arranges its axes automatically."""
-    figure = NotebookFigure(
-        figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained"
-    )
+    figure = NotebookFigure(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03)  # type: ignore[union-attr]
     return figure
 
@@ -119,17 +110,12 @@ def framed_figure(
     """
     figure = fixed_figure(width_mm, height_mm)
     figure.subplots_adjust(
-        left_mm / width_mm,
-        foot_mm / height_mm,
-        1 - right_mm / width_mm,
-        1 - top_mm / height_mm,
+        left_mm / width_mm, foot_mm / height_mm, 1 - right_mm / width_mm, 1 - top_mm / height_mm
     )
     return figure
 
 
-def style_axes(
-    axes: Axes, title: str = "", xlabel: str = "", ylabel: str = ""
-) -> None:
+def style_axes(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> None:
     """Give axes a title, labels of the x and the y axis (empty for none), the type sizes of this
     module, and a light frame and grid.
     """
@@ -151,9 +137,7 @@ def add_legend(axes: Axes, title: str = "") -> None:
     """Add a small legend with a white background, readable over lines, and a title, if any, to
     axes.
     """
-    box = axes.legend(
-        title=title, fontsize=SMALL_PT, title_fontsize=SMALL_PT, framealpha=0.85
-    )
+    box = axes.legend(title=title, fontsize=SMALL_PT, title_fontsize=SMALL_PT, framealpha=0.85)
     box.get_frame().set(edgecolor="none", facecolor="white")
 
 
@@ -186,9 +170,7 @@ def add_figure_legend(figure: Figure, columns: int, **how: Any) -> None:
     **how
         Further arguments of `Figure.legend`, which replace the default place and look.
     """
-    handles, labels = (
-        figure.axes[0].get_legend_handles_labels() if figure.axes else ([], [])
-    )
+    handles, labels = figure.axes[0].get_legend_handles_labels() if figure.axes else ([], [])
     place = {"loc": "outside upper left", "fontsize": TEXT_PT, "frameon": False}
     figure.legend(handles, labels, ncols=columns, **place | how)
 
@@ -198,9 +180,7 @@ def format_plain_numbers(axis: Axis, form: str = "g") -> None:
 
     `form` is the format of a number.
     """
-    axis.set_major_formatter(
-        FuncFormatter(lambda value, _: format(value, form))
-    )
+    axis.set_major_formatter(FuncFormatter(lambda value, _: format(value, form)))
     axis.set_minor_locator(NullLocator())
 
 
@@ -216,19 +196,11 @@ def make_log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     widen = max(1.0, least_ratio / (high / low)) ** 0.5
     axes.set_ylim(low / widen, high * widen)
     plain = low > 1e-3 and high < 1e5
-    few = high / low < (
-        1e3 if plain else 30.0
-    )  # powers beside all else are too wide
-    subs = (
-        (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10 else (1.0, 2.0, 5.0)
-    )
-    axes.yaxis.set_major_locator(
-        LogLocator(subs=subs if few else (1.0,), numticks=7)
-    )
+    few = high / low < (1e3 if plain else 30.0)  # powers beside all else are too wide
+    subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10 else (1.0, 2.0, 5.0)
+    axes.yaxis.set_major_locator(LogLocator(subs=subs if few else (1.0,), numticks=7))
     axes.yaxis.set_minor_locator(NullLocator())
     if few and plain:
         format_plain_numbers(axes.yaxis)
     else:
-        axes.yaxis.set_major_formatter(
-            LogFormatterSciNotation(minor_thresholds=(inf, inf))
-        )
+        axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(inf, inf)))

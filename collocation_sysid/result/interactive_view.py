@@ -34,10 +34,7 @@ SURFACE_FIELDS = ("pressures_pa", "gaps_m")
 
 
 def export_page(
-    run: str | Path,
-    file: str | Path,
-    experiment: str | None = None,
-    field: str | None = None,
+    run: str | Path, file: str | Path, experiment: str | None = None, field: str | None = None
 ) -> Path:
     """Write an experiment of a run folder as a stand-alone web page, and return the page's file; an
     existing file is replaced.
@@ -96,10 +93,7 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
     InputError
         If the frames have no such field, are damaged, or there are none.
     """
-    if (
-        field in SURFACE_FIELDS
-        and (values_of_faces := getattr(replay, field)) is not None
-    ):
+    if field in SURFACE_FIELDS and (values_of_faces := getattr(replay, field)) is not None:
         return values_of_faces
     frames = _frames_of_fit(run, replay)
     cells = cells_below_faces(replay.tetrahedra, replay.surface)
@@ -114,9 +108,7 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
                 values = in_cells[field][0][cells]
             else:
                 values = points[field][replay.surface].mean(axis=1)
-            shown.append(
-                np.linalg.norm(values, axis=1) if values.ndim == 2 else values
-            )
+            shown.append(np.linalg.norm(values, axis=1) if values.ndim == 2 else values)
         times = np.array([time for time, _ in frames])
         nearest = np.abs(replay.t_s[:, None] - times).argmin(axis=1)
         return np.array(shown)[nearest]
@@ -157,9 +149,7 @@ def view_run(
     replay = experiment_named(replays, experiment, run=run)
     frames = _frames_of_fit(run, replay)
     with _damaged_frames_refused(Path(run)):
-        scene = _FrameWindow(
-            frames, field, replay=replay, off_screen=screenshot is not None
-        )
+        scene = _FrameWindow(frames, field, replay=replay, off_screen=screenshot is not None)
     if screenshot is None:
         scene.plotter.show()
     else:
@@ -185,13 +175,8 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
         raise _missing_frames(run, experiment)
     with _damaged_frames_refused(run):
         sets = ElementTree.parse(listing).getroot().iter("DataSet")
-        frames = [
-            (float(s.attrib["timestep"]), listing.parent / s.attrib["file"])
-            for s in sets
-        ]
-        if not frames or not all(
-            is_own(run, file) for _, file in (*frames, (0.0, listing))
-        ):
+        frames = [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
+        if not frames or not all(is_own(run, file) for _, file in (*frames, (0.0, listing))):
             raise ValueError(
                 "it lists no frames, or frames that are missing or outside the run folder"
             )
@@ -207,23 +192,8 @@ def _missing_frames(run: str | Path, experiment: str) -> InputError:
     )
 
 
-def _frames_of_fit(
-    run: str | Path, replay: MotionRecord
-) -> list[tuple[float, Path]]:
-    """Return times [s] and files of the frames of an experiment that was fitted, see `frame_files`.
-
-    Parameters
-    ----------
-    run : str or Path
-        The run folder.
-    replay : MotionRecord
-        Experiment of this run.
-
-    Raises
-    ------
-    InputError
-        If the experiment was not fitted, or has no frames or damaged ones.
-    """
+def _frames_of_fit(run: str | Path, replay: MotionRecord) -> list[tuple[float, Path]]:
+    """Return times [s] and files of the frames of an experiment that was fitted, see `frame_files`."""
     if replay.positions_m is None:
         raise _missing_frames(run, replay.name)
     return frame_files(Path(run), replay.name)
@@ -232,9 +202,7 @@ def _frames_of_fit(
 def _damaged_frames_refused(run: Path) -> AbstractContextManager[None]:
     """Return a context in which errors from damaged frames become an InputError on the run."""
     return damage_refused(
-        run,
-        f"{FRAMES_FILE} or one of its frames",
-        remedy="solve the problem again",
+        run, f"{FRAMES_FILE} or one of its frames", remedy="solve the problem again"
     )
 
 
@@ -259,11 +227,7 @@ class _FrameWindow:
     """
 
     def __init__(
-        self,
-        frames: list[tuple[float, Path]],
-        field: str,
-        replay: MotionRecord,
-        off_screen: bool,
+        self, frames: list[tuple[float, Path]], field: str, replay: MotionRecord, off_screen: bool
     ) -> None:
         pv: Any = import_module("pyvista")
         self.pv = pv
@@ -273,17 +237,14 @@ class _FrameWindow:
         self.meshes: list[Any] = [pv.read(file) for _, file in frames]
         known = [*self.meshes[0].cell_data, *self.meshes[0].point_data]
         require_among(field, known, where="--field")
-        self.plotter = pv.Plotter(
-            off_screen=off_screen, window_size=list(WINDOW_SIZE_PIXELS)
-        )
+        self.plotter = pv.Plotter(off_screen=off_screen, window_size=list(WINDOW_SIZE_PIXELS))
         self.plotter.set_background("white")
         self.range = self._value_range()
         self.plotter.add_axes(color="black")
         self.show_nearest_frame(self.times[0])
         positions = np.array([mesh.points for mesh in self.meshes])
         self.plotter.view_vector(
-            ParallelCamera.facing_motion(positions, replay.up).axes[2],
-            viewup=replay.up,
+            ParallelCamera.facing_motion(positions, replay.up).axes[2], viewup=replay.up
         )
         self._fit_camera()
         if not off_screen:
@@ -302,18 +263,11 @@ class _FrameWindow:
         largest value of the field; NaN is ignored.
         """
         values = [self._field_values(mesh) for mesh in self.meshes]
-        return min(float(np.nanmin(v)) for v in values), max(
-            float(np.nanmax(v)) for v in values
-        )
+        return min(float(np.nanmin(v)) for v in values), max(float(np.nanmax(v)) for v in values)
 
     def _field_values(self, mesh: Any) -> np.ndarray:
         """Return the field of this window on a mesh, (n,) for point data or (E,) for cell data; of
         vectors their norms. `KeyError` if the mesh has no such field.
-
-        Parameters
-        ----------
-        mesh : pyvista mesh
-            Mesh of one frame.
         """
         values = np.asarray(mesh[self.field])
         return np.linalg.norm(values, axis=1) if values.ndim == 2 else values
@@ -338,56 +292,32 @@ class _FrameWindow:
         sample = int(np.abs(self.replay.t_s - time_s).argmin())
         if self.replay.obstacles_m is not None:
             points = self.replay.obstacles_m[sample]
-            pairs = np.array(
-                [np.arange(len(points) - 1), np.arange(1, len(points))]
-            ).T
+            pairs = np.array([np.arange(len(points) - 1), np.arange(1, len(points))]).T
             # Lines end where a point is no number.
             pairs = pairs[np.isfinite(points[pairs]).all(axis=(1, 2))]
             drawn = np.hstack([np.full((len(pairs), 1), 2), pairs])
             lines = self.pv.PolyData(np.nan_to_num(points), lines=drawn)
-            self.plotter.add_mesh(
-                lines, color=BLACK, name="obstacles", reset_camera=False
-            )
-        bar = {
-            "title": self.field,
-            "color": "black",
-            "vertical": True,
-            "fmt": "%.3g",
-        }
-        bar |= {
-            "title_font_size": 16,
-            "label_font_size": 16,
-            "position_x": 0.86,
-        }
+            self.plotter.add_mesh(lines, color=BLACK, name="obstacles", reset_camera=False)
+        bar = {"title": self.field, "color": "black", "vertical": True, "fmt": "%.3g"}
+        bar |= {"title_font_size": 16, "label_font_size": 16, "position_x": 0.86}
         self.plotter.add_mesh(
             mesh, scalars=self.field, clim=self.range, cmap="cividis", show_edges=True, name="body",
             edge_color="#5A6B7B", line_width=1, scalar_bar_args=bar, reset_camera=False,
             ambient=0.45, diffuse=0.6,
         )  # fmt: skip
-        balls = {
-            "render_points_as_spheres": True,
-            "point_size": 12,
-            "reset_camera": False,
-        }
+        balls = {"render_points_as_spheres": True, "point_size": 12, "reset_camera": False}
         measured = self.replay.measured_m[sample]
         measured = measured[np.isfinite(measured).all(axis=1)]
         if len(measured):
             self.plotter.add_mesh(
-                self.pv.PolyData(measured),
-                color=VERMILION,
-                name="measured",
-                **balls,
+                self.pv.PolyData(measured), color=VERMILION, name="measured", **balls
             )
         else:
             self.plotter.remove_actor("measured", reset_camera=False)
         shapes = self.replay.shapes_m
         grasped = np.flatnonzero(self.replay.is_prescribed[sample])
         if shapes is not None and len(grasped):
-            nodes = self.pv.PolyData(
-                np.asarray(shapes[sample][grasped], dtype=float)
-            )
-            self.plotter.add_mesh(
-                nodes, color=BLACK, name="grasped", **{**balls, "point_size": 8}
-            )
+            nodes = self.pv.PolyData(np.asarray(shapes[sample][grasped], dtype=float))
+            self.plotter.add_mesh(nodes, color=BLACK, name="grasped", **{**balls, "point_size": 8})
         else:
             self.plotter.remove_actor("grasped", reset_camera=False)

@@ -64,11 +64,7 @@ class SliderRange:
 
     @classmethod
     def from_estimate(
-        cls,
-        estimate: ReportedEstimate,
-        *,
-        linear: bool,
-        bounds: tuple[float, float],
+        cls, estimate: ReportedEstimate, *, linear: bool, bounds: tuple[float, float]
     ) -> SliderRange:
         """Return a range around an estimate.
 
@@ -89,28 +85,19 @@ class SliderRange:
         value = estimate.value
         interval = estimate.combined95 or (value, value)
         if linear or value <= 0:
-            margin = (1 + WIDENING) * max(
-                value - interval[0], interval[1] - value
-            )
+            margin = (1 + WIDENING) * max(value - interval[0], interval[1] - value)
             margin = max(margin, (LEAST_RATIO - 1) * abs(value)) or 1.0
             low = value - margin
             high = value + margin
         else:
-            ratio = max(
-                interval[1] / value, value / max(interval[0], 1e-12 * value)
-            )
+            ratio = max(interval[1] / value, value / max(interval[0], 1e-12 * value))
             factor = max(ratio ** (1 + WIDENING), LEAST_RATIO)
             low = value / factor
             high = value * factor
         is_logarithmic = not linear and value > 0
         low = max(low, bounds[0])
         high = min(high, bounds[1])
-        return cls(
-            low,
-            float(np.clip(value, low, high)),
-            high=high,
-            is_logarithmic=is_logarithmic,
-        )
+        return cls(low, float(np.clip(value, low, high)), high=high, is_logarithmic=is_logarithmic)
 
 
 class ParameterSliders:
@@ -122,7 +109,7 @@ class ParameterSliders:
         Its integrator and step are used.
     experiment : Experiment
         The recording.
-    segment : Transcription
+    transcription : Transcription
         The recording as it was fitted.
     phi : (k,) array
         Nuisance parameters of the recording, which stay as estimated.
@@ -154,7 +141,7 @@ class ParameterSliders:
         problem: Problem,
         experiment: Experiment,
         *,
-        segment: Transcription,
+        transcription: Transcription,
         phi: Array,
         parameters: Parameters,
         ranges: Mapping[str, SliderRange],
@@ -163,23 +150,18 @@ class ParameterSliders:
         widgets: Any = import_module("ipywidgets")
         self._problem = problem
         self._experiment = experiment
-        self._segment = segment
+        self._segment = transcription
         self._phi = phi
         self._parameters = parameters
         self._ranges = ranges
         self._fitted_markers_m = fitted_markers_m
         self._is_resetting = False
         self.simulation: ForwardSimulation | None = None
-        self.sliders = {
-            name: _slider(widgets, name, values=each)
-            for name, each in ranges.items()
-        }
+        self.sliders = {name: _slider(widgets, name, values=each) for name, each in ranges.items()}
         self.picture = widgets.Image(format="png")
         self.message = widgets.Label()
         self.reset_button = widgets.Button(description="estimates")
-        controls = widgets.VBox(
-            [*self.sliders.values(), self.reset_button, self.message]
-        )
+        controls = widgets.VBox([*self.sliders.values(), self.reset_button, self.message])
         self.widget = widgets.HBox([controls, self.picture])
         for slider in self.sliders.values():
             slider.observe(self._on_change, names="value")
@@ -187,9 +169,7 @@ class ParameterSliders:
         self.update()
 
     @classmethod
-    def from_run(
-        cls, run: SolvedProblem, experiment: str | None = None
-    ) -> ParameterSliders:
+    def from_run(cls, run: SolvedProblem, experiment: str | None = None) -> ParameterSliders:
         """Return the sliders of a run, see `Run.interactive`; the first simulation is made at once.
 
         If that fails, `simulation` is None and the message says why.
@@ -212,10 +192,7 @@ class ParameterSliders:
         by_name = {each.name: each for each in run.problem.experiments}
         name = next(iter(by_name)) if experiment is None else experiment
         require_among(name, by_name)
-        names = [
-            each.name
-            for each in run.solution.collocation.parameters.free_scalars
-        ]
+        names = [each.name for each in run.solution.collocation.parameters.free_scalars]
         if not names:
             raise InputError(
                 "no parameter was estimated; expected a run with one that is not fixed, because "
@@ -223,21 +200,17 @@ class ParameterSliders:
             )
         ranges = {}
         for each in names:
-            linear, bounds = (
-                run.solution.collocation.parameters.scale_and_bounds(each)
-            )
+            linear, bounds = run.solution.collocation.parameters.scale_and_bounds(each)
             ranges[each] = SliderRange.from_estimate(
                 run.estimates[each], linear=linear, bounds=bounds
             )
-        segment, phi = transcription_and_nuisance(by_name[name], run.solution)
+        transcription, phi = transcription_and_nuisance(by_name[name], run.solution)
         fitted = zip(run.solution.parts, run.solution.readings_m, strict=True)
-        markers_m = {
-            part.segment.experiment.name: readings for part, readings in fitted
-        }
+        markers_m = {part.transcription.experiment.name: readings for part, readings in fitted}
         return cls(
             run.problem,
             by_name[name],
-            segment=segment,
+            transcription=transcription,
             phi=phi,
             parameters=run.solution.collocation.parameters.with_estimates(
                 {
@@ -279,7 +252,7 @@ class ParameterSliders:
             self.simulation = simulate_with_parameters(
                 self._problem,
                 self._experiment,
-                segment=self._segment,
+                transcription=self._segment,
                 phi=self._phi,
                 parameters=self.read_values(),
             )
@@ -308,11 +281,7 @@ class ParameterSliders:
             rms_mm = number(1e3 * simulation.rms_m, 3)
             max_mm = number(1e3 * simulation.max_m, 3)
             texts.append(f"markers: {rms_mm} mm RMS, at most {max_mm} mm")
-        texts += [
-            text
-            for feature in FEATURES
-            for text in feature.brief_texts(simulation.error)
-        ]
+        texts += [text for feature in FEATURES for text in feature.brief_texts(simulation.error)]
         return "; ".join(texts) or "no measurement to compare with"
 
     def _figure(self, simulation: ForwardSimulation) -> Figure:
@@ -333,12 +302,8 @@ class ParameterSliders:
                 simulated_m=simulation.trajectory.markers_m,
             )
         for feature in FEATURES:
-            for series in feature.simulated_series(
-                experiment, simulation.predicted
-            ):
-                return sensor_picture(
-                    series.columns, series.names, units=series.units
-                )
+            for series in feature.simulated_series(experiment, simulation.predicted):
+                return sensor_picture(series.columns, series.names, units=series.units)
         return self._shapes_figure(simulation)
 
     def _shapes_figure(self, simulation: ForwardSimulation) -> Figure:
@@ -350,23 +315,11 @@ class ParameterSliders:
 
         trajectory = simulation.trajectory
         simulated = trajectory.positions_m, trajectory.markers_m
-        return shapes_picture(
-            MotionRecord.from_experiment(self._experiment, simulated=simulated)
-        )
+        return shapes_picture(MotionRecord.from_experiment(self._experiment, simulated=simulated))
 
 
 def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
-    """Return the slider of a parameter, which reports its value when it is released.
-
-    Parameters
-    ----------
-    widgets : module
-        The module ipywidgets.
-    name : str
-        Name of the parameter, for the label.
-    values : SliderRange
-        First value, ends and scale.
-    """
+    """Return the slider of a parameter, which reports its value when it is released."""
     common = {
         "description": symbol_with_unit(name),
         "continuous_update": False,
@@ -376,12 +329,7 @@ def _slider(widgets: Any, name: str, values: SliderRange) -> Any:
         low = float(np.log10(values.low))
         high = float(np.log10(values.high))
         return widgets.FloatLogSlider(
-            value=values.value,
-            base=10,
-            min=low,
-            max=high,
-            step=(high - low) / STEPS,
-            **common,
+            value=values.value, base=10, min=low, max=high, step=(high - low) / STEPS, **common
         )
     step = (values.high - values.low) / STEPS
     return widgets.FloatSlider(

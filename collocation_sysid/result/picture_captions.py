@@ -42,10 +42,7 @@ def _all_captions() -> dict[str, str]:
 PICTURE_CAPTIONS = _all_captions()
 # Pictures that show measurement and fit, one of which leads the page.
 LEADING_PICTURES = tuple(
-    kind.name
-    for feature in FEATURES
-    for kind in feature.picture_kinds
-    if kind.is_leading
+    kind.name for feature in FEATURES for kind in feature.picture_kinds if kind.is_leading
 )
 
 
@@ -64,22 +61,10 @@ def captioned_pictures(run: Path) -> list[Picture]:
         """Return the key of `PICTURE_CAPTIONS` with which a name begins; "" if none."""
         return next(k for k in order if file.stem.startswith(k))
 
-    for file in sorted(
-        own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)
-    ):
+    for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):
         about = file.stem.removeprefix(kind(file)).strip("_")
         caption = PICTURE_CAPTIONS.get(kind(file), file.stem)
-        pictures.append(
-            Picture(
-                file, f"{about}: {caption}" if about and kind(file) else caption
-            )
-        )
-    compared = (
-        each for each in pictures if kind(each.file) in LEADING_PICTURES
-    )
+        pictures.append(Picture(file, f"{about}: {caption}" if about and kind(file) else caption))
+    compared = (each for each in pictures if kind(each.file) in LEADING_PICTURES)
     first = next(compared, None)
-    return (
-        pictures
-        if first is None
-        else [first, *(p for p in pictures if p is not first)]
-    )
+    return pictures if first is None else [first, *(p for p in pictures if p is not first)]

@@ -9,11 +9,7 @@ from ..errors import listed
 from ..fem.laws.constants import symbol_of
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
-from ..statistics.probes.relaxed_assumptions import (
-    EstimateChange,
-    Probe,
-    assumption_name,
-)
+from ..statistics.probes.relaxed_assumptions import EstimateChange, Probe, assumption_name
 
 # Measures of stiffness, the most important first.
 STIFFNESS_NAMES = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
@@ -51,13 +47,9 @@ def probe_section(result: Result) -> TitledParts:
         (
             source_label(p.name) if p.kind == "assumption" else p.name,
             f"{p.chi_squared:.1f}",
-            ""
-            if p.size is None
-            else f"{short(p.size)} ± {short(p.size_error or 0.0)}",
+            "" if p.size is None else f"{short(p.size)} ± {short(p.size_error or 0.0)}",
             *(
-                _change_with_ratios(
-                    p.moves.get(name), result.collect_estimates()[name].value
-                )
+                _change_with_ratios(p.moves.get(name), result.collect_estimates()[name].value)
                 for name in names
             ),
         )
@@ -69,12 +61,7 @@ def probe_section(result: Result) -> TitledParts:
         "significant assumptions."
     )
     return TitledParts(
-        "Probes",
-        (
-            Table("", heads, rows=tuple(rows), texts=1),
-            read,
-            *_conclusions(result),
-        ),
+        "Probes", (Table("", heads, rows=tuple(rows), texts=1), read, *_conclusions(result))
     )
 
 
@@ -84,15 +71,9 @@ def probe_lines(result: Result) -> list[str | Table]:
     After the probes of every solve alone, without a significant result, only the conclusions are
     returned. Empty without probes.
     """
-    if is_routine(result) and not any(
-        probe.sentences for probe in result.probes
-    ):
+    if is_routine(result) and not any(probe.sentences for probe in result.probes):
         return [*_conclusions(result)] if result.probes else []
-    return [
-        each
-        for each in probe_section(result).parts
-        if isinstance(each, (str, Table))
-    ]
+    return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
 
 
 def _size_and_ratio(probe: Probe) -> str:
@@ -122,9 +103,7 @@ def _largest_probes(result: Result) -> list[Probe]:
 
 def _ratio(probe: Probe) -> float:
     """Return the absolute size of a relaxed assumption over its standard error; 0 without one."""
-    return (
-        abs(probe.size or 0.0) / probe.size_error if probe.size_error else 0.0
-    )
+    return abs(probe.size or 0.0) / probe.size_error if probe.size_error else 0.0
 
 
 def is_routine(result: Result) -> bool:
@@ -156,47 +135,29 @@ def _shown_estimates(result: Result) -> list[str]:
     They are those with a statistical interval: Young's modulus of the whole body first, then
     parameters; other derived moduli, also those of regions, are left out.
     """
-    known = [
-        n
-        for n, each in result.collect_estimates().items()
-        if each.statistical95
-    ]
+    known = [n for n, each in result.collect_estimates().items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
-    return [
-        *first,
-        *(n for n in known if n in result.parameters and n not in first),
-    ][:MAX_ESTIMATES]
+    return [*first, *(n for n in known if n in result.parameters and n not in first)][
+        :MAX_ESTIMATES
+    ]
 
 
 def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
     """Return the change of an estimate in percent of its value, with its signed ratios to the half
     widths of the statistical and of the combined interval in parentheses, of which unknown ones are
     left out; "–" for None.
-
-    Parameters
-    ----------
-    move : EstimateChange or None
-        Change of the estimate in a refit; None if the refit does not have it.
-    value : float
-        The estimate itself; if it is zero, the change is in its unit instead of percent.
     """
     if move is None:
         return "–"
     shares = ", ".join(
-        f"{x:+.1f}"
-        for x in (move.of_statistical95, move.of_combined95)
-        if x is not None
+        f"{x:+.1f}" for x in (move.of_statistical95, move.of_combined95) if x is not None
     )
     return f"{_change_text(move, value)} ({shares})"
 
 
 def _change_text(move: EstimateChange, value: float) -> str:
     """Return the change of an estimate as text, in percent of `value` unless that is zero."""
-    return (
-        f"{100 * move.change / abs(value):+.2f} %"
-        if value
-        else f"{move.change:+.2g}"
-    )
+    return f"{100 * move.change / abs(value):+.2f} %" if value else f"{move.change:+.2g}"
 
 
 def _conclusions(result: Result) -> Iterator[str]:
@@ -208,8 +169,7 @@ def _conclusions(result: Result) -> Iterator[str]:
     """
     significant = [probe for probe in result.probes if probe.sentences]
     relaxed = sorted(
-        (p for p in significant if p.kind == "assumption"),
-        key=lambda p: -p.chi_squared,
+        (p for p in significant if p.kind == "assumption"), key=lambda p: -p.chi_squared
     )
     for kind in ("window", "recording"):
         disagreeing = [p for p in significant if p.kind == kind]
@@ -222,11 +182,7 @@ def _conclusions(result: Result) -> Iterator[str]:
     if relaxed:
         first = relaxed[0]
         names = _shown_estimates(result)
-        moved = [
-            _named_change(first, result, name=n)
-            for n in names
-            if n in first.moves
-        ][:2]
+        moved = [_named_change(first, result, name=n) for n in names if n in first.moves][:2]
         size = short(first.size or 0.0)
         error = short(first.size_error or 0.0)
         yield (
@@ -234,9 +190,7 @@ def _conclusions(result: Result) -> Iterator[str]:
             f"by {first.chi_squared:.3g} and the estimates change by {listed(moved)}; measure it, "
             "or estimate it"
         )
-        if others := [
-            f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]
-        ]:
+        if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
             yield f"alternative explanations with similar effects: {listed(others)}"
     elif not significant and is_routine(result):
         *others, last = map(_size_and_ratio, _largest_probes(result))
@@ -263,18 +217,12 @@ def _most_important_assumption(result: Result) -> Iterator[str]:
     Of these assumptions the sentence names the one with the largest share in the budget of the
     first parameter whose budget contains any, stiffnesses before other parameters.
     """
-    significant = {
-        assumption_name(name) for p in result.probes for name in p.sentences
-    }
+    significant = {assumption_name(name) for p in result.probes for name in p.sentences}
     undetermined = {
         assumption_name(p.name) for p in result.probes if p.kind == "assumption"
     } - significant
-    for name in (
-        n for n in (*STIFFNESS_NAMES, *result.parameters) if n in result.budget
-    ):
-        source = next(
-            (s for s in result.budget[name] if s in undetermined), None
-        )
+    for name in (n for n in (*STIFFNESS_NAMES, *result.parameters) if n in result.budget):
+        source = next((s for s in result.budget[name] if s in undetermined), None)
         if source is not None:
             share = result.budget[name][source]
             yield (

@@ -32,16 +32,10 @@ from ..runs.result_content import Result
 ARRAYS_FILE = "trajectory.npz"
 # Kinds of sensors whose arrays are named after the kind and the number of the sensor, from 1.
 SERIES_KINDS = {
-    each.series_kind.name: each.series_kind
-    for each in FEATURES
-    if each.series_kind is not None
+    each.series_kind.name: each.series_kind for each in FEATURES if each.series_kind is not None
 }
 # Prefixes of arrays of the attributes that are mappings, before the name.
-GROUP_PREFIXES = {
-    "readings": "reading_",
-    "fields": "field_",
-    "visible_points": "visible_",
-}
+GROUP_PREFIXES = {"readings": "reading_", "fields": "field_", "visible_points": "visible_"}
 # Prefix of the unit of a custom sensor, before its name.
 UNIT_PREFIX = "unit_"
 # Arrays of the body, the same for all experiments of a run but specimens, which have their own.
@@ -83,12 +77,7 @@ KINDS_TEXT = {"f": "floats", "iu": "whole numbers", "b": "booleans"}
 # Side of the square that represents a plane, over the body's largest extent.
 PLANE_SIZE_RATIO = 1.4
 # Arrays that may have NaN or infinity.
-ARRAYS_WITH_NAN = ARRAY_LAYOUT.keys() - {
-    "undeformed_m",
-    "t_s",
-    "up",
-    "marker_places_m",
-}
+ARRAYS_WITH_NAN = ARRAY_LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
 # Largest magnitude of any number in an array: beyond, squares overflow.
 LARGEST_NUMBER = 1e100
 
@@ -224,8 +213,7 @@ class MotionRecord:
         nodes_m = body.nodes.points_m
         # Frames of obstacles are left out: experiments of a run have one body, but not as many.
         fitted, simulated = (
-            each and (each[0][:, : len(nodes_m)], each[1])
-            for each in (fitted, simulated)
+            each and (each[0][:, : len(nodes_m)], each[1]) for each in (fitted, simulated)
         )
         return cls(
             experiment.name,
@@ -234,13 +222,9 @@ class MotionRecord:
             body.mesh.tetrahedra,
             body.mesh.surface,
             body.part_of_cells[body.mesh.surface_cells],
-            nodes_of_faces(
-                body.cells[body.mesh.surface_cells], body.mesh.surface
-            ),
+            nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
-            np.asarray(experiment.is_prescribed(experiment.t_s).any(axis=2))[
-                :, : len(nodes_m)
-            ],
+            np.asarray(experiment.is_prescribed(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
             experiment.compute_upward_direction(),
             markers.names,
             declared_m if places_m is None else places_m,
@@ -250,29 +234,17 @@ class MotionRecord:
             *(simulated or (None, None)),
             natural_hz,
             static=experiment.is_static,
-            tendons_m=_join_polylines(
-                [tendon.points_m for tendon in experiment.tendons]
-            ),
+            tendons_m=_join_polylines([tendon.points_m for tendon in experiment.tendons]),
             obstacles_m=_obstacle_outlines(experiment),
-            reading_units={
-                gauge.name: gauge.unit
-                for gauge in experiment.readings
-                if gauge.unit
-            },
-            strain=specimen_strains(experiment)[0]
-            if experiment.specimen
-            else None,
+            reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit},
+            strain=specimen_strains(experiment)[0] if experiment.specimen else None,
             **recorded,
         )
 
     @property
     def shapes_m(self) -> Array | None:
         """Fitted node positions (T, n, 3), else the simulated ones; None if neither exists."""
-        return (
-            self.positions_m
-            if self.positions_m is not None
-            else self.rolled_out_positions_m
-        )
+        return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
 
     def camera_points_m(self, sample: int) -> Array:
         """Return the points (P, 3) [m] of all cameras at the time of the sample with index
@@ -282,18 +254,14 @@ class MotionRecord:
         distance between samples away; without one the camera adds no points, and P may be 0.
         Points that do not count are left out.
         """
-        tolerance_s = (
-            float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
-        )
+        tolerance_s = float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
         nearest = [np.zeros((0, 3))]
         for rows in self.visible_points.values():
             points = rows[np.isfinite(rows[:, 4])]
             times = np.unique(points[:, 0])
             differences_s = np.abs(times - self.t_s[sample])
             if differences_s.min(initial=np.inf) <= tolerance_s:
-                nearest.append(
-                    points[points[:, 0] == times[differences_s.argmin()], 5:]
-                )
+                nearest.append(points[points[:, 0] == times[differences_s.argmin()], 5:])
         return np.concatenate(nearest)
 
     @property
@@ -308,9 +276,7 @@ class MotionRecord:
     def has_shapes(self) -> bool:
         """Return whether at least one sample has finite positions of all nodes."""
         shapes_m = self.shapes_m
-        return shapes_m is not None and bool(
-            np.isfinite(shapes_m).all(axis=(1, 2)).any()
-        )
+        return shapes_m is not None and bool(np.isfinite(shapes_m).all(axis=(1, 2)).any())
 
     def to_arrays(self, prefix: str = "") -> dict[str, Array]:
         """Return the arrays to store in a file, by name; attributes that are None are left out.
@@ -319,47 +285,22 @@ class MotionRecord:
         experiments of a run share except specimens. Simulated positions are rounded to single
         precision. "residuals_m", the fitted minus the measured markers, is added if there is a fit.
         """
-        stored: dict[str, Any] = {
-            key: getattr(self, key) for key in ARRAY_LAYOUT
-        }
+        stored: dict[str, Any] = {key: getattr(self, key) for key in ARRAY_LAYOUT}
         stored |= {
-            k: stored[k].astype(np.int32)
-            for k, (kinds, _) in ARRAY_LAYOUT.items()
-            if "i" in kinds
+            k: stored[k].astype(np.int32) for k, (kinds, _) in ARRAY_LAYOUT.items() if "i" in kinds
         }
         if self.rolled_out_positions_m is not None:
-            stored["rolled_out_positions_m"] = (
-                self.rolled_out_positions_m.astype(np.float32)
-            )
-        stored |= {
-            key: np.array(getattr(self, key))
-            for key in ("part_names", "marker_names")
-        }
+            stored["rolled_out_positions_m"] = self.rolled_out_positions_m.astype(np.float32)
+        stored |= {key: np.array(getattr(self, key)) for key in ("part_names", "marker_names")}
         stored["static"] = np.array(True) if self.static else None
-        stored["residuals_m"] = (
-            None if self.markers_m is None else self.markers_m - self.measured_m
-        )
-        stored |= {
-            f"{each.kind}_{each.number}": each.columns
-            for each in self.sensor_series
-        }
+        stored["residuals_m"] = None if self.markers_m is None else self.markers_m - self.measured_m
+        stored |= {f"{each.kind}_{each.number}": each.columns for each in self.sensor_series}
         for group, front in GROUP_PREFIXES.items():
-            stored |= {
-                f"{front}{name}": values
-                for name, values in getattr(self, group).items()
-            }
-        stored |= {
-            f"{UNIT_PREFIX}{n}": np.array(unit)
-            for n, unit in self.reading_units.items()
-        }
-        there = {
-            key: value for key, value in stored.items() if value is not None
-        }
+            stored |= {f"{front}{name}": values for name, values in getattr(self, group).items()}
+        stored |= {f"{UNIT_PREFIX}{n}": np.array(unit) for n, unit in self.reading_units.items()}
+        there = {key: value for key, value in stored.items() if value is not None}
         shared = BODY_ARRAYS if self.strain is None else ()
-        return {
-            key if key in shared else prefix + key: value
-            for key, value in there.items()
-        }
+        return {key if key in shared else prefix + key: value for key, value in there.items()}
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> MotionRecord:
@@ -379,13 +320,10 @@ class MotionRecord:
         """
         prefix = f"{name}/" if f"{name}/t_s" in arrays else ""
         shared = () if f"{prefix}{BODY_ARRAYS[0]}" in arrays else BODY_ARRAYS
-        own = {
-            key: key if key in shared else prefix + key for key in ARRAY_LAYOUT
-        }
+        own = {key: key if key in shared else prefix + key for key in ARRAY_LAYOUT}
         needed = {each.name for each in fields(cls) if each.default is MISSING}
         stored: dict[str, Any] = {
-            key: arrays[at] if key in needed else arrays.get(at)
-            for key, at in own.items()
+            key: arrays[at] if key in needed else arrays.get(at) for key, at in own.items()
         }
         stored["sensor_columns"] = {}
         for kind in SERIES_KINDS:
@@ -407,12 +345,8 @@ class MotionRecord:
         }
         stored["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(stored)
-        stored["marker_names"] = [
-            str(marker) for marker in arrays[f"{prefix}marker_names"]
-        ]
-        names_key = (
-            "part_names" if "part_names" in shared else f"{prefix}part_names"
-        )
+        stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
+        names_key = "part_names" if "part_names" in shared else f"{prefix}part_names"
         stored["part_names"] = [str(part) for part in arrays[names_key]]
         parts = stored["surface_parts"]
         if len(stored["marker_names"]) != len(stored["marker_places_m"]):
@@ -441,14 +375,10 @@ def _obstacle_outlines(experiment: Experiment) -> Array | None:
         low = body.min(axis=0)
         high = body.max(axis=0)
         size_m = PLANE_SIZE_RATIO * float((high - low).max())
-        outline = _join_polylines(
-            obstacle.shape.outline_polylines((low + high) / 2, size_m)
-        )
+        outline = _join_polylines(obstacle.shape.outline_polylines((low + high) / 2, size_m))
         assert outline is not None
         rotations, shifts = obstacle.poses.at(experiment.t_s)
-        outlines.append(
-            np.einsum("tij,kj->tki", rotations, outline) + shifts[:, None]
-        )
+        outlines.append(np.einsum("tij,kj->tki", rotations, outline) + shifts[:, None])
     return np.concatenate(outlines, axis=1) if outlines else None
 
 
@@ -458,14 +388,10 @@ def _join_polylines(lines_m: Sequence[Array]) -> Array | None:
     """
     if not lines_m:
         return None
-    return np.concatenate(
-        [np.vstack([line, np.full(3, np.nan)]) for line in lines_m]
-    )
+    return np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in lines_m])
 
 
-def nodes_of_faces(
-    cells: NDArray[np.integer], faces: NDArray[np.integer]
-) -> NDArray[np.integer]:
+def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> NDArray[np.integer]:
     """Return the nodes of each boundary face: its corners and, for quadratic cells, those on its
     sides.
 
@@ -502,42 +428,24 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             continue
         expected = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
         here = array.shape
-        empty = any(
-            not size
-            for x, size in zip(letters, here, strict=False)
-            if x not in "Mk"
-        )
+        empty = any(not size for x, size in zip(letters, here, strict=False) if x not in "Mk")
         if array.dtype.kind not in kinds or array.ndim != len(letters) or empty:
             raise ValueError(
                 f"{key} is {array.dtype} of shape {here}; expected {KINDS_TEXT[kinds]} with "
                 f"{len(letters)} axes, none of length 0"
             )
         if any(
-            size not in (None, size_here)
-            for size, size_here in zip(expected, here, strict=True)
+            size not in (None, size_here) for size, size_here in zip(expected, here, strict=True)
         ):
-            raise ValueError(
-                f"{key} has shape {here}, which does not match the other arrays"
-            )
-        sizes |= {
-            x: size
-            for x, size in zip(letters, here, strict=True)
-            if not x.isdigit()
-        }
-        if kinds == "f" and not (
-            key in ARRAYS_WITH_NAN or np.isfinite(array).all()
-        ):
+            raise ValueError(f"{key} has shape {here}, which does not match the other arrays")
+        sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
+        if kinds == "f" and not (key in ARRAYS_WITH_NAN or np.isfinite(array).all()):
             raise ValueError(f"{key} contains numbers that are not finite")
-        if (
-            kinds == "f"
-            and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST_NUMBER
-        ):
+        if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST_NUMBER:
             raise ValueError(f"{key} contains numbers above {LARGEST_NUMBER:g}")
     elements = len(arrays["tetrahedra"])
     fits = {
-        "readings": lambda shape: (
-            len(shape) == 2 and shape[0] and shape[1] % 3 == 1 < shape[1]
-        ),
+        "readings": lambda shape: len(shape) == 2 and shape[0] and shape[1] % 3 == 1 < shape[1],
         "fields": lambda shape: shape == (elements, 4),
         "visible_points": lambda shape: shape[1:] == (8,),
     }
@@ -556,9 +464,7 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
             raise ValueError(f"{key} contains nodes that do not exist")
-    if not (np.diff(arrays["t_s"]) > 0).all() or not np.isclose(
-        np.linalg.norm(arrays["up"]), 1.0
-    ):
+    if not (np.diff(arrays["t_s"]) > 0).all() or not np.isclose(np.linalg.norm(arrays["up"]), 1.0):
         raise ValueError("t_s does not increase, or up is not a direction")
 
 
@@ -575,15 +481,11 @@ def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:
     run = Path(folder)
     result = Result.read(folder)
     rolled = result.rollout.experiments
-    predicted = [
-        n for n, r in rolled.items() if not r.fitted and r.failed is None
-    ]
+    predicted = [n for n, r in rolled.items() if not r.fitted and r.failed is None]
     with damaged_run_refused(run):
         arrays = read_arrays(run)
         names = [*result.fit.experiments, *predicted]
-        return result, [
-            MotionRecord.from_arrays(name, arrays) for name in names
-        ]
+        return result, [MotionRecord.from_arrays(name, arrays) for name in names]
 
 
 def run_headline(result: Result) -> str:
@@ -617,15 +519,11 @@ def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
     file = run / ARRAYS_FILE
     require_own(file)
     if not file.is_file():
-        raise InputError(
-            f"this is not a run folder: it has no {ARRAYS_FILE}", run
-        )
+        raise InputError(f"this is not a run folder: it has no {ARRAYS_FILE}", run)
     try:
         with np.load(file) as stored:
             return dict(stored)
-    except (
-        OSError
-    ) as error:  # what NumPy says of a file that is none of its own
+    except OSError as error:  # what NumPy says of a file that is none of its own
         raise ValueError(error) from error
 
 
@@ -633,6 +531,4 @@ def damaged_run_refused(run: Path) -> AbstractContextManager[None]:
     """Return a context that turns errors from damaged files of a run into an `InputError` that
     names the files; an `InputError` itself passes.
     """
-    return damage_refused(
-        run, f"{RESULT_FILE} or {ARRAYS_FILE}", remedy="solve the problem again"
-    )
+    return damage_refused(run, f"{RESULT_FILE} or {ARRAYS_FILE}", remedy="solve the problem again")

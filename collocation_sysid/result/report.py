@@ -87,22 +87,12 @@ def comparison_report(folder: str | Path) -> TitledParts:
     """
     folder = Path(folder)
     content = read_json(
-        folder / SUMMARY_FILE,
-        "a folder of compare-methods, compare-models or sweep",
+        folder / SUMMARY_FILE, "a folder of compare-methods, compare-models or sweep"
     )
-    with damage_refused(
-        folder, SUMMARY_FILE, remedy="repeat the study; finished runs are kept"
-    ):
+    with damage_refused(folder, SUMMARY_FILE, remedy="repeat the study; finished runs are kept"):
         study = read(StudySummary, content)
-        pictures = [
-            Picture(f, CAPTIONS.get(f.stem, f.stem))
-            for f in own_pictures(folder)
-        ]
-        ended = {
-            "Runs without a result": [Items(study.failures)]
-            if study.failures
-            else []
-        }
+        pictures = [Picture(f, CAPTIONS.get(f.stem, f.stem)) for f in own_pictures(folder)]
+        ended = {"Runs without a result": [Items(study.failures)] if study.failures else []}
         titled = {**ended, "Pictures": pictures}
         return TitledParts(
             study.title,
@@ -111,11 +101,7 @@ def comparison_report(folder: str | Path) -> TitledParts:
                 TitledParts("", study.headline, style="verdict good"),
                 *(Line(note, "quiet") for note in study.notes),
                 *study.tables,
-                *(
-                    TitledParts(title, tuple(each))
-                    for title, each in titled.items()
-                    if each
-                ),
+                *(TitledParts(title, tuple(each)) for title, each in titled.items() if each),
             ),
             level=1,
         )
@@ -123,9 +109,7 @@ def comparison_report(folder: str | Path) -> TitledParts:
 
 def report_text(report: TitledParts, file: Path) -> str:
     """Return the text of a report for a file: Markdown if its name ends in ``.md``, else HTML."""
-    return (
-        as_markdown([report]) if file.suffix == ".md" else report_html(report)
-    )
+    return as_markdown([report]) if file.suffix == ".md" else report_html(report)
 
 
 def report_html(report: TitledParts) -> str:
@@ -133,11 +117,7 @@ def report_html(report: TitledParts) -> str:
 
     Nothing is loaded from a network; pictures are embedded.
     """
-    page = (
-        files("collocation_sysid.result")
-        .joinpath("report.html")
-        .read_text("utf-8")
-    )
+    page = files("collocation_sysid.result").joinpath("report.html").read_text("utf-8")
     # A text cannot hold these places, since "<" is escaped.
     page = page.replace("<!--TITLE-->", escape(report.title))
     return page.replace("<!--BODY-->", as_html(report))

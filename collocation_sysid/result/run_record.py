@@ -33,11 +33,7 @@ REFINEMENT_FILE = "refinement.json"
 
 
 def write_run(
-    solved: SolvedProblem,
-    folder: str | Path,
-    *,
-    frames: bool = True,
-    pictures: bool = True,
+    solved: SolvedProblem, folder: str | Path, *, frames: bool = True, pictures: bool = True
 ) -> Path:
     """Write the folder of a run completely or not at all, then its pictures, and return the folder.
 
@@ -74,9 +70,7 @@ def write_run(
             text = as_json(solved.refinement)
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
         arrays = _trajectory_arrays(replays(solved))
-        np.savez_compressed(
-            place / "trajectory.npz", allow_pickle=False, **arrays
-        )
+        np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **arrays)
         if frames:
             write_all_frames(solved, place)
     if pictures:
@@ -85,9 +79,7 @@ def write_run(
 
 
 def draw_run(
-    solved: SolvedProblem,
-    folder: Path,
-    report: Callable[[str], None] | None = None,
+    solved: SolvedProblem, folder: Path, report: Callable[[str], None] | None = None
 ) -> Result:
     """Draw the pictures of a run into its folder, and store in ``result.json`` how long that took.
 
@@ -114,21 +106,15 @@ def draw_run(
     began_s = time.perf_counter()
     result = build_result(solved)
     file = folder / RESULT_FILE
-    write_pictures(
-        solved, result, folder=folder, say=report or (lambda _: None)
-    )
-    if not file.is_file() or file.read_text(encoding="utf-8") != _result_text(
-        result
-    ):
+    write_pictures(solved, result, folder=folder, say=report or (lambda _: None))
+    if not file.is_file() or file.read_text(encoding="utf-8") != _result_text(result):
         raise InputError(
             f"{RESULT_FILE} was changed while the pictures were drawn; draw them again with: "
             f"collocation-sysid plot {folder}",
             folder,
         )
     pictures_s = time.perf_counter() - began_s
-    result = replace(
-        result, elapsed_s=replace(result.elapsed_s, pictures=pictures_s)
-    )
+    result = replace(result, elapsed_s=replace(result.elapsed_s, pictures=pictures_s))
     write_text_file(file, _result_text(result))
     return result
 
@@ -139,10 +125,7 @@ def _result_text(result: Result) -> str:
 
 
 def write_pictures(
-    finished: SolvedProblem,
-    result: Result,
-    folder: Path,
-    say: Callable[[str], None],
+    finished: SolvedProblem, result: Result, folder: Path, say: Callable[[str], None]
 ) -> None:
     """Draw all pictures of a run, including the Jacobian's structure, and write them into its
     folder as PNG files; existing ones are replaced.
@@ -170,11 +153,7 @@ def write_pictures(
 
     solution = finished.solution
     jacobian = jacobian_sparsity(solution.collocation, solution.z)
-    save_pictures(
-        folder,
-        all_pictures(replays(finished), result) | {"jacobian": jacobian},
-        say=say,
-    )
+    save_pictures(folder, all_pictures(replays(finished), result) | {"jacobian": jacobian}, say=say)
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
@@ -184,17 +163,8 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     Each array (E,) has one entry for each element. A constant has four arrays: its estimate, the
     ends of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
     standard deviation (suffix ``_over_prior``); they are NaN in other regions.
-
-    Parameters
-    ----------
-    finished : SolvedProblem
-        The solved problem, with the estimates of the fields.
-    body : Body
-        One of its bodies.
     """
-    data: dict[str, Any] = (
-        {"region": body.part_of_cells} if len(body.parts) > 1 else {}
-    )
+    data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
     for name, values in _field_estimates(finished, body).items():
         heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
         data |= dict(zip(heads, values.T, strict=True))
@@ -222,27 +192,21 @@ def write_all_frames(finished: SolvedProblem, place: Path) -> None:
         If a file cannot be written.
     """
     for part in finished.solution.parts:
-        segment = part.segment
+        transcription = part.transcription
         positions = part.x.reshape(len(part.x), -1, 3)
-        here = (
-            place
-            if len(finished.solution.parts) == 1
-            else place / segment.experiment.name
-        )
+        here = place if len(finished.solution.parts) == 1 else place / transcription.experiment.name
         here.mkdir(exist_ok=True)
-        body = segment.body
-        residual = np.zeros((len(positions), segment.dof_count))
-        residual[:, segment.free_dofs] = part.compute_residual_n()
+        body = transcription.body
+        residual = np.zeros((len(positions), transcription.dof_count))
+        residual[:, transcription.free_dofs] = part.compute_residual_n()
         write_frames(
             here,
-            segment.dynamics.t_s,
+            transcription.dynamics.t_s,
             positions_m=positions,
             cells=body.cells,
             element=body.element,
             undeformed_m=body.nodes_m,
-            point_series={
-                "residual_force_n": residual.reshape(positions.shape)
-            },
+            point_series={"residual_force_n": residual.reshape(positions.shape)},
             fields=ElementFields.from_body(
                 body, body.theta_from_values(finished.solution.parameters)
             ),
@@ -260,32 +224,20 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     """
     fitted = {}
     collected = []
-    for part, readings in zip(
-        finished.solution.parts, finished.solution.readings_m, strict=True
-    ):
-        x = part.x[part.segment.markers.observable.rows]
-        fitted[part.segment.experiment.name] = (
-            x.reshape(len(x), -1, 3),
-            readings,
-        )
-    for experiment in sorted(
-        finished.problem.experiments, key=lambda each: each.validation
-    ):
+    for part, readings in zip(finished.solution.parts, finished.solution.readings_m, strict=True):
+        x = part.x[part.transcription.markers.observable.rows]
+        fitted[part.transcription.experiment.name] = (x.reshape(len(x), -1, 3), readings)
+    for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
         rollout = finished.rollouts[experiment.name]
         rolled_out = None
         predicted = None
         if isinstance(rollout, ForwardSimulation):
             predicted = rollout.predicted
-            rolled_out = (
-                rollout.trajectory.positions_m,
-                rollout.trajectory.markers_m,
-            )
+            rolled_out = (rollout.trajectory.positions_m, rollout.trajectory.markers_m)
         fit = fitted.get(experiment.name)
         if (shown := fit or rolled_out) is not None:
             motion = finished.modes_by_experiment.get(experiment.name)
-            natural = motion and np.array(
-                [mode.frequency_hz for mode in motion.modes]
-            )
+            natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
             places_m = _marker_places_m(finished, experiment.name)
             replay = MotionRecord.from_experiment(
                 experiment,
@@ -294,35 +246,22 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
                 natural_hz=natural,
                 places_m=places_m,
                 recorded=merged_fields(
-                    feature.recorded(
-                        experiment, finished.solution, predicted, shown[0]
-                    )
+                    feature.recorded(experiment, finished.solution, predicted, shown[0])
                     for feature in FEATURES
                 ),
             )
             of_cells = _field_estimates(finished, experiment.body)
             of_cameras = _visible_points(finished, experiment)
-            collected.append(
-                replace(replay, fields=of_cells, visible_points=of_cameras)
-            )
+            collected.append(replace(replay, fields=of_cells, visible_points=of_cameras))
     return collected
 
 
-def _visible_points(
-    finished: SolvedProblem, experiment: Experiment
-) -> dict[str, Array]:
+def _visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return the points of each camera of an experiment on the fitted surface, or else on the
     simulated one.
 
     The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`. The
     mapping is empty where neither surface is known, or without cameras.
-
-    Parameters
-    ----------
-    finished : SolvedProblem
-        The solved problem, with the forward simulations.
-    experiment : Experiment
-        One of its experiments, fitted or for validation.
     """
     if not experiment.camera_names:
         return {}
@@ -353,9 +292,7 @@ def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     simulation failed.
     """
     if experiment in finished.places:
-        places = [
-            place.position_m for place in finished.places[experiment].values()
-        ]
+        places = [place.position_m for place in finished.places[experiment].values()]
         return np.array(places).reshape(-1, 3)
     rollout = finished.rollouts[experiment]
     if not isinstance(rollout, ForwardSimulation):
@@ -368,11 +305,6 @@ def _trajectory_arrays(replays: Sequence[MotionRecord]) -> dict[str, Array]:
 
     The name of the experiment and a slash precede the names of its arrays, except if it is the only
     fitted one.
-
-    Parameters
-    ----------
-    replays : sequence of MotionRecord
-        All experiments of a run; one without fitted positions counts as not fitted.
     """
     alone = sum(replay.positions_m is not None for replay in replays) == 1
     arrays = {}

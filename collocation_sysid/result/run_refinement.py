@@ -91,9 +91,7 @@ def refine_run(
             "again first",
             file,
         )
-    problem = Problem.read(
-        run / "problem.toml", allow_code=allow_code, folder=home
-    )
+    problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
     problem = replace(problem, substeps=before.problem.substeps)
     estimates = _estimates_at_optimum(before, problem.parameters)
     with damaged_run_refused(run):
@@ -102,9 +100,7 @@ def refine_run(
 
     def keep(refinement: Refinement) -> Result:
         """Write a refinement and the updated result into the folder, and return the latter."""
-        after = with_refinement(
-            before, refinement, parameters=problem.parameters
-        )
+        after = with_refinement(before, refinement, parameters=problem.parameters)
         with replaced_file(levels_file) as levels, replaced_file(file) as draft:
             levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
@@ -123,9 +119,7 @@ def refine_run(
     return refinement, keep(refinement)
 
 
-def with_refinement(
-    before: Result, refinement: Refinement, parameters: Parameters
-) -> Result:
+def with_refinement(before: Result, refinement: Refinement, parameters: Parameters) -> Result:
     """Return a result with the measured discretisation error in place of the estimated one; nothing
     is written.
 
@@ -143,9 +137,7 @@ def with_refinement(
     """
     optimum = _estimates_at_optimum(before, parameters)
 
-    def corrected(
-        values: Mapping[str, ReportedEstimate],
-    ) -> dict[str, ReportedEstimate]:
+    def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:
         """Return estimates by name, corrected where the refinement measured their error, otherwise
         unchanged.
         """
@@ -163,21 +155,16 @@ def with_refinement(
         }
 
     after = replace(
-        before,
-        parameters=corrected(before.parameters),
-        derived=corrected(before.derived),
+        before, parameters=corrected(before.parameters), derived=corrected(before.derived)
     )
     budget = {
         name: _updated_shares(
-            shares,
-            before.collect_estimates()[name],
-            after=after.collect_estimates()[name],
+            shares, before.collect_estimates()[name], after=after.collect_estimates()[name]
         )
         for name, shares in before.budget.items()
     }
     uncertainties = {
-        name: each.combined_std_error
-        for name, each in after.collect_estimates().items()
+        name: each.combined_std_error for name, each in after.collect_estimates().items()
     }
     others = [
         each
@@ -187,32 +174,17 @@ def with_refinement(
     concerns = (
         *others,
         *numerical_concerns(optimum, uncertainties, refinement=refinement),
-        *combined_concerns(
-            parameters, after.collect_estimates(), shares=budget
-        ),
+        *combined_concerns(parameters, after.collect_estimates(), shares=budget),
     )
-    return replace(
-        after, budget=budget, trust=Assessment.from_concerns(concerns)
-    )
+    return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
 
 
-def _estimates_at_optimum(
-    result: Result, parameters: Parameters
-) -> dict[str, Estimate]:
+def _estimates_at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
     """Return the estimates of parameters and derived moduli, without coefficients of fields, before
     the correction of the discretisation error, by name.
-
-    Parameters
-    ----------
-    result : Result
-        Content of ``result.json``; not modified.
-    parameters : Parameters
-        Parameters of the problem, which state what is estimated as a value instead of a logarithm.
     """
     return {
-        name: each.at_optimum(
-            name, linear=name in parameters.list_linear_names()
-        )
+        name: each.at_optimum(name, linear=name in parameters.list_linear_names())
         for name, each in result.collect_estimates().items()
     }
 
@@ -227,20 +199,6 @@ def _corrected_estimate(
     """Return an estimate corrected for its measured discretisation error: value, known correction,
     and the statistical and combined intervals with their standard errors change, everything else
     stays as before.
-
-    Parameters
-    ----------
-    name : str
-        Name of the estimate.
-    before : ReportedEstimate
-        The estimate in the result, whose systematic effects and known effect enter the combined
-        interval; not modified.
-    optimum : Estimate
-        The estimate at the optimum, before any correction.
-    error : DiscretisationError
-        The measured discretisation error, which is stored in the estimate.
-    parameters : Parameters
-        Parameters with their coordinates and bounds.
     """
     linear, bounds = parameters.scale_and_bounds(name)
     combined = combine(
@@ -256,31 +214,18 @@ def _corrected_estimate(
 
 
 def _updated_shares(
-    shares: Mapping[str, float],
-    before: ReportedEstimate,
-    after: ReportedEstimate,
+    shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
 ) -> dict[str, float]:
     """Return the contributions to an estimate's variance with the measured discretisation error,
     largest first; they sum to one. Without a combined standard error before or after they are
     unchanged.
-
-    Parameters
-    ----------
-    shares : mapping of source to share
-        The contributions before; they sum to one.
-    before, after : ReportedEstimate
-        The estimate with the estimated and with the measured error.
     """
     if not before.combined_std_error or not after.combined_std_error:
         return dict(shares)
     ratio = (before.combined_std_error / after.combined_std_error) ** 2
     # Standard errors are relative to their values, see `IntervalCoordinate`.
     ratio *= (after.value / before.value) ** 2 if before.value else 1.0
-    others = {
-        name: share * ratio
-        for name, share in shares.items()
-        if name != DISCRETISATION
-    }
+    others = {name: share * ratio for name, share in shares.items() if name != DISCRETISATION}
     total = max(1.0, sum(others.values()))
     corrected = {name: share / total for name, share in others.items()}
     corrected[DISCRETISATION] = 1.0 - sum(corrected.values())
@@ -290,28 +235,9 @@ def _updated_shares(
 def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
     """Return the levels that an earlier call finished, with the values of `names` alone; empty
     without a file.
-
-    Parameters
-    ----------
-    file : Path
-        The file ``refinement.json`` of a run folder.
-    names : iterable of str
-        Names of the estimates that each level must have.
-
-    Raises
-    ------
-    InputError
-        If the file is a link to another folder.
-    KeyError, ValueError
-        If the file is damaged, or lacks one of the names.
     """
     if not file.is_file():
         return []
     require_own(file)
-    levels = read(
-        Refinement, json.loads(file.read_text(encoding="utf-8"))
-    ).levels
-    return [
-        replace(each, values={name: each.values[name] for name in names})
-        for each in levels
-    ]
+    levels = read(Refinement, json.loads(file.read_text(encoding="utf-8"))).levels
+    return [replace(each, values={name: each.values[name] for name in names}) for each in levels]

@@ -71,9 +71,7 @@ SMALLEST_SHOWN_SHARE = 0.01
 SYSTEMATIC_RATIO = 1.5
 
 
-def run_summary(
-    result: Result, folder: Path | None = None, budget: bool = False
-) -> list[Shown]:
+def run_summary(result: Result, folder: Path | None = None, budget: bool = False) -> list[Shown]:
     """Return the description of a run that fits on one screen: outcome, verdict, estimates, fit,
     notes, probes, and the diagnoses of the largest residuals.
 
@@ -86,9 +84,7 @@ def run_summary(
     budget : bool
         Whether to add the complete table of contributions to each variance, if there is a budget.
     """
-    largest = sorted(result.residuals, key=lambda each: -each.rms_m)[
-        :SHOWN_DIAGNOSES
-    ]
+    largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
     ended = [f"residuals: {each.sentence}" for each in largest]
     sections = (
         _outcome_section(result),
@@ -98,13 +94,7 @@ def run_summary(
     )
     tables = [budget_table(result)] if budget and result.budget else []
     written = [] if folder is None else [f"written to {folder}"]
-    return [
-        *flattened_parts(sections),
-        *tables,
-        *probe_lines(result),
-        *ended,
-        *written,
-    ]
+    return [*flattened_parts(sections), *tables, *probe_lines(result), *ended, *written]
 
 
 def estimate_sections(result: Result) -> list[Shown]:
@@ -112,10 +102,7 @@ def estimate_sections(result: Result) -> list[Shown]:
     of a deeper check where that is worthwhile, and the table of parameters with their intervals,
     each as a part without title.
     """
-    sections = [
-        verdict_section(result.trust),
-        *remedy_command(result.trust.concerns),
-    ]
+    sections = [verdict_section(result.trust), *remedy_command(result.trust.concerns)]
     sections += [*_deeper_check_advice(result), _parameter_section(result)]
     return [*flattened_parts(sections)]
 
@@ -133,24 +120,20 @@ def run_report(run: str | Path) -> TitledParts:
     result = Result.read(run)
     with damaged_run_refused(run):
         verdict = verdict_section(result.trust, linked=True)
-        took = f" {result.method}, {result.iterations} iterations; {_elapsed_text(result.elapsed_s)}"
+        took = (
+            f" {result.method}, {result.iterations} iterations; {_elapsed_text(result.elapsed_s)}"
+        )
         badge = Span(result.status, f"badge {result.trust.verdict}")
         pictures = captioned_pictures(run)
         meaning = Line(f"{VERDICT_MEANINGS[result.trust.verdict]}.", "quiet")
         parts: list[Shown] = [
             Line((badge, Span(took)), "quiet"),
-            replace(
-                verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])
-            ),
+            replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
             _cards(result),
             *flattened_parts([_outcome_section(result)]),
             *pictures[:1],
             TitledParts(
-                "What to do",
-                (
-                    *remedy_lines(result.trust.concerns),
-                    *_deeper_check_advice(result),
-                ),
+                "What to do", (*remedy_lines(result.trust.concerns), *_deeper_check_advice(result))
             ),
             _parameter_section(result),
             TitledParts("Error bars", tuple(_error_bars(result))),
@@ -161,15 +144,9 @@ def run_report(run: str | Path) -> TitledParts:
             *_nuisance_sections(result),
             TitledParts("Residuals", tuple(_residual_tables(result, run))),
             TitledParts("Pictures", tuple(pictures[1:])),
-            TitledParts(
-                "Problem and provenance", tuple(_provenance_parts(result, run))
-            ),
+            TitledParts("Problem and provenance", tuple(_provenance_parts(result, run))),
         ]
-        shown = (
-            each
-            for each in parts
-            if not isinstance(each, TitledParts) or each.parts
-        )
+        shown = (each for each in parts if not isinstance(each, TitledParts) or each.parts)
         return TitledParts(result.title or "Run", tuple(shown), level=1)
 
 
@@ -214,21 +191,13 @@ def verdict_section(
 
 def _deeper_check_advice(result: Result) -> list[Line]:
     """Return the recommendation of a deeper check where it is worthwhile, else an empty list."""
-    return (
-        [Line(DEEPER_CHECK_ADVICE, "quiet")]
-        if is_deeper_check_worthwhile(result)
-        else []
-    )
+    return [Line(DEEPER_CHECK_ADVICE, "quiet")] if is_deeper_check_worthwhile(result) else []
 
 
 def remedy_command(concerns: Iterable[Concern]) -> list[Line]:
     """Return the command that explains the remedies of some concerns; empty without concerns."""
     pages = dict.fromkeys(topic.page for topic in topics_of(concerns).values())
-    return (
-        [Line(f"what to do: {explain_command(*pages)}", "quiet")]
-        if pages
-        else []
-    )
+    return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
 
 
 def _parameter_section(result: Result) -> TitledParts:
@@ -239,15 +208,10 @@ def _parameter_section(result: Result) -> TitledParts:
     not determined, and on the largest contributions; each is left out if it does not apply.
     """
     values = result.collect_estimates()
-    rows = tuple(
-        (symbol_with_unit(name), *_estimate_row(result, name))
-        for name in values
-    )
+    rows = tuple((symbol_with_unit(name), *_estimate_row(result, name)) for name in values)
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
-    parts: list[Shown] = [
-        Table("", heads, rows=rows, texts=1, faint=faint, note_column=1)
-    ]
+    parts: list[Shown] = [Table("", heads, rows=rows, texts=1, faint=faint, note_column=1)]
     parts += [field.sentence(name) for name, field in result.fields.items()]
     if any(each.combined95 for each in values.values()):
         parts.append(_coverage_sentence(result))
@@ -260,12 +224,9 @@ def _parameter_section(result: Result) -> TitledParts:
     elif corrected := [
         f"{symbol_of(name)} {100 * (error.extrapolated / optimum - 1):+.2g} %"
         for name, error in result.collect_numerical_errors().items()
-        if (optimum := values[name].optimum)
-        and values[name].statistical95 is not None
+        if (optimum := values[name].optimum) and values[name].statistical95 is not None
     ]:
-        parts.append(
-            f"corrected for the estimated time-step error: {', '.join(corrected)}"
-        )
+        parts.append(f"corrected for the estimated time-step error: {', '.join(corrected)}")
     if known := [
         f"{symbol_of(name)} {100 * each.known_correction / each.value:+.2g} %"
         for name, each in values.items()
@@ -275,9 +236,7 @@ def _parameter_section(result: Result) -> TitledParts:
             f"corrected for the stated grip layer and machine compliance: {', '.join(known)}"
         )
     parts += _undetermined_sentence(result)
-    return TitledParts(
-        "Parameters", (*parts, *_largest_contributions(result), *result.basis)
-    )
+    return TitledParts("Parameters", (*parts, *_largest_contributions(result), *result.basis))
 
 
 def _undetermined_sentence(result: Result) -> list[str]:
@@ -290,8 +249,7 @@ def _undetermined_sentence(result: Result) -> list[str]:
     stated = {
         name
         for concern in result.trust.concerns
-        if concern.code
-        in ("information/none", "information/combined", "specimen/none")
+        if concern.code in ("information/none", "information/combined", "specimen/none")
         for name in concern.data.get("names", [concern.data.get("name")])
     }
     sources = []
@@ -317,21 +275,13 @@ def _coverage_sentence(result: Result) -> str:
     moving = any(not each.static for each in result.fit.experiments.values())
     meshed = any(each.test is None for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",) if meshed else ()
-    covered = [
-        f"the {kind} error"
-        for kind in kinds
-        if kind in result.list_discretisation_kinds()
-    ]
+    covered = [f"the {kind} error" for kind in kinds if kind in result.list_discretisation_kinds()]
     missing = [
-        f"the {kind} error"
-        for kind in kinds
-        if kind not in result.list_discretisation_kinds()
+        f"the {kind} error" for kind in kinds if kind not in result.list_discretisation_kinds()
     ]
     parts = listed(["noise", *covered, "systematic effects"])
     sentence = f"± (standard uncertainty) and intervals combine {parts}"
-    return sentence + (
-        f", but not {listed(missing)} (measured by refine)" if missing else ""
-    )
+    return sentence + (f", but not {listed(missing)} (measured by refine)" if missing else "")
 
 
 def _largest_contributions(result: Result) -> list[str]:
@@ -345,28 +295,18 @@ def _largest_contributions(result: Result) -> list[str]:
     ratios = {
         name: each.combined_std_error / each.statistical_std_error
         for name, each in result.collect_estimates().items()
-        if each.combined_std_error
-        and each.statistical_std_error
-        and name in result.budget
+        if each.combined_std_error and each.statistical_std_error and name in result.budget
     }
-    systematic = {
-        name: ratio
-        for name, ratio in ratios.items()
-        if ratio > SYSTEMATIC_RATIO
-    }
+    systematic = {name: ratio for name, ratio in ratios.items() if ratio > SYSTEMATIC_RATIO}
     sentences = []
     remedies = []
-    for name in sorted(systematic, key=lambda name: -systematic[name])[
-        :SHOWN_BUDGETS
-    ]:
+    for name in sorted(systematic, key=lambda name: -systematic[name])[:SHOWN_BUDGETS]:
         shares = list(result.budget[name].items())[:SHOWN_SOURCES]
         largest = shares[0][0]
         if largest in SHOWN_REMEDIES and largest not in remedies:
             remedies.append(largest)
         sources = ", ".join(
-            f"{source_label(s)} {share:.0%}"
-            for s, share in shares
-            if share > SMALLEST_SHOWN_SHARE
+            f"{source_label(s)} {share:.0%}" for s, share in shares if share > SMALLEST_SHOWN_SHARE
         )
         sentences.append(
             f"largest contributions to the combined uncertainty of {symbol_of(name)}: {sources}"
@@ -384,15 +324,10 @@ def budget_table(result: Result) -> Table:
     lines = result.budget
     shown = main_sources(lines, SMALLEST_SHOWN_SHARE)
     rows = [
-        (
-            source_label(s),
-            *(f"{100 * line.get(s, 0):.0f}" for line in lines.values()),
-        )
+        (source_label(s), *(f"{100 * line.get(s, 0):.0f}" for line in lines.values()))
         for s in shown
     ]
-    return Table(
-        "", ("% of the variance", *map(symbol_of, lines)), rows=tuple(rows)
-    )
+    return Table("", ("% of the variance", *map(symbol_of, lines)), rows=tuple(rows))
 
 
 def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
@@ -403,13 +338,6 @@ def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
     interval the cell is "at its bound"; if the estimate has a `reason`, which is the remark, it is
     "not identifiable", or "not determined" without a statistical interval. Instead of the guess of
     a fixed or tied parameter the cell is "fixed" or "tied".
-
-    Parameters
-    ----------
-    result : Result
-        Content of ``result.json``.
-    name : str
-        Name of one of its estimates; KeyError for another one.
     """
     each = result.collect_estimates()[name]
     interval = _interval_text(each.combined95)
@@ -417,11 +345,7 @@ def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
     if each.at_bound:
         interval = "at its bound"
     elif each.reason:
-        interval = (
-            "not determined"
-            if each.statistical95 is None
-            else "not identifiable"
-        )
+        interval = "not determined" if each.statistical95 is None else "not identifiable"
     guess = "" if each.guess is None else f"{each.guess:.5g}"
     if each.fixed:
         guess = "tied" if each.tied else "fixed"
@@ -469,15 +393,7 @@ def refinement_table(result: Result) -> Table | Line:
         )
     return Table(
         "",
-        (
-            "",
-            "half the step",
-            "order",
-            "half the edges",
-            "order",
-            "corrected",
-            "95 % interval",
-        ),
+        ("", "half the step", "order", "half the edges", "order", "corrected", "95 % interval"),
         rows=tuple(rows),
     )
 
@@ -508,24 +424,15 @@ def _fit_section(result: Result) -> TitledParts:
     for name, each in result.rollout.experiments.items():
         lines += _simulation_lines(name, each)
     for parts in sorted({*(fit.symmetry or {}).values()}):
-        names = listed(
-            f"'{name}'"
-            for name, each in (fit.symmetry or {}).items()
-            if each == parts
-        )
+        names = listed(f"'{name}'" for name, each in (fit.symmetry or {}).items() if each == parts)
         lines.append(
             f"loads of {names} are those of the whole specimen, {parts} times those of the "
             "modelled part"
         )
-    lines += [
-        f"time: {_elapsed_text(result.elapsed_s)}",
-        _iterations_text(result),
-    ]
+    lines += [f"time: {_elapsed_text(result.elapsed_s)}", _iterations_text(result)]
     for name, each in experiments.items():
         if each.notes:
-            lines.append(
-                f"nuisance parameters of '{name}': {'; '.join(each.notes)}"
-            )
+            lines.append(f"nuisance parameters of '{name}': {'; '.join(each.notes)}")
     return TitledParts("Fit", tuple(lines))
 
 
@@ -533,16 +440,8 @@ def _elapsed_text(elapsed: Elapsed) -> str:
     """Return the times of search, checks and pictures as text, such as "search 1.2 s, checks
     3.4 s"; pictures that were not drawn are left out.
     """
-    parts = {
-        "search": elapsed.search,
-        "checks": elapsed.checks,
-        "pictures": elapsed.pictures,
-    }
-    known = (
-        f"{part} {time_s:.1f} s"
-        for part, time_s in parts.items()
-        if time_s is not None
-    )
+    parts = {"search": elapsed.search, "checks": elapsed.checks, "pictures": elapsed.pictures}
+    known = (f"{part} {time_s:.1f} s" for part, time_s in parts.items() if time_s is not None)
     return ", ".join(known)
 
 
@@ -557,20 +456,11 @@ def _iterations_text(result: Result) -> str:
     )
 
 
-def _simulation_lines(
-    name: str, simulated: SimulatedExperiment
-) -> Iterator[str]:
+def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
     """Yield lines on how far a forward simulation is from the measurements.
 
     If it failed, the only line says why. For a validation experiment, the errors of a blind
     prediction and of copied measurements follow for comparison.
-
-    Parameters
-    ----------
-    name : str
-        Name of the experiment.
-    simulated : SimulatedExperiment
-        Errors of its forward simulation.
     """
     kind = "forward simulation" if simulated.fitted else "validation"
     if simulated.failed is not None:
@@ -594,25 +484,12 @@ def _simulation_lines(
         yield f"  no comparison with measurements of another recording: {simulated.not_copied}"
 
 
-def _errors_text(
-    error: PredictionErrors, units: Mapping[str, str] | None
-) -> str:
+def _errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
     """Return the errors of a prediction in words; "" if nothing is compared.
 
     Errors that are None, and errors of markers and forces that are zero, are left out.
-
-    Parameters
-    ----------
-    error : PredictionErrors
-        Errors of all kinds of measurements.
-    units : mapping of str to str, or None
-        Units of custom sensors by name; None if none states a unit.
     """
-    return "; ".join(
-        text
-        for feature in FEATURES
-        for text in feature.error_texts(error, units)
-    )
+    return "; ".join(text for feature in FEATURES for text in feature.error_texts(error, units))
 
 
 def _millimetres(metres: float) -> str:
@@ -635,16 +512,10 @@ def _cards(result: Result) -> Cards:
     values = result.collect_estimates()
     fit = result.fit
     simulated = result.rollout
-    name = next(
-        (key for key in STIFFNESS_NAMES if key in values), next(iter(values))
-    )
+    name = next((key for key in STIFFNESS_NAMES if key in values), next(iter(values)))
     interval = values[name].combined95
     value = f"{number(values[name].value, 4)} {unit_of(name)}"
-    known = (
-        "{:.4g} to {:.4g} (95 %)".format(*interval)
-        if interval
-        else "no error bar"
-    )
+    known = "{:.4g} to {:.4g} (95 %)".format(*interval) if interval else "no error bar"
     alone = f"RMS; expected from noise alone: {millimetres(fit.noise_rms_m)}"
     most = f"RMS; {millimetres(simulated.max_m)} at most"
     return Cards(
@@ -691,28 +562,12 @@ def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
     for experiment, places in result.places.items():
         rows = []
         for marker, place in places.items():
-            errors_m = (
-                [None] * 3 if place.std_error_m is None else place.std_error_m
-            )
+            errors_m = [None] * 3 if place.std_error_m is None else place.std_error_m
             cells = []
             for x, error in zip(place.position_m, errors_m, strict=True):
-                cells += [
-                    f"{1e3 * x:.2f}",
-                    "–" if error is None else number(1e3 * error, 2),
-                ]
-            prior = (
-                "exact"
-                if place.prior_m == 0
-                else _size_text(place.prior_m, "m")
-            )
-            rows.append(
-                (
-                    marker,
-                    *cells,
-                    prior,
-                    "" if place.is_declared else "not given",
-                )
-            )
+                cells += [f"{1e3 * x:.2f}", "–" if error is None else number(1e3 * error, 2)]
+            prior = "exact" if place.prior_m == 0 else _size_text(place.prior_m, "m")
+            rows.append((marker, *cells, prior, "" if place.is_declared else "not given"))
         heads = ("", "x", "±", "y", "±", "z", "±", "prior ±", "")
         if rows:
             table = Table("", heads, rows=tuple(rows), texts=1)
@@ -744,20 +599,6 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
     """Yield a table with the diagnosis of each marker's residuals, and a headed table of the
     largest marker errors; a table without rows is left out.
-
-    Parameters
-    ----------
-    result : Result
-        Content of ``result.json``, with the diagnoses.
-    run : Path
-        Run folder, whose arrays have the marker errors.
-
-    Raises
-    ------
-    InputError
-        If the folder has no file of arrays.
-    ValueError
-        If that file is damaged.
     """
     if result.residuals:
         rows = tuple(
@@ -769,17 +610,10 @@ def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
             )
             for each in result.residuals
         )
-        yield Table(
-            "", ("marker", "RMS", "samples", "diagnosis"), rows=rows, texts=1
-        )
+        yield Table("", ("marker", "RMS", "samples", "diagnosis"), rows=rows, texts=1)
     if worst := _largest_errors(run):
-        rows = tuple(
-            (w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst
-        )
-        yield from (
-            "Largest errors:",
-            Table("", ("marker", "time", "error"), rows=rows),
-        )
+        rows = tuple((w, f"{number(t_s, 4)} s", millimetres(m)) for m, t_s, w in worst)
+        yield from ("Largest errors:", Table("", ("marker", "time", "error"), rows=rows))
 
 
 def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
@@ -788,20 +622,10 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
 
     At most `SHOWN_ERRORS` are returned; empty without fitted markers. Of each marker, two listed
     errors are more than `ERROR_SPACING_SAMPLES` samples apart.
-
-    Raises
-    ------
-    InputError
-        If the folder has no file of arrays.
-    ValueError
-        If that file is damaged, or an array of residuals does not have the size of its times and
-        markers.
     """
     arrays = read_arrays(run)
     worst = []
-    for key in (
-        key for key in arrays if key.rpartition("/")[2] == "residuals_m"
-    ):
+    for key in (key for key in arrays if key.rpartition("/")[2] == "residuals_m"):
         prefix = key.removesuffix("residuals_m")
         t_s = arrays[f"{prefix}t_s"]
         markers = arrays[f"{prefix}marker_names"]
@@ -819,47 +643,23 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
             t, m = np.unravel_index(int(errors.argmax()), errors.shape)
             if not errors[t, m] > 0:
                 break
-            worst.append(
-                (float(errors[t, m]), float(t_s[t]), f"{prefix}{markers[m]}")
-            )
-            errors[
-                max(0, t - ERROR_SPACING_SAMPLES) : t
-                + ERROR_SPACING_SAMPLES
-                + 1,
-                m,
-            ] = 0
+            worst.append((float(errors[t, m]), float(t_s[t]), f"{prefix}{markers[m]}"))
+            errors[max(0, t - ERROR_SPACING_SAMPLES) : t + ERROR_SPACING_SAMPLES + 1, m] = 0
     return sorted(worst, key=lambda each: -each[0])[:SHOWN_ERRORS]
 
 
 def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
     """Yield a table of the problem and software versions, and the copy of the problem file as it
     was run, if the run folder has one; a copy that is a link to elsewhere is left out.
-
-    Parameters
-    ----------
-    result : Result
-        Content of ``result.json``.
-    run : Path
-        The run folder.
     """
     rows = content(result.problem) | content(result.provenance)
-    listed_rows = (
-        (key, each if isinstance(each, list) else [each])
-        for key, each in rows.items()
-    )
+    listed_rows = ((key, each if isinstance(each, list) else [each]) for key, each in rows.items())
     yield Table(
-        "",
-        (),
-        rows=tuple(
-            (key, ", ".join(map(str, each))) for key, each in listed_rows
-        ),
-        texts=1,
+        "", (), rows=tuple((key, ", ".join(map(str, each))) for key, each in listed_rows), texts=1
     )
     file = run / "problem.toml"
     if is_own(run, file):
-        yield Listing(
-            "The problem file as run", file.read_text(encoding="utf-8")
-        )
+        yield Listing("The problem file as run", file.read_text(encoding="utf-8"))
 
 
 def _size_text(value: float | None, unit: str) -> str:

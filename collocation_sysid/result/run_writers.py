@@ -73,20 +73,13 @@ def write_vtu(
 
     if meshio_type not in VTK_CELL_TYPES:
         raise InputError(
-            f"no cell type {meshio_type!r}; available: {', '.join(VTK_CELL_TYPES)}",
-            path,
+            f"no cell type {meshio_type!r}; available: {', '.join(VTK_CELL_TYPES)}", path
         )
     points = np.asarray(points_m, dtype=float)
     nodes = np.asarray(cells, dtype=np.int64)
-    at_points = _checked_arrays(
-        "point", point_data or {}, count=len(points), path=path
-    )
-    in_cells = _checked_arrays(
-        "cell", cell_data or {}, count=len(nodes), path=path
-    )
-    by_block: dict[str, Any] = {
-        name: [array] for name, array in in_cells.items()
-    }
+    at_points = _checked_arrays("point", point_data or {}, count=len(points), path=path)
+    in_cells = _checked_arrays("cell", cell_data or {}, count=len(nodes), path=path)
+    by_block: dict[str, Any] = {name: [array] for name, array in in_cells.items()}
     mesh = meshio.Mesh(points, [(meshio_type, nodes)], {**at_points}, by_block)
     meshio.vtu.write(path, mesh, compression="")
 
@@ -96,21 +89,6 @@ def _checked_arrays(
 ) -> dict[str, NDArray]:
     """Return data as arrays with names escaped for XML; booleans, which VTK does not have, become
     8-bit integers, and other types are neither converted nor checked.
-
-    Parameters
-    ----------
-    kind : {"point", "cell"}
-        The kind of data, for messages.
-    data : mapping of name to (count,) or (count, k)
-    count : int
-        Required number of rows.
-    path : str or Path
-        File that an error names.
-
-    Raises
-    ------
-    InputError
-        For data with another number of rows or of dimensions.
     """
     arrays = {name: np.asarray(values) for name, values in data.items()}
     for name, array in arrays.items():
@@ -122,14 +100,10 @@ def _checked_arrays(
             )
         if array.dtype.kind == "b":
             arrays[name] = array.astype(np.int8)
-    return {
-        escape(name, {'"': "&quot;"}): array for name, array in arrays.items()
-    }
+    return {escape(name, {'"': "&quot;"}): array for name, array in arrays.items()}
 
 
-def write_pvd(
-    path: str | Path, frames: Sequence[tuple[float, str | Path]]
-) -> None:
+def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:
     """Write the list of frames that ParaView opens as one animation; an existing file is replaced.
 
     Parameters
@@ -149,9 +123,7 @@ def write_pvd(
     lines = []
     for t_s, file in frames:
         name = Path(os.path.relpath(Path(file).resolve(), folder)).as_posix()
-        lines.append(
-            f'<DataSet timestep="{t_s:.9g}" part="0" file={quoteattr(name)}/>\n'
-        )
+        lines.append(f'<DataSet timestep="{t_s:.9g}" part="0" file={quoteattr(name)}/>\n')
     Path(path).write_text(
         '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
         f"{''.join(lines)}</Collection>\n</VTKFile>\n",
@@ -212,21 +184,12 @@ def write_frames(
     times = np.asarray(t_s, dtype=float)
     positions = np.asarray(positions_m, dtype=float)
     alone = len(times) == 1
-    velocities = (
-        np.zeros_like(positions)
-        if alone
-        else np.gradient(positions, times, axis=0)
-    )
-    series = {
-        name: np.asarray(values)
-        for name, values in (point_series or {}).items()
-    }
+    velocities = np.zeros_like(positions) if alone else np.gradient(positions, times, axis=0)
+    series = {name: np.asarray(values) for name, values in (point_series or {}).items()}
     frames = Path(folder) / "frames"
     frames.mkdir(exist_ok=True)
     written = []
-    for number, k in enumerate(
-        range(0, len(times), -(-len(times) // max_frames))
-    ):
+    for number, k in enumerate(range(0, len(times), -(-len(times) // max_frames))):
         file = frames / f"frame_{number:04d}.vtu"
         data = {
             "displacement_m": positions[k] - undeformed_m,
@@ -236,8 +199,7 @@ def write_frames(
         in_cells = dict(cell_data or {})
         if fields is not None:
             in_cells |= {
-                name: values[0]
-                for name, values in fields.evaluate_at(positions[k]).items()
+                name: values[0] for name, values in fields.evaluate_at(positions[k]).items()
             }
         write_vtu(
             file,
@@ -289,9 +251,7 @@ def replaced_folder(
         the end, the message names the place where the finished one is kept.
     """
     target = _resolved_parent(Path(path))
-    require_replaceable(
-        target, overwrite, marker_file=marker_file, content_word=content_word
-    )
+    require_replaceable(target, overwrite, marker_file=marker_file, content_word=content_word)
     target.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(target)
     process_name = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
@@ -305,16 +265,9 @@ def replaced_folder(
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     try:
-        require_replaceable(
-            target,
-            overwrite,
-            marker_file=marker_file,
-            content_word=content_word,
-        )
+        require_replaceable(target, overwrite, marker_file=marker_file, content_word=content_word)
         _replace_folder(
-            temporary,
-            target,
-            backup=target.with_name(f".{target.name}.{process_name}.old"),
+            temporary, target, backup=target.with_name(f".{target.name}.{process_name}.old")
         )
     except (InputError, OSError) as error:
         backup = target.with_name(f"{target.name}-{process_name}")
@@ -328,11 +281,7 @@ def replaced_folder(
 
 def _resolved_parent(path: Path) -> Path:
     """Return the absolute path with all links resolved, except a link at `path` itself."""
-    return (
-        path.resolve()
-        if path.name in ("", "..")
-        else path.parent.resolve() / path.name
-    )
+    return path.resolve() if path.name in ("", "..") else path.parent.resolve() / path.name
 
 
 def _remove_stale(target: Path) -> None:
@@ -362,10 +311,7 @@ def _is_running(process: int) -> bool:
 
 
 def require_replaceable(
-    target: Path,
-    overwrite: bool = True,
-    marker_file: str = RESULT_FILE,
-    content_word: str = "run",
+    target: Path, overwrite: bool = True, marker_file: str = RESULT_FILE, content_word: str = "run"
 ) -> None:
     """Raise an `InputError` if a place for a run folder holds anything but an earlier run, or one
     that may not be overwritten; a missing or empty folder passes.
@@ -393,13 +339,11 @@ def require_replaceable(
         return
     if not target.is_dir():
         raise InputError(
-            "this is a file; expected a folder for the run: choose another path",
-            target,
+            "this is a file; expected a folder for the run: choose another path", target
         )
     if os.path.ismount(target):
         raise InputError(
-            "this is a mount point and cannot be replaced; choose a folder in it",
-            target,
+            "this is a mount point and cannot be replaced; choose a folder in it", target
         )
     if not any(target.iterdir()):
         return
@@ -460,11 +404,6 @@ def require_only_written(folder: Path) -> None:
 def _replace_folder(new: Path, target: Path, backup: Path) -> None:
     """Rename the folder `new` to `target`; an existing `target` is moved to `backup`, which must
     not exist, and removed once that succeeded.
-
-    Raises
-    ------
-    OSError
-        If a folder cannot be renamed; an existing `target` is then back in its place.
     """
     if not target.exists():
         new.rename(target)

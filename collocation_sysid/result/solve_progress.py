@@ -19,12 +19,7 @@ from rich.text import Text
 
 from ..common.console import Watched
 from ..common.display import Shown, Table, on_terminal
-from ..common.step_counting import (
-    SEARCH,
-    listen_to_activities,
-    listen_to_shares,
-    listen_to_states,
-)
+from ..common.step_counting import SEARCH, listen_to_activities, listen_to_shares, listen_to_states
 from ..fem.laws.constants import symbol_of
 from ..methods.solution import Iteration
 from ..problem import Problem
@@ -71,9 +66,7 @@ class Heartbeat:
         self._tell = show_line
         self._first_s = FIRST_LINE_S if first_s is None else first_s
         self._ended = threading.Event()
-        self._thread = threading.Thread(
-            target=self._run, name=self.NAME, daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, name=self.NAME, daemon=True)
 
     def start(self) -> None:
         """Start the thread and its clock; call it once."""
@@ -89,9 +82,7 @@ class Heartbeat:
         """Show lines until `stop` is called; the body of the thread."""
         began = time.monotonic()
         passed_s = 0.0
-        while not self._ended.wait(
-            max(self._first_s, ELAPSED_GROWTH * passed_s)
-        ):
+        while not self._ended.wait(max(self._first_s, ELAPSED_GROWTH * passed_s)):
             passed_s = time.monotonic() - began
             self._tell(f"{self._doing()} ({passed_s:.3g} s so far)")
 
@@ -138,11 +129,7 @@ class SolveProgress(Watched):
         self._share_shown_s = 0.0
         self._contexts = ExitStack()
         silent = not (console.is_terminal or quiet)
-        self._heartbeat = (
-            Heartbeat(self._activity_with_iterations, self.line)
-            if silent
-            else None
-        )
+        self._heartbeat = Heartbeat(self._activity_with_iterations, self.line) if silent else None
 
     def __enter__(self) -> Self:
         for note in self._notes:
@@ -221,9 +208,7 @@ class SolveProgress(Watched):
             return
         self._share_shown_s = now_s
         elapsed_s = now_s - self._phase_began_s
-        self._remaining = (
-            f": {done:.0%}{_remaining_time(elapsed_s, done)}" if done else ""
-        )
+        self._remaining = f": {done:.0%}{_remaining_time(elapsed_s, done)}" if done else ""
         self._redraw()
 
     def state(self, describe: Callable[[], str]) -> None:
@@ -293,20 +278,7 @@ class _RefreshedText:
 
 
 def _remaining_time(elapsed_s: float, share: float) -> str:
-    """Return the remaining time of an activity in words.
-
-    Parameters
-    ----------
-    elapsed_s : float
-        Time since the activity began [s].
-    share : float
-        Completed share, from 0 to 1.
-
-    Returns
-    -------
-    str
-        Empty within the first second, and before anything is completed.
-    """
+    """Return the remaining time of an activity in words."""
     if elapsed_s < FIRST_REMAINING_S or share <= 0:
         return ""
     remaining_s = elapsed_s * (1 - share) / share
@@ -319,19 +291,8 @@ def _iteration_table(lines: list[Iteration]) -> Shown:
     """Return the table of the last iterations; "" if `lines` is empty."""
     if not lines:
         return ""
-    heads = (
-        "",
-        "RMS mm",
-        "violation N",
-        *map(symbol_of, lines[-1].parameters),
-        "s",
-    )
-    return Table(
-        "",
-        heads,
-        rows=tuple(map(_iteration_row, lines[-SHOWN_ITERATIONS:])),
-        names=0,
-    )
+    heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")
+    return Table("", heads, rows=tuple(map(_iteration_row, lines[-SHOWN_ITERATIONS:])), names=0)
 
 
 def _iteration_row(line: Iteration) -> tuple[str, ...]:

@@ -37,12 +37,7 @@ from ..problem.schema import ProblemFile
 from ..problem.specimen_reader import layout_from_section
 from ..problem.specimen_schema import SpecimenSection
 from ..program.simulation import NEWMARK, Trajectory, simulate
-from ..recording import (
-    Experiment,
-    write_gauge_csv,
-    write_markers_csv,
-    write_poses_csv,
-)
+from ..recording import Experiment, write_gauge_csv, write_markers_csv, write_poses_csv
 from ..recording.recording_writers import write_columns_csv
 from ..recording.specimen_files import SpecimenLayout, specimen_columns
 from .run_writers import (
@@ -165,18 +160,13 @@ def write_data(
     recipe = recipe or Recipe()
     _require_guesses(problem)
     sections = _experiment_sections(problem)
-    names = [
-        _table_names(each, sections.get(each.name))
-        for each in problem.experiments
-    ]
+    names = [_table_names(each, sections.get(each.name)) for each in problem.experiments]
     _require_separate_files(problem, names)
     files = [place / name for named in names for name in named.values()]
     _refuse_foreign(problem, place, files=files)
     for experiment in problem.experiments if recipe.frames else ():
         require_replaceable(
-            place / experiment.name,
-            marker_file=FRAMES_FILE,
-            content_word="simulation",
+            place / experiment.name, marker_file=FRAMES_FILE, content_word="simulation"
         )
     rng = np.random.default_rng(recipe.seed)
     simulated = [
@@ -186,12 +176,8 @@ def write_data(
             integrator=recipe.integrator,
             timestep_s=recipe.timestep_s,
             # The grid of the problem is that of schemes; Newmark's step is stated in the recipe.
-            substeps="auto"
-            if recipe.integrator == NEWMARK
-            else problem.substeps,
-            progress=_share_of_experiment(
-                progress, number, count=len(problem.experiments)
-            ),
+            substeps="auto" if recipe.integrator == NEWMARK else problem.substeps,
+            progress=_share_of_experiment(progress, number, count=len(problem.experiments)),
         )
         for number, experiment in enumerate(problem.experiments)
     ]
@@ -205,18 +191,11 @@ def write_data(
         ):
             section = sections.get(experiment.name)
             files = [place / n for n in named.values()]
-            drafts = [
-                stack.enter_context(replaced_file(file)) for file in files
-            ]
+            drafts = [stack.enter_context(replaced_file(file)) for file in files]
             drafts_of |= dict(zip(files, drafts, strict=True))
             by_key = dict(zip(named, drafts, strict=True))
             _write_tables(
-                experiment,
-                section,
-                trajectory=trajectory,
-                files=by_key,
-                rng=rng,
-                recipe=recipe,
+                experiment, section, trajectory=trajectory, files=by_key, rng=rng, recipe=recipe
             )
             written += files
             if recipe.frames:
@@ -255,23 +234,6 @@ def _write_tables(
     of displacement and load replace those of poses and force sensors. A specimen has one table, of
     its stresses. Components that a force sensor does not measure are left out or NaN. Images of
     cameras are not written.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    section : ExperimentSection, SpecimenSection or None
-        Table of the experiment in the problem file; None without a file.
-    trajectory : Trajectory
-        The simulated motion.
-    files : mapping of str to Path
-        Files by the keys of `_table_names`, from which markers and the poses of any grasp may be
-        absent; these are then not written. Existing files are replaced.
-    rng : Generator
-        Source of the noise; its state advances.
-    recipe : Recipe
-        Its noise_m, noise_n and noise_nm are standard deviations, [m], [N] and [N m]; the last two
-        are of the load on the whole specimen if only a part is modelled. Its noise_own is the noise
-        of custom sensors and of a specimen's stresses in multiples of their sigma.
     """
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         stated = section if isinstance(section, SpecimenSection) else None
@@ -288,48 +250,33 @@ def _write_tables(
     names = experiment.markers.names
     tracks = trajectory.markers_m + noise
     if _MARKERS_KEY in files:
-        write_markers_csv(
-            files[_MARKERS_KEY], experiment.t_s, names=names, positions_m=tracks
-        )
+        write_markers_csv(files[_MARKERS_KEY], experiment.t_s, names=names, positions_m=tracks)
     for k, grasp in enumerate(experiment.grasps):
         if (key := _numbered_key("poses", k)) in files:
             write_poses_csv(files[key], grasp.poses)
-    layouts = _wrench_layouts(section) or [
-        ForceSensorSection.model_construct()
-    ] * len(experiment.wrenches)
+    layouts = _wrench_layouts(section) or [ForceSensorSection.model_construct()] * len(
+        experiment.wrenches
+    )
     wrenches = []
     for sensor, wrench, layout in zip(
         experiment.wrenches, trajectory.wrenches, layouts, strict=True
     ):
         measured = np.where(sensor.measured_components, wrench, np.nan)
         # The load cell's noise: that of the modelled part is as much smaller as its load.
-        sigmas = (
-            np.repeat([recipe.noise_n, recipe.noise_nm], 3) / layout.symmetry
-        )
+        sigmas = np.repeat([recipe.noise_n, recipe.noise_nm], 3) / layout.symmetry
         wrenches.append(measured + sigmas * rng.normal(size=wrench.shape))
     if section is not None and has_displacement_table(section):
-        for name, table in bench_tables(
-            section, experiment, loads=wrenches
-        ).items():
+        for name, table in bench_tables(section, experiment, loads=wrenches).items():
             write_columns_csv(files[name], table.columns)
     else:
-        for k, (sensor, layout) in enumerate(
-            zip(experiment.wrenches, layouts, strict=True)
-        ):
+        for k, (sensor, layout) in enumerate(zip(experiment.wrenches, layouts, strict=True)):
             table = BenchTable(sensor.t_s)
             add_loads(table, layout, at_s=sensor.t_s, loads=wrenches[k])
             write_columns_csv(files[_numbered_key("wrench", k)], table.columns)
-    for gauge, read in zip(
-        experiment.readings, trajectory.custom_sensor_values, strict=True
-    ):
+    for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         key = f"reading_{gauge.name}"
-        write_gauge_csv(
-            files[key],
-            gauge.sample_times_s,
-            names=gauge.columns,
-            values=read + noise,
-        )
+        write_gauge_csv(files[key], gauge.sample_times_s, names=gauge.columns, values=read + noise)
 
 
 def _write_specimen(
@@ -340,28 +287,10 @@ def _write_specimen(
     rng: np.random.Generator,
     recipe: Recipe,
 ) -> None:
-    """Write the table of a specimen with simulated stresses and noise; see `_write_tables`.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment of a specimen.
-    section : SpecimenSection or None
-        Table whose layout the file gets; None for the columns of the test's default layout.
-    trajectory : Trajectory
-        The simulated motion; only its custom sensor values are used.
-    file : Path
-        File that is written, replacing an existing one.
-    rng : Generator
-        Source of the noise; its state advances.
-    recipe : Recipe
-        Its `noise_own` is the noise in multiples of the stresses' sigma.
-    """
+    """Write the table of a specimen with simulated stresses and noise; see `_write_tables`."""
     assert experiment.specimen is not None
     values = {}
-    for gauge, read in zip(
-        experiment.readings, trajectory.custom_sensor_values, strict=True
-    ):
+    for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         values[gauge.name] = (read + noise)[:, 0]
     layout = SpecimenLayout(test=experiment.specimen.test, columns={})
@@ -370,9 +299,7 @@ def _write_specimen(
     write_columns_csv(file, specimen_columns(experiment, values, layout=layout))
 
 
-def _wrench_layouts(
-    section: ExperimentSection | None,
-) -> list[ForceSensorSection]:
+def _wrench_layouts(section: ExperimentSection | None) -> list[ForceSensorSection]:
     """Return the table layout of each force sensor, those of grasps before those of obstacles;
     empty if `section` is None, for a problem without a file.
     """
@@ -392,34 +319,14 @@ def _require_guesses(problem: Problem) -> None:
         )
 
 
-def _refuse_foreign(
-    problem: Problem, place: Path, files: Iterable[Path]
-) -> None:
+def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> None:
     """Refuse to write into a folder with files of others, or over a file that the problem reads.
 
     A file that the problem reads may be a measured recording. The problem's own folder may have
     other files.
-
-    Parameters
-    ----------
-    problem : Problem
-        Problem whose files are protected.
-    place : Path
-        The folder.
-    files : iterable of Path
-        Files to be written.
-
-    Raises
-    ------
-    InputError
-        Naming the folder or the file.
     """
     require_no_link(place)
-    read = (
-        {file.resolve() for file in problem.origin.files}
-        if problem.origin
-        else set()
-    )
+    read = {file.resolve() for file in problem.origin.files} if problem.origin else set()
     for file in files:
         if file.exists() and file.resolve() in read:
             raise InputError(
@@ -433,17 +340,12 @@ def _refuse_foreign(
                 "it is not overwritten; choose another folder, or move the file",
                 file,
             )
-    at_home = (
-        problem.path is not None
-        and problem.path.resolve().parent == place.resolve()
-    )
+    at_home = problem.path is not None and problem.path.resolve().parent == place.resolve()
     if place.is_dir() and not at_home:
         require_only_written(place)
 
 
-def _experiment_sections(
-    problem: Problem,
-) -> dict[str, ExperimentSection | SpecimenSection]:
+def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection | SpecimenSection]:
     """Return the table of each experiment in the problem file, by name of the experiment; empty for
     a problem without a file.
     """
@@ -464,12 +366,6 @@ def _table_names(
     (displacement and force) have the names in the problem file, also as keys. A specimen has one
     file, by the content "specimen", with the name in the problem file, or EXPERIMENT.csv without
     `section`.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    section : ExperimentSection, SpecimenSection or None
-        Its table in the problem file; None without a file.
     """
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         if isinstance(section, SpecimenSection):
@@ -478,29 +374,18 @@ def _table_names(
     keys = [_MARKERS_KEY] * bool(experiment.markers.names)
     for k in range(len(experiment.grasps)):
         moved = section and section.moved_sections[k]
-        if (
-            moved is None
-            or moved.poses is not None
-            or moved.markers is not None
-        ):
+        if moved is None or moved.poses is not None or moved.markers is not None:
             keys.append(_numbered_key("poses", k))
     bench: list[str] = []
     if section is not None and has_displacement_table(section):
         tables = [
-            t
-            for each in section.moved_sections
-            for t in (each.displacement, each.sensor)
-            if t
+            t for each in section.moved_sections for t in (each.displacement, each.sensor) if t
         ]
         bench = [table_name(section, table) for table in tables]
     else:
-        keys += [
-            _numbered_key("wrench", k) for k in range(len(experiment.wrenches))
-        ]
+        keys += [_numbered_key("wrench", k) for k in range(len(experiment.wrenches))]
     keys += [f"reading_{gauge.name}" for gauge in experiment.readings]
-    return {key: f"{experiment.name}_{key}.csv" for key in keys} | {
-        name: name for name in bench
-    }
+    return {key: f"{experiment.name}_{key}.csv" for key in keys} | {name: name for name in bench}
 
 
 def _numbered_key(kind: str, index: int) -> str:
@@ -510,17 +395,10 @@ def _numbered_key(kind: str, index: int) -> str:
     return f"{kind}_{index + 1}" if index else kind
 
 
-def _require_separate_files(
-    problem: Problem, names: Sequence[Mapping[str, str]]
-) -> None:
+def _require_separate_files(problem: Problem, names: Sequence[Mapping[str, str]]) -> None:
     """Refuse experiments that read the same file, because a simulation writes one for each.
 
     `names` are the results of `_table_names`, one for each experiment of the problem.
-
-    Raises
-    ------
-    InputError
-        Naming the file and both experiments.
     """
     owners: dict[str, str] = {}
     for experiment, files in zip(problem.experiments, names, strict=True):

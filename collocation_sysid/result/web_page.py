@@ -63,10 +63,7 @@ class Colouring:
         absolute strain of the first trajectory, the fitted one if there is one, which must be
         finite somewhere.
         """
-        values = {
-            name: surface_strain(replay, x)
-            for name, x in _trajectories(replay).items()
-        }
+        values = {name: surface_strain(replay, x) for name, x in _trajectories(replay).items()}
         shown = np.abs(next(iter(values.values())))
         largest = float(np.nanquantile(shown, STRAIN_QUANTILE)) or 1e-6
         return cls(
@@ -78,9 +75,7 @@ class Colouring:
         )
 
     @classmethod
-    def by_field(
-        cls, name: str, values: Array, trajectory: str = "fitted"
-    ) -> Colouring:
+    def by_field(cls, name: str, values: Array, trajectory: str = "fitted") -> Colouring:
         """Return the colouring of one trajectory, the only one that is shown, by given values.
 
         Parameters
@@ -104,10 +99,7 @@ class Colouring:
 
 
 def write_page(
-    replay: MotionRecord,
-    file: str | Path,
-    headline: str = "",
-    colouring: Colouring | None = None,
+    replay: MotionRecord, file: str | Path, headline: str = "", colouring: Colouring | None = None
 ) -> Path:
     """Write the fitted and the simulated motion of an experiment as a stand-alone web page.
 
@@ -137,11 +129,7 @@ def write_page(
     InputError
         If the file cannot be written.
     """
-    template = (
-        files("collocation_sysid.result")
-        .joinpath("page.html")
-        .read_text(encoding="utf-8")
-    )
+    template = files("collocation_sysid.result").joinpath("page.html").read_text(encoding="utf-8")
     content = _page_data(replay, colouring or Colouring.by_strain(replay))
     texts = {
         "TITLE": escape(replay.name),
@@ -150,9 +138,7 @@ def write_page(
         "DATA": json.dumps(content).replace("<", "\\u003c"),
     }
     # In one pass, so that a name which looks like a place is not filled in.
-    page = re.sub(
-        "@(TITLE|HEADLINE|DATA)@", lambda place: texts[place[1]], template
-    )
+    page = re.sub("@(TITLE|HEADLINE|DATA)@", lambda place: texts[place[1]], template)
     write_text_file(file, page)
     return Path(file)
 
@@ -161,10 +147,7 @@ def _trajectories(replay: MotionRecord) -> dict[str, Array]:
     """Return the node positions (T, n, 3) [m] of the trajectories that exist, by "fitted" and
     "simulated"; empty if there is neither.
     """
-    named = {
-        "fitted": replay.positions_m,
-        "simulated": replay.rolled_out_positions_m,
-    }
+    named = {"fitted": replay.positions_m, "simulated": replay.rolled_out_positions_m}
     return {name: x for name, x in named.items() if x is not None}
 
 
@@ -174,47 +157,19 @@ def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
     Of more than `MAX_PAGE_FRAMES` samples every second, third, … is kept. The page shows the
     trajectories of `colouring.values` alone. Faces whose value is NaN have the colour of the lower
     end.
-
-    Parameters
-    ----------
-    replay : MotionRecord
-        Experiment with the trajectories of the colouring, the first of which must be finite at one
-        sample that is kept.
-    colouring : Colouring
-        Values of at least one trajectory.
-
-    Returns
-    -------
-    dict
-        Arrays in base64 (see `_base64`): "faces" and "sides" (for each face its corners and the
-        nodes on its sides, as indices of surface nodes; "sides" is empty for linear elements),
-        "held" (whether each node is grasped), "outlines" of obstacles ("" without any), "measured"
-        markers, and by trajectory "shapes" (positions of the surface nodes [m]) and "shares"
-        (colours of the faces from 0 to 255). Else "t_s", "nodes" and "markers" (counts), "quantity"
-        and "ends" (labels of the scale), "opening" (index of the sample to begin with, the one with
-        the strongest colours), "colours" of the scale, "axes" of the camera, "centre" and "size" of
-        the motion [m], and the largest dimension "body" [m].
     """
-    samples = np.arange(
-        0, len(replay.t_s), -(-len(replay.t_s) // MAX_PAGE_FRAMES)
-    )
+    samples = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MAX_PAGE_FRAMES))
     surface_nodes, nodes = np.unique(replay.surface_nodes, return_inverse=True)
     nodes = nodes.reshape(len(replay.surface), -1)
     positions = _trajectories(replay)
     values = colouring.values
-    shapes = {
-        name: positions[name][samples][:, surface_nodes] for name in values
-    }
+    shapes = {name: positions[name][samples][:, surface_nodes] for name in values}
     first = next(iter(shapes.values()))
     low = np.nanmin(first, axis=(0, 1))
     high = np.nanmax(first, axis=(0, 1))
     span = (colouring.high - colouring.low) or 1.0
-    shares = {
-        name: (x[samples] - colouring.low) / span for name, x in values.items()
-    }
-    shares = {
-        name: np.clip(np.nan_to_num(x), 0.0, 1.0) for name, x in shares.items()
-    }
+    shares = {name: (x[samples] - colouring.low) / span for name, x in values.items()}
+    shares = {name: np.clip(np.nan_to_num(x), 0.0, 1.0) for name, x in shares.items()}
     finite_m = first[np.isfinite(first).all(axis=(1, 2))]
     return {
         "t_s": replay.t_s[samples].tolist(),
@@ -224,16 +179,9 @@ def _page_data(replay: MotionRecord, colouring: Colouring) -> dict[str, Any]:
         "sides": _base64(nodes[:, 3:], "<i4"),
         "quantity": colouring.name,
         "ends": colouring.end_labels,
-        "shares": {
-            name: _base64(np.rint(255 * x), "u1") for name, x in shares.items()
-        },
-        "opening": int(
-            np.nansum(np.abs(next(iter(shares.values()))), axis=1).argmax()
-        ),
-        "colours": [
-            [round(255 * c) for c in colormaps["cividis"](k / 8)[:3]]
-            for k in range(9)
-        ],
+        "shares": {name: _base64(np.rint(255 * x), "u1") for name, x in shares.items()},
+        "opening": int(np.nansum(np.abs(next(iter(shares.values()))), axis=1).argmax()),
+        "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
         "held": _base64(replay.is_prescribed[samples][:, surface_nodes], "u1"),
         "outlines": ""
         if replay.obstacles_m is None
@@ -273,9 +221,7 @@ def surface_strain(replay: MotionRecord, positions_m: Array) -> Array:
     return np.where(there, stretch - 1.0, np.nan)
 
 
-def cells_below_faces(
-    tetrahedra: NDArray[Any], faces: NDArray[Any]
-) -> NDArray[np.int64]:
+def cells_below_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[np.int64]:
     """Return the index (F,) of the tetrahedron that each boundary triangle is a side of.
 
     Parameters
@@ -290,22 +236,13 @@ def cells_below_faces(
     KeyError
         If a triangle is no side of any tetrahedron.
     """
-    sides = np.sort(
-        tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2
-    )
-    known = {
-        tuple(side): k // 4
-        for k, side in enumerate(sides.reshape(-1, 3).tolist())
-    }
-    return np.array(
-        [known[tuple(face)] for face in np.sort(faces, axis=1).tolist()]
-    )
+    sides = np.sort(tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
+    known = {tuple(side): k // 4 for k, side in enumerate(sides.reshape(-1, 3).tolist())}
+    return np.array([known[tuple(face)] for face in np.sort(faces, axis=1).tolist()])
 
 
 def _base64(array: NDArray[Any], data_type: str) -> str:
     """Return an array, converted to the NumPy data type `data_type` such as "<f4", as base64 text
     of its bytes in row-major order.
     """
-    return base64.b64encode(
-        np.ascontiguousarray(array, dtype=data_type).tobytes()
-    ).decode("ascii")
+    return base64.b64encode(np.ascontiguousarray(array, dtype=data_type).tobytes()).decode("ascii")

@@ -77,8 +77,7 @@ class CoarseStart:
         of all coarsened bodies; mostly above 1.
         """
         return min(
-            each.coarse.mesh.quality().edge_mean_m
-            / each.body.mesh.quality().edge_mean_m
+            each.coarse.mesh.quality().edge_mean_m / each.body.mesh.quality().edge_mean_m
             for each in self.relations.values()
         )
 
@@ -105,9 +104,7 @@ class CoarseStart:
             for item in parameters.free
             if item.name not in undetermined
         }
-        return replace(
-            problem.collocation(), parameters=parameters.with_estimates(values)
-        )
+        return replace(problem.collocation(), parameters=parameters.with_estimates(values))
 
     def variables(self, collocation: Collocation, solution: Solution) -> Array:
         """Return variables z (variables,) of the given problem from a coarse solution.
@@ -136,8 +133,7 @@ class CoarseStart:
         """
         names = [each.name for each in self.problem.experiments]
         return [
-            self._interpolated(name, x)
-            for name, x in zip(names, coarse_positions, strict=True)
+            self._interpolated(name, x) for name, x in zip(names, coarse_positions, strict=True)
         ]
 
     def _interpolated(self, experiment: str, x: Array) -> Array:
@@ -153,14 +149,12 @@ class CoarseStart:
         own = len(relation.coarse.nodes.points_m)
         by_node = points[:, :own].transpose(1, 0, 2).reshape(own, -1)
         interpolated = np.asarray(matrix @ by_node).reshape(-1, len(x), 3)
-        return np.concatenate(
-            [interpolated.transpose(1, 0, 2), points[:, own:]], axis=1
-        ).reshape(len(x), -1)
+        return np.concatenate([interpolated.transpose(1, 0, 2), points[:, own:]], axis=1).reshape(
+            len(x), -1
+        )
 
 
-def plan_coarse_start(
-    problem: Problem, method: ReducedSpace
-) -> CoarseStart | None:
+def plan_coarse_start(problem: Problem, method: ReducedSpace) -> CoarseStart | None:
     """Return the fitted experiments of a problem on coarser meshes, or None if the method's options
     or the sizes of the bodies do not call for a coarse start.
 
@@ -178,8 +172,7 @@ def plan_coarse_start(
     large = {
         id(each.body): each.body
         for each in fitted
-        if each.specimen is None
-        and len(each.body.nodes.points_m) > method.coarse_start_nodes
+        if each.specimen is None and len(each.body.nodes.points_m) > method.coarse_start_nodes
     }
     if not large:
         return None
@@ -188,18 +181,10 @@ def plan_coarse_start(
             "the phases of a two-phase field belong to the elements of the given mesh"
         )
     try:
-        coarse = {
-            key: _coarse_body(body, problem) for key, body in large.items()
-        }
-        relations = {
-            each.name: coarse[id(each.body)]
-            for each in fitted
-            if id(each.body) in coarse
-        }
+        coarse = {key: _coarse_body(body, problem) for key, body in large.items()}
+        relations = {each.name: coarse[id(each.body)] for each in fitted if id(each.body) in coarse}
         experiments = [
-            coarse_experiment(each, relations[each.name])
-            if each.name in relations
-            else each
+            coarse_experiment(each, relations[each.name]) if each.name in relations else each
             for each in fitted
         ]
         moved = replace(problem, experiments=experiments, notes=())
@@ -211,13 +196,6 @@ def plan_coarse_start(
 def _coarse_body(body: Body, problem: Problem) -> CoarseBody:
     """Return a body of the problem on a coarser mesh, with the node sets of all experiments on the
     same mesh.
-
-    Raises
-    ------
-    NoCoarseStartError
-        If the mesh cannot be made much coarser.
-    InputError
-        If the body cannot be transferred.
     """
     sets = [
         nodes
@@ -234,15 +212,11 @@ def _coarse_body(body: Body, problem: Problem) -> CoarseBody:
         )
     change = coarse.mesh.volume_m3 / body.mesh.volume_m3 - 1
     if abs(change) > LARGEST_VOLUME_CHANGE:
-        raise NoCoarseStartError(
-            f"the volume of the coarser mesh differs by {change:+.0%}"
-        )
+        raise NoCoarseStartError(f"the volume of the coarser mesh differs by {change:+.0%}")
     return relation
 
 
-def interrupted_solution(
-    start: CoarseStart, problem: Problem, coarse: Solution
-) -> Solution:
+def interrupted_solution(start: CoarseStart, problem: Problem, coarse: Solution) -> Solution:
     """Return the present point of an interrupted coarse solve as an interrupted solution of the
     given problem: parameters of the coarse solution and interpolated positions.
 
@@ -258,9 +232,7 @@ def interrupted_solution(
     coarse : Solution
         Solution of `start.problem`, interrupted.
     """
-    collocation = start.given_collocation(
-        problem, coarse, undetermined=undetermined_names(coarse)
-    )
+    collocation = start.given_collocation(problem, coarse, undetermined=undetermined_names(coarse))
     collocation = WarmStart.of(coarse).apply_to_places(collocation)
     z = start.variables(collocation, coarse)
     recorder = Recorder(ReducedSpace.name, collocation)
@@ -278,10 +250,7 @@ def interrupted_solution(
         "not satisfy the equations of motion of the given mesh"
     )
     return replace(
-        solution,
-        notes=(note,),
-        scan=coarse.scan,
-        timing=solution.timing + coarse.timing,
+        solution, notes=(note,), scan=coarse.scan, timing=solution.timing + coarse.timing
     )
 
 
@@ -300,7 +269,7 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
     lower, upper = collocation.parameters.compute_bounds_q()
     is_excluded = (q - lower < BOUND_DISTANCE) | (upper - q < BOUND_DISTANCE)
     p, positions = collocation.unpack(solution.z)
-    rows = [segment.grid_times for segment in collocation.transcriptions]
+    rows = [transcription.grid_times for transcription in collocation.transcriptions]
     try:
         fit = Horizon(collocation, rows).evaluate(p, positions).fit
     except SimulationError:
@@ -319,9 +288,7 @@ def require_determined_moduli(undetermined: Sequence[str]) -> None:
     """
     for name in undetermined:
         if is_modulus(name):
-            raise NoCoarseStartError(
-                f"the coarse mesh does not determine {symbol_of(name)}"
-            )
+            raise NoCoarseStartError(f"the coarse mesh does not determine {symbol_of(name)}")
 
 
 def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:
@@ -335,9 +302,7 @@ def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:
     )
 
 
-def mesh_error_note(
-    start: CoarseStart, coarse: Solution, given: Solution
-) -> str | None:
+def mesh_error_note(start: CoarseStart, coarse: Solution, given: Solution) -> str | None:
     """Return a note with the estimated error of the given mesh [%] in each estimated scalar
     parameter; None if none is estimated, or every estimate is zero or has no finite error.
 

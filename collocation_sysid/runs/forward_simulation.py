@@ -154,11 +154,11 @@ def simulate_experiment(
         If the fit of the nuisance parameters is interrupted.
     """
     try:
-        segment, phi = transcription_and_nuisance(experiment, solution)
+        transcription, phi = transcription_and_nuisance(experiment, solution)
         rollout = simulate_with_parameters(
             problem,
             experiment,
-            segment=segment,
+            transcription=transcription,
             phi=phi,
             parameters=solution.parameters,
             report=report,
@@ -168,16 +168,14 @@ def simulate_experiment(
         return str(error)
     if not experiment.validation:
         return rollout
-    nuisance = segment.nuisance
-    places_m = segment.marker_places_m(phi).tolist()
-    fitted = [part.segment.experiment for part in solution.parts]
+    nuisance = transcription.nuisance
+    places_m = transcription.marker_places_m(phi).tolist()
+    fitted = [part.transcription.experiment for part in solution.parts]
     return replace(
         rollout,
-        nuisance=dict(
-            zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)
-        ),
+        nuisance=dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)),
         places_m=dict(zip(experiment.markers.names, places_m, strict=True)),
-        blind_error=_blind_error(problem, segment, solution=solution),
+        blind_error=_blind_error(problem, transcription, solution=solution),
         copy_error=nearest_recording_error(experiment, fitted),
     )
 
@@ -186,7 +184,7 @@ def simulate_with_parameters(
     problem: Problem,
     experiment: Experiment,
     *,
-    segment: Transcription,
+    transcription: Transcription,
     phi: Array,
     parameters: Mapping[str, float],
     report: Callable[[float], None] | None = None,
@@ -200,7 +198,7 @@ def simulate_with_parameters(
         finer step than in the fit.
     experiment : Experiment
         The recording, with which the simulation is compared.
-    segment : Transcription
+    transcription : Transcription
         The recording as it was fitted, see `transcription_and_nuisance`.
     phi : (k,) array
         Nuisance parameters of the recording, in units of their prior standard deviations.
@@ -219,24 +217,20 @@ def simulate_with_parameters(
     InputError, SimulationError
         Where the simulation fails.
     """
-    integrator = (
-        problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
-    )
-    corrected = segment.corrected_experiment(phi)
+    integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
+    corrected = transcription.corrected_experiment(phi)
     for feature in FEATURES:
         corrected = feature.for_simulation(corrected)
     trajectory = simulate(
         corrected,
-        segment.body.theta_from_values(parameters),
+        transcription.body.theta_from_values(parameters),
         integrator=integrator,
-        timestep_s=_step_s(problem, segment),
-        substeps=segment.substeps,
+        timestep_s=_step_s(problem, transcription),
+        substeps=transcription.substeps,
         progress=report,
     )
     predicted = InstrumentPrediction(
-        **merged_fields(
-            feature.predict(segment, trajectory, phi) for feature in FEATURES
-        )
+        **merged_fields(feature.predict(transcription, trajectory, phi) for feature in FEATURES)
     )
     error = prediction_error(experiment, predicted)
     return ForwardSimulation(
@@ -252,26 +246,17 @@ def simulate_with_parameters(
 
 
 def _blind_error(
-    problem: Problem, segment: Transcription, solution: Solution
+    problem: Problem, transcription: Transcription, solution: Solution
 ) -> PredictionErrors | None:
     """Return the errors of a prediction of a recording with the nuisance parameters of the fitted
     recordings; None if the simulation fails.
-
-    Parameters
-    ----------
-    problem : Problem
-        Its integrator and step are used.
-    segment : Transcription
-        Recording to be predicted, with its measurements.
-    solution : Solution
-        Solution of the fitted recordings.
     """
-    phi = nuisance_of_fitted_recordings(segment, solution)
+    phi = nuisance_of_fitted_recordings(transcription, solution)
     try:
         simulation = simulate_with_parameters(
             problem,
-            segment.experiment,
-            segment=segment,
+            transcription.experiment,
+            transcription=transcription,
             phi=phi,
             parameters=solution.parameters,
         )
@@ -296,7 +281,7 @@ def transcription_and_nuisance(
         If that solve is interrupted.
     """
     if (part := solution.part_of(experiment.name)) is not None:
-        return part.segment, part.phi
+        return part.transcription, part.phi
     values = solution.parameters
     body = experiment.body
     alone = replace(
@@ -306,13 +291,11 @@ def transcription_and_nuisance(
             {name: values[name] for name in body.used_names(list(values))}
         ),
     )
-    (segment,) = alone.transcriptions
+    (transcription,) = alone.transcriptions
     # All that is left to estimate is φ.
     if not alone.nphi:
-        return segment, np.zeros(0)
-    return segment, alone.parameters_from(
-        ReducedSpace()(alone).unless_interrupted().z
-    )
+        return transcription, np.zeros(0)
+    return transcription, alone.parameters_from(ReducedSpace()(alone).unless_interrupted().z)
 
 
 def step_error(
@@ -347,16 +330,12 @@ def step_error(
     """
     differences: list[Array] = []
     collocation = solution.collocation
-    moving = [
-        s.experiment
-        for s in collocation.transcriptions
-        if not s.experiment.is_static
-    ]
+    moving = [s.experiment for s in collocation.transcriptions if not s.experiment.is_static]
     if not moving or any(experiment.obstacles for experiment in moving):
         return None
     for part in solution.parts:
-        rollout = rollouts.get(part.segment.experiment.name)
-        share = _step_error_share(problem, part.segment)
+        rollout = rollouts.get(part.transcription.experiment.name)
+        share = _step_error_share(problem, part.transcription)
         if not isinstance(rollout, ForwardSimulation) or share is None:
             return None
         for feature in FEATURES:
@@ -378,19 +357,19 @@ def step_error(
     )
 
 
-def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
+def _step_error_share(problem: Problem, transcription: Transcription) -> float | None:
     """Return the share of the difference between forward simulation and fit that half the time step
-    would remove, from the orders of both schemes: that of the fit of `segment`, and that of the
-    simulation by `problem.rollout`.
+    would remove, from the orders of both schemes: that of the fit of `transcription`, and that of
+    the simulation by `problem.rollout`.
 
     None if the simulation is not Newmark's or its step is not at most half as large; 1 for static
     experiments.
     """
-    experiment = segment.experiment
+    experiment = transcription.experiment
     options = problem.rollout
     if experiment.is_static:
         return 1.0
-    steps = experiment.timestep_s / _step_s(problem, segment) / segment.substeps
+    steps = experiment.timestep_s / _step_s(problem, transcription) / transcription.substeps
     if options.integrator != "newmark" or steps < LEAST_STEP_RATIO:
         return None
     order = as_scheme(problem.scheme).order
@@ -399,12 +378,12 @@ def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
     return (1 - 0.5**order) / (1 - remaining)
 
 
-def _step_s(problem: Problem, segment: Transcription) -> float:
-    """Return the step of the forward simulation of the recording of `segment` [s]: the one of
+def _step_s(problem: Problem, transcription: Transcription) -> float:
+    """Return the step of the forward simulation of the recording of `transcription` [s]: the one of
     `problem.rollout`, by default finer than the grid of the fit.
 
     The default is the sample interval over four, or over twice the substeps of the fit if these are
     more, unless that makes more than the largest number of steps.
     """
-    count = min(max(4, 2 * segment.substeps), MOST_STEPS - 1)
-    return problem.rollout.timestep_s or segment.experiment.timestep_s / count
+    count = min(max(4, 2 * transcription.substeps), MOST_STEPS - 1)
+    return problem.rollout.timestep_s or transcription.experiment.timestep_s / count

@@ -21,9 +21,7 @@ from .check.declared_simulation import is_declared_simulated
 MESH = "mesh"
 
 
-def mesh_resolution_concerns(
-    problem: Problem, refinement: Refinement | None
-) -> list[Concern]:
+def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) -> list[Concern]:
     """Return a "check" concern for each body of linear tetrahedra whose mesh is too coarse for its
     bending.
 
@@ -37,14 +35,10 @@ def mesh_resolution_concerns(
         Discretisation errors of the estimates.
     """
     levels = () if refinement is None else refinement.levels
-    if is_declared_simulated(problem) or any(
-        level.refined == MESH for level in levels
-    ):
+    if is_declared_simulated(problem) or any(level.refined == MESH for level in levels):
         return []
     return [
-        concern
-        for concern in _coarse_mesh_concerns(problem)
-        if concern.data["element"] == LINEAR
+        concern for concern in _coarse_mesh_concerns(problem) if concern.data["element"] == LINEAR
     ]
 
 
@@ -68,27 +62,19 @@ def _coarse_mesh_concerns(problem: Problem) -> Iterator[Concern]:
     """
     fitted = [each for each in problem.experiments if not each.validation]
     estimated = {without_region(item.name) for item in problem.parameters.free}
-    bodies = dict.fromkeys(
-        each.body for each in fitted if each.specimen is None
-    )
+    bodies = dict.fromkeys(each.body for each in fitted if each.specimen is None)
     for body in bodies:
         if estimated.isdisjoint(_elastic_names(body)):
             continue
         names = [repr(each.name) for each in fitted if each.body is body]
         of = f"in the body of {', '.join(names)}" if len(bodies) > 1 else ""
         for concern in bending_concerns(body, slenderness(body.mesh)):
-            yield Concern(
-                concern.code, concern.grade, data={**concern.data, "of": of}
-            )
+            yield Concern(concern.code, concern.grade, data={**concern.data, "of": of})
 
 
 def _elastic_names(body: Body) -> set[str]:
     """Return the names of the moduli and of the constants of the materials of a body, without
     regions.
     """
-    constants = (
-        constant.name
-        for part in body.parts
-        for constant in part.material.constants
-    )
+    constants = (constant.name for part in body.parts for constant in part.material.constants)
     return {*ELASTIC, *constants}

@@ -4,21 +4,12 @@ from __future__ import annotations
 
 from ..features.registry import FEATURES
 from ..methods.solution import Solution
-from ..statistics.misspecification.fit_misspecifications import (
-    motion_misspecifications,
-)
-from ..statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    rank,
-)
-from ..statistics.misspecification.specimen_misspecifications import (
-    find_specimen_misspecifications,
-)
+from ..statistics.misspecification.fit_misspecifications import motion_misspecifications
+from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
+from ..statistics.misspecification.specimen_misspecifications import find_specimen_misspecifications
 
 
-def find_misspecifications(
-    solution: Solution, budget: int | None = None
-) -> tuple[Hypothesis, ...]:
+def find_misspecifications(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
     """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
     are noise.
 
@@ -39,9 +30,7 @@ def find_misspecifications(
         `strength` is the factor by which the misfit decreases without the mistake.
     """
     hypotheses = [
-        hypothesis
-        for feature in FEATURES
-        for hypothesis in feature.fit_hypotheses(solution)
+        hypothesis for feature in FEATURES for hypothesis in feature.fit_hypotheses(solution)
     ]
     hypotheses += find_specimen_misspecifications(solution)
     hypotheses += motion_misspecifications(solution, hypotheses, budget=budget)

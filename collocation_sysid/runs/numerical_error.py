@@ -46,13 +46,8 @@ def finer_mesh(problem: Problem) -> Problem:
     Bodies that experiments share stay shared; specimens without a mesh stay as they are. The
     problem itself is not modified.
     """
-    meshed = [
-        each.body for each in problem.experiments if each.specimen is None
-    ]
-    bodies = {
-        id(body): refine_body(body)
-        for body in {id(b): b for b in meshed}.values()
-    }
+    meshed = [each.body for each in problem.experiments if each.specimen is None]
+    bodies = {id(body): refine_body(body) for body in {id(b): b for b in meshed}.values()}
     experiments = [
         e
         if e.specimen is not None
@@ -155,11 +150,7 @@ def solve_refined(
     """
     if not 2 <= levels <= MOST_LEVELS:
         raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
-    fitted = [
-        experiment
-        for experiment in problem.experiments
-        if not experiment.validation
-    ]
+    fitted = [experiment for experiment in problem.experiments if not experiment.validation]
     if not problem.parameters.free:
         raise InputError(
             "no parameter was estimated, and only estimates have a discretisation error; expected "
@@ -177,53 +168,33 @@ def solve_refined(
     for kind, finer in REFINEMENTS.items():
         at = coarse
         start = solution
-        for level in range(
-            1, levels if moving or kind == "mesh" else 1
-        ):  # equilibria have no step
+        for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
             at = finer(at)
             if (kind, level) in solved:
                 reached.append(solved[kind, level])
-                start = replace(
-                    solution, values={**solution.values, **reached[-1].values}
-                )
+                start = replace(solution, values={**solution.values, **reached[-1].values})
                 continue
             what = f"{kind} halved {level}×"
             activity = f"solving again: {what}"
             if report_progress is not None:
                 report_progress(activity)
             with search_activity(activity):
-                refined = _solve_refined_problem(
-                    at, start, what=what, watch=watch
-                )
+                refined = _solve_refined_problem(at, start, what=what, watch=watch)
             start = WarmStart.of(refined)
             reached.append(_level_summary(kind, level, solution=refined))
             if save_progress is not None:
-                save_progress(
-                    _errors_from_levels(reached, problem, estimates=estimates)
-                )
+                save_progress(_errors_from_levels(reached, problem, estimates=estimates))
     return _errors_from_levels(reached, problem, estimates=estimates)
 
 
 def _errors_from_levels(
-    levels: Sequence[RefinementLevel],
-    problem: Problem,
-    estimates: Mapping[str, Estimate],
+    levels: Sequence[RefinementLevel], problem: Problem, estimates: Mapping[str, Estimate]
 ) -> Refinement:
     """Return the numerical errors of the estimates from the levels solved so far, with these
     levels.
-
-    Parameters
-    ----------
-    levels : sequence of RefinementLevel
-        Levels of the step, of the mesh, or of both, in ascending order.
-    problem : Problem
-        Problem that was refined, with its time scheme.
-    estimates : mapping of name to Estimate
-        Estimates at the given discretisation, with their statistical intervals.
     """
     by_step, by_mesh = (
-        [each.values for each in levels if each.refined == kind]
-        for kind in REFINEMENTS
+        [each.values for each in levels if each.refined == kind] for kind in REFINEMENTS
     )
     order = as_scheme(problem.scheme).order
     errors = discretisation_errors(
@@ -241,14 +212,6 @@ def _solve_refined_problem(
 ) -> Solution:
     """Return the converged solution of a finer problem in reduced space, starting from the answer
     `start` on a coarser one; `watch` is called with each iteration.
-
-    Raises
-    ------
-    InputError
-        If the problem is refused or the search does not converge; then `what` names the problem in
-        the message.
-    KeyboardInterrupt
-        If the solve is interrupted.
     """
     method = ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE)
     solution = solve(problem, method, watch=watch, start=start)
@@ -261,27 +224,18 @@ def _solve_refined_problem(
     return solution
 
 
-def _level_summary(
-    kind: str, level: int, solution: Solution
-) -> RefinementLevel:
+def _level_summary(kind: str, level: int, solution: Solution) -> RefinementLevel:
     """Return size, cost and estimates of a solved level.
 
     Nodes and time steps are sums over the bodies and the fitted experiments; the values, also of
     fixed parameters and derived moduli, are physical.
-
-    Parameters
-    ----------
-    kind : {"step", "mesh"}
-    level : int
-        How often the step or the edges were halved.
-    solution : Solution
     """
-    segments = solution.collocation.transcriptions
+    transcriptions = solution.collocation.transcriptions
     return RefinementLevel(
         refined=kind,
         halvings=level,
-        timesteps=sum(segment.grid_times for segment in segments),
-        nodes=sum({id(s.body): len(s.body.nodes_m) for s in segments}.values()),
+        timesteps=sum(transcription.grid_times for transcription in transcriptions),
+        nodes=sum({id(s.body): len(s.body.nodes_m) for s in transcriptions}.values()),
         iterations=solution.iterations,
         time_s=solution.timing.total,
         values=dict(WarmStart.of(solution).values),

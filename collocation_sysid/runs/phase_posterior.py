@@ -223,9 +223,7 @@ class ElementSurrogate:
         residual = (_residuals(self.fit) + self.errors.mean) / root
         normal = normal / temperature - mixed @ np.linalg.solve(gram, mixed.T)
         score = score + _pull_back(self.fit, self.errors.mean)
-        score = score / temperature - mixed @ np.linalg.solve(
-            gram, errors.T @ residual
-        )
+        score = score / temperature - mixed @ np.linalg.solve(gram, errors.T @ residual)
         others = self.other_columns
         elements = self.columns
         priors = self.fit.prior_jacobian[others]
@@ -242,15 +240,10 @@ class ElementSurrogate:
             score_z=slope * score[elements],
             base=self.to_power(self.base),
             deviation=stretch * self.prior.deviation,
-            mean=float(
-                self.to_power(np.array(typical))
-                + stretch * (self.prior.mean - typical)
-            ),
+            mean=float(self.to_power(np.array(typical)) + stretch * (self.prior.mean - typical)),
         )
 
-    def simulate_errors(
-        self, logarithms: Array, changes: Array
-    ) -> SimulatedSamples:
+    def simulate_errors(self, logarithms: Array, changes: Array) -> SimulatedSamples:
         """Simulate samples, and return the errors of the linearised residuals; samples that cannot
         be simulated are left out.
 
@@ -268,9 +261,7 @@ class ElementSurrogate:
             p[self.columns] = each - self.base
             p[self.other_columns] += change
             try:
-                residuals.append(
-                    exact_residuals(self.collocation, p, guess=self.positions)
-                )
+                residuals.append(exact_residuals(self.collocation, p, guess=self.positions))
             except SimulationError:
                 continue
             simulated.append(p)
@@ -332,10 +323,7 @@ class SimulatedSamples:
             return float(squares.mean() + departure**2)
 
         search = minimize_scalar(
-            loss,
-            bounds=EXPONENT_LIMITS,
-            method="bounded",
-            options={"xatol": 0.01},
+            loss, bounds=EXPONENT_LIMITS, method="bounded", options={"xatol": 0.01}
         )
         exponent = float(search.x)
         return replace(
@@ -375,13 +363,7 @@ class PhasePosterior:
     ) -> PhasePosterior:
         """Sample the posterior from phases (E,) or (C, E) on, see `sample_phases`."""
         information = surrogate.information(temperature)
-        draws = sample_phases(
-            information,
-            surrogate.faces,
-            start,
-            settings=settings,
-            seed=seed,
-        )
+        draws = sample_phases(information, surrogate.faces, start, settings=settings, seed=seed)
         return cls(surrogate, draws, information=information)
 
     @cached_property
@@ -428,9 +410,7 @@ class PhasePosterior:
         mean.
         """
         powers = self.surrogate.to_power(self.contrasts)
-        return self.surrogate.to_logarithm(
-            powers @ self.phases / len(self.phases)
-        )
+        return self.surrogate.to_logarithm(powers @ self.phases / len(self.phases))
 
     def select_last_phases(self) -> Array:
         """Return the last phases (C, E) of the chains."""
@@ -441,15 +421,12 @@ class PhasePosterior:
         count = len(self.select_last_phases())
         contrasts = self.contrasts[-count:]
         return self.surrogate.simulate_errors(
-            contrasts[:, None] * self.select_last_phases(),
-            changes=self.mean_changes[-count:],
+            contrasts[:, None] * self.select_last_phases(), changes=self.mean_changes[-count:]
         )
 
 
 def exact_residuals(
-    collocation: Collocation,
-    p: Array,
-    guess: Sequence[Array] | None = None,
+    collocation: Collocation, p: Array, guess: Sequence[Array] | None = None
 ) -> Array:
     """Return the residuals (n,) of all measurements at simulated trajectories, in the order and
     with the weights of `linearise_fit`.
@@ -474,7 +451,7 @@ def exact_residuals(
     for iterate in collocation.iterates(collocation.pack(p, positions)):
         linearised = iterate.linearise_fixed_motion()
         for reading, (values, by_phi) in zip(
-            iterate.segment.residuals, linearised, strict=True
+            iterate.transcription.residuals, linearised, strict=True
         ):
             weighted, _ = huber_as_weights(values, by_phi, huber=reading.huber)
             residuals.append(reading.pool_values(weighted).ravel())
@@ -493,9 +470,7 @@ def _residuals(fit: LinearisedFit) -> Array:
 
 def _matrices(fit: LinearisedFit) -> list[Array]:
     """Return the Jacobian (n_k, np) of each block of a fit."""
-    return [
-        block.jacobian.reshape(block.residual.size, -1) for block in fit.blocks
-    ]
+    return [block.jacobian.reshape(block.residual.size, -1) for block in fit.blocks]
 
 
 def _pull_back(fit: LinearisedFit, values: Array) -> Array:

@@ -27,9 +27,7 @@ from ..recording import Experiment
 from ..recording.sample_times import TIME_TOLERANCE_S
 
 
-def prediction_error(
-    experiment: Experiment, predicted: InstrumentPrediction
-) -> PredictionErrors:
+def prediction_error(experiment: Experiment, predicted: InstrumentPrediction) -> PredictionErrors:
     """Return RMS and maximum differences between a prediction and the measurements of its
     recording, for each kind of instrument.
 
@@ -44,9 +42,7 @@ def prediction_error(
         Prediction at the same samples and for the same instruments, in the same order.
     """
     return PredictionErrors(
-        **merged_fields(
-            feature.errors(experiment, predicted) for feature in FEATURES
-        )
+        **merged_fields(feature.errors(experiment, predicted) for feature in FEATURES)
     )
 
 
@@ -66,21 +62,15 @@ def instrument_misfits(
     predicted : InstrumentPrediction
         Prediction at the same samples and for the same instruments, in the same order.
     """
-    return [
-        misfit
-        for feature in FEATURES
-        for misfit in feature.misfits(experiment, predicted)
-    ]
+    return [misfit for feature in FEATURES for misfit in feature.misfits(experiment, predicted)]
 
 
 # Blind predictions --------------------------------------------------------------------------------
 
 
-def nuisance_of_fitted_recordings(
-    segment: Transcription, solution: Solution
-) -> Array:
-    """Return nuisance parameters φ (k,) for a recording that is not fitted, from the fitted ones, in
-    units of the prior standard deviations of that recording.
+def nuisance_of_fitted_recordings(transcription: Transcription, solution: Solution) -> Array:
+    """Return nuisance parameters φ (k,) for a recording that is not fitted, from the fitted ones,
+    in units of the prior standard deviations of that recording.
 
     Each is the mean of the estimates, in physical units, of the parameters with the same label in
     the fitted recordings, divided by its own prior standard deviation. The place of a marker that
@@ -92,34 +82,34 @@ def nuisance_of_fitted_recordings(
 
     Parameters
     ----------
-    segment : Transcription
+    transcription : Transcription
         Transcription of the recording to be predicted.
     solution : Solution
         Solution of the fitted recordings.
     """
-    nuisance = segment.nuisance
-    places = segment.markers.observable.coordinate_parameters
+    nuisance = transcription.nuisance
+    places = transcription.markers.observable.coordinate_parameters
     known: dict[str, list[float]] = {}
     for part in solution.parts:
-        for entry, _, value in part.segment.nuisance.iterate_values(part.phi):
+        for entry, _, value in part.transcription.nuisance.iterate_values(part.phi):
             known.setdefault(entry.label, []).append(value)
     phi = np.zeros(nuisance.size)
     for k, entry in enumerate(nuisance.entries):
         phi[k] = np.mean(known.get(entry.label, [0.0])) / entry.sigma
-    start_m = segment.marker_places_m(np.zeros(nuisance.size))
-    for number in segment.association.markers.estimated.tolist():
-        name = segment.experiment.markers.names[number]
+    start_m = transcription.marker_places_m(np.zeros(nuisance.size))
+    for number in transcription.association.markers.estimated.tolist():
+        name = transcription.experiment.markers.names[number]
         places_m = [
-            part.segment.marker_places_m(part.phi)[
-                part.segment.experiment.markers.names.index(name)
+            part.transcription.marker_places_m(part.phi)[
+                part.transcription.experiment.markers.names.index(name)
             ]
             for part in solution.parts
-            if name in part.segment.experiment.markers.names
+            if name in part.transcription.experiment.markers.names
         ]
         if places_m:
             directions_m = (
-                segment.association.markers.sigma_m[number]
-                * segment.association.markers.axes[number]
+                transcription.association.markers.sigma_m[number]
+                * transcription.association.markers.axes[number]
             )
             way_m = np.mean(places_m, axis=0) - start_m[number]
             phi[places[number]] = np.linalg.pinv(directions_m) @ way_m
@@ -158,43 +148,27 @@ def nearest_recording_error(
             reasons[other.name] = reason
             continue
         copy = InstrumentPrediction(
-            **merged_fields(
-                feature.copied(experiment, other) for feature in FEATURES
-            )
+            **merged_fields(feature.copied(experiment, other) for feature in FEATURES)
         )
         copies.append(CopyError(other.name, prediction_error(experiment, copy)))
     if not copies:
-        explanation = "; ".join(
-            f"{name}: {reason}" for name, reason in reasons.items()
-        )
+        explanation = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         return f"no fitted recording has the same samples ({explanation})"
-    return min(
-        copies,
-        key=lambda each: main_error(each.error),
-    )
+    return min(copies, key=lambda each: main_error(each.error))
 
 
 def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     """Return why the measurements of `other` cannot be compared with those of a recording as a
     prediction, such as other markers; "" if they can.
     """
-    reasons = (
-        feature.reason_against_copy(experiment, other) for feature in FEATURES
-    )
+    reasons = (feature.reason_against_copy(experiment, other) for feature in FEATURES)
     if reason := next(filter(None, reasons), ""):
         return reason
-    times = [
-        pair
-        for feature in FEATURES
-        for pair in feature.copied_times_s(experiment, other)
-    ]
+    times = [pair for feature in FEATURES for pair in feature.copied_times_s(experiment, other)]
     starts_s = experiment.t_s[0], other.t_s[0]
     for here_s, there_s in times:
         if len(here_s) != len(there_s):
             return f"{len(there_s)} samples instead of {len(here_s)}"
-        if (
-            np.abs((here_s - starts_s[0]) - (there_s - starts_s[1])).max()
-            > TIME_TOLERANCE_S
-        ):
+        if np.abs((here_s - starts_s[0]) - (there_s - starts_s[1])).max() > TIME_TOLERANCE_S:
             return "other times"
     return ""

@@ -79,13 +79,9 @@ def build_result(answer: SolvedProblem) -> Result:
         probes=answer.probes,
         places=answer.places,
         nuisance=_nuisance(answer),
-        fields={
-            name: _field_result(field) for name, field in answer.fields.items()
-        },
+        fields={name: _field_result(field) for name, field in answer.fields.items()},
         uncertainty=_uncertainty_result(answer),
-        scan=None
-        if solution.scan is None
-        else copy_fields(ScanSummary, solution.scan),
+        scan=None if solution.scan is None else copy_fields(ScanSummary, solution.scan),
         fit=_fit_result(answer),
         residuals=answer.diagnoses,
         dynamics=DynamicsResult(
@@ -102,16 +98,12 @@ def build_result(answer: SolvedProblem) -> Result:
             sum(len(body.nodes_m) for body in problem.bodies),
             sum(len(body.cells) for body in problem.bodies),
             substeps=collocation.substeps,
-            timesteps=sum(
-                segment.grid_times for segment in collocation.transcriptions
-            ),
+            timesteps=sum(transcription.grid_times for transcription in collocation.transcriptions),
             variables=collocation.variable_count,
             constraints=collocation.constraint_count,
             scheme=as_scheme(collocation.scheme).name,
         ),
-        notes=tuple(
-            dict.fromkeys([*problem.notes, *solution.notes, *answer.all_notes])
-        ),
+        notes=tuple(dict.fromkeys([*problem.notes, *solution.notes, *answer.all_notes])),
         history=tuple(solution.history),
         provenance=_provenance(problem),
     )
@@ -132,9 +124,7 @@ def _provenance(problem: Problem) -> Provenance:
         python=platform.python_version(),
         platform=platform.platform(),
         problem_file=None if origin is None else str(origin.path),
-        problem_sha256=None
-        if text is None
-        else hashlib.sha256(text).hexdigest(),
+        problem_sha256=None if text is None else hashlib.sha256(text).hexdigest(),
         mesh_sha256=tuple(body.mesh.sha256 for body in problem.bodies),
     )
 
@@ -144,18 +134,13 @@ def _reference_sentences(problem: Problem) -> Iterator[str]:
     it, and how moduli are scaled if no force is measured.
     """
     parts = [part for body in problem.bodies for part in body.parts]
-    laws = dict.fromkeys(
-        part.damping.name for part in parts if GAMMA_R in part.damping.constants
-    )
+    laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
     law_names = [
-        law + (", which also damps rigid rotation" if law == "rayleigh" else "")
-        for law in laws
+        law + (", which also damps rigid rotation" if law == "rayleigh" else "") for law in laws
     ]
     if law_names:
         yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
-    if (
-        relative := relative_scale_note(problem.experiments, problem.parameters)
-    ) is not None:
+    if (relative := relative_scale_note(problem.experiments, problem.parameters)) is not None:
         yield relative
 
 
@@ -167,9 +152,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
     known = answer.uncertainty
     if known is None:
         return None
-    reported = [
-        k for k, name in enumerate(known.names) if name in known.estimates
-    ]
+    reported = [k for k, name in enumerate(known.names) if name in known.estimates]
     return copy_fields(
         UncertaintyResult,
         known,
@@ -215,10 +198,7 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
             phases=estimate.phases,
         )
     share = float(volumes_m3[is_determined].sum() / volumes_m3.sum())
-    likelier = {
-        f"{each:g}": estimate.log_evidence_ratio(each)
-        for each in modes.field.lengths_m
-    }
+    likelier = {f"{each:g}": estimate.log_evidence_ratio(each) for each in modes.field.lengths_m}
     return FieldResult(
         modes.describe_resolution(),
         ends,
@@ -229,17 +209,12 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
     )
 
 
-def _recordings_agreement(
-    answer: SolvedProblem,
-) -> dict[str, RecordingsAgreement] | None:
+def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreement] | None:
     """Return the estimates from single recordings, to first order, and their agreement, by
     scalar parameter; None if this was not evaluated. Values are NaN for recordings that do not
     determine the parameter.
     """
-    if (
-        answer.uncertainty is None
-        or (scatter := answer.uncertainty.scatter) is None
-    ):
+    if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
         return None
     q = answer.solution.q
     agreements = {}
@@ -247,10 +222,7 @@ def _recordings_agreement(
     for k in parameters.scalar_coordinates:
         item = parameters.free[k]
         away = q[k] + scatter.differences[:, k]
-        values = [
-            item.from_coordinate(float(x)) if np.isfinite(x) else np.nan
-            for x in away
-        ]
+        values = [item.from_coordinate(float(x)) if np.isfinite(x) else np.nan for x in away]
         deviations = scatter.deviations[:, k].tolist()
         agreements[item.name] = RecordingsAgreement(
             dict(zip(scatter.recordings, values, strict=True)),
@@ -269,7 +241,7 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
     solution = answer.solution
     experiments = {}
     for part in solution.parts:
-        experiment = part.segment.experiment
+        experiment = part.transcription.experiment
         name = experiment.name
         markers = experiment.markers
         experiments[name] = FittedExperiment(
@@ -277,13 +249,8 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
             markers.count_samples(),
             int(markers.count_missing().sum()),
             experiment.is_static,
-            (
-                *_place_sentences(answer.places[name]),
-                *_nuisance_sentences(part, answer),
-            ),
-            **merged_fields(
-                feature.fit_fields(part, solution) for feature in FEATURES
-            ),
+            (*_place_sentences(answer.places[name]), *_nuisance_sentences(part, answer)),
+            **merged_fields(feature.fit_fields(part, solution) for feature in FEATURES),
             air_density_kg_m3=experiment.air_density_kg_m3,
             test=experiment.specimen and experiment.specimen.test,
         )
@@ -297,9 +264,7 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         solution.rms_m,
         answer.compute_noise_rms_m(),
         experiments,
-        **merged_fields(
-            feature.pooled_fields(solution) for feature in FEATURES
-        ),
+        **merged_fields(feature.pooled_fields(solution) for feature in FEATURES),
         symmetry=symmetry,
     )
 
@@ -313,32 +278,19 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
     squares = []
     largest = []
     for experiment in answer.problem.experiments:
-        experiments[experiment.name] = compared = _forward_result(
-            answer, experiment
-        )
-        if (
-            compared.fitted
-            and compared.rms_m is not None
-            and compared.max_m is not None
-        ):
-            squares.append(
-                experiment.markers.count_samples()
-                * np.array([compared.rms_m**2, 1.0])
-            )
+        experiments[experiment.name] = compared = _forward_result(answer, experiment)
+        if compared.fitted and compared.rms_m is not None and compared.max_m is not None:
+            squares.append(experiment.markers.count_samples() * np.array([compared.rms_m**2, 1.0]))
             largest.append(compared.max_m)
     if not largest:
         return ForwardResult(None, None, experiments=experiments)
     total, count = np.sum(squares, axis=0)
     return ForwardResult(
-        float(np.sqrt(total / max(1, count))),
-        max(largest),
-        experiments=experiments,
+        float(np.sqrt(total / max(1, count))), max(largest), experiments=experiments
     )
 
 
-def _forward_result(
-    answer: SolvedProblem, experiment: Experiment
-) -> SimulatedExperiment:
+def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
     """Return the errors of the forward simulation of an experiment; if it failed, only the reason
     and whether the experiment was fitted. `answer.rollouts` must have an entry for it.
     """
@@ -347,9 +299,7 @@ def _forward_result(
     if not isinstance(simulated, ForwardSimulation):
         return SimulatedExperiment(fitted, failed=simulated)
     errors = {
-        key: value
-        for key, value in vars(simulated.error).items()
-        if key not in ("rms_m", "max_m")
+        key: value for key, value in vars(simulated.error).items() if key not in ("rms_m", "max_m")
     }
     return copy_fields(
         SimulatedExperiment,
@@ -359,12 +309,8 @@ def _forward_result(
         **errors,
         reading_unit=units_by_name(experiment),
         blind=simulated.blind_error,
-        copied=simulated.copy_error
-        if isinstance(simulated.copy_error, CopyError)
-        else None,
-        not_copied=simulated.copy_error
-        if isinstance(simulated.copy_error, str)
-        else None,
+        copied=simulated.copy_error if isinstance(simulated.copy_error, CopyError) else None,
+        not_copied=simulated.copy_error if isinstance(simulated.copy_error, str) else None,
     )
 
 
@@ -378,21 +324,13 @@ def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
     Values, prior standard deviations and standard errors are in the unit of the label; the standard
     error is None without error bars. Experiments without such parameters have no entry.
     """
-    deviations = (
-        answer.uncertainty.nuisance if answer.uncertainty is not None else {}
-    )
+    deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
     named: dict[str, dict[str, NuisanceResult]] = {}
     for part in answer.solution.parts:
-        for entry, name, value in part.segment.nuisance.iterate_values(
-            part.phi
-        ):
-            error = (
-                deviations[name] * entry.sigma if name in deviations else None
-            )
-            here = named.setdefault(part.segment.experiment.name, {})
-            here[entry.label] = NuisanceResult(
-                value, entry.sigma, std_error=error
-            )
+        for entry, name, value in part.transcription.nuisance.iterate_values(part.phi):
+            error = deviations[name] * entry.sigma if name in deviations else None
+            here = named.setdefault(part.transcription.experiment.name, {})
+            here[entry.label] = NuisanceResult(value, entry.sigma, std_error=error)
     return named
 
 
@@ -414,22 +352,14 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
         )
     if unknown := [place for place in places.values() if not place.is_declared]:
         count = f"{len(unknown)} marker" + ("s" if len(unknown) > 1 else "")
-        errors = [
-            float(p.std_error_m.max())
-            for p in unknown
-            if p.std_error_m is not None
-        ]
+        errors = [float(p.std_error_m.max()) for p in unknown if p.std_error_m is not None]
         known = (
-            f", estimated to ±{short(1e3 * max(errors))} mm"
-            if len(errors) == len(unknown)
-            else ""
+            f", estimated to ±{short(1e3 * max(errors))} mm" if len(errors) == len(unknown) else ""
         )
         yield f"positions of {count}{known} (prior ±{short(1e3 * unknown[0].prior_m)} mm)"
 
 
-def _nuisance_sentences(
-    part: ExperimentIterate, answer: SolvedProblem
-) -> Iterator[str]:
+def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
     """Yield sentences on the nuisance parameters of an experiment except the places, with estimate
     and prior.
 
@@ -437,71 +367,47 @@ def _nuisance_sentences(
     vectors, "worst" one on the value farthest from its prior, in standard deviations, anything else
     one on each value.
     """
-    nuisance = part.segment.nuisance
+    nuisance = part.transcription.nuisance
     values = part.phi * nuisance.scales
-    for row in (*part.segment.experiment.nuisance.list_kinds(), GAUGE):
+    for row in (*part.transcription.experiment.nuisance.list_kinds(), GAUGE):
         here = nuisance.indices_of_rows(row).tolist()
         if row == PLACE or not here:
             continue
         groups = [[k] for k in here]
         if row.by == "length":
-            entry_numbers = dict.fromkeys(
-                nuisance.entries[k].number for k in here
-            )
+            entry_numbers = dict.fromkeys(nuisance.entries[k].number for k in here)
             vectors = [
-                nuisance.indices_of_rows(row, component=number).tolist()
-                for number in entry_numbers
+                nuisance.indices_of_rows(row, component=number).tolist() for number in entry_numbers
             ]
             # Several markers have one each: the longest counts.
-            groups = [
-                max(vectors, key=lambda own: float(np.linalg.norm(values[own])))
-            ]
+            groups = [max(vectors, key=lambda own: float(np.linalg.norm(values[own])))]
         elif row.by == "worst":
             groups = [[max(here, key=lambda k: abs(part.phi[k]))]]
         for own in groups:
-            yield _nuisance_sentence(
-                part, own, values=values[own], answer=answer
-            )
+            yield _nuisance_sentence(part, own, values=values[own], answer=answer)
 
 
 def _nuisance_sentence(
-    part: ExperimentIterate,
-    components: Sequence[int],
-    values: Array,
-    answer: SolvedProblem,
+    part: ExperimentIterate, components: Sequence[int], values: Array, answer: SolvedProblem
 ) -> str:
     """Return a sentence with the size of a nuisance parameter, or of a vector of them, its standard
-    error if known, its prior, and, for kinds whose sentence has a place for it, whether it is at its
-    bound.
+    error if known, its prior, and, for kinds whose sentence has a place for it, whether it is at
+    its bound.
 
     The tare is multiplied by the symmetry of the experiment: the sensor measures the load of the
     whole specimen.
-
-    Parameters
-    ----------
-    part : ExperimentIterate
-        Experiment at the solution.
-    components : sequence of int
-        Indices of its components in φ, at least one; the first gives label, unit, prior, standard
-        error and bound.
-    values : (k,) array
-        Values of the k components in the unit of the entry; the size is their norm, and the sign
-        that of the first.
-    answer : SolvedProblem
-        Solved problem with the standard errors, if it has any.
     """
-    nuisance = part.segment.nuisance
+    nuisance = part.transcription.nuisance
     k = components[0]
     entry = nuisance.entries[k]
     name = nuisance.names[k]
     known = answer.uncertainty.nuisance if answer.uncertainty else {}
     low, high = (
-        limit[k]
-        for limit in nuisance.bounds(part.segment.association.clock_samples)
+        limit[k] for limit in nuisance.bounds(part.transcription.association.clock_samples)
     )
     factor, unit = in_readable_unit(1.0, entry.unit_in_label())
     if entry.row == TARE:  # of the sensor, on which the whole specimen acts
-        factor *= part.segment.experiment.find_symmetry()
+        factor *= part.transcription.experiment.find_symmetry()
     size = float(np.linalg.norm(values))
     error = entry.sigma * known.get(name, np.nan)
     allowed = low + 1e-3 < part.phi[k] < high - 1e-3

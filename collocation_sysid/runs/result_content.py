@@ -18,10 +18,7 @@ from ..fem.two_phase import PhaseSummary
 from ..methods.solution import Iteration, Timing
 from ..methods.stiffness_scan import ScanSummary
 from ..statistics.assessment import Assessment
-from ..statistics.budget.discretisation_error import (
-    DiscretisationError,
-    known_kinds,
-)
+from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
@@ -85,21 +82,14 @@ class ReportedEstimate(Estimate):
         linear : bool
             Whether the parameter is its own coordinate, see `IntervalCoordinate`.
         """
-        if (
-            self.optimum is None
-            or self.statistical95 is None
-            or self.optimum == self.value
-        ):
+        if self.optimum is None or self.statistical95 is None or self.optimum == self.value:
             optimum = self.value if self.optimum is None else self.optimum
             return replace(self._to_statistical(), value=optimum)
         at = IntervalCoordinate.for_estimate(
             name, (self.value, self.optimum, *self.statistical95), linear=linear
         )
         correction = at.from_value(self.value) - at.from_value(self.optimum)
-        low, high = (
-            at.to_value(at.from_value(end) - correction)
-            for end in self.statistical95
-        )
+        low, high = (at.to_value(at.from_value(end) - correction) for end in self.statistical95)
         spread = self.statistical_std_error
         if spread is not None:
             spread *= at.derivative(self.value) / at.derivative(self.optimum)
@@ -133,10 +123,7 @@ class ReportedEstimate(Estimate):
         """Return the part of the combined standard uncertainty that is not statistical, √(combined²
         − statistical²), at least 0; None if one of the two is unknown.
         """
-        if (
-            self.combined_std_error is None
-            or self.statistical_std_error is None
-        ):
+        if self.combined_std_error is None or self.statistical_std_error is None:
             return None
         difference = self.combined_std_error**2 - self.statistical_std_error**2
         return max(0.0, difference) ** 0.5
@@ -199,9 +186,7 @@ class FieldResult:
         """
         region, dot, _ = name.rpartition(".")
         count = self.shapes.modes if self.phases is None else 0
-        return [
-            f"{region}{dot}{field_coefficient(k).name}" for k in range(count)
-        ]
+        return [f"{region}{dot}{field_coefficient(k).name}" for k in range(count)]
 
     def sentence(self, name: str) -> str:
         """Return a one-line summary of the field; `name` is the name of its constant."""
@@ -218,18 +203,11 @@ class FieldResult:
                 f"{1e6 * most_m3:.3g}); the phase is determined in {self.determined_share:.0%} of "
                 "the volume"
             )
-        shapes = (
-            f"{self.identified} of the {self.shapes.modes} shapes of its field"
-        )
+        shapes = f"{self.identified} of the {self.shapes.modes} shapes of its field"
         share = f"halve the prior uncertainty in {self.determined_share:.0%} of the volume"
-        details = [
-            f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm"
-        ]
+        details = [f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm"]
         if len(self.likelier) > 1:
-            each = ", ".join(
-                f"{length} m {gain:+.1f}"
-                for length, gain in self.likelier.items()
-            )
+            each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
             details.append(
                 f"correlation length {self.shapes.length_m:g} m; relative log evidence of the "
                 f"lengths: {each}"
@@ -534,9 +512,7 @@ class Result:
         """
         folder = Path(run)
         content = read_json(folder / RESULT_FILE, expected)
-        with damage_refused(
-            folder, RESULT_FILE, remedy="solve the problem again"
-        ):
+        with damage_refused(folder, RESULT_FILE, remedy="solve the problem again"):
             return read(cls, content)
 
     def collect_estimates(self) -> dict[str, ReportedEstimate]:
@@ -547,11 +523,7 @@ class Result:
             for coefficient in field.coefficient_names(name)
         }
         both = {**self.parameters, **self.derived}
-        return {
-            name: each
-            for name, each in both.items()
-            if name not in coefficients
-        }
+        return {name: each for name, each in both.items() if name not in coefficients}
 
     def list_discretisation_kinds(self) -> tuple[str, ...]:
         """Return the kinds of discretisation error that the combined intervals contain: "step",
@@ -561,10 +533,7 @@ class Result:
 
     def collect_numerical_errors(self) -> dict[str, DiscretisationError]:
         """Return the known discretisation errors, by name of the estimate."""
-        errors = (
-            (name, each.numerical_error)
-            for name, each in self.collect_estimates().items()
-        )
+        errors = ((name, each.numerical_error) for name, each in self.collect_estimates().items())
         return {name: error for name, error in errors if error is not None}
 
     def problem_folder(self, run: str | Path, purpose: str) -> Path:

@@ -1,6 +1,7 @@
 """Starts of a second search, where the first one may have ended in the worse of several optima.
 
-- *Poisson's ratio near one half*: linear elements lock towards ν = ½, so that with a smaller modulus
+- *Poisson's ratio near one half*: linear elements lock towards ν = ½, so that with a smaller
+  modulus
   and a ratio near one half a body can move almost like a stiffer, compressible one.
 - *Exponents of two terms in powers of the stretches*: the two exponents have the same sign in one
   optimum and opposite signs in another, and no search crosses an exponent of zero, at which the
@@ -73,9 +74,7 @@ def _usual_poisson_start(solution: Solution) -> SecondStart | None:
             own = [region + each for each in LAME if region + each in free]
             if len(own) == 2 or own == [name]:
                 young_pa = values[region + "young_pa"]
-                changed |= {
-                    each: _usual_modulus(each, young_pa) for each in own
-                }
+                changed |= {each: _usual_modulus(each, young_pa) for each in own}
     if not changed:
         return None
     return _changed_start(
@@ -125,24 +124,18 @@ def _negative_exponent_start(solution: Solution) -> SecondStart | None:
     changed = {SECOND_EXPONENT: NEGATIVE_EXPONENT}
     if "beta_1" not in names:  # in foam the factors alone are shear moduli
         changed[SECOND_FACTOR] = (
-            guesses[SECOND_FACTOR]
-            * guesses[SECOND_EXPONENT]
-            / NEGATIVE_EXPONENT
+            guesses[SECOND_FACTOR] * guesses[SECOND_EXPONENT] / NEGATIVE_EXPONENT
         )
     return _changed_start(
         collocation.parameters,
         guesses,
         changed,
-        reason=f"the exponent α₂ ended at {ended:.3g}; a second start, from "
-        f"{NEGATIVE_EXPONENT:g},",
+        reason=f"the exponent α₂ ended at {ended:.3g}; a second start, from {NEGATIVE_EXPONENT:g},",
     )
 
 
 def _changed_start(
-    parameters: Parameters,
-    values: Mapping[str, float],
-    changed: Mapping[str, float],
-    reason: str,
+    parameters: Parameters, values: Mapping[str, float], changed: Mapping[str, float], reason: str
 ) -> SecondStart | None:
     """Return the start from values of the estimated parameters, some of them changed, all by name;
     None if a changed value is not within its bounds.

@@ -52,12 +52,11 @@ class CompletedStart:
 
 
 def has_local_minima(collocation: Collocation) -> bool:
-    """Return whether a fitted experiment has correspondences, which change during the search and can
-    make local minima.
+    """Return whether a fitted experiment has correspondences, which change during the search and
+    can make local minima.
     """
     return any(
-        segment.association.correspondences
-        for segment in collocation.transcriptions
+        transcription.association.correspondences for transcription in collocation.transcriptions
     )
 
 
@@ -71,15 +70,9 @@ def robust_loss(solution: Solution) -> float:
     p, _ = collocation.unpack(solution.z)
     prior, _ = collocation.prior_residuals(p)
     excluded_loss = sum(
-        feature.excluded_loss(part)
-        for part in solution.parts
-        for feature in FEATURES
+        feature.excluded_loss(part) for part in solution.parts for feature in FEATURES
     )
-    return (
-        sum(part.loss for part in solution.parts)
-        + float(prior @ prior)
-        + excluded_loss
-    )
+    return sum(part.loss for part in solution.parts) + float(prior @ prior) + excluded_loss
 
 
 class _KnownMinimum(Exception):
@@ -97,14 +90,13 @@ class _KnownMinimum(Exception):
 
 
 def _until_known(method: Method, known: Sequence[Solution]) -> Method:
-    """Return a method that raises `_KnownMinimum` as soon as an iterate with complete recordings has
-    the loss of a known solution, up to `SAME_LOSS`, and its parameters, up to `SAME_PARAMETERS`.
+    """Return a method that raises `_KnownMinimum` as soon as an iterate with complete recordings
+    has the loss of a known solution, up to `SAME_LOSS`, and its parameters, up to
+    `SAME_PARAMETERS`.
     """
 
     def solve(
-        collocation: Collocation,
-        watch: Watch | None = None,
-        start: Array | None = None,
+        collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
         """Solve by the method; see `Method`."""
 
@@ -135,10 +127,7 @@ def _is_at(line: Iteration, solution: Solution) -> bool:
 
 
 def follow_starts(
-    solver: Method,
-    collocation: Collocation,
-    scan: Scan,
-    solve: Solve,
+    solver: Method, collocation: Collocation, scan: Scan, solve: Solve
 ) -> CompletedStart:
     """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
 
@@ -168,9 +157,7 @@ def follow_starts(
     first = CompletedStart(collocation, scan, solution=None, note="")
     if not scan.others or not has_local_minima(collocation):
         return first
-    own = getattr(
-        solver, "name", getattr(getattr(solver, "func", None), "name", "")
-    )
+    own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
     is_own = own == ReducedSpace.name
     method: Method = solver if is_own else ReducedSpace()
     candidates: list[tuple[float, int, Solution]] = []
@@ -178,13 +165,9 @@ def follow_starts(
         # The search associates cameras with its first shape itself.
         started = collocation.with_parameters(scan.starts[number])
         try:
-            solution = solve(
-                _until_known(method, [each for *_, each in candidates]), started
-            )
+            solution = solve(_until_known(method, [each for *_, each in candidates]), started)
         except _KnownMinimum as known:
-            candidates.append(
-                (robust_loss(known.solution), number, known.solution)
-            )
+            candidates.append((robust_loss(known.solution), number, known.solution))
             continue
         if solution.status is Status.INTERRUPTED:
             return first if not is_own else replace(first, solution=solution)
@@ -194,8 +177,7 @@ def follow_starts(
         return first
     loss, best, solution = min(candidates, key=lambda each: each[0])
     losses = ", ".join(
-        f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa"
-        for each, number, _ in candidates
+        f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa" for each, number, _ in candidates
     )
     note = (
         f"{len(candidates)} initial values of the scan were solved to the end, or to a minimum that "
@@ -205,6 +187,4 @@ def follow_starts(
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = collocation.with_parameters(scan.starts[best])
-    return CompletedStart(
-        started, chosen, solution=solution if is_own else None, note=note
-    )
+    return CompletedStart(started, chosen, solution=solution if is_own else None, note=note)

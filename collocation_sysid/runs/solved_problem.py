@@ -14,22 +14,10 @@ from ..errors import InputError, hint_at
 from ..fem.laws.constants import unit_of
 from ..methods.solution import Solution
 from ..problem import Problem
-from ..statistics.assessment import (
-    Assessment,
-    cause_concerns,
-    numerical_concerns,
-    probe_concerns,
-)
+from ..statistics.assessment import Assessment, cause_concerns, numerical_concerns, probe_concerns
 from ..statistics.budget.combined_intervals import combine
-from ..statistics.budget.discretisation_error import (
-    DiscretisationError,
-    Refinement,
-)
-from ..statistics.budget.uncertainty_budget import (
-    BudgetLine,
-    VarianceSources,
-    budget,
-)
+from ..statistics.budget.discretisation_error import DiscretisationError, Refinement
+from ..statistics.budget.uncertainty_budget import BudgetLine, VarianceSources, budget
 from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate
 from ..statistics.field_estimates import FieldEstimate, field_estimates
@@ -45,12 +33,7 @@ from .check.modes_check import ModesCheck
 from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
 from .result_content import Elapsed, ReportedEstimate
-from .verdict import (
-    combined_concerns,
-    expected_rms_m,
-    modes_by_experiment,
-    solution_concerns,
-)
+from .verdict import combined_concerns, expected_rms_m, modes_by_experiment, solution_concerns
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +59,9 @@ class SolvedProblem:
     causes : tuple of Hypothesis
         Likely errors in the description of the problem, likeliest first.
     refinement : Refinement or None
-        Discretisation errors of the estimates: from solves at finer discretisations if requested, else the
-        first-order effect of the step from finer forward simulations; None where these are missing.
+        Discretisation errors of the estimates: from solves at finer discretisations if requested,
+        else the first-order effect of the step from finer forward simulations; None where these are
+        missing.
     omitted_checks : str
         Checks that were left out after Ctrl-C; empty if all were done.
     systematic_effects : VarianceSources or None
@@ -110,9 +94,7 @@ class SolvedProblem:
             for item in self.problem.parameters.free_scalars
         )
         rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
-        summary = (
-            f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
-        )
+        summary = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
         return f"Run({summary}: {values}; {rms})"
 
     @property
@@ -120,21 +102,15 @@ class SolvedProblem:
         """Values of all parameters by name in SI units, also fixed ones, corrected for the known
         discretisation error and known effects.
         """
-        return {
-            name: self.estimates[name].value
-            for name in self.solution.parameters
-        }
+        return {name: self.estimates[name].value for name in self.solution.parameters}
 
     @cached_property
     def derived(self) -> dict[str, float]:
         """Moduli that follow from the parameters at the optimum, by name, in SI units."""
         constants = (
-            segment.constants
-            for segment in self.solution.collocation.transcriptions
+            transcription.constants for transcription in self.solution.collocation.transcriptions
         )
-        return dict(
-            DerivedModuli.from_bodies(constants, self.solution.q).values
-        )
+        return dict(DerivedModuli.from_bodies(constants, self.solution.q).values)
 
     @cached_property
     def estimates(self) -> dict[str, ReportedEstimate]:
@@ -143,39 +119,21 @@ class SolvedProblem:
         """
         values = self.solution.parameters | self.derived
         return {
-            name: self._report_estimate(
-                name, self.optimum.get(name, Estimate(value))
-            )
+            name: self._report_estimate(name, self.optimum.get(name, Estimate(value)))
             for name, value in values.items()
         }
 
-    def _report_estimate(
-        self, name: str, optimum: Estimate
-    ) -> ReportedEstimate:
+    def _report_estimate(self, name: str, optimum: Estimate) -> ReportedEstimate:
         """Return the estimate to report: corrected for the known discretisation error and known
         effects, with combined and statistical uncertainties.
-
-        Parameters
-        ----------
-        name : str
-            Name of a parameter or derived modulus.
-        optimum : Estimate
-            Its estimate at the optimum of the discretised problem; of a coefficient of a field its
-            value alone.
         """
         item = next(
-            (
-                each
-                for each in self.solution.collocation.parameters.components
-                if each.name == name
-            ),
+            (each for each in self.solution.collocation.parameters.components if each.name == name),
             None,
         )
         line = self.budget.get(name)
         error = self.collect_discretisation_errors().get(name)
-        linear, bounds = self.solution.collocation.parameters.scale_and_bounds(
-            name
-        )
+        linear, bounds = self.solution.collocation.parameters.scale_and_bounds(name)
         systematic = None if line is None else line.systematic
         known_effect = 0.0 if line is None else line.known_effect
         combined = combine(
@@ -216,9 +174,7 @@ class SolvedProblem:
             parameters=self.solution.collocation.parameters,
         )
 
-    def collect_discretisation_errors(
-        self,
-    ) -> Mapping[str, DiscretisationError]:
+    def collect_discretisation_errors(self) -> Mapping[str, DiscretisationError]:
         """Return the known discretisation errors, by name of the estimate; empty without
         `refinement`.
         """
@@ -233,9 +189,7 @@ class SolvedProblem:
         """
         bars = self.uncertainty
         known = {} if bars is None else {**bars.estimates, **bars.derived}
-        values = self.solution.collocation.parameters.scalar_values(
-            self.solution.q
-        )
+        values = self.solution.collocation.parameters.scalar_values(self.solution.q)
         return {
             name: known.get(name, Estimate(value))
             for name, value in (values | self.derived).items()
@@ -248,12 +202,8 @@ class SolvedProblem:
 
         An experiment without markers has an empty entry; see `marker_places`.
         """
-        named = (
-            (part.segment.experiment.name, part) for part in self.solution.parts
-        )
-        return {
-            name: marker_places(part, self.uncertainty) for name, part in named
-        }
+        named = ((part.transcription.experiment.name, part) for part in self.solution.parts)
+        return {name: marker_places(part, self.uncertainty) for name, part in named}
 
     @cached_property
     def trust(self) -> Assessment:
@@ -270,30 +220,18 @@ class SolvedProblem:
             uncertainty=self.uncertainty,
             diagnoses=self.diagnoses,
         )
-        uncertainties = {
-            name: each.combined_std_error
-            for name, each in self.estimates.items()
-        }
-        numerical = numerical_concerns(
-            self.optimum, uncertainties, refinement=self.refinement
-        )
+        uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
+        numerical = numerical_concerns(self.optimum, uncertainties, refinement=self.refinement)
         shares = {name: line.shares for name, line in self.budget.items()}
         vague = combined_concerns(
             self.solution.collocation.parameters, self.estimates, shares=shares
         )
-        of_fields = [
-            concern
-            for field in self.fields.values()
-            for concern in field.list_concerns()
-        ]
+        of_fields = [concern for field in self.fields.values() for concern in field.list_concerns()]
         if not self.omitted_checks:
             probed = probe_concerns(
                 self.probes,
                 self._compute_discretisation_corrections(),
-                [
-                    each.experiment
-                    for each in self.solution.collocation.transcriptions
-                ],
+                [each.experiment for each in self.solution.collocation.transcriptions],
             )
             causes = cause_concerns(self.causes)
             meshes = mesh_resolution_concerns(self.problem, self.refinement)
@@ -310,9 +248,7 @@ class SolvedProblem:
                 )
             )
         interrupted = Concern(
-            "solve/interrupted",
-            "doubtful",
-            data={"left_out": self.omitted_checks},
+            "solve/interrupted", "doubtful", data={"left_out": self.omitted_checks}
         )
         return Assessment.from_concerns(
             (interrupted, *(of_fit if self.uncertainty is not None else ()))
@@ -345,13 +281,9 @@ class SolvedProblem:
         """
         collocation = self.solution.collocation
         q = self.solution.q
-        bodies = dict.fromkeys(
-            segment.body for segment in collocation.transcriptions
-        )
+        bodies = dict.fromkeys(transcription.body for transcription in collocation.transcriptions)
         known = (
-            field_estimates(
-                b, collocation.parameters, q=q, uncertainty=self.uncertainty
-            )
+            field_estimates(b, collocation.parameters, q=q, uncertainty=self.uncertainty)
             for b in bodies
         )
         return {field.name: field for each in known for field in each}
@@ -418,9 +350,7 @@ class SolvedProblem:
         try:
             pandas = import_module("pandas")
         except ImportError as error:
-            raise InputError(
-                "a data frame needs pandas: pip install pandas"
-            ) from error
+            raise InputError("a data frame needs pandas: pip install pandas") from error
         rows = {name: self._row(name) for name in self.estimates}
         return pandas.DataFrame.from_dict(rows, orient="index")
 
@@ -445,18 +375,10 @@ class SolvedProblem:
         }
 
     def _estimate(self, name: str) -> ReportedEstimate:
-        """Return the estimate with a name.
-
-        Raises
-        ------
-        InputError
-            For an unknown name, with the known ones.
-        """
+        """Return the estimate with a name."""
         if name not in self.estimates:
             known = list(self.estimates)
-            expected = (
-                f"expected one of {', '.join(known)}{hint_at(name, known)}"
-            )
+            expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
             raise InputError(f"no parameter {name!r}; {expected}")
         return self.estimates[name]
 
@@ -475,10 +397,7 @@ class SolvedProblem:
             *self.uncertainty.notes,
             *identifiability_sentences(self.uncertainty),
         )
-        return (
-            *dict.fromkeys(notes),
-            *(profile.message for profile in self.profiles),
-        )
+        return (*dict.fromkeys(notes), *(profile.message for profile in self.profiles))
 
 
 def _or_nan(value: float | None) -> float:
@@ -490,14 +409,8 @@ def _estimate_text(estimate: ReportedEstimate) -> str:
     """Return an estimate as text without its unit: the value, then " ± " and the combined standard
     uncertainty, and the combined interval in brackets, these two only if they are known.
     """
-    error = (
-        ""
-        if estimate.combined_std_error is None
-        else f" ± {estimate.combined_std_error:.2g}"
-    )
+    error = "" if estimate.combined_std_error is None else f" ± {estimate.combined_std_error:.2g}"
     interval = (
-        ""
-        if estimate.combined95 is None
-        else " [{:.5g}, {:.5g}]".format(*estimate.combined95)
+        "" if estimate.combined95 is None else " [{:.5g}, {:.5g}]".format(*estimate.combined95)
     )
     return f"{estimate.value:.5g}{error}{interval}"

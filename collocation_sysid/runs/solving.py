@@ -121,13 +121,8 @@ def solve(
             where="--scheduler",
         )
     with connect_executor(scheduler) as workers:
-        solve_once = partial(
-            _solve_once, solver=solver, watch=watch, workers=workers
-        )
-        if any(
-            not modes.has_phases()
-            for modes in problem.find_two_phase_fields().values()
-        ):
+        solve_once = partial(_solve_once, solver=solver, watch=watch, workers=workers)
+        if any(not modes.has_phases() for modes in problem.find_two_phase_fields().values()):
             return solve_two_phases(problem, start, solve_once=solve_once)
         solution = solve_once(problem, start)
         tried = [problem.collect_lengths_m()]
@@ -140,26 +135,14 @@ def solve(
         return solution
 
 
-def _likeliest_lengths(
-    problem: Problem, solution: Solution
-) -> dict[str, float] | None:
+def _likeliest_lengths(problem: Problem, solution: Solution) -> dict[str, float] | None:
     """Return the most likely of the correlation lengths [m] that the fields of a problem allow, by
     name of the field; None if there is no choice or the solution did not converge.
 
     The likelihood of each length follows to first order from the solution, see
     `statistics.field_estimates`.
-
-    Raises
-    ------
-    SimulationError
-        If the equations of motion are singular at the solution.
     """
-    fields = {
-        part.field
-        for body in problem.bodies
-        for part in body.parts
-        if part.field
-    }
+    fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     has_choice = any(len(field.field.lengths_m) > 1 for field in fields)
     if not has_choice or not solution.status.converged:
         return None
@@ -171,28 +154,18 @@ def _likeliest_lengths(
 
 
 def _solve_by_coarse_start(
-    problem: Problem,
-    solver: ReducedSpace,
-    watch: Watch | None,
-    workers: ExperimentExecutor | None,
+    problem: Problem, solver: ReducedSpace, watch: Watch | None, workers: ExperimentExecutor | None
 ) -> Solution | None:
     """Solve a problem with fixed correlation lengths on a coarser mesh first, and from there on its
     own; None if the method's options or the sizes of the bodies do not call for a coarse start.
 
     After an interrupt of the coarse solve its point is returned as an interrupted solution, see
     `interrupted_solution`. The arguments are those of `_solve_once`.
-
-    Raises
-    ------
-    NoCoarseStartError
-        If the coarse start is not possible or fails.
     """
     coarse_start = plan_coarse_start(problem, solver)
     if coarse_start is None:
         return None
-    coarse = _solve_on_coarse_mesh(
-        coarse_start, solver=solver, watch=watch, workers=workers
-    )
+    coarse = _solve_on_coarse_mesh(coarse_start, solver=solver, watch=watch, workers=workers)
     if coarse.status is Status.INTERRUPTED:
         return interrupted_solution(coarse_start, problem, coarse)
     if not coarse.status.converged:
@@ -222,11 +195,6 @@ def _solve_on_coarse_mesh(
     """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
     if it did not converge. The problem is `coarse_start.problem`, solved from its guesses or a
     scan; the other arguments are those of `_solve_once`.
-
-    Raises
-    ------
-    NoCoarseStartError
-        If no start is found on the coarser mesh, or the method refuses the problem there.
     """
     tolerance = max(solver.tolerance, COARSE_TOLERANCE)
     with search_activity(f"coarse start on {coarse_start.describe_size()}"):
@@ -256,28 +224,8 @@ def _solve_from_coarse(
 
     The result counts the iterations and evaluations on the given mesh only, but the times of both
     solves; the scan and its notes are those of the coarse solve.
-
-    Parameters
-    ----------
-    problem : Problem
-    coarse_start : CoarseStart
-    coarse : Solution
-        Converged solution of `coarse_start.problem`.
-    undetermined : sequence of str
-        Parameters that it does not determine, see `undetermined_names`.
-    solver, watch, workers
-        See `_solve_once`.
-
-    Raises
-    ------
-    NoCoarseStartError
-        If the search from there does not converge for another reason than a limit.
-    InputError
-        If the machine lacks memory.
     """
-    collocation = coarse_start.given_collocation(
-        problem, coarse, undetermined=undetermined
-    )
+    collocation = coarse_start.given_collocation(problem, coarse, undetermined=undetermined)
     try:
         require_memory(problem, collocation, method=solver)
     except InputError as error:
@@ -287,10 +235,7 @@ def _solve_from_coarse(
     tolerance = max(solver.tolerance, solver.coarse_start_tolerance)
     method = with_workers(replace(solver, tolerance=tolerance), workers)
     solution = solve_with_renewed_correspondences(
-        method,
-        collocation,
-        watch=watch,
-        start=coarse_start.variables(collocation, coarse),
+        method, collocation, watch=watch, start=coarse_start.variables(collocation, coarse)
     )
     if solution.status in FAILED_STATUSES:
         raise NoCoarseStartError(
@@ -326,64 +271,27 @@ def _solve_once(
     a start with thinned clouds of cameras. If the search from guesses fails, a scan follows;
     if it converges near ν = ½ in reduced space and without an earlier solution, a second start is
     tried.
-
-    Parameters
-    ----------
-    problem : Problem
-    start : str, Path, WarmStart or None
-        Earlier solution or its run folder; None for the guesses of the problem, or a scan if it
-        lacks some.
-    solver : Method
-        Method to use.
-    watch : callable or None
-        Called with every iteration.
-    workers : ExperimentExecutor or None
-        Workers for reduced space; None for this process.
-
-    Returns
-    -------
-    Solution
-        Also if the search failed: see its `status`. Its history, counts and times are those of the
-        search that gave it alone; a scan that gave the start is stored in `scan`, with a note.
-
-    Raises
-    ------
-    InputError
-        If the start is unsuitable or none is found, if the machine lacks memory, or if the method
-        refuses the problem.
     """
     notes: list[str] = []
     if start is None and isinstance(solver, ReducedSpace):
         try:
-            solution = _solve_by_coarse_start(
-                problem, solver, watch=watch, workers=workers
-            )
+            solution = _solve_by_coarse_start(problem, solver, watch=watch, workers=workers)
         except NoCoarseStartError as reason:
             solution = None
-            notes.append(
-                f"the search was not started on a coarser mesh: {reason}"
-            )
+            notes.append(f"the search was not started on a coarser mesh: {reason}")
         if solution is not None:
             return solution
         try:
-            solution = _solve_by_thinned_start(
-                problem, solver, watch=watch, workers=workers
-            )
+            solution = _solve_by_thinned_start(problem, solver, watch=watch, workers=workers)
         except NoThinnedStartError as reason:
-            notes.append(
-                f"the search was not started with fewer points: {reason}"
-            )
+            notes.append(f"the search was not started with fewer points: {reason}")
         if solution is not None:
             return replace(solution, notes=(*notes, *solution.notes))
-    warm_start = (
-        WarmStart.read(start) if isinstance(start, (str, Path)) else start
-    )
+    warm_start = WarmStart.read(start) if isinstance(start, (str, Path)) else start
     if warm_start is not None:
         problem = warm_start.apply_to_problem(problem)
     try:
-        collocation, scan, variables = _program_and_start(
-            problem, solver, warm_start=warm_start
-        )
+        collocation, scan, variables = _program_and_start(problem, solver, warm_start=warm_start)
         solver = with_workers(solver, workers)
         solution = None
         comparison = ""
@@ -415,11 +323,7 @@ def _solve_once(
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
-        raise InputError(
-            f"{solution.message} {reasons}".strip(),
-            problem.path,
-            where="solver",
-        )
+        raise InputError(f"{solution.message} {reasons}".strip(), problem.path, where="solver")
     if scan is not None:
         notes.append(scan.sentence)
     if comparison:
@@ -432,10 +336,7 @@ def _solve_once(
 
 
 def _solve_by_thinned_start(
-    problem: Problem,
-    solver: ReducedSpace,
-    watch: Watch | None,
-    workers: ExperimentExecutor | None,
+    problem: Problem, solver: ReducedSpace, watch: Watch | None, workers: ExperimentExecutor | None
 ) -> Solution | None:
     """Solve a problem with thinned clouds of its cameras first, and from there with all
     points; None if no cloud has many points.
@@ -443,13 +344,6 @@ def _solve_by_thinned_start(
     The result counts the sweeps with all points only, but the times of both searches. After an
     interrupt of the first its point is returned, see `interrupted_with_all_points`. The arguments
     are those of `_solve_once`.
-
-    Raises
-    ------
-    NoThinnedStartError
-        If one of the searches fails, or the thinned clouds do not determine all parameters.
-    InputError
-        If the machine lacks memory, or no start is found.
     """
     thinned = thinned_problem(problem)
     if thinned is None:
@@ -457,11 +351,7 @@ def _solve_by_thinned_start(
     tolerance = max(solver.tolerance, COARSE_TOLERANCE)
     with search_activity("search with fewer points"):
         rough = _solve_once(
-            thinned,
-            None,
-            solver=replace(solver, tolerance=tolerance),
-            watch=watch,
-            workers=workers,
+            thinned, None, solver=replace(solver, tolerance=tolerance), watch=watch, workers=workers
         )
     if rough.status is Status.INTERRUPTED:
         return interrupted_with_all_points(problem, rough)
@@ -497,31 +387,7 @@ def _solve_by_thinned_start(
 def _program_and_start(
     problem: Problem, solver: Method, warm_start: WarmStart | None
 ) -> tuple[Collocation, Scan | None, Array | None]:
-    """Return the nonlinear program of a problem with complete guesses, and the start of its search.
-
-    Parameters
-    ----------
-    problem : Problem
-        Problem to which the earlier solution has been applied.
-    solver : Method
-        Method of the search.
-    warm_start : WarmStart or None
-        Earlier solution.
-
-    Returns
-    -------
-    collocation : Collocation
-        Program; its measurements are associated at the guess if there was no scan.
-    scan : Scan or None
-        Scan from which the guesses are; None if the problem has them.
-    variables : (variables,) array or None
-        Variables simulated at an earlier solution.
-
-    Raises
-    ------
-    InputError
-        If no start is found, an experiment is invalid, or the machine lacks memory.
-    """
+    """Return the nonlinear program of a problem with complete guesses, and the start of its search."""
     collocation = problem.collocation()
     for experiment in collocation.experiments:
         for feature in FEATURES:
@@ -531,9 +397,7 @@ def _program_and_start(
     has_guesses = not collocation.parameters.list_names_without_guess()
     if has_guesses:
         require_memory(problem, collocation, method=solver)
-    collocation, scan = start_problem(
-        collocation, getattr(solver, "needs_complete_start", False)
-    )
+    collocation, scan = start_problem(collocation, getattr(solver, "needs_complete_start", False))
     if not has_guesses:  # the estimate evaluates the program at a guess
         require_memory(problem, collocation, method=solver)
     if scan is not None:
@@ -549,12 +413,7 @@ def _feature_notes(solution: Solution) -> list[str]:
     """Return the notes of all features on the fitted experiments of a solution, in their order;
     empty without any.
     """
-    return [
-        note
-        for part in solution.parts
-        for feature in FEATURES
-        for note in feature.notes(part)
-    ]
+    return [note for part in solution.parts for feature in FEATURES for note in feature.notes(part)]
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
@@ -570,57 +429,30 @@ def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
 def _solve_from_scan(
     solver: Method, failed: Solution, watch: Watch | None
 ) -> tuple[Scan | None, Solution]:
-    """Solve from the result of a scan after a search from the guess failed.
-
-    Parameters
-    ----------
-    solver : Method
-        Method to use.
-    failed : Solution
-        The failed search.
-    watch : callable or None
-        Called with every iteration.
-
-    Returns
-    -------
-    scan : Scan or None
-        None if the scan finds no start, or the search from there fails too.
-    solution : Solution
-        The new solution, also if it was interrupted, or the failed one; after an interrupt of the
-        scan the failed one, as interrupted. History, counts and times are those of one of the two
-        searches, not of both.
-    """
+    """Solve from the result of a scan after a search from the guess failed."""
     reason = f"the search from the guess failed ({failed.status.value})"
     needs_complete_start = getattr(solver, "needs_complete_start", False)
     try:
-        scan = rescue(
-            failed.collocation, reason, is_complete=needs_complete_start
-        )
+        scan = rescue(failed.collocation, reason, is_complete=needs_complete_start)
         if scan is None:
             return None, failed
-        again = associated_at_guess(
-            failed.collocation.with_parameters(scan.parameters)
-        )
-        solution = solve_with_renewed_correspondences(
-            solver, again, watch=watch
-        )
+        again = associated_at_guess(failed.collocation.with_parameters(scan.parameters))
+        solution = solve_with_renewed_correspondences(solver, again, watch=watch)
     except KeyboardInterrupt:
         return None, _as_interrupted(failed)
     ended = solution.status.converged or solution.status is Status.INTERRUPTED
     return (scan, solution) if ended else (None, failed)
 
 
-def best_of_second_start(
-    solver: Method, first: Solution, watch: Watch | None
-) -> Solution:
+def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -> Solution:
     """Return the better of a solution and of the solution from its `second_start`, with a note if
     that is the second one.
 
     The second is better if it converges with a χ² that is lower by more than `LEAST_GAIN`, an
-    absolute difference. If it is not, or there is no second start, `first` itself is returned; after
-    an interrupt of the second search a copy of it with the status and message of the interrupt. The
-    history, counts and times of the result are those of its own search alone. Exceptions of the
-    method are not caught.
+    absolute difference. If it is not, or there is no second start, `first` itself is returned;
+    after an interrupt of the second search a copy of it with the status and message of the
+    interrupt. The history, counts and times of the result are those of its own search alone.
+    Exceptions of the method are not caught.
 
     Parameters
     ----------
@@ -635,9 +467,7 @@ def best_of_second_start(
         other = second_start(first)
         if other is None:
             return first
-        again = associated_at_guess(
-            first.collocation.with_parameters(other.parameters)
-        )
+        again = associated_at_guess(first.collocation.with_parameters(other.parameters))
         second = solve_with_renewed_correspondences(solver, again, watch=watch)
     except KeyboardInterrupt:
         return _as_interrupted(first)
@@ -652,18 +482,11 @@ def best_of_second_start(
 
 def _as_interrupted(solution: Solution) -> Solution:
     """Return a copy of a solution whose further search was interrupted before an iterate."""
-    return replace(
-        solution,
-        status=Status.INTERRUPTED,
-        message=Status.INTERRUPTED.sentence,
-    )
+    return replace(solution, status=Status.INTERRUPTED, message=Status.INTERRUPTED.sentence)
 
 
 def solve_with_renewed_correspondences(
-    solver: Method,
-    collocation: Collocation,
-    watch: Watch | None,
-    start: Array | None = None,
+    solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
 ) -> Solution:
     """Solve, and repeat while estimates change the correspondences of the measurements.
 
@@ -691,7 +514,5 @@ def solve_with_renewed_correspondences(
         collocation, moved = solution.collocation.follow_estimates(p, positions)
         if collocation is solution.collocation:
             break
-        solution = solver(
-            collocation, watch, collocation.pack(moved, positions)
-        )
+        solution = solver(collocation, watch, collocation.pack(moved, positions))
     return solution

@@ -39,9 +39,7 @@ def thinned_problem(problem: Problem) -> Problem | None:
     one. The problem is not modified.
     """
     experiments = [
-        each
-        if each.validation
-        else thinned_experiment(each, many=MANY_POINTS, most=THINNED_POINTS)
+        each if each.validation else thinned_experiment(each, many=MANY_POINTS, most=THINNED_POINTS)
         for each in problem.experiments
     ]
     pairs = zip(experiments, problem.experiments, strict=True)
@@ -65,9 +63,7 @@ def require_determined(thinned: Solution) -> None:
         )
 
 
-def collocation_with_all_points(
-    problem: Problem, thinned: Solution
-) -> Collocation:
+def collocation_with_all_points(problem: Problem, thinned: Solution) -> Collocation:
     """Return the program of a problem with the parameters, places and clocks of a solution with
     thinned clouds, and the correspondences of all points with its shapes.
 
@@ -84,25 +80,19 @@ def collocation_with_all_points(
     given = {each.name: each for each in problem.experiments}
     associations = {}
     for iterate in program.iterates(thinned.z):
-        segment = iterate.segment
-        name = segment.experiment.name
+        transcription = iterate.transcription
+        name = transcription.experiment.name
         correspondences = tuple(
             residual.correspondences_of(measured, iterate.x, phi=iterate.phi)
             for residual, measured in zip(
-                segment.reassociable, declared_points(given[name]), strict=True
+                transcription.reassociable, declared_points(given[name]), strict=True
             )
         )
-        associations[name] = replace(
-            segment.association, correspondences=correspondences
-        )
-    return replace(
-        program, experiments=problem.experiments, associations=associations
-    )
+        associations[name] = replace(transcription.association, correspondences=correspondences)
+    return replace(program, experiments=problem.experiments, associations=associations)
 
 
-def interrupted_with_all_points(
-    problem: Problem, thinned: Solution
-) -> Solution:
+def interrupted_with_all_points(problem: Problem, thinned: Solution) -> Solution:
     """Return the present point of an interrupted search with thinned clouds as an interrupted
     solution of the given problem; its history has one entry, the evaluation at that point.
 
@@ -129,10 +119,7 @@ def interrupted_with_all_points(
         "not fit all points best"
     )
     return replace(
-        solution,
-        notes=(note,),
-        scan=thinned.scan,
-        timing=solution.timing + thinned.timing,
+        solution, notes=(note,), scan=thinned.scan, timing=solution.timing + thinned.timing
     )
 
 
@@ -140,8 +127,8 @@ def point_counts(collocation: Collocation) -> str:
     """Return the number of unlabelled points of all fitted experiments, in words."""
     sensors = [
         sensor
-        for segment in collocation.transcriptions
-        for sensor in segment.experiment.separate_sensors
+        for transcription in collocation.transcriptions
+        for sensor in transcription.experiment.separate_sensors
         if sensor.point_counts
     ]
     count = sum(sum(sensor.point_counts) for sensor in sensors)

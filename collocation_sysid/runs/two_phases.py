@@ -21,27 +21,15 @@ from ..common.array_types import Array
 from ..errors import InputError, SimulationError
 from ..fem.body import Body
 from ..fem.laws.constants import CONTRAST, field_coefficient
-from ..fem.two_phase import (
-    ElementLogarithms,
-    PhaseSamples,
-    TwoPhaseModes,
-)
+from ..fem.two_phase import ElementLogarithms, PhaseSamples, TwoPhaseModes
 from ..methods.solution import Solution
 from ..problem import Problem
 from ..program.association import Association
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
 from ..statistics.field_estimates import mean_logarithm
-from ..statistics.linearised import (
-    LinearisedFit,
-    factorise_information,
-    linearise_fit,
-)
-from ..statistics.phase_sampling import (
-    USUAL,
-    InternalFaces,
-    initial_phases,
-)
+from ..statistics.linearised import LinearisedFit, factorise_information, linearise_fit
+from ..statistics.phase_sampling import USUAL, InternalFaces, initial_phases
 from .phase_posterior import (
     FEWEST_SIMULATED,
     FIRST_EXPONENT,
@@ -116,9 +104,7 @@ class _SmoothFitQuality:
         """Return the temperature T of `statistics.phase_sampling` for a fit with phases of this χ²:
         its excess over the smooth fit per determined parameter, at least one.
         """
-        return max(
-            1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined)
-        )
+        return max(1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined))
 
 
 def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
@@ -133,9 +119,7 @@ def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
 
 
 def solve_two_phases(
-    problem: Problem,
-    start: str | Path | WarmStart | None,
-    solve_once: SolveOnce,
+    problem: Problem, start: str | Path | WarmStart | None, solve_once: SolveOnce
 ) -> Solution:
     """Solve a problem with a two-phase field; the body of the solution has the phases and their
     samples.
@@ -162,16 +146,11 @@ def solve_two_phases(
         If the equations of motion are singular at a solution.
     """
     search = _two_phase_search(problem)
-    solution = solve_once(
-        problem.with_fields({search.name: search.modes.to_smooth_field()}),
-        start,
-    )
+    solution = solve_once(problem.with_fields({search.name: search.modes.to_smooth_field()}), start)
     if not solution.status.converged:
         return solution
     smooth = _smooth_fit(linearise_fit(solution.collocation, solution.z))
-    sampled = _sample_posterior(
-        problem, search, solution=solution, smooth=smooth
-    )
+    sampled = _sample_posterior(problem, search, solution=solution, smooth=smooth)
     phase = _representative_phases(
         sampled.posterior.draws.compute_probability(), search.modes.volumes_m3
     )
@@ -215,36 +194,16 @@ class _SampledPosterior:
 
 
 def _sample_posterior(
-    problem: Problem,
-    search: _PhaseSearch,
-    solution: Solution,
-    smooth: _SmoothFitQuality,
+    problem: Problem, search: _PhaseSearch, solution: Solution, smooth: _SmoothFitQuality
 ) -> _SampledPosterior:
     """Sample the posterior of phases and parameters, from the solution with a smooth field on.
 
     Each round linearises the measurements, samples, simulates a sample of each chain, and samples
     again with the linearised measurements corrected by these simulations.
-
-    Parameters
-    ----------
-    problem : Problem
-    search : _PhaseSearch
-        Its two-phase field.
-    solution : Solution
-        Solution with the smooth field.
-    smooth : _SmoothFitQuality
-        Quality of this solution, for the lack of fit.
-
-    Raises
-    ------
-    SimulationError
-        If the equations of motion are singular at the solution.
     """
     in_logarithms = _linearise_at(problem, search, solution=solution)
     phases = initial_phases(
-        in_logarithms.information(),
-        in_logarithms.faces,
-        volumes_m3=search.modes.volumes_m3,
+        in_logarithms.information(), in_logarithms.faces, volumes_m3=search.modes.volumes_m3
     )
     surrogate = replace(in_logarithms, exponent=FIRST_EXPONENT)
     least_chi_squared = np.inf
@@ -252,13 +211,9 @@ def _sample_posterior(
     rounds = 0
     while True:
         rounds += 1
-        draft = PhasePosterior.sample(
-            surrogate, phases, settings=USUAL, seed=2 * rounds
-        )
+        draft = PhasePosterior.sample(surrogate, phases, settings=USUAL, seed=2 * rounds)
         simulated = draft.simulate()
-        least_chi_squared = min(
-            least_chi_squared, simulated.find_least_chi_squared()
-        )
+        least_chi_squared = min(least_chi_squared, simulated.find_least_chi_squared())
         posterior = PhasePosterior.sample(
             simulated.corrected_surrogate(),
             draft.select_last_phases(),
@@ -267,13 +222,9 @@ def _sample_posterior(
         )
         phases = posterior.select_last_phases()
         mean = posterior.contrasts.mean()
-        change = abs(mean - last_mean) / max(
-            posterior.contrasts.std(), GIVEN_DEVIATION
-        )
+        change = abs(mean - last_mean) / max(posterior.contrasts.std(), GIVEN_DEVIATION)
         last_mean = mean
-        if rounds >= MOST_ROUNDS or (
-            rounds >= FEWEST_ROUNDS and change < SETTLED_DEVIATIONS
-        ):
+        if rounds >= MOST_ROUNDS or (rounds >= FEWEST_ROUNDS and change < SETTLED_DEVIATIONS):
             break
         try:
             surrogate = _linearise_at_mean(problem, search, posterior)
@@ -290,29 +241,17 @@ def _sample_posterior(
             seed=2 * rounds + 2,
             temperature=temperature,
         )
-    return _SampledPosterior(
-        posterior, temperature, rounds, simulated=len(simulated.p)
-    )
+    return _SampledPosterior(posterior, temperature, rounds, simulated=len(simulated.p))
 
 
 def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
     """Return the body, among those of a solution, that has the two-phase field of `search`."""
-    segments = solution.collocation.transcriptions
-    return next(
-        s.body
-        for s in segments
-        if search.name in s.body.collect_field_lengths_m()
-    )
+    transcriptions = solution.collocation.transcriptions
+    return next(s.body for s in transcriptions if search.name in s.body.collect_field_lengths_m())
 
 
 def _two_phase_search(problem: Problem) -> _PhaseSearch:
-    """Return the two-phase field of a problem, of which there is at least one.
-
-    Raises
-    ------
-    InputError
-        For several fields, or too many elements.
-    """
+    """Return the two-phase field of a problem, of which there is at least one."""
     fields = problem.find_two_phase_fields()
     if len(fields) > 1:
         raise InputError(
@@ -325,23 +264,12 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
             f"the two-phase field of {name} has {len(modes.phase)} elements; expected at most "
             f"{MOST_ELEMENTS}: use a coarser mesh, or a region around the inclusion"
         )
-    parts = next(
-        body.parts
-        for body in problem.bodies
-        if name in body.collect_field_lengths_m()
-    )
+    parts = next(body.parts for body in problem.bodies if name in body.collect_field_lengths_m())
     number = next(k for k, part in enumerate(parts) if part.field_name == name)
     part = parts[number]
-    elements = tuple(
-        part.full_name(field_coefficient(k).name)
-        for k in range(len(modes.phase))
-    )
+    elements = tuple(part.full_name(field_coefficient(k).name) for k in range(len(modes.phase)))
     return _PhaseSearch(
-        name,
-        part.full_name(CONTRAST.name),
-        modes=modes,
-        number=number,
-        elements=elements,
+        name, part.full_name(CONTRAST.name), modes=modes, number=number, elements=elements
     )
 
 
@@ -363,26 +291,9 @@ def _representative_phases(probability: Array, volumes_m3: Array) -> Array:
     return phase
 
 
-def _linearise_at(
-    problem: Problem,
-    search: _PhaseSearch,
-    solution: Solution,
-) -> ElementSurrogate:
+def _linearise_at(problem: Problem, search: _PhaseSearch, solution: Solution) -> ElementSurrogate:
     """Return the measurements linearised at a solution by the logarithm of the constant in every
     element, instead of the shapes of the field.
-
-    Parameters
-    ----------
-    problem : Problem
-        Problem with the two-phase field `search`.
-    search : _PhaseSearch
-    solution : Solution
-        Solution with a smooth field or with phases.
-
-    Raises
-    ------
-    SimulationError
-        If the equations of motion are singular at a solution.
     """
     solved = solution.collocation
     body = _two_phase_body(solution, search)
@@ -390,18 +301,13 @@ def _linearise_at(
     assert part.field is not None
     theta = body.theta_from_values(solution.parameters)
     base = part.field.logarithms(theta[body.field_slices[search.number]])
-    collocation = _collocation_with_elements(
-        problem, search, collocation=solved, base=base
-    )
+    collocation = _collocation_with_elements(problem, search, collocation=solved, base=base)
     p, positions = solved.unpack(solution.z)
-    values = dict(
-        zip((item.name for item in solved.parameters.free), p, strict=False)
-    )
+    values = dict(zip((item.name for item in solved.parameters.free), p, strict=False))
     # Shapes of a smooth field have the names of elements.
     elements = set(search.elements)
     q = [
-        0.0 if item.name in elements else values[item.name]
-        for item in collocation.parameters.free
+        0.0 if item.name in elements else values[item.name] for item in collocation.parameters.free
     ]
     return ElementSurrogate.linearise(
         collocation,
@@ -418,21 +324,13 @@ def _linearise_at(
 def _linearise_at_mean(
     problem: Problem, search: _PhaseSearch, posterior: PhasePosterior
 ) -> ElementSurrogate:
-    """Return the measurements linearised at the mean of samples, with the exponent of these.
-
-    Raises
-    ------
-    SimulationError
-        If the body cannot be simulated there.
-    """
+    """Return the measurements linearised at the mean of samples, with the exponent of these."""
     before = posterior.surrogate
     base = posterior.compute_mean_logarithms()
     p = before.p.copy()
     p[before.other_columns] += posterior.mean_changes.mean(axis=0)
     return ElementSurrogate.linearise(
-        _collocation_with_elements(
-            problem, search, collocation=before.collocation, base=base
-        ),
+        _collocation_with_elements(problem, search, collocation=before.collocation, base=base),
         p,
         element_names=search.elements,
         base=base,
@@ -444,10 +342,7 @@ def _linearise_at_mean(
 
 
 def _collocation_with_elements(
-    problem: Problem,
-    search: _PhaseSearch,
-    collocation: Collocation,
-    base: Array,
+    problem: Problem, search: _PhaseSearch, collocation: Collocation, base: Array
 ) -> Collocation:
     """Return the program of a problem with the logarithm of each element as a parameter, relative
     to `base` (E,), with the associations of a program that has been solved.
@@ -466,11 +361,7 @@ def _contrast_prior(problem: Problem, search: _PhaseSearch) -> ContrastPrior:
     """Return the prior of the logarithm of the contrast: that of the field, or that of the user, or
     the value that the user has fixed.
     """
-    (item,) = (
-        item
-        for item in problem.parameters.scalars
-        if item.name == search.contrast
-    )
+    (item,) = (item for item in problem.parameters.scalars if item.name == search.contrast)
     if item.is_fixed:
         assert item.guess is not None
         return ContrastPrior(float(np.log(item.guess)), GIVEN_DEVIATION)
@@ -480,25 +371,8 @@ def _contrast_prior(problem: Problem, search: _PhaseSearch) -> ContrastPrior:
     return ContrastPrior(0.0, search.modes.field.deviation)
 
 
-def _samples(
-    sampled: _SampledPosterior, search: _PhaseSearch, solution: Solution
-) -> PhaseSamples:
-    """Return samples of the logarithms in the elements of the part with the field.
-
-    Parameters
-    ----------
-    sampled : _SampledPosterior
-        Samples of phases, contrasts and parameters.
-    search : _PhaseSearch
-        The two-phase field.
-    solution : Solution
-        Solution whose estimates the second moments of the samples refer to.
-
-    Returns
-    -------
-    PhaseSamples
-        `smooth_misfit` is NaN: the caller sets it.
-    """
+def _samples(sampled: _SampledPosterior, search: _PhaseSearch, solution: Solution) -> PhaseSamples:
+    """Return samples of the logarithms in the elements of the part with the field."""
     posterior = sampled.posterior
     surrogate = posterior.surrogate
     others = surrogate.other_columns
@@ -520,8 +394,7 @@ def _samples(
     departures = np.column_stack(
         [
             shift + posterior.mean_changes[:, is_shared],
-            posterior.mean_contrasts
-            - np.log(_contrast_of_solution(solution, search)),
+            posterior.mean_contrasts - np.log(_contrast_of_solution(solution, search)),
         ]
     )
     fit = linearise_fit(solution.collocation, solution.z)
@@ -558,9 +431,7 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
     """
     collocation = solution.collocation
     bodies: dict[int, Body] = {}
-    for body in dict.fromkeys(
-        segment.body for segment in collocation.transcriptions
-    ):
+    for body in dict.fromkeys(transcription.body for transcription in collocation.transcriptions):
         fields = {
             part.field_name: replace(part.field, samples=samples)
             for part in body.parts
@@ -568,15 +439,12 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
         }
         bodies[id(body)] = body.with_fields(fields)
     experiments = [
-        replace(each, body=bodies.get(id(each.body), each.body))
-        for each in collocation.experiments
+        replace(each, body=bodies.get(id(each.body), each.body)) for each in collocation.experiments
     ]
-    charts = _associations(collocation, experiments)
+    associations = _associations(collocation, experiments)
     return replace(
         solution,
-        collocation=replace(
-            collocation, experiments=experiments, associations=charts
-        ),
+        collocation=replace(collocation, experiments=experiments, associations=associations),
     )
 
 
@@ -591,8 +459,8 @@ def _associations(
     """
     bodies = {experiment.name: experiment.body for experiment in experiments}
     return {
-        segment.experiment.name: segment.association.on_body(
-            bodies[segment.experiment.name]
+        transcription.experiment.name: transcription.association.on_body(
+            bodies[transcription.experiment.name]
         )
-        for segment in collocation.transcriptions
+        for transcription in collocation.transcriptions
     }

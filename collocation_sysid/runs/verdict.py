@@ -90,8 +90,8 @@ def solution_concerns(
     yield from allowance_concerns(solution)
     yield from outlier_share_concerns(diagnoses)
     for part in solution.parts:
-        nuisance = part.segment.nuisance
-        low, high = nuisance.bounds(part.segment.association.clock_samples)
+        nuisance = part.transcription.nuisance
+        low, high = nuisance.bounds(part.transcription.association.clock_samples)
         # Zero is a plausible value of a lag or a tool's mass, although it is a bound.
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(
@@ -99,19 +99,15 @@ def solution_concerns(
             part.phi,
             low=low,
             high=high,
-            is_specimen=part.segment.experiment.specimen is not None,
+            is_specimen=part.transcription.experiment.specimen is not None,
         )
         for feature in FEATURES:
             yield from feature.part_concerns(part)
         for k in nuisance.indices_of_rows(TIME):
             scale = float(nuisance.scales[k])
-            name = part.segment.experiment.name
-            yield from clock_concerns(
-                name, float(part.phi[k]) * scale, prior_s=scale
-            )
-    yield from stability_concerns(
-        find_instabilities(solution.collocation, solution.z)
-    )
+            name = part.transcription.experiment.name
+            yield from clock_concerns(name, float(part.phi[k]) * scale, prior_s=scale)
+    yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
     yield from strain_stability_concerns(solution.parts)
     for feature in FEATURES:
         yield from feature.concerns(solution.parts)
@@ -122,24 +118,18 @@ def solution_concerns(
             for feature in FEATURES:
                 yield from feature.simulation_concerns(name, rollout.error)
         yield from _forward_concerns(
-            name,
-            rollout,
-            solution=solution,
-            noise_m=expected_rms_m(solution, uncertainty),
+            name, rollout, solution=solution, noise_m=expected_rms_m(solution, uncertainty)
         )
     collocation = solution.collocation
-    for segment in collocation.transcriptions:
+    for transcription in collocation.transcriptions:
         yield from rotation_step_concerns(
-            segment.experiment,
+            transcription.experiment,
             collocation.substeps,
             limit_rad=DOUBTFUL_ANGLE_RAD,
             code="scheme/turn",
         )
     for motion in motions:
-        if (
-            motion.first_mode is not None
-            and motion.first_mode.damping_ratio < 1
-        ):
+        if motion.first_mode is not None and motion.first_mode.damping_ratio < 1:
             yield from scheme_concerns(
                 motion.experiment,
                 motion.first_mode.damping_ratio,
@@ -170,9 +160,7 @@ def combined_concerns(
         out.
     """
     return [
-        _undetermined_concern(
-            item.name, estimates[item.name], shares=shares[item.name]
-        )
+        _undetermined_concern(item.name, estimates[item.name], shares=shares[item.name])
         for item in parameters.free
         if item.name in shares
         and estimates[item.name].statistical_std_error is not None
@@ -188,18 +176,8 @@ def _undetermined_concern(
     """
     source, share = next(iter(shares.items()))
     low, high = estimate.combined95 or (np.nan, np.nan)
-    data = {
-        "name": name,
-        "low": low,
-        "high": high,
-        "source": source_label(source),
-        "share": share,
-    }
-    return Concern(
-        "information/combined",
-        "check",
-        data={**data, "remedy": remedy_for(source)},
-    )
+    data = {"name": name, "low": low, "high": high, "source": source_label(source), "share": share}
+    return Concern("information/combined", "check", data={**data, "remedy": remedy_for(source)})
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
@@ -208,22 +186,16 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
     doubtful.
     """
     for body in dict.fromkeys(
-        segment.body for segment in solution.collocation.transcriptions
+        transcription.body for transcription in solution.collocation.transcriptions
     ):
         odd = size_and_density_hypotheses(body) or [
-            material_hypothesis(
-                body, body.theta_from_values(solution.parameters)
-            )
+            material_hypothesis(body, body.theta_from_values(solution.parameters))
         ]
-        yield from (
-            each.concern("doubtful") for each in odd if each is not None
-        )
+        yield from (each.concern("doubtful") for each in odd if each is not None)
     experiments = [
-        segment.experiment for segment in solution.collocation.transcriptions
+        transcription.experiment for transcription in solution.collocation.transcriptions
     ]
-    yield from scale_concerns(
-        experiments, solution.collocation.parameters, grade="doubtful"
-    )
+    yield from scale_concerns(experiments, solution.collocation.parameters, grade="doubtful")
 
 
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
@@ -233,88 +205,53 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
     In motions the autocorrelation of the residuals shows this; static experiments have none.
     """
     for experiment in (
-        segment.experiment for segment in solution.collocation.transcriptions
+        transcription.experiment for transcription in solution.collocation.transcriptions
     ):
         if not experiment.is_static or not experiment.markers.count_samples():
             continue
         sigma_m = float(np.max(experiment.markers.sigma_m))
         share = sigma_m / float(np.ptp(experiment.body.nodes_m, axis=0).max())
         if share > LARGEST_CAMERA_NOISE:
-            yield Concern(
-                "noise/allowance",
-                data={"sigma_mm": 1e3 * sigma_m, "share": share},
-            )
+            yield Concern("noise/allowance", data={"sigma_mm": 1e3 * sigma_m, "share": share})
 
 
-def _prediction_concerns(
-    rollouts: Mapping[str, ForwardSimulation | str],
-) -> Iterator[Concern]:
+def _prediction_concerns(rollouts: Mapping[str, ForwardSimulation | str]) -> Iterator[Concern]:
     """Yield concerns about forward simulations that differ from the measurements by more than the
     noise; failed simulations, given by their reason, are ignored. `rollouts` are by name of the
     experiment.
     """
     for name, rollout in rollouts.items():
-        for misfit in (
-            rollout.misfits if isinstance(rollout, ForwardSimulation) else ()
-        ):
+        for misfit in rollout.misfits if isinstance(rollout, ForwardSimulation) else ():
             yield from prediction_concerns(name, **vars(misfit))
 
 
 def _forward_concerns(
-    name: str,
-    rollout: ForwardSimulation | str,
-    solution: Solution,
-    noise_m: float,
+    name: str, rollout: ForwardSimulation | str, solution: Solution, noise_m: float
 ) -> list[Concern]:
     """Return concerns about the forward simulation of an experiment: that it failed, or that its
     errors are larger than the noise and the residuals of the fit.
 
     Other measurements than markers are compared only for experiments that were not fitted, and only
     if their markers give no concern.
-
-    Parameters
-    ----------
-    name : str
-        Name of the experiment.
-    rollout : ForwardSimulation or str
-        Forward simulation, or why there is none.
-    solution : Solution
-        Solution with the residuals of the fit.
-    noise_m : float
-        Expected RMS distance of the markers by their noise [m].
     """
     fit_rms_m = solution.rms_by_experiment_m
     if not isinstance(rollout, ForwardSimulation):
-        return [
-            Concern(
-                "roll-out/failed",
-                "doubtful",
-                data={"experiment": name, "why": rollout},
-            )
-        ]
+        return [Concern("roll-out/failed", "doubtful", data={"experiment": name, "why": rollout})]
     fitted = name in fit_rms_m
     fit_m = fit_rms_m.get(name, solution.rms_m)
     of_markers = forward_simulation_concerns(
-        name,
-        rollout.rms_m,
-        fit_rms_m=fit_m,
-        noise_rms_m=noise_m,
-        is_fitted=fitted,
+        name, rollout.rms_m, fit_rms_m=fit_m, noise_rms_m=noise_m, is_fitted=fitted
     )
     if fitted or of_markers:
         return of_markers
     return [
         concern
         for feature in FEATURES
-        for concern in feature.validation_concerns(
-            name, rollout.error, solution
-        )
+        for concern in feature.validation_concerns(name, rollout.error, solution)
     ]
 
 
-def expected_rms_m(
-    solution: Solution, uncertainty: Uncertainty | None
-) -> float:
+def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:
     """Return the RMS distance [m] of the fitted markers that is expected from noise with the stated
     σ, less what the fitted parameters absorb; 0 without markers.
 
@@ -325,27 +262,16 @@ def expected_rms_m(
         Its degrees of freedom say how much the parameters absorb; for None they absorb nothing.
     """
     markers = [
-        segment.experiment.markers
-        for segment in solution.collocation.transcriptions
+        transcription.experiment.markers for transcription in solution.collocation.transcriptions
     ]
-    samples = np.concatenate(
-        [each.is_present.sum(axis=0) for each in markers]
-    ).astype(float)
+    samples = np.concatenate([each.is_present.sum(axis=0) for each in markers]).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
     measured = solution.collocation.count_measurements()
-    fitted = (
-        0.0
-        if uncertainty is None
-        else measured - uncertainty.degrees_of_freedom
-    )
-    return rms_expected_from_noise_m(
-        sigma_m, samples, parameter_count=float(fitted)
-    )
+    fitted = 0.0 if uncertainty is None else measured - uncertainty.degrees_of_freedom
+    return rms_expected_from_noise_m(sigma_m, samples, parameter_count=float(fitted))
 
 
-def modes_by_experiment(
-    problem: Problem, solution: Solution
-) -> dict[str, ModesCheck]:
+def modes_by_experiment(problem: Problem, solution: Solution) -> dict[str, ModesCheck]:
     """Return the natural modes of each body at the estimates of `solution`, by name of the
     experiment; empty if the search failed.
 
@@ -357,19 +283,12 @@ def modes_by_experiment(
     motions = {}
     substeps = solution.collocation.substeps
     scheme = as_scheme(solution.collocation.scheme)
-    moving = [
-        experiment
-        for experiment in problem.experiments
-        if not experiment.is_static
-    ]
+    moving = [experiment for experiment in problem.experiments if not experiment.is_static]
     for experiment in moving if solution.status.converged else ():
         theta = experiment.body.theta_from_values(solution.parameters)
         try:
             motions[experiment.name] = check_modes(
-                experiment,
-                scheme,
-                step_s=experiment.timestep_s / substeps,
-                theta=theta,
+                experiment, scheme, step_s=experiment.timestep_s / substeps, theta=theta
             )
         except SimulationError:
             continue

@@ -54,9 +54,7 @@ class WarmStart:
         InputError
             If the folder is no run folder, or damaged, or a value is not finite.
         """
-        return cls.from_result(
-            Result.read(folder, "the folder of an earlier run"), Path(folder)
-        )
+        return cls.from_result(Result.read(folder, "the folder of an earlier run"), Path(folder))
 
     @classmethod
     def from_result(cls, result: Result, folder: Path) -> WarmStart:
@@ -82,32 +80,18 @@ class WarmStart:
             for name, each in named.items()
         }
         places_m = {
-            experiment: {
-                name: place.position_m for name, place in named.items()
-            }
+            experiment: {name: place.position_m for name, place in named.items()}
             for experiment, named in result.places.items()
         }
-        points = np.array(
-            [place for named in places_m.values() for place in named.values()]
-        )
-        with damage_refused(
-            folder, RESULT_FILE, remedy="solve that problem again"
-        ):
+        points = np.array([place for named in places_m.values() for place in named.values()])
+        with damage_refused(folder, RESULT_FILE, remedy="solve that problem again"):
             all_values = np.array(
-                [
-                    *values.values(),
-                    *nuisance.values(),
-                    *points.reshape(-1, 3).flat,
-                ]
+                [*values.values(), *nuisance.values(), *points.reshape(-1, 3).flat]
             )
             if not np.isfinite(all_values).all():
                 raise ValueError("a value that is not finite")
         return cls(
-            folder,
-            values,
-            nuisance=nuisance,
-            places_m=places_m,
-            substeps=result.problem.substeps,
+            folder, values, nuisance=nuisance, places_m=places_m, substeps=result.problem.substeps
         )
 
     @classmethod
@@ -119,24 +103,18 @@ class WarmStart:
         nuisance = {}
         places_m = {}
         for part in solution.parts:
-            segment = part.segment
-            name = segment.experiment.name
+            transcription = part.transcription
+            name = transcription.experiment.name
             nuisance |= {
                 f"{name}: {e.label}": v
-                for e, _, v in segment.nuisance.iterate_values(part.phi)
+                for e, _, v in transcription.nuisance.iterate_values(part.phi)
             }
-            markers = segment.experiment.markers.names
-            places = segment.marker_places_m(part.phi)
-            places_m[segment.experiment.name] = dict(
-                zip(markers, places, strict=True)
-            )
+            markers = transcription.experiment.markers.names
+            places = transcription.marker_places_m(part.phi)
+            places_m[transcription.experiment.name] = dict(zip(markers, places, strict=True))
         values = parameter_values(collocation, solution.q)
         return cls(
-            Path(),
-            values,
-            nuisance=nuisance,
-            places_m=places_m,
-            substeps=collocation.substeps,
+            Path(), values, nuisance=nuisance, places_m=places_m, substeps=collocation.substeps
         )
 
     def apply_to_problem(self, problem: Problem) -> Problem:
@@ -148,18 +126,14 @@ class WarmStart:
             If no estimated parameter has a name among the values.
         """
         free = problem.parameters.free
-        known = {
-            i.name: self.values[i.name] for i in free if i.name in self.values
-        }
+        known = {i.name: self.values[i.name] for i in free if i.name in self.values}
         if not known:
             raise InputError(
                 f"found the parameters {', '.join(self.values)}; expected at least one of those that are "
                 f"estimated, {', '.join(i.name for i in problem.parameters.free_scalars)}",
                 self.folder / RESULT_FILE,
             )
-        return replace(
-            problem, parameters=problem.parameters.with_estimates(known)
-        )
+        return replace(problem, parameters=problem.parameters.with_estimates(known))
 
     def apply_to_places(self, collocation: Collocation) -> Collocation:
         """Return the discretised problem in which markers whose place is estimated start at the
@@ -167,23 +141,21 @@ class WarmStart:
         there; the given problem is not modified.
         """
         places_m = []
-        for segment in collocation.transcriptions:
-            here = segment.marker_places_m(segment.compute_guess_phi())
-            for m, place in self._known_places(segment).items():
+        for transcription in collocation.transcriptions:
+            here = transcription.marker_places_m(transcription.compute_guess_phi())
+            for m, place in self._known_places(transcription).items():
                 here[m] = place
             places_m.append(here)
         return collocation.with_marker_places(places_m)
 
-    def _known_places(self, segment: Transcription) -> dict[int, Array]:
-        """Return the earlier place (3,) [m] of each marker whose place is estimated in a segment,
-        by index of the marker; markers without an earlier place are left out.
+    def _known_places(self, transcription: Transcription) -> dict[int, Array]:
+        """Return the earlier place (3,) [m] of each marker whose place is estimated in a
+        transcription, by index of the marker; markers without an earlier place are left out.
         """
-        places_m = self.places_m.get(segment.experiment.name, {})
-        names = segment.experiment.markers.names
-        estimated = segment.association.markers.estimated.tolist()
-        return {
-            m: places_m[names[m]] for m in estimated if names[m] in places_m
-        }
+        places_m = self.places_m.get(transcription.experiment.name, {})
+        names = transcription.experiment.markers.names
+        estimated = transcription.association.markers.estimated.tolist()
+        return {m: places_m[names[m]] for m in estimated if names[m] in places_m}
 
     def apply_to_nuisance(self, collocation: Collocation) -> tuple[Array, int]:
         """Return p (np,), the guesses of parameters and nuisance parameters in the solver's
@@ -196,13 +168,11 @@ class WarmStart:
         """
         p = collocation.guess_p
         matches = 0
-        for segment in collocation.transcriptions:
+        for transcription in collocation.transcriptions:
             for place, entry in zip(
-                segment.nuisance_indices.indices,
-                segment.nuisance.entries,
-                strict=True,
+                transcription.nuisance_indices.indices, transcription.nuisance.entries, strict=True
             ):
-                name = f"{segment.experiment.name}: {entry.label}"
+                name = f"{transcription.experiment.name}: {entry.label}"
                 if name in self.nuisance:
                     p[place] = self.nuisance[name] / entry.sigma
                     matches += 1
@@ -218,8 +188,7 @@ class WarmStart:
         """
         p, matches = self.apply_to_nuisance(collocation)
         matches += sum(
-            len(self._known_places(segment))
-            for segment in collocation.transcriptions
+            len(self._known_places(transcription)) for transcription in collocation.transcriptions
         )
         if not matches:
             return None

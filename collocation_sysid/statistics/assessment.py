@@ -27,12 +27,7 @@ from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name
 from .misspecification.misspecification_hypothesis import Hypothesis
-from .probes.relaxed_assumptions import (
-    DRIFT,
-    MEMORY,
-    Probe,
-    assumption_name,
-)
+from .probes.relaxed_assumptions import DRIFT, MEMORY, Probe, assumption_name
 from .probes.routine_probes import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import PERSISTENT
 from .residuals.noise_level import NoiseLevel
@@ -132,13 +127,8 @@ class Assessment:
 
         Of several concerns with the same message the first is kept, whatever its grade and code.
         """
-        by_message = {
-            concern.message: concern for concern in reversed([*concerns])
-        }
-        gravest = sorted(
-            reversed(by_message.values()),
-            key=lambda each: each.grade == "check",
-        )
+        by_message = {concern.message: concern for concern in reversed([*concerns])}
+        gravest = sorted(reversed(by_message.values()), key=lambda each: each.grade == "check")
         return cls(tuple(gravest))
 
     @property
@@ -159,9 +149,7 @@ class Assessment:
         """Return the assessment with the concerns of both, by `from_concerns`; those of the graver
         one come first within each grade, and of equal verdicts those of `self`.
         """
-        light, grave = sorted(
-            (other, self), key=lambda t: get_args(Verdict).index(t.verdict)
-        )
+        light, grave = sorted((other, self), key=lambda t: get_args(Verdict).index(t.verdict))
         return Assessment.from_concerns((*grave.concerns, *light.concerns))
 
 
@@ -205,8 +193,8 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     shared = dependence.shared_p < RARE
     is_used = uncertainty.errors == "autocorrelated" and (persistent or shared)
     larger = factor > MISFIT and level.larger_p < RARE
-    # Of single samples nothing tells that it is noise; of a few, only a clear correlation tells that
-    # it is not.
+    # Of single samples nothing tells that it is noise; of a few, only a clear correlation tells
+    # that it is not.
     no_noise = (
         persistent
         or shared
@@ -214,12 +202,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
         or abs(dependence.lag1) > CLEARLY_PERSISTENT
     )
     # Residuals of exactly zero are those of no measurement at all.
-    smaller = (
-        not larger
-        and 0 < factor < 1 / MISFIT
-        and level.smaller_p < RARE
-        and not is_used
-    )
+    smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not is_used
     sigma_key = level.sigma_key
     return [
         *(outlier.to_concern() for outlier in uncertainty.outliers),
@@ -238,11 +221,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
             stated=sigma_key,
         ),
         *concern_if(
-            smaller,
-            False,
-            code="noise/smaller",
-            factor=1 / (factor or 1.0),
-            stated=sigma_key,
+            smaller, False, code="noise/smaller", factor=1 / (factor or 1.0), stated=sigma_key
         ),
         *_noisy_marker_concerns(level),
         *_disagreement_concerns(uncertainty),
@@ -254,18 +233,12 @@ def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
     there are none, or if recordings were not compared.
     """
     scatter = uncertainty.scatter
-    disagreeing = (
-        []
-        if scatter is None
-        else np.flatnonzero(scatter.find_disagreements()).tolist()
-    )
+    disagreeing = [] if scatter is None else np.flatnonzero(scatter.find_disagreements()).tolist()
     names = [
         display_name(name, is_scalar=name in uncertainty.estimates)
         for name in (uncertainty.names[k] for k in disagreeing)
     ]
-    return concern_if(
-        bool(names), False, code="residuals/recordings", names=names
-    )
+    return concern_if(bool(names), False, code="residuals/recordings", names=names)
 
 
 def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
@@ -278,20 +251,12 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
     if not level.unequal_p < RARE:
         return []
     usual = float(np.median([*level.factors.values()]))
-    noisy = [
-        n
-        for n, f in level.factors.items()
-        if f > MARKER_MISFIT * max(1.0, usual)
-    ]
+    noisy = [n for n, f in level.factors.items() if f > MARKER_MISFIT * max(1.0, usual)]
     if not noisy:
         return []
     worst = max(noisy, key=level.factors.__getitem__)
     code = "noise/marker" if len(noisy) == 1 else "noise/markers"
-    data = {
-        "marker": worst,
-        "factor": level.factors[worst],
-        "count": len(noisy),
-    }
+    data = {"marker": worst, "factor": level.factors[worst], "count": len(noisy)}
     return [Concern(code, data=data)]
 
 
@@ -304,12 +269,8 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     else "check". Mode coefficients of fields do not count.
     """
     known = uncertainty.estimates
-    estimates = {
-        name: known[name] for name in uncertainty.names if name in known
-    }
-    bounded = [
-        name for name, estimate in estimates.items() if estimate.at_bound
-    ]
+    estimates = {name: known[name] for name in uncertainty.names if name in known}
+    bounded = [name for name, estimate in estimates.items() if estimate.at_bound]
     undetermined = [
         name
         for name, estimate in estimates.items()
@@ -360,11 +321,7 @@ def numerical_concerns(
     value = optimum[worst].value
     percent = 100 * (refinement.errors[worst].extrapolated - value) / abs(value)
     code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
-    return [
-        Concern(
-            code, data={"name": worst, "percent": percent, "errors": largest}
-        )
-    ]
+    return [Concern(code, data={"name": worst, "percent": percent, "errors": largest})]
 
 
 # What is assumed, by the name of the relaxed assumption, for messages.
@@ -397,30 +354,20 @@ def probe_concerns(
     experiments : iterable of Experiment
         Fitted experiments, whose hysteresis is named as a cause of a drift of the stiffness.
     """
-    alarming = sorted(
-        filter(is_alarming, probes), key=lambda each: -each.chi_squared
-    )
+    alarming = sorted(filter(is_alarming, probes), key=lambda each: -each.chi_squared)
     if not alarming:
         return []
     worst, *others = alarming
     label = source_label(worst.name)
-    instead = listed(
-        f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others
-    )
+    instead = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others)
     data = {
-        "assumption": RELAXED.get(
-            assumption_name(worst.name), f"{label} is as stated"
-        ),
+        "assumption": RELAXED.get(assumption_name(worst.name), f"{label} is as stated"),
         "name": label,
         "size": short(worst.size or 0.0),
         "size_error": short(worst.size_error or 0.0),
         "chi_squared": worst.chi_squared,
-        "estimates": [
-            _relaxed_estimate(worst, *each) for each in corrections.items()
-        ],
-        "instead": (
-            f"; alternatives that decrease χ² less: {instead}" if others else ""
-        )
+        "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
+        "instead": (f"; alternatives that decrease χ² less: {instead}" if others else "")
         + (_hysteresis_text(experiments) if worst.name == DRIFT else "")
         + _advice(worst),
     }
@@ -449,12 +396,7 @@ def _hysteresis_text(experiments: Iterable[Experiment]) -> str:
     }
     if not differences:
         return ""
-    sizes = listed(
-        [
-            f"{100 * share:+.2g} % in '{name}'"
-            for name, share in differences.items()
-        ]
-    )
+    sizes = listed([f"{100 * share:+.2g} % in '{name}'" for name, share in differences.items()])
     return (
         f"; hysteresis resembles such a drift: the stress in unloading differs from that in "
         f'loading by {sizes}. To fit the loading alone, set branch = "loading"'
@@ -473,23 +415,14 @@ def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
     return f"{symbol_of(name)} = {value:.4g} ± {move.std_error:.2g} {unit_of(name)}".strip()
 
 
-def outlier_share_concerns(
-    diagnoses: Iterable[MarkerDiagnosis],
-) -> list[Concern]:
+def outlier_share_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
     """Return one concern, as a list, if the share of samples beyond Huber's threshold, of all
     samples of all markers, exceeds `WILD`; "doubtful" above `HARDLY_TAME`. Else empty, also
     without samples.
     """
     diagnoses_list = tuple(diagnoses)
-    share = sum(d.wild for d in diagnoses_list) / max(
-        1, sum(d.samples for d in diagnoses_list)
-    )
-    return concern_if(
-        share > WILD,
-        share > HARDLY_TAME,
-        code="residuals/wild",
-        percent=100 * share,
-    )
+    share = sum(d.wild for d in diagnoses_list) / max(1, sum(d.samples for d in diagnoses_list))
+    return concern_if(share > WILD, share > HARDLY_TAME, code="residuals/wild", percent=100 * share)
 
 
 def nuisance_concerns(
@@ -527,10 +460,7 @@ def nuisance_concerns(
         deviation = abs(float(phi))
         limited = not lowest + 1e-3 < phi < highest - 1e-3
         concerns += concern_if(
-            limited,
-            True,
-            code="specimen/limit" if is_specimen else "nuisance/limit",
-            name=name,
+            limited, True, code="specimen/limit" if is_specimen else "nuisance/limit", name=name
         )
         concerns += concern_if(
             deviation > limit and not limited,
@@ -566,11 +496,7 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
 
 
 def forward_simulation_concerns(
-    name: str,
-    rms_m: float,
-    fit_rms_m: float,
-    noise_rms_m: float,
-    is_fitted: bool,
+    name: str, rms_m: float, fit_rms_m: float, noise_rms_m: float, is_fitted: bool
 ) -> list[Concern]:
     """Return one concern, as a list, if the forward simulation of an experiment is much worse than
     the fit; else empty.
@@ -600,11 +526,7 @@ def forward_simulation_concerns(
         times = rms_m / yardstick_m
         gross = times > GROSS_PREDICTION
         return concern_if(
-            times > PREDICTION,
-            gross,
-            code="roll-out/predicted",
-            experiment=name,
-            times=times,
+            times > PREDICTION, gross, code="roll-out/predicted", experiment=name, times=times
         )
     missed = float(np.sqrt(max(0.0, rms_m**2 - fit_rms_m**2))) / yardstick_m
     return concern_if(
@@ -668,9 +590,7 @@ def stability_concerns(instabilities: Iterable[Instability]) -> list[Concern]:
     for each in instabilities:
         grows = each.e_foldings > E_FOLDINGS
         grossly = each.e_foldings > GROSS_E_FOLDINGS
-        concerns += concern_if(
-            grows, grossly, code="stability/grows", **vars(each)
-        )
+        concerns += concern_if(grows, grossly, code="stability/grows", **vars(each))
     return concerns
 
 
@@ -694,13 +614,8 @@ def rotation_step_concerns(
         Code of the concern, whose grade is "check".
     """
     turn = fastest_rotation(experiment, substeps)
-    sizes = {
-        "step_ms": 1e3 * turn.step_s,
-        "rate_rad_s": turn.angle_rad / turn.step_s,
-    }
-    return concern_if(
-        turn.angle_rad > limit_rad, False, code=code, **vars(turn), **sizes
-    )
+    sizes = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.angle_rad / turn.step_s}
+    return concern_if(turn.angle_rad > limit_rad, False, code=code, **vars(turn), **sizes)
 
 
 def scheme_concerns(
@@ -743,9 +658,7 @@ def scheme_concerns(
     ]
 
 
-def rms_expected_from_noise_m(
-    sigma_m: Array, samples: Array, parameter_count: float
-) -> float:
+def rms_expected_from_noise_m(sigma_m: Array, samples: Array, parameter_count: float) -> float:
     """Return the RMS distance of markers that noise alone would leave, √(3 (1 − p/N) σ²), with the
     mean σ² of all samples [m]; 0 without samples or if p ≥ N.
 

@@ -15,10 +15,7 @@ def _other_axes() -> Iterator[tuple[str, AxesOrder]]:
     for order in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
             if order != (0, 1, 2) or min(signs) < 0:
-                shown = (
-                    "−" * (sign < 0) + "xyz"[k]
-                    for k, sign in zip(order, signs, strict=True)
-                )
+                shown = ("−" * (sign < 0) + "xyz"[k] for k, sign in zip(order, signs, strict=True))
                 yield ", ".join(shown), (order, signs)
 
 

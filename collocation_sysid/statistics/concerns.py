@@ -56,7 +56,7 @@ TOPICS: dict[str, Topic] = {
         messages={
             "unknown": "only the ratios of {names} are identifiable (E/ρ), because no known "
             "force or mass sets their scale; fix a density, state a known mass, or measure a "
-            "force",
+            "force"
         },
     ),
     "description": Topic(
@@ -208,7 +208,7 @@ TOPICS: dict[str, Topic] = {
         messages={
             "contradicted": "the data contradict the assumption that {assumption}: with {name} = "
             "{size} ± {size_error}, χ² decreases by {chi_squared:.3g}, and the estimates become "
-            "{estimates}{instead}",
+            "{estimates}{instead}"
         },
     ),
     "information": Topic(
@@ -386,7 +386,7 @@ TOPICS: dict[str, Topic] = {
         "parameter.",
         messages={
             "misses": "the prediction of '{experiment}' deviates from {what} by {size}{sigmas:.2g} "
-            "times {stated}: check the stated parameters, {stated}, and what the model lacks",
+            "times {stated}: check the stated parameters, {stated}, and what the model lacks"
         },
     ),
     "memory": Topic(
@@ -395,7 +395,7 @@ TOPICS: dict[str, Topic] = {
         remedy="Use the method reduced-space, fewer time steps or a coarser mesh.",
         messages={
             "short": "{method} will take about {needed_gb:.2g} GB, more than this machine's "
-            "{there_gb:.2g} GB: {remedy}",
+            "{there_gb:.2g} GB: {remedy}"
         },
     ),
     "field": Topic(
@@ -512,19 +512,12 @@ def message_of(code: str, data: Mapping[str, Any]) -> str:
         If the code is unknown or a placeholder has no value.
     """
     topic, _, rest = code.partition("/")
-    shown = {
-        k: listed(v) if isinstance(v, (list, tuple)) else v
-        for k, v in data.items()
-    }
+    shown = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in data.items()}
     message = TOPICS[topic].messages[rest].format(**shown)
     distance_text = (
-        f" (the misfit becomes {data['nearer']:.2g} times smaller)"
-        if "nearer" in data
-        else ""
+        f" (the misfit becomes {data['nearer']:.2g} times smaller)" if "nearer" in data else ""
     )
-    return (
-        f"{data['of']}: {message}{distance_text}" if data.get("of") else message
-    )
+    return f"{data['of']}: {message}{distance_text}" if data.get("of") else message
 
 
 @dataclass(frozen=True)
@@ -556,17 +549,11 @@ class Concern:
         return message_of(self.code, self.data)
 
 
-def concern_if(
-    is_present: bool, is_gross: bool, code: str, **data: Any
-) -> list[Concern]:
+def concern_if(is_present: bool, is_gross: bool, code: str, **data: Any) -> list[Concern]:
     """Return a list with the concern of a code and its data, graded "doubtful" if `is_gross` and
     else "check"; an empty list unless `is_present`.
     """
-    return (
-        [Concern(code, "doubtful" if is_gross else "check", data=data)]
-        if is_present
-        else []
-    )
+    return [Concern(code, "doubtful" if is_gross else "check", data=data)] if is_present else []
 
 
 def topics_of(concerns: Iterable[Concern]) -> dict[str, Topic]:

@@ -48,9 +48,7 @@ def beta_sf(value: ArrayLike, a: ArrayLike, b: ArrayLike) -> Any:
     return betaincc(a, b, value)
 
 
-def f_sf(
-    value: ArrayLike, numerator_freedom: ArrayLike, freedom: ArrayLike
-) -> Any:
+def f_sf(value: ArrayLike, numerator_freedom: ArrayLike, freedom: ArrayLike) -> Any:
     """Return the probability that an F variable exceeds `value`, with `numerator_freedom` and
     `freedom` degrees of freedom of numerator and denominator.
     """

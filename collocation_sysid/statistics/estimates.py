@@ -87,9 +87,7 @@ class IntervalCoordinate:
     is_linear: bool
 
     @classmethod
-    def for_estimate(
-        cls, name: str, values: Iterable[float], linear: bool
-    ) -> IntervalCoordinate:
+    def for_estimate(cls, name: str, values: Iterable[float], linear: bool) -> IntervalCoordinate:
         """Return the coordinate for an estimate.
 
         Parameters
@@ -104,10 +102,7 @@ class IntervalCoordinate:
             nevertheless.
         """
         lowest = min(values)
-        return cls(
-            without_region(name) == "poisson" and lowest > 0,
-            linear or lowest <= 0,
-        )
+        return cls(without_region(name) == "poisson" and lowest > 0, linear or lowest <= 0)
 
     def derivative(self, value: float) -> float:
         """Return the derivative of the coordinate by the value, at a value within the domain."""
@@ -144,11 +139,7 @@ def correlation_from_covariance(covariance: Array) -> Array:
 
 
 def user_estimates(
-    parameters: Parameters,
-    q: Array,
-    covariance_q: Array,
-    at_bound: Mask,
-    quantiles: Array,
+    parameters: Parameters, q: Array, covariance_q: Array, at_bound: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
     """Return the estimates of the scalar parameters by name.
 
@@ -179,15 +170,12 @@ def user_estimates(
     Infinite or NaN variances in `covariance_q` mean that the data do not determine the parameter.
     The argument arrays are not modified.
     """
-    estimates = {
-        name: Estimate(value)
-        for name, value in parameters.scalar_values(q).items()
-    }
+    estimates = {name: Estimate(value) for name, value in parameters.scalar_values(q).items()}
     partners = np.zeros_like(covariance_q)
     scalars = list(parameters.scalar_coordinates)
-    partners[:, scalars] = np.abs(
-        np.nan_to_num(correlation_from_covariance(covariance_q))
-    )[:, scalars]
+    partners[:, scalars] = np.abs(np.nan_to_num(correlation_from_covariance(covariance_q)))[
+        :, scalars
+    ]
     np.fill_diagonal(partners, 0.0)
     for k in scalars:
         item = parameters.free[k]
@@ -200,40 +188,22 @@ def user_estimates(
             item, value, deviation=deviation, quantile=float(quantiles[k])
         )
         other = int(np.argmax(partners[k]))
-        relative = (
-            deviation * item.value_derivative(value) / max(abs(value), 1e-300)
-        )
-        if (
-            estimate.statistical_std_error is None
-            or estimate.statistical95 is None
-        ):
+        relative = deviation * item.value_derivative(value) / max(abs(value), 1e-300)
+        if estimate.statistical_std_error is None or estimate.statistical95 is None:
             pass
-        elif (
-            estimate.statistical95[0] <= item.lower
-            and estimate.statistical95[1] >= item.upper
-        ):
-            reason = (
-                "its 95 % interval covers the whole range between its bounds"
-            )
-            estimate = Estimate(
-                value, None, statistical95=estimate.statistical95, reason=reason
-            )
-        elif (
-            partners[k, other] > CONFOUNDED and relative > CONFOUNDED_DEVIATION
-        ):
+        elif estimate.statistical95[0] <= item.lower and estimate.statistical95[1] >= item.upper:
+            reason = "its 95 % interval covers the whole range between its bounds"
+            estimate = Estimate(value, None, statistical95=estimate.statistical95, reason=reason)
+        elif partners[k, other] > CONFOUNDED and relative > CONFOUNDED_DEVIATION:
             reason = (
                 f"confounded with {parameters.free[other].name} "
                 f"(correlation {correlation_from_covariance(covariance_q)[k, other]:.3f})"
             )
-            estimate = Estimate(
-                value, None, statistical95=estimate.statistical95, reason=reason
-            )
+            estimate = Estimate(value, None, statistical95=estimate.statistical95, reason=reason)
         estimates[item.name] = estimate
     for item in parameters.scalars:
         if item.tied is not None:
-            estimates[item.name] = _scaled_estimate(
-                estimates[item.tied.to], item.tied.ratio
-            )
+            estimates[item.name] = _scaled_estimate(estimates[item.tied.to], item.tied.ratio)
     return estimates
 
 
@@ -258,10 +228,7 @@ def relative_derivatives(parameters: Parameters, q: Array) -> Array:
 
 
 def derived_estimates(
-    derived: DerivedModuli,
-    covariance_q: Array,
-    at_bound: Mask,
-    quantiles: Array,
+    derived: DerivedModuli, covariance_q: Array, at_bound: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
     """Return the estimates of the moduli that follow from the parameters, by the delta method.
 
@@ -289,17 +256,10 @@ def derived_estimates(
         elif not len(used) or not value > 0:
             estimates[name] = Estimate(value)
         else:
-            variance = (
-                gradient[used]
-                @ covariance_q[np.ix_(used, used)]
-                @ gradient[used]
-            )
+            variance = gradient[used] @ covariance_q[np.ix_(used, used)] @ gradient[used]
             deviation = float(np.sqrt(variance)) / value
             estimates[name] = _logarithmic_estimate(
-                name,
-                value,
-                deviation=deviation,
-                quantile=float(quantiles[used].max()),
+                name, value, deviation=deviation, quantile=float(quantiles[used].max())
             )
     return estimates
 
@@ -313,27 +273,12 @@ def _parameter_estimate(
     Logarithmic parameters and positive Poisson's ratios are treated by `_logarithmic_estimate`.
     Others have a symmetric interval, cut off at the least value of the constant; with a deviation
     of q above `UNDETERMINED`, or NaN, only a value and a reason.
-
-    Parameters
-    ----------
-    item : Parameter
-    value : float
-        Estimated value.
-    deviation : float
-        Standard deviation of its coordinate q; NaN or a large one if it is not determined.
-    quantile : float
-        Half width of the interval in standard deviations.
     """
     if item.scale == "log":
-        return _logarithmic_estimate(
-            item.name, value, deviation=deviation, quantile=quantile
-        )
+        return _logarithmic_estimate(item.name, value, deviation=deviation, quantile=quantile)
     if without_region(item.name) == "poisson" and value > 0:
         return _logarithmic_estimate(
-            item.name,
-            value,
-            deviation=deviation * item.unit / value,
-            quantile=quantile,
+            item.name, value, deviation=deviation * item.unit / value, quantile=quantile
         )
     if not deviation <= UNDETERMINED:
         return Estimate(value, reason="the data do not determine it")
@@ -342,10 +287,7 @@ def _parameter_estimate(
     return Estimate(
         value,
         spread,
-        statistical95=(
-            max(least, value - quantile * spread),
-            value + quantile * spread,
-        ),
+        statistical95=(max(least, value - quantile * spread), value + quantile * spread),
     )
 
 
@@ -372,41 +314,21 @@ def _estimate_at_bound(value: float) -> Estimate:
     and interval, with a reason.
     """
     return Estimate(
-        value,
-        at_bound=True,
-        reason="it ended at a bound, or follows from a parameter that did",
+        value, at_bound=True, reason="it ended at a bound, or follows from a parameter that did"
     )
 
 
-def _logarithmic_estimate(
-    name: str, value: float, deviation: float, quantile: float
-) -> Estimate:
+def _logarithmic_estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
     """Return the estimate of a positive value from the standard deviation of its logarithm.
 
     For Poisson's ratio the interval is symmetric in ln ν/(½ − ν). An interval that is too wide
     (`WIDE_FACTOR`, `WIDE_POISSON`) remains, but there is no standard error.
-
-    Parameters
-    ----------
-    name : str
-        Name of the parameter or modulus.
-    value : float
-        Estimated value, above 0.
-    deviation : float
-        Standard deviation of the logarithm; NaN or above `UNDETERMINED` if it is not determined,
-        and then the estimate has neither interval nor standard error.
-    quantile : float
-        Half width of the interval in standard deviations.
     """
     if not deviation <= UNDETERMINED:  # or NaN
         return Estimate(value, reason="the data do not determine it")
     at = IntervalCoordinate.for_estimate(name, [value], linear=False)
-    reach = min(
-        quantile * deviation * value * at.derivative(value), UNDETERMINED
-    )
-    low, high = (
-        at.to_value(at.from_value(value) + way * reach) for way in (-1, 1)
-    )
+    reach = min(quantile * deviation * value * at.derivative(value), UNDETERMINED)
+    low, high = (at.to_value(at.from_value(value) + way * reach) for way in (-1, 1))
     reason = f"its 95 % interval spans more than a factor of {WIDE_FACTOR:g}"
     if at.is_odds:
         reason = "its 95 % interval covers nearly all of (0, 0.5)"
@@ -421,9 +343,7 @@ LONG = 1.0
 NOTEWORTHY = 1.1
 
 
-def parameter_notes(
-    parameters: Parameters, estimates: Mapping[str, Estimate]
-) -> list[str]:
+def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -> list[str]:
     """Return notes on free parameters at a bound, not determined, or not identifiable.
 
     Notes on bounds and undetermined parameters come first, in the order of the parameters, then
@@ -436,8 +356,7 @@ def parameter_notes(
         estimate = estimates[item.name]
         if estimate.at_bound:
             nearest = min(
-                ("lower", "upper"),
-                key=lambda side: abs(getattr(item, side) - estimate.value),
+                ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
             )
             notes.append(
                 f"{name} ended at its {nearest} bound {getattr(item, nearest):g}: it has no "
@@ -446,11 +365,7 @@ def parameter_notes(
             )
         elif estimate.statistical95 is None:
             damping = is_damping(name)
-            by = (
-                ": no information on damping in these data"
-                if damping
-                else " by these data"
-            )
+            by = ": no information on damping in these data" if damping else " by these data"
             notes.append(
                 f"{name} is not determined{by}; fix it, give it a prior, or record "
                 f"{'a motion' if damping else 'another motion'}"
@@ -463,12 +378,6 @@ def parameter_notes(
 def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
     """Return one note for each parameter that is not identifiable, and one for two parameters that
     are confounded with each other.
-
-    Parameters
-    ----------
-    reasons : mapping of str to str
-        Reason by the name of each parameter without a standard error; "confounded with NAME " at
-        its beginning names another parameter.
     """
     notes = []
     mentioned = set()
@@ -490,9 +399,7 @@ def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
     return notes
 
 
-def memory_notes(
-    estimates: Mapping[str, Estimate], longest_s: float
-) -> list[str]:
+def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[str]:
     """Return notes on memory branches, at most one for each.
 
     A branch gets a note if its share ended at its bound zero, if the interval of the share contains
@@ -521,11 +428,7 @@ def memory_notes(
                 f"the data do not determine whether there is memory: the share of {branch} "
                 f"may be 0, and is at most {share.statistical95[1]:.2g} (95 %)"
             )
-        elif (
-            (share.at_bound or share.statistical95)
-            and tau
-            and tau.value > LONG * longest_s
-        ):
+        elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
             notes.append(
                 f"{branch} relaxes within {tau.value:.2g} s, slower than the longest "
                 f"recording of {longest_s:.2g} s: its share and the long-term moduli are "
@@ -534,9 +437,7 @@ def memory_notes(
     return notes
 
 
-def noise_notes(
-    requested: str, kind: Noise, level: NoiseLevel, errors: str
-) -> list[str]:
+def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> list[str]:
     """Return notes on residuals larger or smaller than the stated σ, and how the error bars account
     for that.
 
@@ -561,14 +462,8 @@ def noise_notes(
         return []
     factor = float(np.sqrt(level.pooled))
     sigma_key = level.sigma_key
-    low, high = (
-        pick(level.factors, key=level.factors.__getitem__)
-        for pick in (min, max)
-    )
-    if (
-        level.is_unequal()
-        and level.factors[high] > NOTEWORTHY**2 * level.factors[low]
-    ):
+    low, high = (pick(level.factors, key=level.factors.__getitem__) for pick in (min, max))
+    if level.is_unequal() and level.factors[high] > NOTEWORTHY**2 * level.factors[low]:
         least = f"{level.factors[low]:.2g} ({low})"
         most = f"{level.factors[high]:.2g} ({high})"
         size = f"between {least} and {most} times as large as expected from {sigma_key}"
@@ -594,9 +489,7 @@ def noise_notes(
     return [f"the residuals are {size}; {so}"]
 
 
-def correlation_notes(
-    requested: str, errors: str, dependence: Dependence
-) -> list[str]:
+def correlation_notes(requested: str, errors: str, dependence: Dependence) -> list[str]:
     """Return one note, as a list, on correlated residuals and how the error bars account for that;
     else empty.
 
@@ -646,9 +539,7 @@ def correlation_notes(
     ]
 
 
-def disagreement_notes(
-    parameters: Parameters, scatter: RecordingComparison | None
-) -> list[str]:
+def disagreement_notes(parameters: Parameters, scatter: RecordingComparison | None) -> list[str]:
     """Return one note for each parameter on which the recordings disagree; empty without a
     comparison (None).
     """
@@ -668,7 +559,7 @@ def disagreement_notes(
 
 
 def display_name(name: str, *, is_scalar: bool) -> str:
-    """Return the name of an estimated parameter for messages: itself, or for a component of a vector
-    a phrase with the name of its kind and its own name.
+    """Return the name of an estimated parameter for messages: itself, or for a component of a
+    vector a phrase with the name of its kind and its own name.
     """
     return name if is_scalar else f"the {FIELD_COEFFICIENT.name} (share {name})"

@@ -86,18 +86,10 @@ def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
         ends = {"name": name, "lower": lower, "median": median, "upper": upper}
         concerns.append(Concern("field/one-phase", data=ends))
     if phases.elements < FEWEST_ELEMENTS:
-        few = {
-            "name": name,
-            "elements": phases.elements,
-            "fewest": FEWEST_ELEMENTS,
-        }
+        few = {"name": name, "elements": phases.elements, "fewest": FEWEST_ELEMENTS}
         concerns.append(Concern("field/few", data=few))
     if phases.misfit > WORSE * max(1.0, phases.smooth_misfit):
-        both = {
-            "name": name,
-            "misfit": phases.misfit,
-            "smooth": phases.smooth_misfit,
-        }
+        both = {"name": name, "misfit": phases.misfit, "smooth": phases.smooth_misfit}
         concerns.append(Concern("field/phases", data=both))
     return concerns
 
@@ -154,9 +146,7 @@ class FieldEstimate:
         if self.sampled_intervals is not None:
             return self.sampled_intervals
         if self.declared_density_kg_m3 is not None:
-            half_width = (
-                self.quantile * self.deviation * self.declared_density_kg_m3
-            )
+            half_width = self.quantile * self.deviation * self.declared_density_kg_m3
             return self.value - half_width, self.value + half_width
         factor = np.exp(self.quantile * self.deviation)
         return self.value / factor, self.value * factor
@@ -165,11 +155,7 @@ class FieldEstimate:
         """Return the standard deviation (k,) of the logarithm over that of the prior about the
         mean; for sampled phases over `PhaseSummary.deviation`. NaN without error bars.
         """
-        prior = (
-            self.modes.field.deviation
-            if self.phases is None
-            else self.phases.deviation
-        )
+        prior = self.modes.field.deviation if self.phases is None else self.phases.deviation
         return self.deviation / prior
 
     @property
@@ -195,11 +181,7 @@ class FieldEstimate:
         that of the prior.
         """
         return np.column_stack(
-            [
-                self.value,
-                *self.statistical95,
-                self.compute_deviation_over_prior(),
-            ]
+            [self.value, *self.statistical95, self.compute_deviation_over_prior()]
         )
 
     @cached_property
@@ -207,9 +189,7 @@ class FieldEstimate:
         """Information H (m, m) of the data alone and the score b (m,), see the module's
         documentation; eigenvalues of the covariance are limited to at most 1.
         """
-        values, vectors = np.linalg.eigh(
-            (self.covariance + self.covariance.T) / 2
-        )
+        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
         # Rounding, or error bars that are wider than the fit's: no less than nothing.
         values = np.clip(values, 1e-12, 1.0)
         alone = vectors * (1 / values - 1) @ vectors.T
@@ -222,14 +202,9 @@ class FieldEstimate:
         is no valid evidence.
         """
         known = self.covariance
-        return (
-            not np.isfinite(known).all()
-            or np.linalg.eigvalsh(known)[-1] > WIDER
-        )
+        return not np.isfinite(known).all() or np.linalg.eigvalsh(known)[-1] > WIDER
 
-    def log_evidence_ratio(
-        self, length_m: float | None = None, factor: float = 1.0
-    ) -> float:
+    def log_evidence_ratio(self, length_m: float | None = None, factor: float = 1.0) -> float:
         """Return ln Z(D) − ln Z(I) for another correlation length [m], or for the amplitude times a
         factor.
 
@@ -247,18 +222,12 @@ class FieldEstimate:
         Positive values favour the other prior. A length equal to the present one counts as None.
         """
         size = len(self.coefficients)
-        if (
-            self.phases is not None
-            or len(self.covariance) < size
-            or self._is_wider_than_prior
-        ):
+        if self.phases is not None or len(self.covariance) < size or self._is_wider_than_prior:
             return 0.0
         prior = factor**2 * np.eye(size)
         if length_m is not None and length_m != self.modes.length_m:
             other = np.linalg.lstsq(
-                self.modes.shapes,
-                self.modes.with_length(length_m).shapes,
-                rcond=None,
+                self.modes.shapes, self.modes.with_length(length_m).shapes, rcond=None
             )
             prior = factor**2 * other[0] @ other[0].T
         return self._log_evidence(prior) - self._log_evidence(np.eye(size))
@@ -269,13 +238,7 @@ class FieldEstimate:
         """
         alone, score = self._data_information
         both = np.eye(len(alone)) + alone @ prior
-        return (
-            float(
-                score @ prior @ np.linalg.solve(both, score)
-                - np.linalg.slogdet(both)[1]
-            )
-            / 2
-        )
+        return float(score @ prior @ np.linalg.solve(both, score) - np.linalg.slogdet(both)[1]) / 2
 
     def list_concerns(self) -> list[Concern]:
         """Return the concerns about the field: for two phases those of `phase_concerns`; for a
@@ -289,15 +252,9 @@ class FieldEstimate:
             return phase_concerns(self.phases, self.name)
         amplitude = self.modes.field.deviation
         contradicted = dict[str, dict[str, float]]()
-        best = max(
-            AMPLITUDES,
-            key=lambda factor: self.log_evidence_ratio(factor=factor),
-        )
+        best = max(AMPLITUDES, key=lambda factor: self.log_evidence_ratio(factor=factor))
         if best > 1 and self.log_evidence_ratio(factor=best) > LIKELIER:
-            contradicted["amplitude"] = {
-                "stated": amplitude,
-                "likely": best * amplitude,
-            }
+            contradicted["amplitude"] = {"stated": amplitude, "likely": best * amplitude}
         if self.log_evidence_ratio(self.modes.length_m / 2) > LIKELIER:
             contradicted["length"] = {
                 "stated": self.modes.length_m,
@@ -308,23 +265,14 @@ class FieldEstimate:
             for what, v in contradicted.items()
         ]
         if below := int((self.value <= 0).sum()):
-            counts = {
-                "name": self.name,
-                "below": below,
-                "elements": len(self.value),
-            }
+            counts = {"name": self.name, "below": below, "elements": len(self.value)}
             least = {"least": float(self.value.min()), "stated": amplitude}
-            determined.insert(
-                0, Concern("field/negative", "doubtful", data=counts | least)
-            )
+            determined.insert(0, Concern("field/negative", "doubtful", data=counts | least))
         return determined
 
 
 def field_estimates(
-    body: Body,
-    parameters: Parameters,
-    q: Array,
-    uncertainty: Uncertainty | Array | None,
+    body: Body, parameters: Parameters, q: Array, uncertainty: Uncertainty | Array | None
 ) -> list[FieldEstimate]:
     """Return the estimates of all fields of a body, one for each part with a field, in the order of
     the parts; empty if there is none.
@@ -365,39 +313,27 @@ def field_estimates(
         if (modes := part.field) is None:
             continue
         coefficients = body.field_slices[number]
-        mean, slopes = _mean_logarithm(
-            constants, number, modes=modes
-        ).evaluate_with_jacobian(q, NOTHING)
+        mean, slopes = _mean_logarithm(constants, number, modes=modes).evaluate_with_jacobian(
+            q, NOTHING
+        )
         local = mean[0] + modes.logarithms(theta[coefficients])
         declared = None
         if part.stress_field is None:
             declared = part.density_kg_m3
-        gradient = (
-            slopes + modes.jacobian(theta[coefficients]) @ by_q[coefficients]
-        )
+        gradient = slopes + modes.jacobian(theta[coefficients]) @ by_q[coefficients]
         # What is at a bound has no variance: it is taken for known.
-        used = np.flatnonzero(
-            gradient.any(axis=0) & ~np.isnan(np.diag(covariance))
-        )
+        used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
         own = gradient[:, used]
-        variance = np.einsum(
-            "ei,ij,ej->e", own, covariance[np.ix_(used, used)], own
-        )
+        variance = np.einsum("ei,ij,ej->e", own, covariance[np.ix_(used, used)], own)
         deviation = np.sqrt(variance + modes.omitted_deviation**2)
-        free = [
-            names.index(name)
-            for name in [*body.constants][coefficients]
-            if name in names
-        ]
+        free = [names.index(name) for name in [*body.constants][coefficients] if name in names]
         values = np.exp(local) if declared is None else declared * local
         estimate = FieldEstimate(
             name=part.field_name,
             modes=modes,
             cells=part.cells,
             value=values,
-            deviation=deviation
-            if uncertainty is not None
-            else np.full_like(deviation, np.nan),
+            deviation=deviation if uncertainty is not None else np.full_like(deviation, np.nan),
             quantile=quantile,
             coefficients=theta[coefficients],
             covariance=covariance[np.ix_(free, free)],
@@ -410,23 +346,12 @@ def field_estimates(
     return estimates
 
 
-def _with_phases(
-    estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float
-) -> FieldEstimate:
+def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float) -> FieldEstimate:
     """Return the estimate of a two-phase field with intervals from its samples.
 
     Intervals are quantiles of the samples, widened to contain the value, so that an element at the
     boundary has an interval from one phase to the other. Without samples, or without error bars,
     the phases count as known, and the estimate is returned unchanged.
-
-    Parameters
-    ----------
-    estimate : FieldEstimate
-        Estimate with known phases.
-    modes : TwoPhaseModes
-        Modes with their samples.
-    contrast : float
-        Ratio of the inclusion to the surroundings in the answer, above 0.
     """
     samples = modes.samples
     if samples is None or not np.isfinite(estimate.deviation).all():
@@ -447,10 +372,7 @@ def _with_phases(
     return replace(
         estimate,
         deviation=samples.logarithms.std(axis=0),
-        sampled_intervals=(
-            np.minimum(lower, estimate.value),
-            np.maximum(upper, estimate.value),
-        ),
+        sampled_intervals=(np.minimum(lower, estimate.value), np.maximum(upper, estimate.value)),
         phases=finding,
     )
 
@@ -479,9 +401,7 @@ def _quantiles(values: Array) -> SampleQuantiles:
     return SampleQuantiles(float(lower), float(median), upper=float(upper))
 
 
-def field_estimates_at(
-    collocation: Collocation, z: Array
-) -> dict[str, FieldEstimate]:
+def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
     """Return the field estimates of all bodies at a solution by name, with the covariance for
     independent errors of the stated σ.
 
@@ -493,29 +413,18 @@ def field_estimates_at(
     z : (variables,) array
         Variables at the answer.
     """
-    covariance = factorise_information(
-        linearise_fit(collocation, z)
-    ).fit.covariance()
+    covariance = factorise_information(linearise_fit(collocation, z)).fit.covariance()
     nq = collocation.nq
     estimates = dict[str, FieldEstimate]()
-    for body in dict.fromkeys(
-        segment.body for segment in collocation.transcriptions
-    ):
+    for body in dict.fromkeys(transcription.body for transcription in collocation.transcriptions):
         known = covariance[:nq, :nq]
-        for field in field_estimates(
-            body, collocation.parameters, q=z[:nq], uncertainty=known
-        ):
+        for field in field_estimates(body, collocation.parameters, q=z[:nq], uncertainty=known):
             estimates.setdefault(field.name, field)
     return estimates
 
 
 def mean_logarithm(
-    body: Body,
-    parameters: Parameters,
-    q: Array,
-    *,
-    part_index: int,
-    names: Sequence[str],
+    body: Body, parameters: Parameters, q: Array, *, part_index: int, names: Sequence[str]
 ) -> tuple[float, Array]:
     """Return the logarithm of the mean of a part's field, and its derivatives by some parameters;
     for a density the ratio to the stated density in place of the logarithm.
@@ -543,28 +452,12 @@ def mean_logarithm(
         ThetaMap(parameters, body), part_index, modes=modes
     ).evaluate_with_jacobian(q, NOTHING)
     free = [item.name for item in parameters.free]
-    return float(mean[0]), slopes.reshape(-1)[
-        [free.index(name) for name in names]
-    ]
+    return float(mean[0]), slopes.reshape(-1)[[free.index(name) for name in names]]
 
 
-def _mean_logarithm(
-    constants: ThetaMap, part_index: int, modes: FieldModes
-) -> GeneratedFunction:
+def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> GeneratedFunction:
     """Return the generated logarithm of the mean of a part's field as a function of q; for a
     density, the generated ratio to the stated density.
-
-    Parameters
-    ----------
-    constants : ThetaMap
-    part_index : int
-    modes : FieldModes
-        Field of the part.
-
-    Notes
-    -----
-    For a field of all moduli of a part the mean is Young's modulus, for other fields the first
-    constant that the field scales. The ratio of a density that is not estimated is 1.
     """
     body = constants.body
     part = constants.body.parts[part_index]
@@ -574,8 +467,7 @@ def _mean_logarithm(
         own = body.split_theta(constants.expression(q))[part_index]
         if part.stress_field is None:
             return (
-                own[(part.law_constant_count + 2 * len(part.prony)) + 1]
-                / part.density_kg_m3
+                own[(part.law_constant_count + 2 * len(part.prony)) + 1] / part.density_kg_m3
                 if part.has_free_density
                 else ca.SX(1)
             )
@@ -584,6 +476,4 @@ def _mean_logarithm(
         lame = part.material.lame(own[: len(part.material.constants)])
         return ca.log(engineering_constants(lame[0], lame[1])[0])
 
-    return GeneratedFunction(
-        logarithm, len(constants.parameters.free), data_size=0
-    )
+    return GeneratedFunction(logarithm, len(constants.parameters.free), data_size=0)

@@ -40,21 +40,10 @@ def identifiability_sentences(uncertainty: Uncertainty) -> tuple[str, ...]:
         elastic convention (only if a combination or one of the following is reported), then the
         notes of `uncertainty` that begin with a parameter's name. Empty if nothing can be said.
     """
-    open_ends = [
-        note
-        for note in uncertainty.notes
-        if note.split()[0] in uncertainty.names
-    ]
+    open_ends = [note for note in uncertainty.notes if note.split()[0] in uncertainty.names]
     combined = _combination_sentences(uncertainty)
-    in_other_terms = (
-        _other_convention(uncertainty) if open_ends or combined else []
-    )
-    return (
-        *_single_sentences(uncertainty),
-        *combined,
-        *in_other_terms,
-        *open_ends,
-    )
+    in_other_terms = _other_convention(uncertainty) if open_ends or combined else []
+    return (*_single_sentences(uncertainty), *combined, *in_other_terms, *open_ends)
 
 
 def _single_sentences(uncertainty: Uncertainty) -> list[str]:
@@ -65,25 +54,14 @@ def _single_sentences(uncertainty: Uncertainty) -> list[str]:
         name: factor
         for name in uncertainty.names
         if name in uncertainty.estimates
-        and (factor := _interval_factor(uncertainty.estimates[name]))
-        is not None
+        and (factor := _interval_factor(uncertainty.estimates[name])) is not None
     }
-    well = [
-        f"{name} to {_precision_text(f)}"
-        for name, f in factors.items()
-        if f <= WELL_FIXED
-    ]
+    well = [f"{name} to {_precision_text(f)}" for name, f in factors.items() if f <= WELL_FIXED]
     badly = [
-        f"{name} only to {_precision_text(f)}"
-        for name, f in factors.items()
-        if f > WELL_FIXED
+        f"{name} only to {_precision_text(f)}" for name, f in factors.items() if f > WELL_FIXED
     ]
     parts = [listed(part) for part in (well, badly) if part]
-    return (
-        [f"the data determine {'; '.join(parts)} (95 %, statistical)"]
-        if parts
-        else []
-    )
+    return [f"the data determine {'; '.join(parts)} (95 %, statistical)"] if parts else []
 
 
 def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
@@ -94,13 +72,8 @@ def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
     combinations of three or more parameters that are all well determined.
     """
     deviations = np.sqrt(np.diag(uncertainty.covariance))
-    is_scalar = np.array(
-        [name in uncertainty.estimates for name in uncertainty.names],
-        dtype=bool,
-    )
-    known = np.flatnonzero(
-        np.isfinite(deviations) & (deviations > 0) & is_scalar
-    )
+    is_scalar = np.array([name in uncertainty.estimates for name in uncertainty.names], dtype=bool)
+    known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0) & is_scalar)
     if len(known) < 2:
         return []
     correlation = uncertainty.correlation[np.ix_(known, known)]
@@ -112,25 +85,17 @@ def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
         members = np.flatnonzero(np.abs(vector) > MEMBER * np.abs(vector).max())
         # Three or more that are well known each need no word about their company.
         widths = (uncertainty.quantiles * deviations)[known[members]]
-        if len(members) == 2 or (
-            len(members) > 2 and widths.max() > np.log(WELL_FIXED)
-        ):
+        if len(members) == 2 or (len(members) > 2 and widths.max() > np.log(WELL_FIXED)):
             sentences.append(
                 _combination_sentence(
-                    uncertainty,
-                    known[members],
-                    eigenvalue=max(value, 0.0),
-                    vector=vector[members],
+                    uncertainty, known[members], eigenvalue=max(value, 0.0), vector=vector[members]
                 )
             )
     return sentences
 
 
 def _combination_sentence(
-    uncertainty: Uncertainty,
-    members: NDArray[np.intp],
-    eigenvalue: float,
-    vector: Array,
+    uncertainty: Uncertainty, members: NDArray[np.intp], eigenvalue: float, vector: Array
 ) -> str:
     """Return the sentence about one combination of confounded parameters, from a small eigenvalue
     of their correlations.
@@ -139,25 +104,13 @@ def _combination_sentence(
     95 % interval; of two parameters also their correlation, unless a note of `uncertainty` states
     that they are confounded. If the value of a parameter is not above 0, it only states that one
     combination is determined.
-
-    Parameters
-    ----------
-    uncertainty : Uncertainty
-    members : (k,) array of int
-        Indices of the parameters.
-    eigenvalue : float
-        Small eigenvalue of the correlation of all parameters, 0 or above.
-    vector : (k,) array
-        Components of its eigenvector at the members.
     """
     names = [uncertainty.names[k] for k in members]
     deviations = np.sqrt(np.diag(uncertainty.covariance))[members]
     quantiles = uncertainty.quantiles[members]
     weights = vector / deviations
     largest = int(np.argmax(np.abs(weights)))
-    fixed = np.exp(
-        quantiles.max() * np.sqrt(eigenvalue) / abs(weights[largest])
-    )
+    fixed = np.exp(quantiles.max() * np.sqrt(eigenvalue) / abs(weights[largest]))
     how = ""
     if len(members) == 2:
         how = f" (correlation {uncertainty.correlation[members[0], members[1]]:.3f})"
@@ -180,18 +133,14 @@ def _combination_sentence(
     )
 
 
-def _is_confounding_noted(
-    uncertainty: Uncertainty, names: Sequence[str]
-) -> bool:
+def _is_confounding_noted(uncertainty: Uncertainty, names: Sequence[str]) -> bool:
     """Return whether two parameters are those of a note on confounded parameters, which the reason
     of the estimate of one of them is; false for another number of parameters.
     """
     if len(names) != 2:
         return False
     return any(
-        (uncertainty.estimates[name].reason or "").startswith(
-            f"confounded with {other} "
-        )
+        (uncertainty.estimates[name].reason or "").startswith(f"confounded with {other} ")
         for name, other in (names, names[::-1])
     )
 
@@ -210,9 +159,7 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
                 f"{name} {'only ' if factor > WELL_FIXED else ''}to {_precision_text(factor)}"
             )
     return (
-        [
-            f"expressed as other elastic constants, the data determine {listed(parts)} (95 %)"
-        ]
+        [f"expressed as other elastic constants, the data determine {listed(parts)} (95 %)"]
         if parts
         else []
     )
@@ -224,9 +171,7 @@ def _interval_factor(estimate: Estimate) -> float | None:
     """
     if estimate.statistical95 is None or not estimate.statistical95[0] > 0:
         return None
-    factor = float(
-        np.sqrt(estimate.statistical95[1] / estimate.statistical95[0])
-    )
+    factor = float(np.sqrt(estimate.statistical95[1] / estimate.statistical95[0]))
     return factor if factor < HOPELESS else None
 
 
@@ -236,11 +181,7 @@ def _precision_text(factor: float) -> str:
     """
     if factor < 1.5:
         return f"±{100 * (factor - 1):.2g} %"
-    return (
-        f"within a factor of {factor:.2g}"
-        if factor < HOPELESS
-        else "no useful range"
-    )
+    return f"within a factor of {factor:.2g}" if factor < HOPELESS else "no useful range"
 
 
 def _product_text(names: Sequence[str], powers: Array) -> str:

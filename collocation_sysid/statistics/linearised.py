@@ -59,17 +59,13 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
         If the equations of a step are singular.
     """
     return [
-        np.stack(
-            list(Sweep(part.segment).sensitivities(part.x, part.equations))
-        )
+        np.stack(list(Sweep(part.transcription).sensitivities(part.x, part.equations)))
         for part in collocation.iterates(z)
     ]
 
 
 @one_blas_thread()
-def observable_responses(
-    collocation: Collocation, z: Array
-) -> list[ObservableResponse]:
+def observable_responses(collocation: Collocation, z: Array) -> list[ObservableResponse]:
     """Return the changes of the observables of each experiment with its parameters, computed in
     parallel.
 
@@ -87,20 +83,18 @@ def observable_responses(
 
     def of(iterate: ExperimentIterate) -> ObservableResponse:
         """Return the changes of the observables of one experiment with its parameters."""
-        segment = iterate.segment
+        transcription = iterate.transcription
         grasp_forces = GraspForces.zeros(
             len(iterate.x),
-            len(segment.sensed_dofs),
-            columns=len(segment.dynamic_parameters),
+            len(transcription.sensed_dofs),
+            columns=len(transcription.dynamic_parameters),
         )
-        rows = Sweep(segment).sensitivities(
+        rows = Sweep(transcription).sensitivities(
             iterate.x, iterate.equations, grasp_forces=grasp_forces
         )
         return ObservableResponse.from_rows(iterate, rows, grasp_forces)
 
-    return map_experiments(
-        of, collocation.iterates(z), threads=collocation.threads
-    )
+    return map_experiments(of, collocation.iterates(z), threads=collocation.threads)
 
 
 def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
@@ -115,10 +109,7 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     SimulationError
         If the equations of a step are singular.
     """
-    return [
-        response.observed_changes[0]
-        for response in observable_responses(collocation, z)
-    ]
+    return [response.observed_changes[0] for response in observable_responses(collocation, z)]
 
 
 Mask = NDArray[np.bool_]
@@ -152,8 +143,8 @@ class Channels(NamedTuple):
 class ResidualBlock:
     """Residuals of one measurement of an experiment, with derivatives at the answer.
 
-    Markers are the entities of the measurement; a sensor of a grasp has two, force and torque [N, N m],
-    and a custom sensor one for each three numbers.
+    Markers are the entities of the measurement; a sensor of a grasp has two, force and torque [N, N
+    m], and a custom sensor one for each three numbers.
 
     Attributes
     ----------
@@ -221,10 +212,7 @@ class ResidualBlock:
         """
         if self.misfit is None:
             return np.zeros(self.is_present.shape, dtype=bool)
-        return (
-            np.linalg.norm(self.misfit, axis=2)
-            > np.linalg.norm(self.residual, axis=2) + 1e-9
-        )
+        return np.linalg.norm(self.misfit, axis=2) > np.linalg.norm(self.residual, axis=2) + 1e-9
 
     def compute_root_weight(self) -> Array:
         """Return the square root (T, M, 1) of Huber's weights, which residuals and derivatives
@@ -232,9 +220,7 @@ class ResidualBlock:
         """
         if self.misfit is None:
             return np.ones((*self.is_present.shape, 1))
-        long, short = (
-            np.linalg.norm(r, axis=2) for r in (self.misfit, self.residual)
-        )
+        long, short = (np.linalg.norm(r, axis=2) for r in (self.misfit, self.residual))
         share = np.divide(short, long, out=np.ones_like(long), where=long > 0)
         return np.sqrt(share)[..., None]
 
@@ -248,9 +234,7 @@ class ResidualBlock:
         samples, markers = self.is_present.shape
         return Channels(
             self.residual.reshape(samples, 3 * markers),
-            self.jacobian.reshape(
-                samples, 3 * markers, self.jacobian.shape[-1]
-            ),
+            self.jacobian.reshape(samples, 3 * markers, self.jacobian.shape[-1]),
             is_measured=self.is_measured.reshape(samples, 3 * markers),
         )
 
@@ -271,9 +255,7 @@ class DerivedModuli:
     derivatives: Mapping[str, Array]
 
     @classmethod
-    def from_bodies(
-        cls, constants: Iterable[ThetaMap], q: Array
-    ) -> DerivedModuli:
+    def from_bodies(cls, constants: Iterable[ThetaMap], q: Array) -> DerivedModuli:
         """Compute the moduli of several bodies at q (nq,); of moduli with the same name, those of
         the last body count.
 
@@ -288,9 +270,7 @@ class DerivedModuli:
         by_q: dict[str, Array] = {}
         for each in constants:
             moduli, slopes = each.derived_moduli(q)
-            values |= dict(
-                zip(each.derived_names, moduli.tolist(), strict=True)
-            )
+            values |= dict(zip(each.derived_names, moduli.tolist(), strict=True))
             by_q |= dict(zip(each.derived_names, slopes, strict=True))
         return cls(values, by_q)
 
@@ -299,11 +279,8 @@ def parameter_values(collocation: Collocation, q: Array) -> dict[str, float]:
     """Return derived moduli, then all parameters (fixed ones too) by name, in SI units, at q (nq,)
     in the solver's coordinates.
     """
-    constants = (segment.constants for segment in collocation.transcriptions)
-    return {
-        **DerivedModuli.from_bodies(constants, q).values,
-        **collocation.parameters.values(q),
-    }
+    constants = (transcription.constants for transcription in collocation.transcriptions)
+    return {**DerivedModuli.from_bodies(constants, q).values, **collocation.parameters.values(q)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,18 +312,14 @@ class LinearisedFit:
     prior_residual: Array
     prior_jacobian: Array
     at_bound: Mask
-    derived: DerivedModuli = field(
-        default_factory=lambda: DerivedModuli({}, {})
-    )
+    derived: DerivedModuli = field(default_factory=lambda: DerivedModuli({}, {}))
     phase_covariance: Array | None = None
 
     def count_measurements(self) -> int:
         """Return the number of scalar measurements of all blocks, without priors."""
         return sum(block.count_measurements() for block in self.blocks)
 
-    def with_disturbances(
-        self, samples: Iterable[Array | None]
-    ) -> LinearisedFit:
+    def with_disturbances(self, samples: Iterable[Array | None]) -> LinearisedFit:
         """Return the fit with samples of known errors of the residuals, which replace those of
         before.
 
@@ -356,10 +329,7 @@ class LinearisedFit:
             For each block; None for a block without known errors.
         """
         pairs = zip(self.blocks, samples, strict=True)
-        return replace(
-            self,
-            blocks=tuple(replace(b, disturbances=each) for b, each in pairs),
-        )
+        return replace(self, blocks=tuple(replace(b, disturbances=each) for b, each in pairs))
 
     def after_step(self, step: Array) -> LinearisedFit:
         """Return the fit after a step (p,) of all parameters, to first order: with changed
@@ -367,10 +337,7 @@ class LinearisedFit:
 
         `misfit`, `derived` and `at_bound` are not changed.
         """
-        blocks_after = (
-            replace(b, residual=b.residual + b.jacobian @ step)
-            for b in self.blocks
-        )
+        blocks_after = (replace(b, residual=b.residual + b.jacobian @ step) for b in self.blocks)
         at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 
@@ -407,31 +374,21 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     p = collocation.parameters_from(z)
     blocks = []
     for response in observable_responses(collocation, z):
-        segment = response.iterate.segment
-        experiment = segment.experiment
-        relaxed = segment.body.has_memory and bool(
-            np.isinf(experiment.loaded_since_s)
-        )
+        transcription = response.iterate.transcription
+        experiment = transcription.experiment
+        relaxed = transcription.body.has_memory and bool(np.isinf(experiment.loaded_since_s))
         linearised = response.linearise()
-        for reading, (misfit, by_own) in zip(
-            segment.residuals, linearised, strict=True
-        ):
-            residual, by_own = huber_as_weights(
-                misfit, by_own, huber=reading.huber
-            )
-            residual, misfit, by_own = map(
-                reading.pool_values, (residual, misfit, by_own)
-            )
+        for reading, (misfit, by_own) in zip(transcription.residuals, linearised, strict=True):
+            residual, by_own = huber_as_weights(misfit, by_own, huber=reading.huber)
+            residual, misfit, by_own = map(reading.pool_values, (residual, misfit, by_own))
             slope = np.zeros((*residual.shape, len(p)))
-            slope[..., segment.list_parameter_indices()] = by_own
+            slope[..., transcription.list_parameter_indices()] = by_own
             blocks.append(
                 ResidualBlock(
                     name=experiment.name,
                     t_s=reading.t_s,
                     marker_names=reading.pooled_groups.names,
-                    is_present=np.asarray(
-                        reading.pooled_groups.is_compared.any(axis=2)
-                    ),
+                    is_present=np.asarray(reading.pooled_groups.is_compared.any(axis=2)),
                     residual=residual,
                     jacobian=slope,
                     sigma_m=reading.pooled_groups.sigmas,
@@ -454,8 +411,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         prior_jacobian=prior_slope,
         at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
         derived=DerivedModuli.from_bodies(
-            (s.constants for s in collocation.transcriptions),
-            p[: collocation.nq],
+            (s.constants for s in collocation.transcriptions), p[: collocation.nq]
         ),
         phase_covariance=_covariance_by_phases(collocation),
     )
@@ -467,22 +423,12 @@ def _covariance_by_phases(collocation: Collocation) -> Array | None:
     """
     names = [item.name for item in collocation.parameters.free]
     covariance: Array | None = None
-    for body in dict.fromkeys(
-        segment.body for segment in collocation.transcriptions
-    ):
+    for body in dict.fromkeys(transcription.body for transcription in collocation.transcriptions):
         for samples in body.list_phase_samples():
-            places = [
-                k for k, name in enumerate(samples.names) if name in names
-            ]
+            places = [k for k, name in enumerate(samples.names) if name in names]
             own = [names.index(samples.names[k]) for k in places]
-            covariance = (
-                np.zeros((len(names), len(names)))
-                if covariance is None
-                else covariance
-            )
-            covariance[np.ix_(own, own)] += samples.deviations[
-                np.ix_(places, places)
-            ]
+            covariance = np.zeros((len(names), len(names))) if covariance is None else covariance
+            covariance[np.ix_(own, own)] += samples.deviations[np.ix_(places, places)]
     return covariance
 
 
@@ -521,9 +467,7 @@ def factorise_information(fit: LinearisedFit) -> Information:
     Directions that neither data nor priors determine are left out. Parameters at a bound are free.
     """
     all_rows = least_squares_of_fit(fit)
-    slopes = tuple(
-        block.channels.jacobian @ all_rows.root for block in fit.blocks
-    )
+    slopes = tuple(block.channels.jacobian @ all_rows.root for block in fit.blocks)
     prior = all_rows.root * fit.prior_jacobian[:, None]
     return Information(all_rows, slopes, prior=prior.T @ prior)
 
@@ -536,9 +480,7 @@ def least_squares_of_fit(fit: LinearisedFit) -> SquareRootInformation:
     return of_all.with_rows(fit.prior_residual, np.diag(fit.prior_jacobian))
 
 
-def least_squares_of_blocks(
-    fit: LinearisedFit, indices: Iterable[int]
-) -> SquareRootInformation:
+def least_squares_of_blocks(fit: LinearisedFit, indices: Iterable[int]) -> SquareRootInformation:
     """Return the residuals of some blocks (indices, from 0) as a least-squares problem in a step of
     all p parameters, without priors.
     """

@@ -16,8 +16,8 @@ after the elimination of p,
 
 Sampling s and h in turn instead would not move along the direction in which a smaller inclusion
 with a larger contrast fits as well: intervals would be several times too narrow. Phases start at a
-total-variation estimate of z, divided into two classes (Otsu 1979), and are changed one element at a
-time by locally balanced proposals (Zanella 2020). A modal level set, ln c = s H(φ) with a smooth
+total-variation estimate of z, divided into two classes (Otsu 1979), and are changed one element at
+a time by locally balanced proposals (Zanella 2020). A modal level set, ln c = s H(φ) with a smooth
 step H and a normal φ, was tried: its posterior mode has H near one half everywhere and several
 times the contrast (10 for 3).
 """
@@ -114,9 +114,7 @@ class InternalFaces:
             are left out.
         """
         corners = mesh.tetrahedra[cells]
-        triples = np.sort(
-            corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2
-        )
+        triples = np.sort(corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
         cell_of_face = np.repeat(np.arange(len(cells)), 4)
         all_triples = triples.reshape(-1, 3)
         order = np.lexsort(all_triples.T)
@@ -137,9 +135,7 @@ class InternalFaces:
         """
         i, j = self.pairs.T
         both = (np.r_[self.weights, self.weights], (np.r_[i, j], np.r_[j, i]))
-        return sp.csr_array(
-            both, shape=(self.element_count, self.element_count)
-        )
+        return sp.csr_array(both, shape=(self.element_count, self.element_count))
 
     def build_jump_operator(self) -> sp.csr_array:
         """Return the sparse matrix (F, E) from values in elements to their jump across each face:
@@ -148,9 +144,7 @@ class InternalFaces:
         faces = np.arange(len(self.pairs))
         ends = np.r_[faces, faces], self.pairs.T.ravel()
         signs = np.repeat([1.0, -1.0], len(faces))
-        return sp.csr_array(
-            (signs, ends), shape=(len(faces), self.element_count)
-        )
+        return sp.csr_array((signs, ends), shape=(len(faces), self.element_count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,9 +267,7 @@ def initial_phases(
     inclusion = above if is_upper else ~above
     order = np.argsort(-z if is_upper else z, kind="stable")
     enclosed_m3 = np.cumsum(volumes_m3[order])
-    factors = np.geomspace(
-        1 / settings.dispersion, settings.dispersion, settings.chains - 1
-    )
+    factors = np.geomspace(1 / settings.dispersion, settings.dispersion, settings.chains - 1)
     phases = np.zeros((settings.chains, len(z)))
     phases[0] = inclusion
     for phase, factor in zip(phases[1:], factors, strict=True):
@@ -288,8 +280,8 @@ def initial_phases(
 def _total_variation_estimate(
     data: ElementInformation, faces: InternalFaces, settings: SamplerSettings
 ) -> Array:
-    """Return the logarithms z (E,) of least squares and least total variation, with p eliminated, by
-    `SamplerSettings.sharpenings` reweighted least-squares solves.
+    """Return the logarithms z (E,) of least squares and least total variation, with p eliminated,
+    by `SamplerSettings.sharpenings` reweighted least-squares solves.
     """
     normal, score = data.eliminated
     jumps = faces.build_jump_operator()
@@ -299,9 +291,7 @@ def _total_variation_estimate(
         weights = settings.total_variation * faces.weights / smoothed
         prior = (jumps.T @ sp.diags_array(weights) @ jumps).toarray()
         # No measurement tells the mean of z, which p has too.
-        prior[np.diag_indices_from(prior)] += (
-            1e-9 * np.trace(prior) / len(prior)
-        )
+        prior[np.diag_indices_from(prior)] += 1e-9 * np.trace(prior) / len(prior)
         z = np.linalg.solve(normal + prior, normal @ data.base - score)
     return z
 
@@ -309,18 +299,6 @@ def _total_variation_estimate(
 def _class_threshold(values: Array, weights: Array) -> float:
     """Return the threshold between two classes of values (E,) with the least weighted variance
     within (Otsu).
-
-    Parameters
-    ----------
-    values : (E,) array
-        Values, at least two.
-    weights : (E,) array
-        Their weights, all positive.
-
-    Returns
-    -------
-    float
-        The least value of the upper class.
     """
     order = np.argsort(values)
     sorted_values = values[order]
@@ -367,9 +345,7 @@ def sample_phases(
     and Hastings.
     """
     rng = np.random.default_rng(seed)
-    steps = max(
-        settings.least_steps, settings.steps_per_element * faces.element_count
-    )
+    steps = max(settings.least_steps, settings.steps_per_element * faces.element_count)
     chains = _Chains(
         data,
         faces,
@@ -453,22 +429,15 @@ class _Chains:
         # Sums over the elements of phase 1 in each chain.
         self._normal_sums = self.phases @ normal
         precision = 1 / data.deviation**2
-        self._information = precision + (self.phases * self._normal_sums).sum(
-            axis=1
-        )
+        self._information = precision + (self.phases * self._normal_sums).sum(axis=1)
         self._moments = data.mean * precision + self.phases @ self._target
         self._neighbour_sums = self.phases @ self._neighbours
         self._energies = self._flip_energies()
 
-    def draw_constants(
-        self, hyperprior: PottsHyperprior, rng: np.random.Generator
-    ) -> None:
+    def draw_constants(self, hyperprior: PottsHyperprior, rng: np.random.Generator) -> None:
         """Replace the constants of the Potts prior by draws given the phases, in place."""
         self.constants = hyperprior.draw(
-            self.phases,
-            2 * self._neighbour_sums - self._degrees,
-            self.constants,
-            rng=rng,
+            self.phases, 2 * self._neighbour_sums - self._degrees, self.constants, rng=rng
         )
         self._energies = self._flip_energies()
 
@@ -512,8 +481,7 @@ class _Chains:
         of_data = np.log(information / before) - moments**2 / information
         of_data += self._moments[:, None] ** 2 / before
         of_prior = (
-            self.constants.face_nats[:, None]
-            * (self._degrees - 2 * self._neighbour_sums)
+            self.constants.face_nats[:, None] * (self._degrees - 2 * self._neighbour_sums)
             - self.constants.element_nats[:, None]
         )
         return of_data / 2 + signs * of_prior
@@ -524,8 +492,7 @@ class _Chains:
         flipped = elements[mask]
         signs = 1 - 2 * self.phases[rows, flipped]
         self._information[rows] += (
-            2 * signs * self._normal_sums[rows, flipped]
-            + self._diagonal[flipped]
+            2 * signs * self._normal_sums[rows, flipped] + self._diagonal[flipped]
         )
         self._moments[rows] += signs * self._target[flipped]
         self._normal_sums[rows] += signs[:, None] * self._normal[flipped]

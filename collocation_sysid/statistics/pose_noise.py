@@ -66,11 +66,7 @@ class PoseNoise:
         """Return the message for the user: the size of the noise in mm and degrees, and whether it
         was stated or estimated.
         """
-        how = (
-            "estimated from their roughness"
-            if self.is_estimated
-            else "as stated"
-        )
+        how = "estimated from their roughness" if self.is_estimated else "as stated"
         return (
             f"the error bars of '{self.experiment}' include noise of the poses of "
             f"{1e3 * self.sigma_m:.2g} mm and {np.degrees(self.sigma_rad):.2g}°, {how}"
@@ -87,17 +83,11 @@ def estimate_pose_noise(poses: PoseSequence) -> tuple[float, float]:
     if len(poses.t_s) < 4 * ORDER:
         return 0.0, 0.0
     rotations = poses.rotation_steps
-    sizes = [
-        np.diff(poses.positions_m, ORDER, axis=0),
-        np.diff(rotations, ORDER - 1, axis=0),
-    ]
+    sizes = [np.diff(poses.positions_m, ORDER, axis=0), np.diff(rotations, ORDER - 1, axis=0)]
     scale = np.sqrt(binom(2 * ORDER, ORDER))
     # The median of squares, so that a jump or a stroke does not count as noise.
     sigmas = [float(np.median(np.abs(size)) / 0.6745 / scale) for size in sizes]
-    return (
-        sigmas[0] if sigmas[0] > LEAST_M else 0.0,
-        sigmas[1] if sigmas[1] > LEAST_RAD else 0.0,
-    )
+    return (sigmas[0] if sigmas[0] > LEAST_M else 0.0, sigmas[1] if sigmas[1] > LEAST_RAD else 0.0)
 
 
 @one_blas_thread()
@@ -130,23 +120,17 @@ def with_pose_noise(
     noises: list[PoseNoise] = []
     for part in collocation.iterates(z):
         noise_of_grasps = [
-            _grasp_noise(part.segment.experiment.name, g)
-            for g in part.segment.experiment.grasps
+            _grasp_noise(part.transcription.experiment.name, g)
+            for g in part.transcription.experiment.grasps
         ]
-        disturbances: list[Array | None] = [None] * len(part.segment.residuals)
+        disturbances: list[Array | None] = [None] * len(part.transcription.residuals)
         if any(noise.sigma_m or noise.sigma_rad for noise in noise_of_grasps):
-            drawn = _residual_samples(
-                part, noise_of_grasps, rng=np.random.default_rng(seed)
-            )
+            drawn = _residual_samples(part, noise_of_grasps, rng=np.random.default_rng(seed))
             if any(np.sqrt(np.mean(each**2)) >= NEGLIGIBLE for each in drawn):
                 disturbances = [*drawn]
         draws += disturbances
         if disturbances[0] is not None:
-            noises += [
-                noise
-                for noise in noise_of_grasps
-                if noise.sigma_m or noise.sigma_rad
-            ]
+            noises += [noise for noise in noise_of_grasps if noise.sigma_m or noise.sigma_rad]
     return fit.with_disturbances(draws), tuple(noises)
 
 
@@ -157,82 +141,52 @@ def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
     rough_m, rough_rad = estimate_pose_noise(grasp.poses)
     sigma_m = rough_m if grasp.sigma_m is None else grasp.sigma_m
     sigma_rad = rough_rad if grasp.sigma_rad is None else grasp.sigma_rad
-    return PoseNoise(
-        name, sigma_m, sigma_rad=sigma_rad, is_estimated=grasp.sigma_m is None
-    )
+    return PoseNoise(name, sigma_m, sigma_rad=sigma_rad, is_estimated=grasp.sigma_m is None)
 
 
 def _residual_samples(
-    iterate: ExperimentIterate,
-    noises: Sequence[PoseNoise],
-    rng: np.random.Generator,
+    iterate: ExperimentIterate, noises: Sequence[PoseNoise], rng: np.random.Generator
 ) -> list[Array]:
     """Return, for each measurement of an experiment, K samples (K, T, M, 3) of the changes of its
     residuals by noise of the poses.
 
     K is `DRAWS`, or less for large bodies, but at least `FEWEST_DRAWS`.
-
-    Parameters
-    ----------
-    iterate : ExperimentIterate
-        Experiment at the answer.
-    noises : sequence of PoseNoise
-        Noise of each grasp, in the order of the experiment.
-    rng : numpy.random.Generator
     """
-    segment = iterate.segment
+    transcription = iterate.transcription
     prescribed = iterate.equations.prescribed
     value_count = prescribed.positions_m.size * 8
     count = int(np.clip(BYTES / value_count, FEWEST_DRAWS, DRAWS))
     displacements_m = np.zeros((*prescribed.positions_m.shape, count))
     pose_errors = []
-    for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
-        shifts, rotations = _pose_samples(
-            iterate, grasp, noise=noise, rng=rng, count=count
-        )
+    for grasp, noise in zip(transcription.experiment.grasps, noises, strict=True):
+        shifts, rotations = _pose_samples(iterate, grasp, noise=noise, rng=rng, count=count)
         _add_displacements(
-            displacements_m,
-            iterate,
-            grasp=grasp,
-            shifts=shifts,
-            rotations=rotations,
+            displacements_m, iterate, grasp=grasp, shifts=shifts, rotations=rotations
         )
         pose_errors.append((grasp, shifts, rotations))
-    solver = Sweep(segment)
+    solver = Sweep(transcription)
     changes = []
-    columns = SweepColumns.from_prescribed(
-        solver, iterate.equations, changes_m=displacements_m
-    )
+    columns = SweepColumns.from_prescribed(solver, iterate.equations, changes_m=displacements_m)
     for response in propagate_columns(iterate, solver, columns=columns):
         reading = response.reading
         by_noise = response.changes
         for grasp, shifts, rotations in pose_errors:
             by_noise = by_noise + reading.observable.frame_changes(
-                grasp,
-                response.motion,
-                phi=iterate.phi,
-                shifts=shifts,
-                rotations=rotations,
+                grasp, response.motion, phi=iterate.phi, shifts=shifts, rotations=rotations
             )
-        residual_changes = reading.residual_changes(
-            response.values, by_noise, phi=iterate.phi
-        )
+        residual_changes = reading.residual_changes(response.values, by_noise, phi=iterate.phi)
         changes.append(np.moveaxis(residual_changes, 3, 0))
     return changes
 
 
 def _pose_samples(
-    iterate: ExperimentIterate,
-    grasp: Grasp,
-    noise: PoseNoise,
-    rng: np.random.Generator,
-    count: int,
+    iterate: ExperimentIterate, grasp: Grasp, noise: PoseNoise, rng: np.random.Generator, count: int
 ) -> tuple[Array, Array]:
     """Return `count` samples of translation [m] and rotation [rad] errors of the poses of a grasp
     at the N grid times, (N, count, 3) each; zero while the grasp does not hold, and for a single
     pose. Noise is white at the times of the poses and interpolated to the grid as the poses are.
     """
-    t_s = iterate.segment.dynamics.t_s
+    t_s = iterate.transcription.dynamics.t_s
     samples = np.zeros((2, len(t_s), count, 3))
     if len(grasp.poses.t_s) > 1:
         rows = np.flatnonzero(grasp.is_active(t_s))
@@ -252,30 +206,16 @@ def _add_displacements(
     shifts: Array,
     rotations: Array,
 ) -> None:
-    """Add the displacements of a grasp's nodes due to pose errors to `displacements_m`, in place.
-
-    Parameters
-    ----------
-    displacements_m : (N, g, c) array
-        Displacements of the g prescribed dofs at the N grid times in c samples [m].
-    iterate : ExperimentIterate
-        Experiment at the answer.
-    grasp : Grasp
-        Grasp whose prescribed dofs are displaced, at the times at which it holds.
-    shifts, rotations : (N, c, 3) arrays
-        Translation [m] and rotation vector [rad] errors.
-    """
-    segment = iterate.segment
+    """Add the displacements of a grasp's nodes due to pose errors to `displacements_m`, in place."""
+    transcription = iterate.transcription
     prescribed = iterate.equations.prescribed
-    t_s = segment.dynamics.t_s
+    t_s = transcription.dynamics.t_s
     count = displacements_m.shape[2]
     rows = np.flatnonzero(grasp.is_active(t_s))
     dofs = np.searchsorted(prescribed.dofs, grasp.prescribed_dofs)
-    arms = grasp.poses.at(t_s[rows])[0] @ segment.body.nodes_m[grasp.nodes].T
+    arms = grasp.poses.at(t_s[rows])[0] @ transcription.body.nodes_m[grasp.nodes].T
     arms = np.moveaxis(arms, 1, 2)
-    change = shifts[rows, None] + np.cross(
-        rotations[rows, None], arms[:, :, None]
-    )
+    change = shifts[rows, None] + np.cross(rotations[rows, None], arms[:, :, None])
     change = change[..., grasp.axis_indices]  # (rows, nodes, c, axes)
     displacements_m[np.ix_(rows, dofs)] += np.moveaxis(change, 3, 2).reshape(
         len(rows), len(dofs), count

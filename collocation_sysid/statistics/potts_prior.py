@@ -6,9 +6,9 @@ With the phases h ∈ {0, 1}ᴱ of the elements, a field B per element of phase 
 
 The first sum is over the faces between two elements, w_f is the face's area over the mean area. A
 given J without B makes inclusions too small and, in exchange, their contrast too large, because the
-area decreases with the volume. B balances it. J and B are therefore unknown, with normal priors, and
-sampled with the phases. Their likelihood is the pseudo-likelihood Π_e π(h_e | neighbours) of Besag
-(1975), which does not contain Z: a logistic regression on the phases of the neighbours.
+area decreases with the volume. B balances it. J and B are therefore unknown, with normal priors,
+and sampled with the phases. Their likelihood is the pseudo-likelihood Π_e π(h_e | neighbours) of
+Besag (1975), which does not contain Z: a logistic regression on the phases of the neighbours.
 """
 
 from __future__ import annotations
@@ -91,16 +91,10 @@ class PottsHyperprior:
             )
         ]
         drawn = np.array(pairs)
-        return PottsConstants(
-            np.maximum(drawn[:, 0], 0.0), element_nats=drawn[:, 1]
-        )
+        return PottsConstants(np.maximum(drawn[:, 0], 0.0), element_nats=drawn[:, 1])
 
     def _draw_chain(
-        self,
-        phase: Array,
-        balance: Array,
-        start: Array,
-        rng: np.random.Generator,
+        self, phase: Array, balance: Array, start: Array, rng: np.random.Generator
     ) -> Array:
         """Draw (J, B) of one chain from its phases (E,) and face balance (E,); `start` (2,) is the
         start of the search for the mode.
@@ -113,9 +107,7 @@ class PottsHyperprior:
         value = start
         information = np.diag(precision)
         for _ in range(self.newton_steps):
-            logit = np.clip(
-                regressors @ value, -self.largest_logit, self.largest_logit
-            )
+            logit = np.clip(regressors @ value, -self.largest_logit, self.largest_logit)
             probability = 1 / (1 + np.exp(-logit))
             score = regressors.T @ (phase - probability)
             score -= precision * (value - mean)

@@ -46,9 +46,7 @@ def parameters_of_open_scale(
     return _scaled_parameters(experiments, parameters, includes_declared=False)
 
 
-def relative_moduli(
-    experiments: Iterable[Experiment], parameters: Parameters
-) -> tuple[str, ...]:
+def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
     """Return the names of the estimated parameters that are determined relative to the stated
     densities only; empty if a known force or a prior sets the scale. Experiments for validation
     are ignored.
@@ -57,24 +55,16 @@ def relative_moduli(
 
 
 def scale_concerns(
-    experiments: Iterable[Experiment],
-    parameters: Parameters,
-    grade: Grade = "check",
+    experiments: Iterable[Experiment], parameters: Parameters, grade: Grade = "check"
 ) -> list[Concern]:
     """Return one concern "scale/unknown" of a grade, as a list, if `parameters_of_open_scale` has
     names; else empty.
     """
     names = parameters_of_open_scale(experiments, parameters)
-    return (
-        [Concern("scale/unknown", grade, data={"names": names})]
-        if names
-        else []
-    )
+    return [Concern("scale/unknown", grade, data={"names": names})] if names else []
 
 
-def relative_scale_note(
-    experiments: Iterable[Experiment], parameters: Parameters
-) -> str | None:
+def relative_scale_note(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
     """Return the note that moduli are relative to the stated density; None if a force or a prior
     sets the scale, or if the scale is open (`parameters_of_open_scale`).
     """
@@ -90,25 +80,12 @@ def relative_scale_note(
 
 
 def _scaled_parameters(
-    experiments: Iterable[Experiment],
-    parameters: Parameters,
-    includes_declared: bool,
+    experiments: Iterable[Experiment], parameters: Parameters, includes_declared: bool
 ) -> tuple[str, ...]:
     """Return the free parameters that multiply all moduli and densities by a common factor; empty
     if data or priors determine the factor.
-
-    Parameters
-    ----------
-    experiments : iterable of Experiment
-        Experiments; those for validation are ignored.
-    parameters : Parameters
-        Shared parameters.
-    includes_declared : bool
-        Whether densities that are not estimated count as multiplied too.
     """
-    fitted = [
-        experiment for experiment in experiments if not experiment.validation
-    ]
+    fitted = [experiment for experiment in experiments if not experiment.validation]
     bodies = {id(e.body): e.body for e in fitted}
     with_known_force = {id(e.body) for e in fitted if e.has_known_force()}
     if len(with_known_force) == len(bodies):
@@ -120,9 +97,7 @@ def _scaled_parameters(
         constants = ThetaMap(usual, body)
         theta = constants.theta(usual.guess_q)
         slope = constants.jacobian(usual.guess_q)
-        change = _common_scaling(
-            body, theta, slope=slope, includes_declared=includes_declared
-        )
+        change = _common_scaling(body, theta, slope=slope, includes_declared=includes_declared)
         if key in with_known_force or change is None:
             change = np.zeros(len(slope))
         size = np.where(theta == 0, 1.0, np.abs(theta))
@@ -133,22 +108,11 @@ def _scaled_parameters(
     if not scaling.any():
         return ()
     solution = np.linalg.lstsq(matrix, scaling, rcond=None)[0]
-    moves = np.abs(solution) > LEAST_REMAINDER * np.abs(solution).max(
-        initial=0.0
-    )
-    priors = np.array(
-        [item.prior is not None for item in usual.free], dtype=bool
-    )
-    if (
-        np.abs(matrix @ solution - scaling).max() > LEAST_REMAINDER
-        or (moves & priors).any()
-    ):
+    moves = np.abs(solution) > LEAST_REMAINDER * np.abs(solution).max(initial=0.0)
+    priors = np.array([item.prior is not None for item in usual.free], dtype=bool)
+    if np.abs(matrix @ solution - scaling).max() > LEAST_REMAINDER or (moves & priors).any():
         return ()
-    return tuple(
-        item.name
-        for item, is_moved in zip(usual.free, moves, strict=True)
-        if is_moved
-    )
+    return tuple(item.name for item, is_moved in zip(usual.free, moves, strict=True) if is_moved)
 
 
 def _common_scaling(
@@ -156,20 +120,8 @@ def _common_scaling(
 ) -> Array | None:
     """Return the change of θ (k,) if all moduli and densities change by a common factor, to first
     order: θ for those, zero for other constants; None if a density cannot change.
-
-    Parameters
-    ----------
-    body : Body
-    theta : (k,) array
-    slope : (k, nq) array
-        Derivatives of θ by q.
-    includes_declared : bool
-        Whether stated densities, which do not depend on q, count as multiplied too: they are then
-        left out of the change. If false, a part whose density is not estimated gives None.
     """
-    if not includes_declared and not all(
-        part.has_free_density for part in body.parts
-    ):
+    if not includes_declared and not all(part.has_free_density for part in body.parts):
         return None
     scaled = [
         is_modulus(name)
@@ -213,39 +165,24 @@ def is_motionless(experiment: Experiment) -> bool:
     present = markers.is_present[..., None]
     counts = np.maximum(present.sum(axis=0), 1)
     mean = np.where(present, markers.positions_m, 0.0).sum(axis=0) / counts
-    deviations = (
-        np.where(present, markers.positions_m - mean, 0.0)
-        / markers.sigma_m[:, None]
-    )
+    deviations = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
     # Of a mean of n samples, the deviations have n − 1 degrees of freedom.
     freedom = 3 * float(np.maximum(present.sum(axis=0) - 1, 0).sum())
     return bool(np.sum(deviations**2) <= chi2_isf(RARE, max(freedom, 1.0)))
 
 
-def static_concerns(
-    experiments: Iterable[Experiment], parameters: Parameters
-) -> list[Concern]:
+def static_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:
     """Return one concern, as a list, if a damping is estimated and nothing moves in all fitted
     recordings, so that damping cannot be determined; else empty.
 
     The code is "information/static" if all recordings are static tests, else "information/still".
     Experiments for validation are ignored.
     """
-    fitted = [
-        experiment for experiment in experiments if not experiment.validation
-    ]
+    fitted = [experiment for experiment in experiments if not experiment.validation]
     damping = [item.name for item in parameters.free if is_damping(item.name)]
-    if (
-        not fitted
-        or not damping
-        or not all(e.is_static or is_motionless(e) for e in fitted)
-    ):
+    if not fitted or not damping or not all(e.is_static or is_motionless(e) for e in fitted):
         return []
-    code = (
-        "static"
-        if all(experiment.is_static for experiment in fitted)
-        else "still"
-    )
+    code = "static" if all(experiment.is_static for experiment in fitted) else "still"
     names = [f"'{e.name}'" for e in fitted]
     verb = "is" if len(fitted) == 1 else "are"
     data = {"names": names, "verb": verb, "damping": damping}

@@ -62,18 +62,10 @@ def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
     strains, and laws to compare with.
     """
     laws = list(
-        dict.fromkeys(
-            part.material.name
-            for each in experiments
-            for part in each.body.parts
-        )
+        dict.fromkeys(part.material.name for each in experiments for part in each.body.parts)
     )
     others = [*laws, *(law for law in COMPARED_LAWS if law not in laws)]
-    return {
-        "laws": laws,
-        "range": " and ".join(_ranges(experiments)),
-        "others": ",".join(others),
-    }
+    return {"laws": laws, "range": " and ".join(_ranges(experiments)), "others": ",".join(others)}
 
 
 def _ranges(experiments: Sequence[Experiment]) -> Iterator[str]:
@@ -81,10 +73,7 @@ def _ranges(experiments: Sequence[Experiment]) -> Iterator[str]:
     shear, if there are such tests.
     """
     tests = [each.specimen.test for each in experiments if each.specimen]
-    for is_shear, name, offset in (
-        (False, "stretches", 1.0),
-        (True, "amounts of shear", 0.0),
-    ):
+    for is_shear, name, offset in ((False, "stretches", 1.0), (True, "amounts of shear", 0.0)):
         values = [
             offset + specimen_strains(each)[0]
             for each, test in zip(experiments, tests, strict=True)

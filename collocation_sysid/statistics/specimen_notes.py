@@ -16,9 +16,7 @@ GENERAL_TESTS = frozenset({"biaxial"})
 FEWEST_CONSTANTS = 2
 
 
-def one_kind_notes(
-    experiments: Sequence[Experiment], parameters: Parameters
-) -> Iterator[str]:
+def one_kind_notes(experiments: Sequence[Experiment], parameters: Parameters) -> Iterator[str]:
     """Yield one note if a law with several constants is fitted to specimens of one kind of test.
 
     Nothing is yielded if another kind of test is predicted, if another recording is fitted, for
@@ -34,20 +32,12 @@ def one_kind_notes(
     """
     if any(each.specimen is None for each in experiments):
         return
-    tests = {
-        each.specimen.test for each in experiments if each.specimen is not None
-    }
+    tests = {each.specimen.test for each in experiments if each.specimen is not None}
     if len(tests) != 1 or tests & GENERAL_TESTS:
         return
     materials = [part.material for part in experiments[0].body.parts]
-    own = {
-        constant.name
-        for material in materials
-        for constant in material.constants
-    }
-    free = {without_region(item.name) for item in parameters.free} & (
-        own | MODULI
-    )
+    own = {constant.name for material in materials for constant in material.constants}
+    free = {without_region(item.name) for item in parameters.free} & (own | MODULI)
     if len(free) < FEWEST_CONSTANTS or free <= MODULI:
         return
     (test,) = tests

@@ -31,9 +31,7 @@ NAMED_ERRORS = 1.5
 PRIOR_SIGMAS = 10.0
 
 
-def stress_offset_notes(
-    fit: LinearisedFit, experiments: Sequence[Experiment]
-) -> list[str]:
+def stress_offset_notes(fit: LinearisedFit, experiments: Sequence[Experiment]) -> list[str]:
     """Return one note, as a list, if constant offsets of the stresses explain residuals above the
     noise; else empty.
 
@@ -56,8 +54,7 @@ def stress_offset_notes(
         if block.marker_names == (STRESS_NAME,)
         and block.count_measurements()
         and not any(
-            name.startswith(f"{block.name}: stress_zero of {STRESS_NAME}")
-            for name in fit.names
+            name.startswith(f"{block.name}: stress_zero of {STRESS_NAME}") for name in fit.names
         )
     ]
     residual, slopes, columns = _stacked(fit, offsets)
@@ -76,12 +73,11 @@ def stress_offset_notes(
         return []
     estimates, errors = _offsets(complete, residual, count=count)
     errors = errors * np.sqrt(after / free)
-    named = [
-        k for k in range(count) if abs(estimates[k]) > NAMED_ERRORS * errors[k]
-    ] or [int(np.argmax(np.abs(estimates) / errors))]
+    named = [k for k in range(count) if abs(estimates[k]) > NAMED_ERRORS * errors[k]] or [
+        int(np.argmax(np.abs(estimates) / errors))
+    ]
     sizes = [
-        f"{short(estimates[k])} ± {short(errors[k])} Pa in "
-        f"'{fit.blocks[offsets[k]].name}'"
+        f"{short(estimates[k])} ± {short(errors[k])} Pa in '{fit.blocks[offsets[k]].name}'"
         for k in named
     ]
     prior_pa = float(f"{np.abs(estimates[named]).max():.1g}")
@@ -93,18 +89,10 @@ def stress_offset_notes(
     ]
 
 
-def _stacked(
-    fit: LinearisedFit, offsets: Sequence[int]
-) -> tuple[Array, Array, Array]:
+def _stacked(fit: LinearisedFit, offsets: Sequence[int]) -> tuple[Array, Array, Array]:
     """Return residuals (n,), derivatives (n, f) by the f parameters that are not at a bound, and
     derivatives (n, k) by the k offsets [1/Pa], of all measurements and then of the priors, which
     the offsets have too (`PRIOR_SIGMAS`).
-
-    Parameters
-    ----------
-    fit : LinearisedFit
-    offsets : sequence of int
-        Indices of the blocks whose stress has an offset.
     """
     residuals = []
     slopes = []
@@ -125,11 +113,7 @@ def _stacked(
     columns.append(np.zeros((len(fit.names), len(offsets))))
     priors_pa = [PRIOR_SIGMAS * fit.blocks[k].sigma_m[0] for k in offsets]
     columns.append(np.diag(1 / np.array(priors_pa)))
-    return (
-        np.concatenate(residuals),
-        np.concatenate(slopes)[:, is_free],
-        np.concatenate(columns),
-    )
+    return (np.concatenate(residuals), np.concatenate(slopes)[:, is_free], np.concatenate(columns))
 
 
 def _remaining_squares(matrix: Array, residual: Array) -> float:

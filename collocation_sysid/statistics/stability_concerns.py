@@ -8,11 +8,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..fem.body import Body
-from ..fem.laws.material_stability import (
-    is_examined,
-    principal_stretches,
-    stability_margins,
-)
+from ..fem.laws.material_stability import is_examined, principal_stretches, stability_margins
 from ..program.experiment_iterate import ExperimentIterate
 from .concerns import Concern
 
@@ -29,17 +25,10 @@ def rest_stability_concerns(body: Body, theta: Array) -> Iterator[Concern]:
     constants `theta` (k,) of the body; materials that are not examined (`is_examined`) yield
     none.
     """
-    for part, constants in zip(
-        body.parts, body.split_theta(theta), strict=True
-    ):
+    for part, constants in zip(body.parts, body.split_theta(theta), strict=True):
         if is_examined(part.material):
             own = np.asarray(constants[: len(part.material.constants)])
-            if (
-                not stability_margins(
-                    part.material, own, stretches=np.ones((1, 3))
-                )[0]
-                > 0
-            ):
+            if not stability_margins(part.material, own, stretches=np.ones((1, 3)))[0] > 0:
                 lam, mu = body.lame(theta)[part.name]
                 data = {
                     "material": part.material.name,
@@ -50,9 +39,7 @@ def rest_stability_concerns(body: Body, theta: Array) -> Iterator[Concern]:
                 yield Concern("stability/rest", "doubtful", data=data)
 
 
-def strain_stability_concerns(
-    iterates: Iterable[ExperimentIterate],
-) -> Iterator[Concern]:
+def strain_stability_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator[Concern]:
     """Yield a concern for each experiment and part whose material is unstable at its strains.
 
     Up to `STATES` samples and, in each part, the `POINTS` quadrature points with the largest
@@ -68,12 +55,10 @@ def strain_stability_concerns(
     The concerns have the grade "check"; materials that are not examined (`is_examined`) yield none.
     """
     for iterate in iterates:
-        experiment = iterate.segment.experiment
-        samples = (
-            np.linspace(0, len(experiment.t_s) - 1, STATES).round().astype(int)
-        )
+        experiment = iterate.transcription.experiment
+        samples = np.linspace(0, len(experiment.t_s) - 1, STATES).round().astype(int)
         samples = np.unique(samples)
-        states = iterate.x[iterate.segment.markers.observable.rows[samples]]
+        states = iterate.x[iterate.transcription.markers.observable.rows[samples]]
         body = experiment.body
         theta = np.asarray(iterate.equations.dynamics.theta)
         if any(is_examined(part.material) for part in body.parts):
@@ -94,22 +79,8 @@ def _part_concerns(
 
     Of each part with a material that is examined, the `POINTS` points with the largest strains of
     all times are examined; inverted elements and margins that are not finite are left out.
-
-    Parameters
-    ----------
-    body : Body
-    theta : (k,)
-        Constants of the body.
-    stretches : (T, E, q, 3)
-        Principal stretches at the quadrature points, ascending.
-    experiment : str
-        Name of the experiment.
-    t_s : (T,)
-        Times [s].
     """
-    for part, constants in zip(
-        body.parts, body.split_theta(theta), strict=True
-    ):
+    for part, constants in zip(body.parts, body.split_theta(theta), strict=True):
         if not is_examined(part.material):
             continue
         own = np.asarray(constants[: len(part.material.constants)])
@@ -119,17 +90,10 @@ def _part_concerns(
         valid = points.min(axis=1) > 0
         points = points[valid]
         times = times[valid]
-        largest = np.argsort(
-            -np.abs(np.log(points)).max(axis=1), kind="stable"
-        )[:POINTS]
-        margins = stability_margins(
-            part.material, own, stretches=points[largest]
-        )
+        largest = np.argsort(-np.abs(np.log(points)).max(axis=1), kind="stable")[:POINTS]
+        margins = stability_margins(part.material, own, stretches=points[largest])
         shear_pa = abs(body.lame(theta)[part.name][1])
-        if (
-            not np.isfinite(margins).any()
-            or np.nanmin(margins) >= -ROUNDING * shear_pa
-        ):
+        if not np.isfinite(margins).any() or np.nanmin(margins) >= -ROUNDING * shear_pa:
             continue
         worst = largest[np.nanargmin(margins)]
         yield Concern(
@@ -140,8 +104,6 @@ def _part_concerns(
                 "where": f" of region '{part.name}'" if part.name else "",
                 "experiment": experiment,
                 "time_s": float(times[worst]),
-                "stretches": ", ".join(
-                    f"{each:.3g}" for each in points[worst][::-1]
-                ),
+                "stretches": ", ".join(f"{each:.3g}" for each in points[worst][::-1]),
             },
         )

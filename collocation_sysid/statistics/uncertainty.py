@@ -216,19 +216,13 @@ def uncertainty_at(
     """
     fit, _ = with_pose_noise(linearise_fit(collocation, z), collocation, z=z)
     return uncertainty_from_fit(
-        fit,
-        collocation.parameters,
-        q=z[: collocation.nq],
-        error_model=error_model,
+        fit, collocation.parameters, q=z[: collocation.nq], error_model=error_model
     )
 
 
 @one_blas_thread()
 def uncertainty_from_fit(
-    fit: LinearisedFit,
-    parameters: Parameters,
-    q: Array,
-    error_model: ErrorModel = AUTO,
+    fit: LinearisedFit, parameters: Parameters, q: Array, error_model: ErrorModel = AUTO
 ) -> Uncertainty:
     """Return the uncertainty of the parameters from the linearised fit.
 
@@ -269,21 +263,15 @@ def uncertainty_from_fit(
         )
     bars = _error_bars(fit, factored, requested=error_model)
     basis = bars.basis
-    of_all, bounded = _reported_covariance(
-        bars.covariance, fit, parameters=parameters, q=q
-    )
+    of_all, bounded = _reported_covariance(bars.covariance, fit, parameters=parameters, q=q)
     scatter = _compare_recordings(fit, parameters, q=q, errors=error_model)
-    widened = _widen_by_scatter(
-        of_all[:shared, :shared], bars.quantiles, scatter=scatter
-    )
+    widened = _widen_by_scatter(of_all[:shared, :shared], bars.quantiles, scatter=scatter)
     of_q = widened.covariance
     quantiles = widened.quantiles
     estimates = user_estimates(
         parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles
     )
-    longest_s = max(
-        (float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0
-    )
+    longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
     sizes = relative_derivatives(parameters, q)
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
     return Uncertainty(
@@ -293,9 +281,7 @@ def uncertainty_from_fit(
         correlation=correlation_from_covariance(of_q),
         quantiles=quantiles,
         estimates=estimates,
-        derived=derived_estimates(
-            fit.derived, of_q, at_bound=bounded, quantiles=quantiles
-        ),
+        derived=derived_estimates(fit.derived, of_q, at_bound=bounded, quantiles=quantiles),
         nuisance=dict(zip(fit.names[shared:], deviations, strict=True)),
         nuisance_covariance=of_all[shared:, shared:],
         chi_squared=fit.compute_chi_squared(),
@@ -303,15 +289,8 @@ def uncertainty_from_fit(
         notes=(
             *parameter_notes(parameters, estimates),
             *memory_notes(estimates, longest_s),
-            *noise_notes(
-                error_model.noise,
-                basis.noise,
-                level=basis.level,
-                errors=basis.errors,
-            ),
-            *correlation_notes(
-                error_model.errors, basis.errors, dependence=basis.dependence
-            ),
+            *noise_notes(error_model.noise, basis.noise, level=basis.level, errors=basis.errors),
+            *correlation_notes(error_model.errors, basis.errors, dependence=basis.dependence),
             *disagreement_notes(parameters, scatter),
         ),
         scatter=scatter,
@@ -338,49 +317,27 @@ class _ErrorBars:
     basis: ErrorBasis
 
 
-def _error_bars(
-    fit: LinearisedFit, factored: Information, requested: ErrorModel
-) -> _ErrorBars:
+def _error_bars(fit: LinearisedFit, factored: Information, requested: ErrorModel) -> _ErrorBars:
     """Choose an error model and return the error bars that follow from it.
 
     Correlated errors are used if they are requested, or with "auto" if tests find them; with the
     stated σ, and unless requested, only if they widen a standard error by more than `CONSEQUENCE`.
     With noise "auto", correlated residuals that are smaller than σ do not reduce it.
-
-    Parameters
-    ----------
-    fit : LinearisedFit
-        The fit at its answer.
-    factored : Information
-        Its information.
-    requested : ErrorModel
-        Assumptions about the errors.
     """
     level = estimate_noise_level(fit, factored)
     without_outliers, outliers = remove_outliers(fit)
     dependence, dependent = _dependence(without_outliers)
-    correlated = requested.errors == "autocorrelated" or (
-        requested.errors == "auto" and dependent
-    )
-    kind: Noise = (
-        level.suggest_noise() if requested.noise == "auto" else requested.noise
-    )
+    correlated = requested.errors == "autocorrelated" or (requested.errors == "auto" and dependent)
+    kind: Noise = level.suggest_noise() if requested.noise == "auto" else requested.noise
     if requested.noise == "auto" and correlated and level.pooled < 1:
         kind = "given"
-    of_score, freedom = level.score_covariance(
-        kind, factored, shared=fit.shared_count
-    )
+    of_score, freedom = level.score_covariance(kind, factored, shared=fit.shared_count)
     covariance = factored.fit.covariance(of_score)
     used = "independent"
     if correlated:
-        of_score, few_freedom = _correlated_score_covariance(
-            fit, factored, kind=kind, level=level
-        )
+        of_score, few_freedom = _correlated_score_covariance(fit, factored, kind=kind, level=level)
         persistent = factored.fit.covariance(of_score)
-        before, after = (
-            np.diag(each)[: fit.shared_count]
-            for each in (covariance, persistent)
-        )
+        before, after = (np.diag(each)[: fit.shared_count] for each in (covariance, persistent))
         widens = (after > CONSEQUENCE**2 * before).any()
         if requested.errors == "autocorrelated" or kind != "given" or widens:
             covariance = persistent
@@ -388,15 +345,11 @@ def _error_bars(
             used = "autocorrelated"
     if fit.phase_covariance is not None:
         covariance = covariance.copy()
-        covariance[: fit.shared_count, : fit.shared_count] += (
-            fit.phase_covariance
-        )
+        covariance[: fit.shared_count, : fit.shared_count] += fit.phase_covariance
     return _ErrorBars(
         covariance,
         student_ppf(0.975, freedom),
-        basis=ErrorBasis(
-            kind, used, level=level, dependence=dependence, outliers=outliers
-        ),
+        basis=ErrorBasis(kind, used, level=level, dependence=dependence, outliers=outliers),
     )
 
 
@@ -408,26 +361,10 @@ def _reported_covariance(
 
     Rows and columns of parameters at a bound are NaN; shared parameters that the data do not
     determine have infinite variance.
-
-    Parameters
-    ----------
-    covariance : (p, p) array
-        Covariance of all parameters, those at a bound free; not modified.
-    fit : LinearisedFit
-    parameters : Parameters
-    q : (nq,) array
-        Estimates in the solver's coordinates.
-
-    Notes
-    -----
-    A damping at its bound that the data do not inform about (`_has_no_information`) counts as not
-    determined, not as at its bound.
     """
     reported = covariance.copy()
     shared = fit.shared_count
-    uninformed = _has_no_information(
-        parameters, q, variances=np.diag(covariance)[:shared]
-    )
+    uninformed = _has_no_information(parameters, q, variances=np.diag(covariance)[:shared])
     at_bound = fit.at_bound.copy()
     at_bound[:shared] &= ~uninformed
     reported[at_bound] = reported[:, at_bound] = np.nan
@@ -463,30 +400,14 @@ class _WidenedBars:
 def _widen_by_scatter(
     covariance_q: Array, quantiles: Array, scatter: RecordingComparison | None
 ) -> _WidenedBars:
-    """Widen the error bars of parameters on which recordings disagree.
-
-    Parameters
-    ----------
-    covariance_q : (nq, nq) array
-        Covariance of q; not modified.
-    quantiles : (nq,) array
-        Half widths of the 95 % intervals in standard deviations; where recordings disagree they are
-        at least those of Student's distribution with the degrees of freedom of the recordings.
-    scatter : RecordingComparison or None
-        Comparison of the recordings; None leaves everything unchanged.
-    """
+    """Widen the error bars of parameters on which recordings disagree."""
     if scatter is None:
-        return _WidenedBars(
-            covariance_q, quantiles, factors=np.ones(len(quantiles))
-        )
+        return _WidenedBars(covariance_q, quantiles, factors=np.ones(len(quantiles)))
     with np.errstate(invalid="ignore"):
-        factors = np.sqrt(
-            scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q)
-        )
+        factors = np.sqrt(scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q))
     factors = np.where(scatter.find_disagreements(), factors, 1.0)
     of_few = np.maximum(
-        quantiles,
-        student_ppf(0.975, np.maximum(scatter.count_degrees_of_freedom(), 1)),
+        quantiles, student_ppf(0.975, np.maximum(scatter.count_degrees_of_freedom(), 1))
     )
     wide = np.where(scatter.find_disagreements(), of_few, quantiles)
     return _WidenedBars(
@@ -511,24 +432,16 @@ def _compare_recordings(
     for alone, step in single_fits(fit):
         if alone.count_measurements() <= len(alone.names):
             continue
-        uncertainty = uncertainty_from_fit(
-            alone, parameters, q=q, error_model=errors
-        )
-        independent = (
-            least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
-        )
+        uncertainty = uncertainty_from_fit(alone, parameters, q=q, error_model=errors)
+        independent = least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
         variances = np.diag(uncertainty.covariance) / sizes**2
         known[alone.blocks[0].name] = RecordingEstimate(
-            step[: fit.shared_count],
-            variances,
-            independent_variances=independent,
+            step[: fit.shared_count], variances, independent_variances=independent
         )
     return compare_recordings(fit, known) if len(known) > 1 else None
 
 
-def _has_no_information(
-    parameters: Parameters, q: Array, variances: Array
-) -> NDArray[np.bool_]:
+def _has_no_information(parameters: Parameters, q: Array, variances: Array) -> NDArray[np.bool_]:
     """Return the mask (nq,) of damping parameters whose standard deviation exceeds `UNINFORMED`
     times their usual value, or is NaN, from the variances (nq,) of q; false for all other
     parameters.
@@ -536,12 +449,8 @@ def _has_no_information(
     uninformed = []
     for item, at, variance in zip(parameters.free, q, variances, strict=True):
         usual = constant_named(item.name).usual or 0.0
-        deviation = np.sqrt(variance) * item.value_derivative(
-            item.from_coordinate(float(at))
-        )
-        uninformed.append(
-            is_damping(item.name) and not deviation <= UNINFORMED * usual
-        )
+        deviation = np.sqrt(variance) * item.value_derivative(item.from_coordinate(float(at)))
+        uninformed.append(is_damping(item.name) and not deviation <= UNINFORMED * usual)
     return np.array(uninformed, dtype=bool)
 
 
@@ -554,20 +463,14 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     factored = factorise_information(fit)
     level = estimate_noise_level(fit, factored)
     tested = analyse_dependence(fit, factored)
-    tested = replace(
-        tested,
-        lag1_deviation=tested.lag1_deviation * level.compute_unevenness(),
-    )
+    tested = replace(tested, lag1_deviation=tested.lag1_deviation * level.compute_unevenness())
     return tested, tested.is_correlated() and not _is_explained(
         fit, factored, level=level, result=tested
     )
 
 
 def _is_explained(
-    fit: LinearisedFit,
-    factored: Information,
-    level: NoiseLevel,
-    result: Dependence,
+    fit: LinearisedFit, factored: Information, level: NoiseLevel, result: Dependence
 ) -> bool:
     """Whether known disturbances (such as noise of the poses) explain residuals as correlated as
     those in `result`; false without disturbances.
@@ -582,8 +485,7 @@ def _is_explained(
     rng = np.random.default_rng(0)
     size = np.sqrt(max(1.0, level.pooled))
     errors = [
-        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape))
-        * block.is_measured
+        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape)) * block.is_measured
         for each, block in zip(added, fit.blocks, strict=True)
     ]
     _, residuals = project_errors(factored, errors)
@@ -601,9 +503,7 @@ def _is_explained(
         for k in range(len(errors[0]))
     ]
     least, most = (pick(each.lag1 for each in replicas) for pick in (min, max))
-    return least <= result.lag1 <= most and result.shared_p >= min(
-        r.shared_p for r in replicas
-    )
+    return least <= result.lag1 <= most and result.shared_p >= min(r.shared_p for r in replicas)
 
 
 def _correlated_score_covariance(
@@ -611,11 +511,6 @@ def _correlated_score_covariance(
 ) -> tuple[Array, Array]:
     """Return the covariance (r, r) of the score for correlated errors, and degrees of freedom
     (shared,).
-
-    Notes
-    -----
-    With noise "given", or with known disturbances, the covariance is raised to at least that of
-    independent errors in every direction.
     """
     of_score, freedom = score_covariance(
         factored, error_processes(fit, factored), shared=fit.shared_count
@@ -623,9 +518,7 @@ def _correlated_score_covariance(
     if kind == "given" or level.known_score_covariance.any():
         # In no direction less than independent errors of the σ given bring, nor than those found
         # with what is known to add to them: an autoregression may miss that.
-        least, _ = level.score_covariance(
-            kind, factored, shared=fit.shared_count
-        )
+        least, _ = level.score_covariance(kind, factored, shared=fit.shared_count)
         root = np.linalg.cholesky(least + 1e-12 * np.eye(len(least)))
         over = np.linalg.solve(root, np.linalg.solve(root, of_score).T)
         values, vectors = np.linalg.eigh((over + over.T) / 2)
@@ -667,11 +560,7 @@ class MarkerPlace:
         stated.
         """
         declared_m = self.declared_m
-        return (
-            None
-            if declared_m is None
-            else float(np.linalg.norm(self.position_m - declared_m))
-        )
+        return None if declared_m is None else float(np.linalg.norm(self.position_m - declared_m))
 
 
 def marker_places(
@@ -680,45 +569,37 @@ def marker_places(
     """Return the places of an experiment's markers at a solution, by the marker's name; without
     `uncertainty` (None), and where it is not finite, a place has no standard errors.
     """
-    segment = iterate.segment
-    chart = segment.association.markers
-    markers = segment.experiment.markers
+    transcription = iterate.transcription
+    association = transcription.association.markers
+    markers = transcription.experiment.markers
     errors = _std_errors_m(iterate, uncertainty)
     return {
         name: MarkerPlace(
             position,
-            None
-            if errors is None or not np.isfinite(errors[m]).all()
-            else errors[m],
-            prior_m=float(chart.sigma_m[m]),
-            declared_m=chart.prior_places_m[m] if markers.located[m] else None,
+            None if errors is None or not np.isfinite(errors[m]).all() else errors[m],
+            prior_m=float(association.sigma_m[m]),
+            declared_m=association.prior_places_m[m] if markers.located[m] else None,
         )
         for m, (name, position) in enumerate(
-            zip(
-                markers.names, segment.marker_places_m(iterate.phi), strict=True
-            )
+            zip(markers.names, transcription.marker_places_m(iterate.phi), strict=True)
         )
     }
 
 
-def _std_errors_m(
-    iterate: ExperimentIterate, uncertainty: Uncertainty | None
-) -> Array | None:
+def _std_errors_m(iterate: ExperimentIterate, uncertainty: Uncertainty | None) -> Array | None:
     """Return the standard errors (M, 3) of the coordinates of an experiment's marker places [m],
     along the axes of the body, zero for exact places; None without `uncertainty`.
     """
     if uncertainty is None:
         return None
-    segment = iterate.segment
-    chart = segment.association.markers
+    transcription = iterate.transcription
+    association = transcription.association.markers
     row = {name: k for k, name in enumerate(uncertainty.nuisance)}
-    at = np.array(
-        [row[name] for name in segment.nuisance.names], dtype=np.int64
-    )
-    errors = np.zeros(chart.centre_places_m.shape)
-    for m in chart.estimated:
-        indices = at[segment.markers.observable.coordinate_parameters[m]]
+    at = np.array([row[name] for name in transcription.nuisance.names], dtype=np.int64)
+    errors = np.zeros(association.centre_places_m.shape)
+    for m in association.estimated:
+        indices = at[transcription.markers.observable.coordinate_parameters[m]]
         of_phi = uncertainty.nuisance_covariance[np.ix_(indices, indices)]
-        axes_m = chart.sigma_m[m] * chart.axes[m]
+        axes_m = association.sigma_m[m] * association.axes[m]
         errors[m] = np.sqrt(np.einsum("ik,kl,il->i", axes_m, of_phi, axes_m))
     return errors

@@ -12,13 +12,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.laws.damping_admissibility import viscous_stress
-from ..fem.laws.materials import (
-    DampingLaw,
-    Energy,
-    Material,
-    as_damping,
-    as_material,
-)
+from ..fem.laws.materials import DampingLaw, Energy, Material, as_damping, as_material
 from .internal_force_check import check_internal_forces, damping_stress
 from .material_check import deformation_gradients, random_rotation
 from .missing_constant_check import check_missing_constant
@@ -84,22 +78,14 @@ def check_damping(
     known = as_material(material)
     check = PropertyCheck(f"damping law {made.name!r}")
     if made.stress is not None and made.potential is not None:
-        check.fail(
-            "it has both a stress and a potential",
-            made,
-            expected="only one of them",
-        )
+        check.fail("it has both a stress and a potential", made, expected="only one of them")
     _check_evaluation(check, made, known)
     values = usual_constants((*known.constants, *made.constants), constants)
     stress = DampingStress(made, known, values=np.array([*values.values()]))
     for number, F in enumerate(
-        deformation_gradients(
-            check.rng, DEFORMATIONS, largest_strain=largest_strain
-        )
+        deformation_gradients(check.rng, DEFORMATIONS, largest_strain=largest_strain)
     ):
-        where = (
-            f"at random deformation {number} (strains up to {largest_strain:g})"
-        )
+        where = f"at random deformation {number} (strains up to {largest_strain:g})"
         rate = check.rng.standard_normal(9)
         _check_derivatives(check, stress, F=F, rate=rate, where=where)
         if is_dissipative:
@@ -118,16 +104,12 @@ def check_damping(
         )
     own = {constant.name: values[constant.name] for constant in made.constants}
     check_missing_constant(check, own, material=known, damping=made)
-    F = next(
-        iter(deformation_gradients(check.rng, 1, largest_strain=largest_strain))
-    )
+    F = next(iter(deformation_gradients(check.rng, 1, largest_strain=largest_strain)))
     check_pickling(
         check,
         made,
         evaluate=lambda each: (
-            DampingStress(each, known, values=stress.values)
-            .evaluate(F, F)
-            .stress
+            DampingStress(each, known, values=stress.values).evaluate(F, F).stress
         ),
     )
 
@@ -178,18 +160,12 @@ class DampingStress:
         F = ca.SX.sym("F", 9)
         rate = ca.SX.sym("rate", 9)
         count = len(self.material.constants)
-        constants = [
-            ca.SX(ca.DM(each)) for each in np.split(self.values, [count])
-        ]
-        stress, stated = damping_stress(
-            self.law, self.material, symbols=[F, rate, *constants]
-        )
+        constants = [ca.SX(ca.DM(each)) for each in np.split(self.values, [count])]
+        stress, stated = damping_stress(self.law, self.material, symbols=[F, rate, *constants])
         by_F = ca.jacobian(stress, F)
         by_rate = ca.jacobian(stress, rate)
         outputs = [stress, by_F if stated is None else stated, by_F, by_rate]
-        return ca.Function(
-            "damping", [F, rate], [ca.densify(each) for each in outputs]
-        )
+        return ca.Function("damping", [F, rate], [ca.densify(each) for each in outputs])
 
     def evaluate(self, F: Array, rate: Array) -> DampingState:
         """Return stress and derivatives at F (9,) and its rate Ḟ (9,) [1/s], column after
@@ -197,16 +173,11 @@ class DampingStress:
         """
         outputs = [o.full() for o in self._function.call([F, rate])]
         return DampingState(
-            stress=outputs[0].ravel(),
-            stated_by_F=outputs[1],
-            by_F=outputs[2],
-            by_rate=outputs[3],
+            stress=outputs[0].ravel(), stated_by_F=outputs[1], by_F=outputs[2], by_rate=outputs[3]
         )
 
 
-def _check_evaluation(
-    check: PropertyCheck, law: DampingLaw, material: Material
-) -> None:
+def _check_evaluation(check: PropertyCheck, law: DampingLaw, material: Material) -> None:
     """Require that the functions of the law can be evaluated, with results of the right shapes."""
     constants = (*material.constants, *law.constants)
     try:
@@ -222,24 +193,16 @@ def _check_evaluation(
 
 
 def _check_derivatives(
-    check: PropertyCheck,
-    stress: DampingStress,
-    F: Array,
-    rate: Array,
-    where: str,
+    check: PropertyCheck, stress: DampingStress, F: Array, rate: Array, where: str
 ) -> None:
     """Require at one deformation a P_v that is linear in the rate, a symmetric ∂P_v/∂Ḟ, and a
     stated ∂P_v/∂F that agrees with the automatic one and with central differences.
     """
     state = stress.evaluate(F, rate)
     by_rate = state.by_rate
+    check.require_equal(by_rate, by_rate.T, statement=f"∂P_v/∂Ḟ is not symmetric {where}")
     check.require_equal(
-        by_rate, by_rate.T, statement=f"∂P_v/∂Ḟ is not symmetric {where}"
-    )
-    check.require_equal(
-        state.stress,
-        by_rate @ rate,
-        statement=f"P_v is not linear in the rate Ḟ {where}",
+        state.stress, by_rate @ rate, statement=f"P_v is not linear in the rate Ḟ {where}"
     )
     check.require_equal(
         stress.evaluate(F, -2.5 * rate).stress,
@@ -260,9 +223,7 @@ def _check_derivatives(
     )
 
 
-def _check_dissipation(
-    check: PropertyCheck, stress: DampingStress, F: Array, where: str
-) -> None:
+def _check_dissipation(check: PropertyCheck, stress: DampingStress, F: Array, where: str) -> None:
     """Require that no eigenvalue of the symmetric part of ∂P_v/∂Ḟ at F (9,) is negative beyond
     rounding: P_v:Ḟ ≥ 0 for every rate.
     """
@@ -278,11 +239,7 @@ def _check_dissipation(
 
 
 def _check_objectivity(
-    check: PropertyCheck,
-    stress: DampingStress,
-    F: Array,
-    rate: Array,
-    where: str,
+    check: PropertyCheck, stress: DampingStress, F: Array, rate: Array, where: str
 ) -> None:
     """Require P_v(QF, Q(Ḟ + ΩF)) = Q P_v(F, Ḟ) for one random rotation Q and one random spin Ω
     (skew-symmetric).
@@ -290,13 +247,9 @@ def _check_objectivity(
     value = stress.evaluate(F, rate).stress
     Q = random_rotation(check.rng)
     spin = np.asarray(ca.skew(3 * check.rng.standard_normal(3)), dtype=float)
-    gradient, gradient_rate = (
-        each.reshape(3, 3, order="F") for each in (F, rate)
-    )
+    gradient, gradient_rate = (each.reshape(3, 3, order="F") for each in (F, rate))
     spinning = Q @ (gradient_rate + spin @ gradient)
-    rotated = stress.evaluate(
-        (Q @ gradient).ravel(order="F"), spinning.ravel(order="F")
-    ).stress
+    rotated = stress.evaluate((Q @ gradient).ravel(order="F"), spinning.ravel(order="F")).stress
     check.require_equal(
         rotated.reshape(3, 3, order="F"),
         Q @ value.reshape(3, 3, order="F"),

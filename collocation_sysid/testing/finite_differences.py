@@ -15,10 +15,7 @@ STEP = 1e-3
 
 
 def directional_derivative(
-    function: Callable[[Array], ArrayLike],
-    point: ArrayLike,
-    direction: Array,
-    step: float = STEP,
+    function: Callable[[Array], ArrayLike], point: ArrayLike, direction: Array, step: float = STEP
 ) -> Array:
     """Return d/ds function(point + s direction) at s = 0, by fourth-order central differences.
 
@@ -42,14 +39,11 @@ def directional_derivative(
         """Return the function at `point` plus a number of steps along `direction`, which may be
         negative.
         """
-        return np.asarray(
-            function(np.asarray(point) + steps * step * direction)
-        )
+        return np.asarray(function(np.asarray(point) + steps * step * direction))
 
-    return (
-        8 * (evaluate_at(1) - evaluate_at(-1))
-        - (evaluate_at(2) - evaluate_at(-2))
-    ) / (12 * step)
+    return (8 * (evaluate_at(1) - evaluate_at(-1)) - (evaluate_at(2) - evaluate_at(-2))) / (
+        12 * step
+    )
 
 
 def assert_derivative(
@@ -91,9 +85,7 @@ def assert_derivative(
         assert product.shape == expected.shape
         error = np.linalg.norm(product - expected)
         size = np.linalg.norm(expected)
-        assert error <= tolerance * size, (
-            f"off by {error:.3g}, the derivative's norm is {size:.3g}"
-        )
+        assert error <= tolerance * size, f"off by {error:.3g}, the derivative's norm is {size:.3g}"
 
 
 def relative_error(found: ArrayLike, expected: ArrayLike) -> float:

@@ -16,13 +16,7 @@ from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.laws.constants import Constant
-from ..fem.node_force import (
-    CONTEXT_OFFSETS,
-    CONTEXT_SIZE,
-    ForceContext,
-    Law,
-    NodeForce,
-)
+from ..fem.node_force import CONTEXT_OFFSETS, CONTEXT_SIZE, ForceContext, Law, NodeForce
 from ..model.generated_functions import GeneratedFunction
 from ..problem.code_loader import CodeLoader
 from ..problem.schema import NodeForceSection
@@ -119,10 +113,7 @@ def check_force(
             f"force {made.name!r} is on faces, where an energy cannot be checked; leave out the energy"
         )
     law = ForceLaw(made, np.array([*values.values()]))
-    states = [
-        law.random_state(check.rng, place)
-        for place in _places(check.rng, positions_m)
-    ]
+    states = [law.random_state(check.rng, place) for place in _places(check.rng, positions_m)]
     for number, state in enumerate(states):
         where = f"at random state {number}"
         _check_derivatives(check, law, state=state, where=where)
@@ -134,17 +125,12 @@ def check_force(
         u, data = law.state_at_rest(states[0])
         found = law.evaluate_plain(u, data)[: law.dofs]
         check.require_equal(
-            found,
-            np.zeros(law.dofs),
-            statement="the force at rest is not zero",
-            scale=1.0,
+            found, np.zeros(law.dofs), statement="the force at rest is not zero", scale=1.0
         )
     unplaced = replace(made, nodes=None)
     _check_messages(check, unplaced, values=values)
     _check_round_trips(check, law, state=states[0], file=file)
-    small = body or Body(
-        uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced]
-    )
+    small = body or Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced])
     check_program(check, program_of(swung_experiment(small), values))
 
 
@@ -197,9 +183,7 @@ class ForceLaw:
             is_compiled=self.force.is_compiled,
         )
 
-    def random_state(
-        self, rng: np.random.Generator, place: Array
-    ) -> tuple[Array, Array]:
+    def random_state(self, rng: np.random.Generator, place: Array) -> tuple[Array, Array]:
         """Return inputs u and data of a random state near a place (3,) [m], after the start.
 
         Corners of a face are the place and points at `FACE_EDGE_M` from it along x and y, all
@@ -208,27 +192,13 @@ class ForceLaw:
         """
         corners = np.zeros((self.dofs // 3, 3))
         corners[1:] = FACE_EDGE_M * np.eye(3)[: self.dofs // 3 - 1]
-        x = (
-            place
-            + corners
-            + rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, corners.shape)
-        )
+        x = place + corners + rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, corners.shape)
         v = VELOCITY_M_S * rng.standard_normal(self.dofs)
         before = 1e-3 * rng.standard_normal(self.force.internal_variable_count)
         normal = rng.standard_normal(3)
         normal /= np.linalg.norm(normal)
-        data = [
-            2.5 * TIMESTEP_S,
-            *place,
-            AREA_M2,
-            VOLUME_M3,
-            *normal,
-            TIMESTEP_S,
-            0.0,
-        ]
-        return np.concatenate([x.ravel(), v, self.values, before]), np.array(
-            data
-        )
+        data = [2.5 * TIMESTEP_S, *place, AREA_M2, VOLUME_M3, *normal, TIMESTEP_S, 0.0]
+        return np.concatenate([x.ravel(), v, self.values, before]), np.array(data)
 
     def state_at_rest(self, state: tuple[Array, Array]) -> tuple[Array, Array]:
         """Return the state (u, data) of an undeformed body at the start (`is_start` is 1), without
@@ -264,16 +234,12 @@ class ForceLaw:
         """
         dofs = self.dofs
         constants = len(self.values)
-        x, v, values, before = ca.vertsplit(
-            u, [0, dofs, 2 * dofs, 2 * dofs + constants, u.numel()]
-        )
+        x, v, values, before = ca.vertsplit(u, [0, dofs, 2 * dofs, 2 * dofs + constants, u.numel()])
         at = ForceContext(*ca.vertsplit(data, [*CONTEXT_OFFSETS]))
         if dofs > 3:
             a, b, c = (x[3 * k : 3 * k + 3] for k in range(3))
             area = ca.cross(b - a, c - a) / 2
-            at = at._replace(
-                area_m2=ca.norm_2(area), normal=area / ca.norm_2(area)
-            )
+            at = at._replace(area_m2=ca.norm_2(area), normal=area / ca.norm_2(area))
             x = (a + b + c) / 3
             v = (v[:3] + v[3:6] + v[6:]) / 3
         named = {c.name: values[k] for k, c in enumerate(self.force.constants)}
@@ -287,9 +253,7 @@ class ForceLaw:
 
     def evaluate_plain(self, u: Array, data: Array) -> Array:
         """Return the outputs of `plain` at u and data of numbers, as a (k,) array."""
-        return np.ravel(
-            ca.evalf(ca.SX(self.plain(ca.DM(u), ca.DM(data)))).full()
-        )
+        return np.ravel(ca.evalf(ca.SX(self.plain(ca.DM(u), ca.DM(data)))).full())
 
     @cached_property
     def automatic(self) -> ca.Function:
@@ -322,25 +286,15 @@ def _check_derivatives(
     columns = data[:, None]
     y, jacobian = law.generated.evaluate_with_jacobian(u[:, None], columns)
     weights = check.rng.standard_normal(len(y))
-    hessian = law.generated.weighted_hessian(
-        u[:, None], columns, weights[:, None]
-    )[..., 0]
-    first, second = (
-        each.full() for each in law.automatic.call([u, data, weights])
-    )
+    hessian = law.generated.weighted_hessian(u[:, None], columns, weights[:, None])[..., 0]
+    first, second = (each.full() for each in law.automatic.call([u, data, weights]))
     plain = law.evaluate_plain(u, data)
-    check.require_equal(
-        y[:, 0], plain, statement=f"the generated force is not the law {where}"
-    )
+    check.require_equal(y[:, 0], plain, statement=f"the generated force is not the law {where}")
     automatic = "is not the automatic derivative of the law"
     check.require_equal(
-        jacobian[..., 0],
-        first,
-        statement=f"the first derivative {automatic} {where}",
+        jacobian[..., 0], first, statement=f"the first derivative {automatic} {where}"
     )
-    check.require_equal(
-        hessian, second, statement=f"the second derivative {automatic} {where}"
-    )
+    check.require_equal(hessian, second, statement=f"the second derivative {automatic} {where}")
     scale = np.maximum(np.abs(u), DISPLACEMENT_M)
     scale[: law.dofs] = DISPLACEMENT_M
     check.require_derivative(
@@ -351,12 +305,7 @@ def _check_derivatives(
         scale=scale,
     )
     check.require_derivative(
-        lambda at: (
-            weights
-            @ law.generated.evaluate_with_jacobian(at[:, None], columns)[1][
-                ..., 0
-            ]
-        ),
+        lambda at: weights @ law.generated.evaluate_with_jacobian(at[:, None], columns)[1][..., 0],
         hessian,
         point=u,
         statement=f"the second derivative of the force by (x, v, constants) is wrong {where}",
@@ -378,22 +327,13 @@ def _check_energy(
     u[3:6] = 0.0
     force = law.evaluate_plain(u, state[1])[:3]
     at = ForceContext(*ca.vertsplit(ca.SX(ca.DM(state[1])), [*CONTEXT_OFFSETS]))
-    named = {
-        c.name: float(v)
-        for c, v in zip(law.force.constants, law.values, strict=True)
-    }
+    named = {c.name: float(v) for c, v in zip(law.force.constants, law.values, strict=True)}
     x = ca.SX.sym("x", 3)
-    gradient = ca.Function(
-        "gradient", [x], [ca.gradient(ca.SX(energy(x, at, **named)), x)]
-    )
+    gradient = ca.Function("gradient", [x], [ca.gradient(ca.SX(energy(x, at, **named)), x)])
     statement = f"the force is not −∂energy/∂x {where}"
-    check.require_equal(
-        force, -gradient(u[:3]).full().ravel(), statement=statement
-    )
+    check.require_equal(force, -gradient(u[:3]).full().ravel(), statement=statement)
     check.require_derivative(
-        lambda place: np.ravel(
-            ca.evalf(ca.SX(energy(ca.DM(place), at, **named))).full()
-        ),
+        lambda place: np.ravel(ca.evalf(ca.SX(energy(ca.DM(place), at, **named))).full()),
         -force,
         point=u[:3],
         statement=statement,
@@ -414,11 +354,7 @@ def _check_dissipation(
     powers = []
     largest = 0.0
     for _ in range(VELOCITIES):
-        v = (
-            VELOCITY_M_S
-            * 10 ** check.rng.uniform(-3, 1)
-            * check.rng.standard_normal(law.dofs)
-        )
+        v = VELOCITY_M_S * 10 ** check.rng.uniform(-3, 1) * check.rng.standard_normal(law.dofs)
         u[velocity] = v
         force = law.evaluate_plain(u, state[1])[: law.dofs] - still
         powers.append(float(force @ v))
@@ -431,27 +367,14 @@ def _check_dissipation(
         )
 
 
-def _check_messages(
-    check: PropertyCheck, force: NodeForce, values: dict[str, float]
-) -> None:
+def _check_messages(check: PropertyCheck, force: NodeForce, values: dict[str, float]) -> None:
     """Require that a definition of a constant that the law does not have, and a problem that lacks
     the value of a constant, are refused by the name of the constant.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    force : NodeForce
-        Force on all nodes or faces.
-    values : dict of str to float
-        Constants of the force; if it has none, only the first message is checked.
     """
     misspelt = f"no_{next(iter(values), 'constant')}"
     check.require_refusal(
         lambda: NodeForce.from_law(
-            force.law,
-            Constant(misspelt),
-            on=force.on,
-            carries=force.internal_variable_count,
+            force.law, Constant(misspelt), on=force.on, carries=force.internal_variable_count
         ),
         naming=misspelt,
         statement=f"the definition of {misspelt!r}, which the law does not have",
@@ -460,10 +383,7 @@ def _check_messages(
 
 
 def _check_round_trips(
-    check: PropertyCheck,
-    law: ForceLaw,
-    state: tuple[Array, Array],
-    file: str | Path | None,
+    check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], file: str | Path | None
 ) -> None:
     """Require the same forces at one state after pickling and, unless `file` is None, from a
     problem file that names the law in this Python file.
@@ -475,9 +395,7 @@ def _check_round_trips(
 
     def load(loader: CodeLoader, table: Mapping[str, Any]) -> NodeForce:
         """Return the force of a table of a problem file."""
-        return loader.force(
-            NodeForceSection.model_validate(table), "object.force.0"
-        )
+        return loader.force(NodeForceSection.model_validate(table), "object.force.0")
 
     check_pickling(check, law.force, evaluate=evaluate)
     if file is not None:
@@ -488,10 +406,5 @@ def _check_round_trips(
             "carries": law.force.internal_variable_count,
         }
         check_problem_file(
-            check,
-            file,
-            table=table,
-            load=load,
-            extension=law.force,
-            evaluate=evaluate,
+            check, file, table=table, load=load, extension=law.force, evaluate=evaluate
         )

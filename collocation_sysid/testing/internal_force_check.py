@@ -108,11 +108,7 @@ class PlainInternalForce:
         part = self.body.parts[0]
         constants = len(part.material.constants) + len(part.damping.constants)
         node_fields = [ca.SX.sym(name, size) for name in "xvw"]
-        return [
-            *node_fields,
-            ca.SX.sym("geometry", width, points),
-            ca.SX.sym("c", constants),
-        ]
+        return [*node_fields, ca.SX.sym("geometry", width, points), ca.SX.sym("c", constants)]
 
     def _build_element_force(self) -> ca.SX:
         """Return the symbolic force (3·nodes,) of one element on its nodes, elastic and viscous,
@@ -124,14 +120,9 @@ class PlainInternalForce:
         force = ca.SX(3 * nodes, 1)
         for point in ca.horzsplit(geometry):
             gradients = ca.reshape(point[:-1], 3, nodes).T
-            F, rate = (
-                ca.vec(ca.reshape(field, 3, nodes) @ gradients)
-                for field in (x, v)
-            )
+            F, rate = (ca.vec(ca.reshape(field, 3, nodes) @ gradients) for field in (x, v))
             stress = self._stress(
-                F,
-                rate,
-                constants=ca.vertsplit(constants, self._split(part.material)),
+                F, rate, constants=ca.vertsplit(constants, self._split(part.material))
             )
             force -= point[-1] * ca.vec(ca.reshape(stress, 3, 3) @ gradients.T)
         return force
@@ -146,20 +137,11 @@ class PlainInternalForce:
     def _stress(self, F: ca.SX, rate: ca.SX, constants: list[ca.SX]) -> ca.SX:
         """Return the first Piola–Kirchhoff stress (9,) of material and damping law at F (9,) and
         its rate (9,).
-
-        Parameters
-        ----------
-        F, rate : (9,) SX
-            Deformation gradient and its rate, column after column.
-        constants : list of two SX
-            Constants of the material, and of the damping law.
         """
         part = self.body.parts[0]
         symbols = [ca.SX.sym("F", 9), ca.SX.sym("rate", 9)]
         psi = part.material.psi(ca.reshape(symbols[0], 3, 3), constants[0])
-        viscous, _ = damping_stress(
-            part.damping, part.material, symbols=[*symbols, *constants]
-        )
+        viscous, _ = damping_stress(part.damping, part.material, symbols=[*symbols, *constants])
         total = ca.gradient(psi, symbols[0]) + viscous
         return ca.substitute(total, ca.vertcat(*symbols), ca.vertcat(F, rate))
 
@@ -174,15 +156,11 @@ class PlainInternalForce:
         second, _ = ca.hessian(ca.dot(w, force), u)
         inputs = self._symbols
         return (
-            ca.Function(
-                "first", inputs, [force, ca.densify(ca.jacobian(force, u))]
-            ),
+            ca.Function("first", inputs, [force, ca.densify(ca.jacobian(force, u))]),
             ca.Function("second", inputs, [ca.densify(second)]),
         )
 
-    def evaluate(
-        self, x: Array, v: Array, w: Array, theta: Array
-    ) -> ForceDerivatives:
+    def evaluate(self, x: Array, v: Array, w: Array, theta: Array) -> ForceDerivatives:
         """Return force and derivatives of one state by u = (x, v, θ), with mass-proportional
         damping.
 
@@ -199,22 +177,14 @@ class PlainInternalForce:
         force = np.zeros(size)
         jacobian = np.zeros((size, count))
         hessian = np.zeros((count, count))
-        for cell, geometry in zip(
-            self.body.cells, self.body.geometry, strict=True
-        ):
+        for cell, geometry in zip(self.body.cells, self.body.geometry, strict=True):
             dofs: Index = (3 * cell[:, None] + np.arange(3)).ravel()
             state = [x[dofs], v[dofs], w[dofs], geometry.T, theta[:laws]]
-            columns = np.concatenate(
-                [dofs, size + dofs, 2 * size + np.arange(laws)]
-            )
-            element_force, element_jacobian = (
-                o.full() for o in self._functions[0].call(state)
-            )
+            columns = np.concatenate([dofs, size + dofs, 2 * size + np.arange(laws)])
+            element_force, element_jacobian = (o.full() for o in self._functions[0].call(state))
             force[dofs] += element_force.ravel()
             jacobian[np.ix_(dofs, columns)] += element_jacobian
-            hessian[np.ix_(columns, columns)] += (
-                self._functions[1].call(state)[0].full()
-            )
+            hessian[np.ix_(columns, columns)] += self._functions[1].call(state)[0].full()
         drag = theta[-1] * self.body.dof_mass
         force -= drag * v
         jacobian[:, size : 2 * size] -= np.diag(drag)
@@ -265,40 +235,21 @@ def check_internal_forces(
     without velocities is minus the gradient of the compiled energy is required too.
     """
     body = Body(
-        uneven_box(1),
-        material,
-        density_kg_m3=DENSITY_KG_M3,
-        element=element,
-        damping=damping,
+        uneven_box(1), material, density_kg_m3=DENSITY_KG_M3, element=element, damping=damping
     )
-    theta = np.array(
-        [*usual_constants(tuple(body.constants.values()), values).values()]
-    )
-    x = body.nodes_m.ravel() + check.rng.uniform(
-        -DISPLACEMENT_M, DISPLACEMENT_M, body.nodes_m.size
-    )
+    theta = np.array([*usual_constants(tuple(body.constants.values()), values).values()])
+    x = body.nodes_m.ravel() + check.rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, body.nodes_m.size)
     v = VELOCITY_M_S * check.rng.standard_normal(x.size)
     w = check.rng.standard_normal(x.size)
     plain = None if body.element.mean_dilatation else PlainInternalForce(body)
-    first = _check_derivatives(
-        check, body, state=[x, v, w], theta=theta, plain=plain, where=""
-    )
+    first = _check_derivatives(check, body, state=[x, v, w], theta=theta, plain=plain, where="")
     at_rest = [body.nodes_m.ravel(), np.zeros_like(v), w]
-    _check_derivatives(
-        check,
-        body,
-        state=at_rest,
-        theta=theta,
-        plain=plain,
-        where=" undeformed",
-    )
+    _check_derivatives(check, body, state=at_rest, theta=theta, plain=plain, where=" undeformed")
     _check_energy(check, body, x=x, theta=theta)
     if is_objective:
         _check_objectivity(check, body, x=x, v=v, theta=theta)
     if is_dissipative:
-        _check_dissipation(
-            check, body, by_velocity=first[:, x.size : 2 * x.size]
-        )
+        _check_dissipation(check, body, by_velocity=first[:, x.size : 2 * x.size])
 
 
 def _check_derivatives(
@@ -310,36 +261,14 @@ def _check_derivatives(
     plain: PlainInternalForce | None,
     where: str,
 ) -> Array:
-    """Compare force and derivatives at a state x, v, w with the plain formula and differences.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    body : Body
-    state : list of (3n,) array
-        Positions, velocities, and weights of the forces.
-    theta : (k,) array
-        Constants of the body.
-    plain : PlainInternalForce, optional
-        Plain formula; without it derivatives are compared with differences alone.
-    where : str
-        Adjective of the elements in the sentence, after a space, or nothing.
-
-    Returns
-    -------
-    (3n, 6n + k) array
-        Derivative of the force by positions, velocities and constants.
-    """
+    """Compare force and derivatives at a state x, v, w with the plain formula and differences."""
     x, v, w = state
     elements = f"{where} {body.element.name} elements".strip()
     force = body.force(x, v, theta)[0]
     first = _first_derivatives(body, x, v=v, theta=theta)
     second = _second_derivatives(body, state, theta=theta)
     # Forces of an undeformed body are zero; what counts is their change by a large change of x.
-    size = max(
-        float(np.abs(force).max()),
-        LARGE_CHANGE_M * float(np.abs(first[:, : x.size]).max()),
-    )
+    size = max(float(np.abs(force).max()), LARGE_CHANGE_M * float(np.abs(first[:, : x.size]).max()))
     check.require_equal(
         body.second_derivatives(x, v, w, theta).theta[0],
         w @ first[:, 2 * x.size :],
@@ -348,15 +277,9 @@ def _check_derivatives(
     )
     if plain is not None:
         expected = plain.evaluate(x, v, w, theta)
-        difference = (
-            f"of {elements} differs from the plain formula with automatic "
-            "derivatives"
-        )
+        difference = f"of {elements} differs from the plain formula with automatic derivatives"
         check.require_equal(
-            force,
-            expected.force,
-            statement=f"the compiled force {difference}",
-            scale=size,
+            force, expected.force, statement=f"the compiled force {difference}", scale=size
         )
         check.require_equal(
             first,
@@ -369,22 +292,16 @@ def _check_derivatives(
             statement=f"the compiled second derivative of the force {difference}",
             tolerance=SECOND_DERIVATIVES,
         )
-    _check_differences(
-        check, body, state=state, theta=theta, derivatives=(first, second)
-    )
+    _check_differences(check, body, state=state, theta=theta, derivatives=(first, second))
     return first
 
 
-def _check_energy(
-    check: PropertyCheck, body: Body, x: Array, theta: Array
-) -> None:
+def _check_energy(check: PropertyCheck, body: Body, x: Array, theta: Array) -> None:
     """Require that the compiled force without velocities is minus the gradient of the compiled
     energy, in one random direction, by central differences.
     """
     named = dict(zip(body.constants, theta, strict=True))
-    constants = {
-        c.name: named[c.name] for c in body.parts[0].material.constants
-    }
+    constants = {c.name: named[c.name] for c in body.parts[0].material.constants}
     direction = LARGE_CHANGE_M * check.rng.standard_normal(x.size)
     force = body.force(x, np.zeros_like(x), theta)[0]
     check.require_product(
@@ -397,9 +314,7 @@ def _check_energy(
     )
 
 
-def _check_objectivity(
-    check: PropertyCheck, body: Body, x: Array, v: Array, theta: Array
-) -> None:
+def _check_objectivity(check: PropertyCheck, body: Body, x: Array, v: Array, theta: Array) -> None:
     """Require f(Qx, Q(v + ω × x)) = Q f(x, v) for a random rotation Q and spin ω, with γ_m, the
     last entry of `theta`, set to zero in a copy.
     """
@@ -420,9 +335,7 @@ def _check_objectivity(
     )
 
 
-def _check_dissipation(
-    check: PropertyCheck, body: Body, by_velocity: Array
-) -> None:
+def _check_dissipation(check: PropertyCheck, body: Body, by_velocity: Array) -> None:
     """Require that no velocity increases the energy: no eigenvalue of the symmetric part of ∂f/∂v
     `by_velocity` (3n, 3n) is positive beyond rounding.
     """
@@ -444,25 +357,11 @@ def _check_differences(
     theta: Array,
     derivatives: tuple[Array, Array],
 ) -> None:
-    """Compare first and second derivatives of compiled forces with differences in one direction.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    body : Body
-    state : list of (3n,) array
-        Positions, velocities, and weights w of the forces.
-    theta : (k,) array
-        Constants of the body.
-    derivatives : two arrays
-        Compiled ∂f/∂u and ∂²(wᵀf)/∂u² at u = (x, v, θ).
-    """
+    """Compare first and second derivatives of compiled forces with differences in one direction."""
     x, v, w = state
     size = len(x)
     point = np.concatenate([x, v, theta])
-    scale = np.concatenate(
-        [np.full(size, LARGE_CHANGE_M), np.ones(size), theta]
-    )
+    scale = np.concatenate([np.full(size, LARGE_CHANGE_M), np.ones(size), theta])
     direction = scale * check.rng.standard_normal(len(point))
 
     def force_at(u: Array) -> Array:
@@ -471,9 +370,7 @@ def _check_differences(
 
     def weighted_derivative_at(u: Array) -> Array:
         """Return the compiled first derivative of wᵀ f at (x, v, θ)."""
-        return w @ _first_derivatives(
-            body, u[:size], v=u[size : 2 * size], theta=u[2 * size :]
-        )
+        return w @ _first_derivatives(body, u[:size], v=u[size : 2 * size], theta=u[2 * size :])
 
     where = f"of the compiled force of {body.element.name} elements is wrong"
     check.require_product(
@@ -495,9 +392,7 @@ def _check_differences(
 def _first_derivatives(body: Body, x: Array, v: Array, theta: Array) -> Array:
     """Return the compiled ∂f/∂(x, v, θ) at one state as a full matrix (3n, 6n + k)."""
     at = body.linearise(x, v, theta)
-    by_x = full_matrix(
-        body.pattern, at.by_position[0], skew=at.by_position_skew[0]
-    )
+    by_x = full_matrix(body.pattern, at.by_position[0], skew=at.by_position_skew[0])
     by_v = full_matrix(body.pattern, at.by_velocity[0], skew=np.zeros(0))
     return np.hstack([by_x.toarray(), by_v.toarray(), at.by_theta[0]])
 
@@ -509,9 +404,7 @@ def _second_derivatives(body: Body, state: list[Array], theta: Array) -> Array:
     x, v, w = state
     at = body.second_derivatives(x, v, w, theta)
     none = np.zeros(0)
-    by_xx = full_matrix(
-        body.pattern, at.position_position[0], skew=none
-    ).toarray()
+    by_xx = full_matrix(body.pattern, at.position_position[0], skew=none).toarray()
     by_xv = full_matrix(
         body.pattern, at.position_velocity[0], skew=at.position_velocity_skew[0]
     ).toarray()

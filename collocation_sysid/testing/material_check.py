@@ -23,13 +23,7 @@ from .missing_constant_check import check_missing_constant
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling, check_problem_file
-from .small_problems import (
-    DENSITY_KG_M3,
-    program_of,
-    swung_experiment,
-    uneven_box,
-    usual_constants,
-)
+from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, uneven_box, usual_constants
 
 # Number of random deformations.
 DEFORMATIONS = 4
@@ -123,9 +117,7 @@ def check_material(
             is_dissipative=True,
         )
     if has_memory:
-        body = Body(
-            uneven_box(1), made, density_kg_m3=DENSITY_KG_M3, prony=["prony_1"]
-        )
+        body = Body(uneven_box(1), made, density_kg_m3=DENSITY_KG_M3, prony=["prony_1"])
         check_program(check, program_of(swung_experiment(body), values))
 
 
@@ -186,24 +178,15 @@ class EnergyDerivatives:
         rule = self.material.chain_rule(gradient, values)
         psi = self.material.psi_in(rule, gradient, values=values)
         stress = rule.gradient(psi, F)
-        outputs = [
-            psi,
-            stress,
-            rule.jacobian(stress, F),
-            rule.jacobian(stress, values),
-        ]
+        outputs = [psi, stress, rule.jacobian(stress, F), rule.jacobian(stress, values)]
         return ca.Function("kernel", [F, values], rule.eliminate(outputs))
 
     def evaluate(self, F: Array) -> StressState:
         """Return energy, stress and stiffness at F (9,), stacked column after column."""
         outputs = [output.full() for output in self._function.call([F])]
-        return StressState(
-            outputs[0].ravel(), outputs[1].ravel(), tangent=outputs[2]
-        )
+        return StressState(outputs[0].ravel(), outputs[1].ravel(), tangent=outputs[2])
 
-    def evaluate_kernel(
-        self, F: Array, values: Array | None = None
-    ) -> StressState:
+    def evaluate_kernel(self, F: Array, values: Array | None = None) -> StressState:
         """Return energy, stress, stiffness and `by_constants`, differentiated as in kernels.
 
         Parameters
@@ -213,14 +196,9 @@ class EnergyDerivatives:
             Values of the constants in place of those of this object.
         """
         constants = self.values if values is None else values
-        outputs = [
-            each.full() for each in self._kernel_function.call([F, constants])
-        ]
+        outputs = [each.full() for each in self._kernel_function.call([F, constants])]
         return StressState(
-            outputs[0].ravel(),
-            outputs[1].ravel(),
-            tangent=outputs[2],
-            by_constants=outputs[3],
+            outputs[0].ravel(), outputs[1].ravel(), tangent=outputs[2], by_constants=outputs[3]
         )
 
     def evaluate_plain(self, F: Array) -> Array:
@@ -228,8 +206,7 @@ class EnergyDerivatives:
         material with numbers.
         """
         named = {
-            c.name: float(v)
-            for c, v in zip(self.material.constants, self.values, strict=True)
+            c.name: float(v) for c, v in zip(self.material.constants, self.values, strict=True)
         }
         psi = self.material.energy(ca.DM(F.reshape(3, 3, order="F")), **named)
         return np.ravel(ca.evalf(ca.SX(psi)).full())
@@ -255,9 +232,7 @@ def deformation_gradients(
         yield F.ravel(order="F")
 
 
-def _deformations(
-    rng: np.random.Generator, largest_strain: float
-) -> Iterator[tuple[str, Array]]:
+def _deformations(rng: np.random.Generator, largest_strain: float) -> Iterator[tuple[str, Array]]:
     """Yield pairs of a description and a deformation gradient (9,): `DEFORMATIONS` random ones,
     then a uniaxial and a volumetric stretch of 1 + `largest_strain`, and both of 1 −
     `largest_strain`.
@@ -265,19 +240,10 @@ def _deformations(
     for number, F in enumerate(
         deformation_gradients(rng, DEFORMATIONS, largest_strain=largest_strain)
     ):
-        yield (
-            f"at random deformation {number} (strains up to {largest_strain:g})",
-            F,
-        )
+        yield (f"at random deformation {number} (strains up to {largest_strain:g})", F)
     for stretch in (1 + largest_strain, 1 - largest_strain):
-        yield (
-            f"at a uniaxial stretch of {stretch:g}",
-            np.diag([1.0, 1.0, stretch]).ravel(),
-        )
-        yield (
-            f"at a volumetric stretch of {stretch:g}",
-            stretch * np.eye(3).ravel(),
-        )
+        yield (f"at a uniaxial stretch of {stretch:g}", np.diag([1.0, 1.0, stretch]).ravel())
+        yield (f"at a volumetric stretch of {stretch:g}", stretch * np.eye(3).ravel())
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
@@ -293,22 +259,14 @@ def _check_undeformed(check: PropertyCheck, law: EnergyDerivatives) -> None:
     stiffness = max(float(np.abs(state.tangent).max()), np.finfo(float).tiny)
     zero = np.zeros(9)
     where = "of the undeformed material is not zero"
-    check.require_equal(
-        state.psi, zero[:1], statement=f"the energy {where}", scale=stiffness
-    )
-    check.require_equal(
-        state.stress, zero, statement=f"the stress {where}", scale=stiffness
-    )
-    shears = [
-        (np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in _axis_pairs()
-    ]
+    check.require_equal(state.psi, zero[:1], statement=f"the energy {where}", scale=stiffness)
+    check.require_equal(state.stress, zero, statement=f"the stress {where}", scale=stiffness)
+    shears = [(np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in _axis_pairs()]
     strains = np.array([each.ravel() for each in (*DIAGONAL, *shears)])
     smallest = np.linalg.eigvalsh(strains @ state.tangent @ strains.T)[0]
     if not smallest > 0:
         check.fail(
-            "the undeformed material does not resist every strain",
-            smallest,
-            expected="above 0 Pa",
+            "the undeformed material does not resist every strain", smallest, expected="above 0 Pa"
         )
 
 
@@ -318,9 +276,7 @@ def _axis_pairs() -> list[tuple[Array, Array]]:
     return [(axes[0], axes[1]), (axes[0], axes[2]), (axes[1], axes[2])]
 
 
-def _check_derivatives(
-    check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
-) -> None:
+def _check_derivatives(check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str) -> None:
     """Require that the energy is finite and equal to its function called with numbers, that stress
     and stiffness are its derivatives by central differences, and that those of kernels agree.
     """
@@ -332,9 +288,7 @@ def _check_derivatives(
             expected="a finite energy, or a smaller largest_strain",
         )
     check.require_equal(
-        state.psi,
-        law.evaluate_plain(F),
-        statement=f"the energy differs from its function {where}",
+        state.psi, law.evaluate_plain(F), statement=f"the energy differs from its function {where}"
     )
     check.require_derivative(
         lambda at: law.evaluate(at).psi,
@@ -387,18 +341,13 @@ def _check_kernel_derivatives(
     )
 
 
-def _check_objectivity(
-    check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
-) -> None:
+def _check_objectivity(check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str) -> None:
     """Require ψ(QF) = ψ(F) and P(QF) = Q P(F) at one F (9,) for one random rotation Q."""
     state = law.evaluate(F)
     Q = random_rotation(check.rng)
     rotated = law.evaluate((Q @ F.reshape(3, 3, order="F")).ravel(order="F"))
     check.require_equal(
-        rotated.psi,
-        state.psi,
-        statement=f"a rotation changes the energy {where}",
-        tolerance=1e-8,
+        rotated.psi, state.psi, statement=f"a rotation changes the energy {where}", tolerance=1e-8
     )
     check.require_equal(
         rotated.stress.reshape(3, 3, order="F"),
@@ -408,17 +357,13 @@ def _check_objectivity(
     )
 
 
-def _check_messages(
-    check: PropertyCheck, material: Material, values: dict[str, float]
-) -> None:
+def _check_messages(check: PropertyCheck, material: Material, values: dict[str, float]) -> None:
     """Require that a definition of a constant that the energy does not have, and a problem that
     lacks the value of the last constant, are refused by the name of the constant.
     """
     misspelt = f"no_{material.constants[0].name}"
     check.require_refusal(
-        lambda: Material.from_energy(
-            material.energy, material.name, Constant(misspelt)
-        ),
+        lambda: Material.from_energy(material.energy, material.name, Constant(misspelt)),
         naming=misspelt,
         statement=f"the definition of {misspelt!r}, which the energy does not have",
     )
@@ -434,23 +379,10 @@ def _check_round_trips(
 ) -> None:
     """Require the same energies at small strains after pickling and, unless `file` is None, from a
     problem file that names the energy function in this Python file.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    material : Material
-    values : dict of str to float
-        Values of all constants of the material.
-    file : str, Path or None
-        Python file with the energy function.
-    function : str or None
-        Name of the function in the file; None means the ``__name__`` of the energy function.
     """
     constants = np.array([*values.values()])
     deformations = [
-        *deformation_gradients(
-            np.random.default_rng(0), DEFORMATIONS, largest_strain=ROUND_TRIP
-        )
+        *deformation_gradients(np.random.default_rng(0), DEFORMATIONS, largest_strain=ROUND_TRIP)
     ]
 
     def evaluate(made: Material) -> Array:
@@ -460,19 +392,12 @@ def _check_round_trips(
 
     def load(loader: CodeLoader, table: Mapping[str, Any]) -> Material:
         """Return the material of a table of a problem file."""
-        return loader.material(
-            CodeSection.model_validate(table), "object.material"
-        )
+        return loader.material(CodeSection.model_validate(table), "object.material")
 
     check_pickling(check, material, evaluate=evaluate)
     if file is not None:
         name = function or getattr(material.energy, "__name__", material.name)
         table = {"file": Path(file).name, "function": name}
         check_problem_file(
-            check,
-            file,
-            table=table,
-            load=load,
-            extension=material,
-            evaluate=evaluate,
+            check, file, table=table, load=load, extension=material, evaluate=evaluate
         )

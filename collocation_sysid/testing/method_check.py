@@ -27,12 +27,7 @@ from .small_problems import DENSITY_KG_M3, swung_experiment
 # Difference of two losses, sums of squares over variances, that rounding explains [1].
 LOSS_ROUNDING = 1e-12
 # Parameters of the simulated recording, and the guesses of those that are estimated.
-TRUTH = {
-    "young_pa": 800.0,
-    "poisson": 0.25,
-    "gamma_r_s": 5e-3,
-    "gamma_m_1_s": 0.3,
-}
+TRUTH = {"young_pa": 800.0, "poisson": 0.25, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.3}
 GUESSES = {"young_pa": 1200.0, "gamma_r_s": 8e-3}
 # Largest relative error of an estimate: markers without noise determine the parameters exactly.
 LARGEST_ERROR = 1e-3
@@ -41,10 +36,7 @@ LARGEST_VIOLATION = 1e-5
 
 
 def check_method(
-    method: Method,
-    *,
-    is_exact: bool = True,
-    largest_error: float = LARGEST_ERROR,
+    method: Method, *, is_exact: bool = True, largest_error: float = LARGEST_ERROR
 ) -> None:
     """Check a method on a small recording: answer, history, restart, options, round trips.
 
@@ -76,53 +68,36 @@ def check_method(
     the program is seen by its guess, bounds and values at one point. A method that raises an error
     lets the check raise it.
     """
-    name = getattr(method, "name", None) or getattr(
-        method, "__name__", type(method).__name__
-    )
+    name = getattr(method, "name", None) or getattr(method, "__name__", type(method).__name__)
     check = PropertyCheck(f"method {name!r}")
     collocation = small_recording()
     lines: list[Iteration] = []
     before = _fingerprint(collocation)
     solution = method(collocation, watch=lines.append)
-    _check_answer(
-        check, solution, is_exact=is_exact, largest_error=largest_error
-    )
+    _check_answer(check, solution, is_exact=is_exact, largest_error=largest_error)
     _check_history(check, solution, lines=lines)
     check.require_equal(
-        _fingerprint(collocation),
-        before,
-        statement="it changes the collocation that it solves",
+        _fingerprint(collocation), before, statement="it changes the collocation that it solves"
     )
     again = method(collocation, start=solution.z)
     _check_answer(
-        check,
-        again,
-        is_exact=is_exact,
-        largest_error=largest_error,
-        where=" from its own answer",
+        check, again, is_exact=is_exact, largest_error=largest_error, where=" from its own answer"
     )
     if is_dataclass(method) and hasattr(type(method), "name"):
         _check_options(check, method)
-        check_pickling(
-            check, method, evaluate=lambda each: [float(each == method)]
-        )
+        check_pickling(check, method, evaluate=lambda each: [float(each == method)])
 
 
 def small_recording() -> Collocation:
     """Return the program of a simulated swing of a foam block without noise, with the constants of
     `GUESSES` to be estimated and all others at their values in `TRUTH`.
     """
-    body = Body(
-        box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3
-    )
+    body = Body(box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3)
     experiment = swung_experiment(body)
     recorded = with_markers(
-        experiment,
-        simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m,
+        experiment, simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     )
-    unknowns: Mapping[str, Any] = TRUTH | {
-        name: Unknown(value) for name, value in GUESSES.items()
-    }
+    unknowns: Mapping[str, Any] = TRUTH | {name: Unknown(value) for name, value in GUESSES.items()}
     return Collocation([recorded], Parameters.from_mapping(unknowns))
 
 
@@ -131,16 +106,9 @@ def _fingerprint(collocation: Collocation) -> Array:
     constraints, gradient and bounds at a rigid motion; infinite ones count as zero.
     """
     p = collocation.guess_p
-    rigid = [
-        s.experiment.rigid_positions(s.dynamics.t_s)
-        for s in collocation.transcriptions
-    ]
+    rigid = [s.experiment.rigid_positions(s.dynamics.t_s) for s in collocation.transcriptions]
     z = collocation.pack(p, [x.reshape(len(x), -1) for x in rigid])
-    values = [
-        collocation.constraint_values(z),
-        collocation.gradient(z),
-        *collocation.bounds(),
-    ]
+    values = [collocation.constraint_values(z), collocation.gradient(z), *collocation.bounds()]
     numbers = np.concatenate([p, [collocation.objective(z)], *values])
     return np.where(np.isfinite(numbers), numbers, 0.0)
 
@@ -153,48 +121,19 @@ def _check_answer(
     largest_error: float,
     where: str = "",
 ) -> None:
-    """Require convergence to the truth, within the bounds, with the equations satisfied.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    solution : Solution
-        What the method returned; any other type fails.
-    is_exact : bool
-        Whether the equations of motion have to hold.
-    largest_error : float
-        Largest relative error of an estimate.
-    where : str
-        End of the sentences, with a space in front, or nothing.
-    """
+    """Require convergence to the truth, within the bounds, with the equations satisfied."""
     if not isinstance(solution, Solution):
-        check.fail(
-            "it does not return a Solution",
-            type(solution).__name__,
-            expected="Solution",
-        )
+        check.fail("it does not return a Solution", type(solution).__name__, expected="Solution")
     if not solution.status.converged:
-        check.fail(
-            f"it does not converge{where}",
-            solution.status.value,
-            expected="converged",
-        )
+        check.fail(f"it does not converge{where}", solution.status.value, expected="converged")
     for name in GUESSES:
         value = solution.parameters[name]
         if not abs(value / TRUTH[name] - 1) <= largest_error:
-            check.fail(
-                f"the estimate of {name} is wrong{where}",
-                value,
-                expected=TRUTH[name],
-            )
+            check.fail(f"the estimate of {name} is wrong{where}", value, expected=TRUTH[name])
     low, high = solution.collocation.bounds()
-    excess = float(
-        np.maximum(low - solution.z, solution.z - high).max(initial=0.0)
-    )
+    excess = float(np.maximum(low - solution.z, solution.z - high).max(initial=0.0))
     if not excess <= 1e-9:
-        check.fail(
-            f"a variable is outside its bounds{where}", excess, expected="0"
-        )
+        check.fail(f"a variable is outside its bounds{where}", excess, expected="0")
     violation = solution.max_violation_relative
     if is_exact and not violation <= LARGEST_VIOLATION:
         check.fail(
@@ -204,27 +143,15 @@ def _check_answer(
         )
 
 
-def _check_history(
-    check: PropertyCheck, solution: Solution, lines: list[Iteration]
-) -> None:
+def _check_history(check: PropertyCheck, solution: Solution, lines: list[Iteration]) -> None:
     """Require a history that `watch` got line by line, with losses that decrease, and a finite
     loss.
 
     Losses are compared between lines about the complete recording: the last of them must not
     exceed the first.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    solution : Solution
-        Answer with its history.
-    lines : list of Iteration
-        Lines that `watch` received, in order.
     """
     if not solution.history:
-        check.fail(
-            "the history of the solve is empty", 0, expected="at least one line"
-        )
+        check.fail("the history of the solve is empty", 0, expected="at least one line")
     if lines != list(solution.history):
         check.fail(
             "watch did not get every line of the history",
@@ -244,16 +171,9 @@ def _check_history(
             complete[-1],
             expected=complete[0],
         )
-    expected = (
-        solution.collocation.objective(solution.z)
-        / solution.collocation.loss_scale
-    )
+    expected = solution.collocation.objective(solution.z) / solution.collocation.loss_scale
     if not np.isfinite(expected):
-        check.fail(
-            "the loss of the answer is not finite",
-            expected,
-            expected="a finite loss",
-        )
+        check.fail("the loss of the answer is not finite", expected, expected="a finite loss")
 
 
 def _check_options(check: PropertyCheck, method: Any) -> None:
@@ -285,18 +205,8 @@ def _check_options(check: PropertyCheck, method: Any) -> None:
         if value is not None and not callable(value)
     }
     try:
-        read = method_from_options(
-            kind, tomllib.loads(tomli_w.dumps(written)), key=key
-        )
+        read = method_from_options(kind, tomllib.loads(tomli_w.dumps(written)), key=key)
     except InputError as error:
-        check.fail(
-            "its options from a problem file are refused",
-            error,
-            expected="the same method",
-        )
+        check.fail("its options from a problem file are refused", error, expected="the same method")
     if read != method:
-        check.fail(
-            "its options from a problem file give another method",
-            read,
-            expected=method,
-        )
+        check.fail("its options from a problem file give another method", read, expected=method)

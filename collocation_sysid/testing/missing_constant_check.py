@@ -10,9 +10,7 @@ from .property_check import PropertyCheck
 from .small_problems import DENSITY_KG_M3, uneven_box, usual_constants
 
 
-def check_missing_constant(
-    check: PropertyCheck, values: Mapping[str, float], **laws: Any
-) -> None:
+def check_missing_constant(check: PropertyCheck, values: Mapping[str, float], **laws: Any) -> None:
     """Require that values without the last constant of an extension are refused by its name.
 
     All other constants of a small box with the extension are stated.

@@ -22,12 +22,7 @@ from ..recording.nuisance import KINDS, Nuisance, NuisanceRow
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling, check_problem_file
-from .small_problems import (
-    DENSITY_KG_M3,
-    program_of,
-    swung_experiment,
-    uneven_box,
-)
+from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, uneven_box
 
 # Standard deviation of a kind that has none by default.
 USUAL_SIGMA = 0.01
@@ -74,9 +69,7 @@ def check_nuisance(
         If the reading or clock cannot be evaluated, has the wrong shape, or is not finite at zero.
     """
     check = PropertyCheck(f"nuisance parameter {row.name!r}")
-    base = experiment or swung_experiment(
-        Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3)
-    )
+    base = experiment or swung_experiment(Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3))
     changed = _with_row(base, row)
     size = NuisanceMap.from_experiment(changed).size
     if size == NuisanceMap.from_experiment(base).size:
@@ -87,9 +80,7 @@ def check_nuisance(
         )
     collocation = program_of(changed, {})
     data = collocation.transcriptions[0].nuisance
-    _check_round_trips(
-        check, row, data=data, file=file, name_in_file=name_in_file
-    )
+    _check_round_trips(check, row, data=data, file=file, name_in_file=name_in_file)
     if row not in KINDS:
         _check_messages(check, row, experiment=base)
     if row.reading is not None:
@@ -108,9 +99,7 @@ def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:
     """
     nuisance = experiment.nuisance
     if row not in KINDS:
-        return replace(
-            experiment, nuisance=replace(nuisance, own=(*nuisance.own, row))
-        )
+        return replace(experiment, nuisance=replace(nuisance, own=(*nuisance.own, row)))
     sigma = row.sigma or row.considered or USUAL_SIGMA
     return replace(experiment, nuisance=replace(nuisance, **{row.name: sigma}))
 
@@ -122,24 +111,9 @@ def _value_count(row: NuisanceRow) -> int:
     return len(row.axes.split()) or 1
 
 
-def _read(
-    row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceMap
-) -> Array:
+def _read(row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceMap) -> Array:
     """Return the reading (3,) of a row, or the delay (1,) of its clock if it has no reading, by
     calling its function with numbers.
-
-    Parameters
-    ----------
-    row : NuisanceRow
-        Row with a reading or a clock.
-    y : (3,) array
-        Position of a marker [m]; not used by a clock.
-    values : array
-        Physical values of the parameter, not in standard deviations.
-    t_s : float
-        Time of the sample [s].
-    data : NuisanceMap
-        Data of the recording that the function may use.
     """
     argument = ca.DM(values)
     result = (
@@ -150,9 +124,7 @@ def _read(
     return np.ravel(ca.evalf(ca.SX(result)).full())
 
 
-def _check_reading(
-    check: PropertyCheck, row: NuisanceRow, collocation: Collocation
-) -> None:
+def _check_reading(check: PropertyCheck, row: NuisanceRow, collocation: Collocation) -> None:
     """Require that zero has no effect, that derivatives are right, and that predicted markers are
     the reading.
 
@@ -176,16 +148,8 @@ def _check_reading(
     expression = ca.SX(row.reading(symbol[:3], symbol[3:], ca.SX(t_s), data))
     first = ca.jacobian(expression, symbol)
     second, _ = ca.hessian(ca.dot(ca.DM(weights), expression), symbol)
-    derivatives = ca.Function(
-        "d", [symbol], [ca.densify(first), ca.densify(second)]
-    )
-    u = np.concatenate(
-        [
-            y,
-            sigma
-            * check.rng.uniform(-LARGEST_DEVIATION, LARGEST_DEVIATION, count),
-        ]
-    )
+    derivatives = ca.Function("d", [symbol], [ca.densify(first), ca.densify(second)])
+    u = np.concatenate([y, sigma * check.rng.uniform(-LARGEST_DEVIATION, LARGEST_DEVIATION, count)])
     jacobian, hessian = (each.full() for each in derivatives.call([u]))
     scale = np.concatenate([np.full(3, 0.01), np.full(count, sigma)])
     check.require_derivative(
@@ -210,9 +174,7 @@ def _marker_residual(collocation: Collocation) -> MarkerResidual:
     experiment with markers.
     """
     (transcription,) = collocation.transcriptions
-    (markers,) = (
-        r for r in transcription.residuals if isinstance(r, MarkerResidual)
-    )
+    (markers,) = (r for r in transcription.residuals if isinstance(r, MarkerResidual))
     return markers
 
 
@@ -230,58 +192,31 @@ def _check_predicted_reading(
     phi = np.zeros(data.size)
     plain = residual.predict_positions(x, phi)
     for marker in range(plain.shape[1]):
-        of_marker = [
-            k
-            for k in residual.own_parameters[marker]
-            if data.entries[k].row == row
-        ]
-        values = check.rng.uniform(
-            -LARGEST_DEVIATION, LARGEST_DEVIATION, len(of_marker)
-        )
+        of_marker = [k for k in residual.own_parameters[marker] if data.entries[k].row == row]
+        values = check.rng.uniform(-LARGEST_DEVIATION, LARGEST_DEVIATION, len(of_marker))
         phi[of_marker] = values
         predicted = residual.predict_positions(x, phi)[:, marker]
         physical = values * data.scales[of_marker]
         for sample, t_s in enumerate(residual.t_s):
             check.require_equal(
                 predicted[sample],
-                _read(
-                    row,
-                    plain[sample, marker],
-                    values=physical,
-                    t_s=float(t_s),
-                    data=data,
-                ),
+                _read(row, plain[sample, marker], values=physical, t_s=float(t_s), data=data),
                 statement=f"the predicted marker {residual.names[marker]} is not the reading "
                 f"at t = {t_s:.4g} s",
                 scale=float(np.abs(plain).max()),
             )
 
 
-def _check_clock(
-    check: PropertyCheck, row: NuisanceRow, collocation: Collocation
-) -> None:
+def _check_clock(check: PropertyCheck, row: NuisanceRow, collocation: Collocation) -> None:
     """Require no delay at zero, and the first marker of a known motion at the later time, at all
     samples from `FIRST_INNER_SAMPLE` on.
     """
     residual = _marker_residual(collocation)
     data = residual.nuisance
     count = _value_count(row)
-    late = _read(
-        row,
-        np.zeros(3),
-        values=np.zeros(count),
-        t_s=float(data.recorded_s[1]),
-        data=data,
-    )
-    check.require_equal(
-        late,
-        np.zeros(1),
-        statement="the value zero changes the clock",
-        scale=1.0,
-    )
-    indices = np.array(
-        [k for k, entry in enumerate(data.entries) if entry.row == row]
-    )
+    late = _read(row, np.zeros(3), values=np.zeros(count), t_s=float(data.recorded_s[1]), data=data)
+    check.require_equal(late, np.zeros(1), statement="the value zero changes the clock", scale=1.0)
+    indices = np.array([k for k, entry in enumerate(data.entries) if entry.row == row])
     phi = np.zeros(data.size)
     phi[indices] = LARGEST_DEVIATION
     x = _smooth_motion(check, collocation)
@@ -304,36 +239,17 @@ def _check_clock(
         )
 
 
-def _smooth_motion(
-    check: PropertyCheck, collocation: Collocation, shift_s: float = 0.0
-) -> Array:
-    """Return grid positions (N, 3n) of a motion that is affine in space and quadratic in time.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-        Not used.
-    collocation : Collocation
-        Program of one recording.
-    shift_s : float
-        Time that is added to the grid times [s]: if positive, each row is where the motion is so
-        much later.
-    """
+def _smooth_motion(check: PropertyCheck, collocation: Collocation, shift_s: float = 0.0) -> Array:
+    """Return grid positions (N, 3n) of a motion that is affine in space and quadratic in time."""
     (transcription,) = collocation.transcriptions
     nodes_m = transcription.body.nodes_m
     rates = np.random.default_rng(3).standard_normal((2, 3, 3))
     t_s = transcription.dynamics.t_s + shift_s
-    steps = (
-        rates[0] * t_s[:, None, None] + 10 * rates[1] * t_s[:, None, None] ** 2
-    )
-    return np.einsum("tij,nj->tni", np.eye(3) + steps, nodes_m).reshape(
-        len(t_s), -1
-    )
+    steps = rates[0] * t_s[:, None, None] + 10 * rates[1] * t_s[:, None, None] ** 2
+    return np.einsum("tij,nj->tni", np.eye(3) + steps, nodes_m).reshape(len(t_s), -1)
 
 
-def _check_messages(
-    check: PropertyCheck, row: NuisanceRow, experiment: Experiment
-) -> None:
+def _check_messages(check: PropertyCheck, row: NuisanceRow, experiment: Experiment) -> None:
     """Require that a repeated name and a prior without width are refused by the name of the row."""
     nuisance = experiment.nuisance
     check.require_refusal(
@@ -357,22 +273,9 @@ def _check_round_trips(
 ) -> None:
     """Require the same effect and prior after pickling and, unless `file` is None, from a problem
     file that names the row in this Python file.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    row : NuisanceRow
-    data : NuisanceMap
-        Data of the recording for reading or clock.
-    file : str, Path or None
-        Python file with the row.
-    name_in_file : str or None
-        Name of the row in the file; None means its own name.
     """
     y = np.array([0.03, 0.05, 0.02])
-    values = (row.sigma or USUAL_SIGMA) * np.linspace(
-        0.3, 0.5, _value_count(row)
-    )
+    values = (row.sigma or USUAL_SIGMA) * np.linspace(0.3, 0.5, _value_count(row))
     t_s = float(np.mean(data.recorded_s))
 
     def evaluate(each: NuisanceRow) -> Array:
@@ -380,11 +283,7 @@ def _check_round_trips(
         at one state; a row without reading and clock has no effect.
         """
         has_effect = each.reading is not None or each.clock is not None
-        effect = (
-            _read(each, y, values=values, t_s=t_s, data=data)
-            if has_effect
-            else np.zeros(0)
-        )
+        effect = _read(each, y, values=values, t_s=t_s, data=data) if has_effect else np.zeros(0)
         limits = np.array([each.low, each.high, each.reach])
         limits = np.where(np.isfinite(limits), limits, 0.0)
         return np.concatenate([[each.sigma or 0.0], limits, effect])
@@ -397,11 +296,5 @@ def _check_round_trips(
     if file is not None:
         table = {"file": Path(file).name, "row": name_in_file or row.name}
         check_problem_file(
-            check,
-            file,
-            table=table,
-            load=load,
-            extension=row,
-            evaluate=evaluate,
-            key="row",
+            check, file, table=table, load=load, extension=row, evaluate=evaluate, key="row"
         )

@@ -48,19 +48,14 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
         """Return the gradient of the Lagrangian by z: `LOSS_WEIGHT` times that of the loss and Jᵀ
         times the multipliers.
         """
-        return (
-            LOSS_WEIGHT * program.gradient(at)
-            + program.jacobian(at).T @ multipliers
-        )
+        return LOSS_WEIGHT * program.gradient(at) + program.jacobian(at).T @ multipliers
 
     jacobian = program.jacobian(z)
     hessian = program.hessian(z, LOSS_WEIGHT, multipliers)
     gradient = program.gradient(z)
     for columns, meaning in _blocks(program):
         direction = np.zeros(len(z))
-        direction[columns] = CHANGE * check.rng.standard_normal(
-            len(direction[columns])
-        )
+        direction[columns] = CHANGE * check.rng.standard_normal(len(direction[columns]))
         if not direction.any():
             continue
         check.require_product(

@@ -40,9 +40,7 @@ class PropertyCheck:
     """
 
     subject: str
-    rng: np.random.Generator = field(
-        default_factory=lambda: np.random.default_rng(0)
-    )
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     def fail(self, statement: str, found: Any, expected: Any) -> NoReturn:
         """Raise the `AssertionError` of a property, always.
@@ -95,21 +93,15 @@ class PropertyCheck:
         values = np.asarray(found, dtype=float)
         references = np.asarray(expected, dtype=float)
         if values.shape != references.shape:
-            self.fail(
-                f"{statement} (shapes)", values.shape, expected=references.shape
-            )
+            self.fail(f"{statement} (shapes)", values.shape, expected=references.shape)
         if not values.size:
             return
         size = np.abs(references).max() if scale is None else scale
         errors = np.abs(values - references)
-        worst = np.unravel_index(
-            int(np.argmax(np.nan_to_num(errors, nan=np.inf))), errors.shape
-        )
+        worst = np.unravel_index(int(np.argmax(np.nan_to_num(errors, nan=np.inf))), errors.shape)
         if not errors[worst] <= tolerance * size:
             entry = f", entry {tuple(map(int, worst))}" if worst else ""
-            self.fail(
-                f"{statement}{entry}", values[worst], expected=references[worst]
-            )
+            self.fail(f"{statement}{entry}", values[worst], expected=references[worst])
 
     def require_derivative(
         self,
@@ -149,16 +141,12 @@ class PropertyCheck:
         any shape of m n entries.
         """
         steps = np.broadcast_to(np.asarray(scale, dtype=float), point.shape)
-        found = (
-            np.asarray(derivative, dtype=float).reshape(-1, point.size) * steps
-        )
+        found = np.asarray(derivative, dtype=float).reshape(-1, point.size) * steps
 
         def differences(step: float) -> Array:
             """Return the derivative by differences, times the scale."""
             columns = [
-                directional_derivative(
-                    function, point, direction=direction, step=step
-                )
+                directional_derivative(function, point, direction=direction, step=step)
                 for direction in np.diag(steps)
             ]
             return np.stack([np.ravel(column) for column in columns], axis=1)
@@ -211,9 +199,7 @@ class PropertyCheck:
         size = _size(found, function(point))
         expected = _closest(
             found,
-            lambda step: directional_derivative(
-                function, point, direction=direction, step=step
-            ),
+            lambda step: directional_derivative(function, point, direction=direction, step=step),
             tolerance=tolerance * size,
         )
         self.require_equal(
@@ -224,9 +210,7 @@ class PropertyCheck:
             scale=size,
         )
 
-    def require_refusal(
-        self, call: Callable[[], Any], *, naming: str, statement: str
-    ) -> None:
+    def require_refusal(self, call: Callable[[], Any], *, naming: str, statement: str) -> None:
         """Require that a call raises an `InputError` that contains a name.
 
         Parameters
@@ -249,53 +233,25 @@ class PropertyCheck:
         except InputError as error:
             if naming not in str(error):
                 self.fail(
-                    f"the message for {statement} lacks the name",
-                    str(error),
-                    expected=expected,
+                    f"the message for {statement} lacks the name", str(error), expected=expected
                 )
         except Exception as error:  # any other error is what the check reports
             self.fail(
-                f"{statement} is not refused",
-                f"{type(error).__name__}: {error}",
-                expected=expected,
+                f"{statement} is not refused", f"{type(error).__name__}: {error}", expected=expected
             )
         else:
-            self.fail(
-                f"{statement} is not refused", "no error", expected=expected
-            )
+            self.fail(f"{statement} is not refused", "no error", expected=expected)
 
 
-def _closest(
-    found: Array, differences: Callable[[float], Array], *, tolerance: float
-) -> Array:
-    """Return, of the differences with each of the `STEPS`, those closest to a derivative.
-
-    Parameters
-    ----------
-    found : array
-        Derivative.
-    differences : callable
-        Differences with a step of this relative size.
-    tolerance : float
-        Largest error of an entry with which no other step is tried.
-
-    Returns
-    -------
-    array
-        Differences with the least largest error; NaN counts as infinite, as does another shape than
-        that of `found`. If all are infinite, those with the first step.
-    """
+def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: float) -> Array:
+    """Return, of the differences with each of the `STEPS`, those closest to a derivative."""
     candidates = []
     distances = []
     for step in STEPS:
         candidates.append(differences(step))
         has_shape = candidates[-1].shape == found.shape
-        errors = (
-            np.abs(candidates[-1] - found) if has_shape else np.array(np.inf)
-        )
-        distances.append(
-            float(np.nan_to_num(errors, nan=np.inf).max(initial=0.0))
-        )
+        errors = np.abs(candidates[-1] - found) if has_shape else np.array(np.inf)
+        distances.append(float(np.nan_to_num(errors, nan=np.inf).max(initial=0.0)))
         if distances[-1] <= tolerance:
             break
     return candidates[int(np.argmin(distances))]
@@ -306,15 +262,9 @@ def _size(derivative: Array, value: ArrayLike) -> float:
     largest absolute value of the function, nor less than the smallest positive float.
     """
     largest = float(np.abs(derivative).max(initial=0.0))
-    return max(
-        largest,
-        ROUNDING * float(np.abs(value).max(initial=0.0)),
-        np.finfo(float).tiny,
-    )
+    return max(largest, ROUNDING * float(np.abs(value).max(initial=0.0)), np.finfo(float).tiny)
 
 
 def _shown(value: Any) -> str:
     """Return a value as part of a sentence: floats with six digits, others as `str` shows them."""
-    return (
-        f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
-    )
+    return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)

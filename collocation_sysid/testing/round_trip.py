@@ -19,9 +19,7 @@ from .property_check import PropertyCheck
 T = TypeVar("T")
 
 
-def check_pickling(
-    check: PropertyCheck, extension: T, evaluate: Callable[[T], ArrayLike]
-) -> None:
+def check_pickling(check: PropertyCheck, extension: T, evaluate: Callable[[T], ArrayLike]) -> None:
     """Require that a copy of an extension, as a worker of a cluster gets it, has the same values.
 
     Functions without a name in a module are pickled with cloudpickle, as on a Dask cluster. Where
@@ -53,9 +51,7 @@ def check_pickling(
             expected="a function that refers to no open file, lock or CasADi symbol",
         )
     check.require_equal(
-        evaluate(copy),
-        evaluate(extension),
-        statement="the pickled copy has other values",
+        evaluate(copy), evaluate(extension), statement="the pickled copy has other values"
     )
 
 

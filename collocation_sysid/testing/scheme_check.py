@@ -18,12 +18,7 @@ from .finite_differences import observed_order
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling
-from .small_problems import (
-    DENSITY_KG_M3,
-    program_of,
-    swung_experiment,
-    usual_constants,
-)
+from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, usual_constants
 
 # Rounding of sums of coefficients.
 ROUNDING = 1e-12
@@ -107,24 +102,13 @@ def _check_regular(check: PropertyCheck, stencil: Stencil) -> None:
 
 
 def _check_start(check: PropertyCheck, stencil: Stencil, row: int) -> None:
-    """Require that the stencil of a first row is consistent and uses no point before the start.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    stencil : Stencil
-    row : int
-        Number of the row: the first row after the start, which computes x_1, is row 1.
-    """
+    """Require that the stencil of a first row is consistent and uses no point before the start."""
     expected = {
         "the position ξ of a constant (Σ p)": (_moment(stencil.p, 0), 1.0),
         "the velocity ν of a constant (Σ q)": (_moment(stencil.q, 0), 0.0),
         "the velocity ν of a straight line": (_moment(stencil.q, 1), 1.0),
         "the acceleration of a constant (Σ s)": (_moment(stencil.s, 0), 0.0),
-        "the acceleration at constant velocity": (
-            _moment(stencil.s, 1) + stencil.r,
-            0.0,
-        ),
+        "the acceleration at constant velocity": (_moment(stencil.s, 1) + stencil.r, 0.0),
     }
     _check_values(check, expected, where=f"the stencil of row {row}")
     points = max(len(stencil.p), len(stencil.q)) + len(stencil.w) - 1
@@ -139,16 +123,7 @@ def _check_start(check: PropertyCheck, stencil: Stencil, row: int) -> None:
 def _check_values(
     check: PropertyCheck, expected: dict[str, tuple[float, float]], where: str
 ) -> None:
-    """Require that values agree with expected ones to an absolute error of `ROUNDING`.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    expected : dict of str to (float, float)
-        Value of the stencil and expected value, by the name of the quantity.
-    where : str
-        Name of the stencil for the sentence.
-    """
+    """Require that values agree with expected ones to an absolute error of `ROUNDING`."""
     for name, (moment, value) in expected.items():
         if not abs(moment - value) <= ROUNDING:
             check.fail(f"{name} in {where} is wrong", moment, expected=value)
@@ -213,10 +188,7 @@ class PlainRows:
         for lag, weight in enumerate(stencil.w):
             own = self.scheme.stencil(row - lag)
             xi = sum(c * x[row - lag - i] for i, c in enumerate(own.p))
-            nu = (
-                sum(c * x[row - lag - i] for i, c in enumerate(own.q))
-                / self.timestep_s
-            )
+            nu = sum(c * x[row - lag - i] for i, c in enumerate(own.q)) / self.timestep_s
             total = total + weight * self.force(xi, nu)
         inertia: Any = sum(c * x[row - i] for i, c in enumerate(stencil.s))
         inertia = inertia + stencil.r * self.timestep_s * self.start_velocity
@@ -242,20 +214,14 @@ def _check_order(check: PropertyCheck, scheme: Scheme) -> None:
         for row in range(1, count + 1):
             at_zero = rows.residual(x, row)
             x[row] = 1.0
-            x[row] = at_zero / (
-                at_zero - rows.residual(x, row)
-            )  # a row is affine in x_t
+            x[row] = at_zero / (at_zero - rows.residual(x, row))  # a row is affine in x_t
         damped = omega * np.sqrt(1 - DAMPING_RATIO**2)
-        exact = (
-            np.exp(-DAMPING_RATIO * omega * t_s) * np.sin(damped * t_s) / damped
-        )
+        exact = np.exp(-DAMPING_RATIO * omega * t_s) * np.sin(damped * t_s) / damped
         errors.append(np.abs(x - exact).max())
     order = observed_order(DURATION_S / np.array(STEP_COUNTS), np.array(errors))
     if not abs(order - scheme.order) <= ORDER_TOLERANCE:
         check.fail(
-            "the error of an oscillator has another order than stated",
-            order,
-            expected=scheme.order,
+            "the error of an oscillator has another order than stated", order, expected=scheme.order
         )
 
 
@@ -263,19 +229,15 @@ def _check_simulation(check: PropertyCheck, scheme: Scheme) -> None:
     """Require that a simulated motion of a small body, swung by a grasp from its undeformed shape,
     satisfies every row of the table at its free dofs; check its program by `check_program`.
     """
-    body = Body(
-        box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3
-    )
+    body = Body(box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3)
     values = usual_constants(tuple(body.constants.values()), None)
     experiment = replace(swung_experiment(body), start="undeformed")
     try:
-        x = simulate(
-            experiment, values, scheme, substeps=1
-        ).positions_m.reshape(-1, 3 * len(body.nodes_m))
-    except SimulationError as error:
-        check.fail(
-            "a small body cannot be simulated", error, expected="a motion"
+        x = simulate(experiment, values, scheme, substeps=1).positions_m.reshape(
+            -1, 3 * len(body.nodes_m)
         )
+    except SimulationError as error:
+        check.fail("a small body cannot be simulated", error, expected="a motion")
     theta = np.array([*values.values()])
     weight = np.tile(experiment.gravity_m_s2, len(body.nodes_m)) * body.dof_mass
     rows = PlainRows(

@@ -17,20 +17,11 @@ from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import box_mesh
 from ..problem.code_loader import CodeLoader
 from ..program.collocation import Collocation
-from ..recording.custom_sensor import (
-    Gauge,
-    stack_values,
-)
+from ..recording.custom_sensor import Gauge, stack_values
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling, check_problem_file
-from .small_problems import (
-    DENSITY_KG_M3,
-    STEPS,
-    TIMESTEP_S,
-    program_of,
-    swung_experiment,
-)
+from .small_problems import DENSITY_KG_M3, STEPS, TIMESTEP_S, program_of, swung_experiment
 
 # Number of random states.
 STATES = 3
@@ -50,10 +41,7 @@ SAMPLES = 7
 
 
 def check_sensor(
-    sensor: Gauge,
-    *,
-    file: str | Path | None = None,
-    function: str | None = None,
+    sensor: Gauge, *, file: str | Path | None = None, function: str | None = None
 ) -> None:
     """Check a custom sensor: values, derivatives, predictions, messages and round trips.
 
@@ -88,13 +76,9 @@ def check_sensor(
     expression = SensorExpression(sensor)
     for number in range(STATES):
         u = expression.random_state(check.rng)
-        _check_derivatives(
-            check, expression, u=u, where=f"at random state {number}"
-        )
+        _check_derivatives(check, expression, u=u, where=f"at random state {number}")
     check.require_refusal(
-        lambda: replace(
-            sensor, unknowns={**sensor.unknowns, "no_such_unknown": 1.0}
-        ),
+        lambda: replace(sensor, unknowns={**sensor.unknowns, "no_such_unknown": 1.0}),
         naming="no_such_unknown",
         statement="an unknown that the expression does not have",
     )
@@ -129,37 +113,25 @@ class SensorExpression:
         if self.sensor.grasp is not None:
             return {name: np.ones((3, 1)) for name in names}
         points = np.asarray(self.sensor.points_m).T
-        return {
-            name: points if name == "position_m" else np.zeros_like(points)
-            for name in names
-        }
+        return {name: points if name == "position_m" else np.zeros_like(points) for name in names}
 
     def random_state(self, rng: np.random.Generator) -> Array:
         """Return u (k,): inputs near the undeformed ones, with deviations of `SIZES`, and unknowns
         of the size of their priors.
         """
         changed = [
-            (each + SIZES[name] * rng.standard_normal(each.shape)).ravel(
-                order="F"
-            )
+            (each + SIZES[name] * rng.standard_normal(each.shape)).ravel(order="F")
             for name, each in self.make_inputs().items()
         ]
         sigmas = np.array([*self.sensor.unknowns.values()], dtype=float)
-        return np.concatenate(
-            [*changed, sigmas * rng.standard_normal(len(sigmas))]
-        )
+        return np.concatenate([*changed, sigmas * rng.standard_normal(len(sigmas))])
 
     def compute_scale(self) -> Array:
         """Return the size of a large change of each entry of u (k,): `SIZES` for inputs, the prior
         standard deviation for unknowns.
         """
-        sizes = [
-            np.full(each.size, SIZES[name])
-            for name, each in self.make_inputs().items()
-        ]
-        return np.concatenate(
-            [*sizes, np.array([*self.sensor.unknowns.values()], dtype=float)]
-        )
+        sizes = [np.full(each.size, SIZES[name]) for name, each in self.make_inputs().items()]
+        return np.concatenate([*sizes, np.array([*self.sensor.unknowns.values()], dtype=float)])
 
     def evaluate_plain(self, u: Array, t_s: float | None = None) -> Array:
         """Return the numbers (c,) of the sensor by calling its expression with numbers; a matrix
@@ -175,12 +147,9 @@ class SensorExpression:
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
         *parts, unknowns = np.split(u, ends)
         values = (
-            ca.DM(part.reshape(shape, order="F"))
-            for part, shape in zip(parts, shapes, strict=True)
+            ca.DM(part.reshape(shape, order="F")) for part, shape in zip(parts, shapes, strict=True)
         )
-        named = dict(
-            zip(self.sensor.unknowns, map(float, unknowns), strict=True)
-        )
+        named = dict(zip(self.sensor.unknowns, map(float, unknowns), strict=True))
         now_s = self.t_s if t_s is None else t_s
         # Numbers in place of expressions.
         at = self.sensor.quantities(now_s, *values)  # type: ignore[arg-type]
@@ -192,10 +161,7 @@ class SensorExpression:
         """Function of u and weights w: y, ∂y/∂u and ∂²(wᵀy)/∂u², from the expression in SX at the
         time `t_s`.
         """
-        symbols = [
-            ca.SX.sym(name, *each.shape)
-            for name, each in self.make_inputs().items()
-        ]
+        symbols = [ca.SX.sym(name, *each.shape) for name, each in self.make_inputs().items()]
         unknowns = ca.SX.sym("unknowns", len(self.sensor.unknowns))
         own = ca.vertsplit(unknowns) if self.sensor.unknowns else []
         y = self.sensor.read(ca.SX(self.t_s), symbols, own)
@@ -214,13 +180,9 @@ def _check_derivatives(
     """
     plain = expression.evaluate_plain(u)
     weights = check.rng.standard_normal(len(plain))
-    y, jacobian, hessian = (
-        each.full() for each in expression.automatic.call([u, weights])
-    )
+    y, jacobian, hessian = (each.full() for each in expression.automatic.call([u, weights]))
     check.require_equal(
-        y.ravel(),
-        plain,
-        statement=f"the expression differs from its function {where}",
+        y.ravel(), plain, statement=f"the expression differs from its function {where}"
     )
     check.require_derivative(
         expression.evaluate_plain,
@@ -243,11 +205,7 @@ def _small_program(sensor: Gauge) -> Collocation:
     the sensor's points with a margin; a sensor on a grasp is on that of the box.
     """
     points = np.asarray(sensor.points_m).reshape(-1, 3)
-    low = (
-        points.min(axis=0, initial=0.0)
-        if not len(points)
-        else points.min(axis=0)
-    )
+    low = points.min(axis=0, initial=0.0) if not len(points) else points.min(axis=0)
     high = points.max(axis=0) if len(points) else low + 0.06
     size = tuple(float(each) for each in high - low + 2 * MARGIN_M)
     box = box_mesh(size, (1, 1, 2))
@@ -267,9 +225,7 @@ def _check_prediction(
     unknowns.
     """
     transcription = collocation.transcriptions[0]
-    rates = [
-        scale * check.rng.standard_normal((3, 3)) for scale in (0.05, 1.0, 20.0)
-    ]
+    rates = [scale * check.rng.standard_normal((3, 3)) for scale in (0.05, 1.0, 20.0)]
     identity = np.eye(3)
 
     def gradient_at(t: float) -> list[Array]:
@@ -277,11 +233,7 @@ def _check_prediction(
         second derivative by time.
         """
         zero, one, two = rates
-        return [
-            identity + zero + one * t + two * t**2,
-            one + 2 * two * t,
-            2 * two,
-        ]
+        return [identity + zero + one * t + two * t**2, one + 2 * two * t, 2 * two]
 
     grid_s = transcription.dynamics.t_s
     nodes_m = transcription.body.nodes_m
@@ -291,45 +243,25 @@ def _check_prediction(
     (iterate,) = collocation.iterates_at(p, [x])
     (residual,) = transcription.custom_sensors
     found = residual.without_padding(
-        residual.predict_motion(
-            iterate.motion_for(residual.observable), iterate.phi
-        )
+        residual.predict_motion(iterate.motion_for(residual.observable), iterate.phi)
     )
-    unknowns = iterate.phi * np.array(
-        [*expression.sensor.unknowns.values()], dtype=float
-    )
+    unknowns = iterate.phi * np.array([*expression.sensor.unknowns.values()], dtype=float)
     points = np.asarray(expression.sensor.points_m).T
     for t_s, numbers in zip(residual.t_s, found, strict=True):
-        exact = [
-            (matrix @ points).ravel(order="F") for matrix in gradient_at(t_s)
-        ]
+        exact = [(matrix @ points).ravel(order="F") for matrix in gradient_at(t_s)]
         check.require_equal(
             numbers,
-            expression.evaluate_plain(
-                np.concatenate([*exact, unknowns]), float(t_s)
-            ),
+            expression.evaluate_plain(np.concatenate([*exact, unknowns]), float(t_s)),
             statement=f"the prediction for a known motion is wrong at t = {t_s:.4g} s",
             tolerance=1e-7,
         )
 
 
 def _check_round_trips(
-    check: PropertyCheck,
-    sensor: Gauge,
-    file: str | Path | None,
-    function: str | None,
+    check: PropertyCheck, sensor: Gauge, file: str | Path | None, function: str | None
 ) -> None:
     """Require the same numbers at one random state after pickling and, unless `file` is None, from
     a problem file that names the expression in this Python file.
-
-    Parameters
-    ----------
-    check : PropertyCheck
-    sensor : Gauge
-    file : str, Path or None
-        Python file with the expression.
-    function : str or None
-        Name of the function in the file; None means the ``__name__`` of the expression.
     """
     u = SensorExpression(sensor).random_state(check.rng)
 
@@ -339,20 +271,11 @@ def _check_round_trips(
 
     def load(loader: CodeLoader, table: Mapping[str, Any]) -> Gauge:
         """Return the sensor with the expression that a table of a problem file names."""
-        _, expression = loader.function(
-            table["code"], table["function"], "reading.0.code"
-        )
+        _, expression = loader.function(table["code"], table["function"], "reading.0.code")
         return replace(sensor, expression=expression)
 
     check_pickling(check, sensor, evaluate=evaluate)
     if file is not None:
         name = function or getattr(sensor.expression, "__name__", sensor.name)
         table = {"code": Path(file).name, "function": name}
-        check_problem_file(
-            check,
-            file,
-            table=table,
-            load=load,
-            extension=sensor,
-            evaluate=evaluate,
-        )
+        check_problem_file(check, file, table=table, load=load, extension=sensor, evaluate=evaluate)

@@ -40,9 +40,7 @@ def uneven_box(divisions: int) -> TetMesh:
         Number of cells along each edge; each consists of six tetrahedra.
     """
     mesh = box_mesh((0.10, 0.12, 0.09), (divisions,) * 3)
-    jitter = np.random.default_rng(1).uniform(
-        -0.008, 0.008, mesh.points_m.shape
-    )
+    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
     return TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
 
 
@@ -86,10 +84,7 @@ def usual_constants(
         Stated values.
     """
     known = dict(values or {})
-    return {
-        c.name: float(known.get(c.name, _usual_constant(c.name)))
-        for c in constants
-    }
+    return {c.name: float(known.get(c.name, _usual_constant(c.name))) for c in constants}
 
 
 def _usual_constant(name: str) -> float:
@@ -131,9 +126,7 @@ def swung_experiment(body: Body, **changes: Any) -> Experiment:
     names = [f"m{k}" for k in range(len(points_m))]
     arguments: dict[str, Any] = {
         "grasps": [Grasp(highest_nodes(body.nodes_m), smooth_poses(t_s))],
-        "markers": Markers(
-            t_s, tracks, sigma_m=1e-2, names=names, places_m=points_m
-        ),
+        "markers": Markers(t_s, tracks, sigma_m=1e-2, names=names, places_m=points_m),
         "nuisance": Nuisance.none(),
         "air_density_kg_m3": "none",
         "name": "check",
@@ -141,9 +134,7 @@ def swung_experiment(body: Body, **changes: Any) -> Experiment:
     return Experiment(body, t_s, **(arguments | changes))
 
 
-def program_of(
-    experiment: Experiment, values: Mapping[str, float]
-) -> Collocation:
+def program_of(experiment: Experiment, values: Mapping[str, float]) -> Collocation:
     """Return the program of an experiment in which all constants of its body are estimated.
 
     Parameters
@@ -156,12 +147,8 @@ def program_of(
     -----
     A constant whose value is zero is fixed instead, because it has no scale.
     """
-    constants = usual_constants(
-        tuple(experiment.body.constants.values()), values
-    )
-    unknowns: dict[str, Any] = {
-        name: _unknown(value) for name, value in constants.items()
-    }
+    constants = usual_constants(tuple(experiment.body.constants.values()), values)
+    unknowns: dict[str, Any] = {name: _unknown(value) for name, value in constants.items()}
     return Collocation([experiment], Parameters.from_mapping(unknowns))
 
 
@@ -170,9 +157,7 @@ def _unknown(value: float) -> Unknown | float:
     return Unknown(value) if value else value
 
 
-def shaken_variables(
-    collocation: Collocation, rng: np.random.Generator
-) -> Array:
+def shaken_variables(collocation: Collocation, rng: np.random.Generator) -> Array:
     """Return variables z of a program that satisfy no equation: rigid motions, parameters and
     lifted variables with random errors.
 
@@ -186,18 +171,13 @@ def shaken_variables(
     """
     positions = []
     for transcription in collocation.transcriptions:
-        rigid = transcription.experiment.rigid_positions(
-            transcription.dynamics.t_s
-        )
+        rigid = transcription.experiment.rigid_positions(transcription.dynamics.t_s)
         rigid = rigid.reshape(-1, transcription.dof_count)
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
     p = collocation.guess_p
     p[: collocation.nq] += 0.1 * rng.normal(size=collocation.nq)
     p[collocation.nq :] += 0.5 * rng.normal(size=collocation.nphi)
-    is_lag = np.array(
-        ["lag of" in name for name in collocation.list_parameter_names()],
-        dtype=bool,
-    )
+    is_lag = np.array(["lag of" in name for name in collocation.list_parameter_names()], dtype=bool)
     p[is_lag] = np.abs(p[is_lag]) + 0.1
     z = collocation.pack(p, positions)
     for lifted in lifted_variables(collocation):

@@ -115,11 +115,7 @@ def exact_position(t, stiffness=STIFFNESS, damping=DAMPING):
     """Return the exact positions of the released mass [m] at the times t [s]."""
     decay = damping / (2 * MASS)
     damped = np.sqrt(stiffness / MASS - decay**2)
-    return (
-        PULL
-        * np.exp(-decay * t)
-        * (np.cos(damped * t) + decay / damped * np.sin(damped * t))
-    )
+    return PULL * np.exp(-decay * t) * (np.cos(damped * t) + decay / damped * np.sin(damped * t))
 
 
 t = np.arange(101) * DT
@@ -127,9 +123,7 @@ y = exact_position(t) + SIGMA * np.random.default_rng(0).normal(size=len(t))
 
 omega = np.sqrt(STIFFNESS / MASS)
 zeta = DAMPING / (2 * np.sqrt(STIFFNESS * MASS))
-print(
-    f"ω = {omega:.3g} rad/s, that is {omega / (2 * np.pi):.2f} Hz; damping ratio ζ = {zeta:.3g}"
-)
+print(f"ω = {omega:.3g} rad/s, that is {omega / (2 * np.pi):.2f} Hz; damping ratio ζ = {zeta:.3g}")
 
 # %% [markdown]
 # ### Midpoint rule
@@ -176,20 +170,11 @@ def spring_program(steps, dt):
     Z = ca.SX.sym("z", steps)
     Y = ca.SX.sym("y", steps)
     X = PULL * Z
-    F = spring_force(
-        (X[1:] + X[:-1]) / 2, (X[1:] - X[:-1]) / dt, theta[0], theta[1]
-    )
+    F = spring_force((X[1:] + X[:-1]) / 2, (X[1:] - X[:-1]) / dt, theta[0], theta[1])
     first = F[0] / 2 - MASS * (X[1] - X[0]) / dt**2
-    others = (F[1:] + F[:-1]) / 2 - MASS * (
-        X[2:] - 2 * X[1:-1] + X[:-2]
-    ) / dt**2
+    others = (F[1:] + F[:-1]) / 2 - MASS * (X[2:] - 2 * X[1:-1] + X[:-2]) / dt**2
     loss = ca.sumsqr((X - Y) / SIGMA)
-    return {
-        "x": ca.vertcat(theta, Z),
-        "p": Y,
-        "f": loss,
-        "g": ca.vertcat(first, others),
-    }
+    return {"x": ca.vertcat(theta, Z), "p": Y, "f": loss, "g": ca.vertcat(first, others)}
 
 
 program = spring_program(len(t), DT)
@@ -206,9 +191,7 @@ solver = ca.nlpsol("spring", "ipopt", program, ipopt_options())
 def identify(solver, y, guess=(10.0, 1.0)):
     """Return the parameters (k, c), the trajectory [m] and the number of iterations."""
     lower = np.concatenate([[0, 0], np.full(len(y), -np.inf)])
-    result = solver(
-        x0=np.concatenate([guess, y / PULL]), p=y, lbx=lower, lbg=0, ubg=0
-    )
+    result = solver(x0=np.concatenate([guess, y / PULL]), p=y, lbx=lower, lbg=0, ubg=0)
     assert solver.stats()["success"], solver.stats()["return_status"]
     z = result["x"].full().ravel()
     return z[:2], PULL * z[2:], solver.stats()["iter_count"]
@@ -223,26 +206,11 @@ print(f"{iterations} iterations from the guess k = 10, c = 1")
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.1, 2.4))
 left.plot(t, 1e3 * y, "k.", label="measured, 1 mm noise")
 left.plot(t, 1e3 * trajectory, color=BLUE, label="fitted")
-left.set(
-    title="Fitted trajectory",
-    xlabel="time [s]",
-    ylabel="position [mm]",
-    ylim=(-50, 75),
-)
+left.set(title="Fitted trajectory", xlabel="time [s]", ylabel="position [mm]", ylim=(-50, 75))
 left.legend()
 right.plot(t, 1e3 * (trajectory - y), "k.", label="fitted − measured")
-right.plot(
-    t,
-    1e3 * (trajectory - exact_position(t)),
-    color=VERMILION,
-    label="fitted − true",
-)
-right.set(
-    title="Residuals and error",
-    xlabel="time [s]",
-    ylabel="difference [mm]",
-    ylim=(-3, 4),
-)
+right.plot(t, 1e3 * (trajectory - exact_position(t)), color=VERMILION, label="fitted − true")
+right.set(title="Residuals and error", xlabel="time [s]", ylabel="difference [mm]", ylim=(-3, 4))
 right.legend()
 plt.show()
 
@@ -260,44 +228,26 @@ plt.show()
 
 # %%
 trials = np.geomspace(4, 400, 600)
-shooting_loss = np.array(
-    [np.mean((exact_position(t, k) - y) ** 2) / SIGMA**2 for k in trials]
-)
-is_minimum = (shooting_loss[1:-1] < shooting_loss[:-2]) & (
-    shooting_loss[1:-1] < shooting_loss[2:]
-)
+shooting_loss = np.array([np.mean((exact_position(t, k) - y) ** 2) / SIGMA**2 for k in trials])
+is_minimum = (shooting_loss[1:-1] < shooting_loss[:-2]) & (shooting_loss[1:-1] < shooting_loss[2:])
 minima = np.flatnonzero(is_minimum) + 1
 guesses = np.array([4.0, 8.0, 15.0, 30.0, 60.0, 120.0, 250.0, 400.0])
-estimates = np.array(
-    [identify(solver, y, (guess, 1.0))[0][0] for guess in guesses]
-)
+estimates = np.array([identify(solver, y, (guess, 1.0))[0][0] for guess in guesses])
 print(f"local minima of the shooting loss: {len(minima)}")
-print(
-    f"estimates by collocation from eight guesses: {np.unique(estimates.round(2))}"
-)
+print(f"estimates by collocation from eight guesses: {np.unique(estimates.round(2))}")
 assert len(minima) > 1
 assert np.ptp(estimates) < 1e-3
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.1, 2.4))
 left.loglog(trials, shooting_loss, color=BLUE)
-left.plot(
-    trials[minima],
-    shooting_loss[minima],
-    "o",
-    color=VERMILION,
-    label="local minima",
-)
+left.plot(trials[minima], shooting_loss[minima], "o", color=VERMILION, label="local minima")
 left.axvline(STIFFNESS, color="black", lw=0.6)
-left.set(
-    title="Loss of shooting", xlabel="k [N/m]", ylabel="mean squared error / σ²"
-)
+left.set(title="Loss of shooting", xlabel="k [N/m]", ylabel="mean squared error / σ²")
 left.legend()
 right.loglog(guesses, estimates, "o-", color=BLUE)
 right.axhline(STIFFNESS, color="black", lw=0.6)
-right.set(
-    title="Estimate by collocation", xlabel="guess of k [N/m]", ylabel="k [N/m]"
-)
+right.set(title="Estimate by collocation", xlabel="guess of k [N/m]", ylabel="k [N/m]")
 right.set_ylim(4, 400)
 plt.show()
 
@@ -372,9 +322,7 @@ def covariance_at(theta, trajectory):
 predicted = covariance_at((k_estimate, c_estimate), trajectory)
 std_errors = np.sqrt(np.diag(predicted))
 k_error, c_error = std_errors
-print(
-    f"k = {k_estimate:.2f} ± {k_error:.2f} N/m, c = {c_estimate:.4f} ± {c_error:.4f} N s/m"
-)
+print(f"k = {k_estimate:.2f} ± {k_error:.2f} N/m, c = {c_estimate:.4f} ± {c_error:.4f} N s/m")
 assert abs(c_estimate - DAMPING) < 4 * c_error
 
 # %% [markdown]
@@ -383,20 +331,12 @@ assert abs(c_estimate - DAMPING) < 4 * c_error
 
 # %%
 rng = np.random.default_rng(1)
-recordings = [
-    exact_position(t) + SIGMA * rng.normal(size=len(t)) for _ in range(200)
-]
-samples = np.array(
-    [identify(solver, recording, (30.0, 0.1))[0] for recording in recordings]
-)
+recordings = [exact_position(t) + SIGMA * rng.normal(size=len(t)) for _ in range(200)]
+samples = np.array([identify(solver, recording, (30.0, 0.1))[0] for recording in recordings])
 inside = np.abs(samples - samples.mean(axis=0)) < 1.96 * std_errors
-print(
-    f"standard deviation of the estimates (k, c): {samples.std(axis=0, ddof=1)}"
-)
+print(f"standard deviation of the estimates (k, c): {samples.std(axis=0, ddof=1)}")
 print(f"predicted standard errors:                  {std_errors}")
-print(
-    f"share within 1.96 predicted standard errors: {inside.mean(axis=0)}, expected 0.95"
-)
+print(f"share within 1.96 predicted standard errors: {inside.mean(axis=0)}, expected 0.95")
 assert np.allclose(samples.std(axis=0), std_errors, rtol=0.25)
 
 bias = samples[:, 0].mean() / STIFFNESS - 1
@@ -410,10 +350,7 @@ def ellipse(mean, covariance, deviations=2.448):
     """Return points (100, 2) on the 95 % region of a bivariate normal distribution."""
     angle = np.linspace(0, 2 * np.pi, 100)
     circle = np.array([np.cos(angle), np.sin(angle)])
-    return (
-        np.array(mean)[:, None]
-        + deviations * np.linalg.cholesky(covariance) @ circle
-    ).T
+    return (np.array(mean)[:, None] + deviations * np.linalg.cholesky(covariance) @ circle).T
 
 
 figure, axes = plt.subplots(figsize=(3.8, 2.8))
@@ -421,9 +358,7 @@ axes.plot(*samples.T, ".", color=BLUE, label="200 estimates")
 outline = ellipse(samples.mean(axis=0), predicted)
 axes.plot(*outline.T, color=VERMILION, label="predicted 95 % region")
 axes.plot(STIFFNESS, DAMPING, "k+", ms=10, mew=1.5, label="true values")
-axes.set(
-    title="Estimates from 200 recordings", xlabel="k [N/m]", ylabel="c [N s/m]"
-)
+axes.set(title="Estimates from 200 recordings", xlabel="k [N/m]", ylabel="c [N s/m]")
 axes.set_ylim(top=axes.get_ylim()[1] + 0.006)
 axes.legend()
 plt.show()
@@ -452,17 +387,12 @@ rho = ca.SX.sym("rho")
 penalised = program["f"] + rho / 2 * ca.sumsqr(program["g"])
 data = ca.vertcat(program["p"], rho)
 newton = ca.nlpsol(
-    "penalty",
-    "ipopt",
-    {"x": program["x"], "p": data, "f": penalised},
-    ipopt_options(500),
+    "penalty", "ipopt", {"x": program["x"], "p": data, "f": penalised}, ipopt_options(500)
 )
 hessian, gradient = ca.hessian(penalised, program["x"])
 penalty_at = ca.Function("values", [program["x"], data], [penalised, gradient])
 hessian_at = ca.Function("H", [program["x"], data], [hessian])
-violation = ca.Function(
-    "c", [program["x"], program["p"]], [ca.mmax(ca.fabs(program["g"]))]
-)
+violation = ca.Function("c", [program["x"], program["p"]], [ca.mmax(ca.fabs(program["g"]))])
 
 
 def minimise_by_cg(rho, iterations=1000):
@@ -474,9 +404,7 @@ def minimise_by_cg(rho, iterations=1000):
 
     start = np.concatenate([[10.0, 1.0], y / PULL])
     options = {"maxiter": iterations, "gtol": 1e-6}
-    return minimize(
-        loss_and_gradient, start, jac=True, method="CG", options=options
-    ).x
+    return minimize(loss_and_gradient, start, jac=True, method="CG", options=options).x
 
 
 def deviation(z):
@@ -491,34 +419,20 @@ conditions = []
 z = np.concatenate([(k_estimate, c_estimate), trajectory / PULL])
 for weight in weights[::-1]:
     z = newton(x0=z, p=np.append(y, weight))["x"].full().ravel()
-    for outcome, minimiser in zip(
-        outcomes.values(), (z, minimise_by_cg(weight)), strict=True
-    ):
-        outcome.insert(
-            0, (deviation(minimiser), float(violation(minimiser, y)))
-        )
-    conditions.insert(
-        0, np.linalg.cond(hessian_at(z, np.append(y, weight)).full())
-    )
+    for outcome, minimiser in zip(outcomes.values(), (z, minimise_by_cg(weight)), strict=True):
+        outcome.insert(0, (deviation(minimiser), float(violation(minimiser, y))))
+    conditions.insert(0, np.linalg.cond(hessian_at(z, np.append(y, weight)).full()))
 
 # %%
-figure, (first, second, third) = plt.subplots(
-    1, 3, figsize=(7.1, 2.7), sharex=True
-)
-for (label, outcome), colour in zip(
-    outcomes.items(), (BLUE, VERMILION), strict=True
-):
+figure, (first, second, third) = plt.subplots(1, 3, figsize=(7.1, 2.7), sharex=True)
+for (label, outcome), colour in zip(outcomes.items(), (BLUE, VERMILION), strict=True):
     deviations, violations = np.transpose(outcome)
     first.loglog(weights, deviations, "o-", color=colour, label=label)
     second.loglog(weights, violations, "o-", color=colour, label=label)
 first.axhline(1, color="black", lw=0.6)
-first.set(
-    title="Deviation of k and c", ylabel="standard errors", ylim=(1e-6, 3e4)
-)
+first.set(title="Deviation of k and c", ylabel="standard errors", ylim=(1e-6, 3e4))
 second.set(title="Residual of the equations", ylabel="largest |c| [N]")
-figure.legend(
-    *first.get_legend_handles_labels(), loc="outside lower center", ncols=2
-)
+figure.legend(*first.get_legend_handles_labels(), loc="outside lower center", ncols=2)
 third.loglog(weights, conditions, "o-", color=BLUE)
 third.set(title="Condition of the Hessian", ylabel="condition number")
 for axes in (first, second, third):
@@ -540,12 +454,8 @@ plt.show()
 
 # %%
 best_deviation, best_violation = min(outcomes["CG, 1000 iterations"])
-print(
-    f"best CG result: {best_deviation:.0f} standard errors from the constrained estimate,"
-)
-print(
-    f"largest residual {best_violation:.1f} N; largest spring force {STIFFNESS * PULL:.1f} N"
-)
+print(f"best CG result: {best_deviation:.0f} standard errors from the constrained estimate,")
+print(f"largest residual {best_violation:.1f} N; largest spring force {STIFFNESS * PULL:.1f} N")
 assert best_deviation > 3
 
 # %% [markdown]
@@ -573,12 +483,7 @@ def euler_program(steps, dt):
     first = F[0] - MASS * (X[1] - X[0]) / dt**2
     others = F[1:] - MASS * (X[2:] - 2 * X[1:-1] + X[:-2]) / dt**2
     loss = ca.sumsqr((X - Y) / SIGMA)
-    return {
-        "x": ca.vertcat(theta, Z),
-        "p": Y,
-        "f": loss,
-        "g": ca.vertcat(first, others),
-    }
+    return {"x": ca.vertcat(theta, Z), "p": Y, "f": loss, "g": ca.vertcat(first, others)}
 
 
 # %% [markdown]
@@ -588,41 +493,22 @@ def euler_program(steps, dt):
 # %%
 steps_s = np.array([0.00125, 0.0025, 0.005, 0.01, 0.02])
 by_scheme = {}
-for name, build in (
-    ("backward Euler", euler_program),
-    ("midpoint", spring_program),
-):
+for name, build in (("backward Euler", euler_program), ("midpoint", spring_program)):
     results = []
     for dt in steps_s:
         exact = exact_position(np.arange(round(1 / dt) + 1) * dt)
-        scheme_solver = ca.nlpsol(
-            "s", "ipopt", build(len(exact), dt), ipopt_options()
-        )
+        scheme_solver = ca.nlpsol("s", "ipopt", build(len(exact), dt), ipopt_options())
         results.append(identify(scheme_solver, exact, (30.0, 0.1))[0])
     by_scheme[name] = np.array(results)
-    print(
-        f"{name}: c / true value = {(by_scheme[name][:, 1] / DAMPING).round(3)}"
-    )
+    print(f"{name}: c / true value = {(by_scheme[name][:, 1] / DAMPING).round(3)}")
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.1, 2.6))
 added_ratio = omega * steps_s / 2
-for (name, results), colour in zip(
-    by_scheme.items(), (VERMILION, BLUE), strict=True
-):
-    left.semilogx(
-        added_ratio, results[:, 1] / DAMPING, "o-", color=colour, label=name
-    )
-    right.semilogx(
-        added_ratio, results[:, 0] / STIFFNESS, "o-", color=colour, label=name
-    )
-left.plot(
-    added_ratio,
-    1 - added_ratio / zeta,
-    "--",
-    color=VERMILION,
-    label="1 − (ωΔt/2) / ζ",
-)
+for (name, results), colour in zip(by_scheme.items(), (VERMILION, BLUE), strict=True):
+    left.semilogx(added_ratio, results[:, 1] / DAMPING, "o-", color=colour, label=name)
+    right.semilogx(added_ratio, results[:, 0] / STIFFNESS, "o-", color=colour, label=name)
+left.plot(added_ratio, 1 - added_ratio / zeta, "--", color=VERMILION, label="1 − (ωΔt/2) / ζ")
 left.set(title="Estimate of c", ylabel="c / true value", ylim=(-0.3, 1.4))
 right.set(title="Estimate of k", ylabel="k / true value")
 for axes in (left, right):
@@ -650,9 +536,7 @@ midpoint = by_scheme["midpoint"]
 assert euler[3, 1] < 1e-3 * DAMPING  # at 10 ms
 assert 1.04 < euler[4, 0] / STIFFNESS < 1.06  # at 20 ms
 assert np.allclose(midpoint[:, 1], DAMPING, rtol=0.05)
-assert np.isclose(
-    midpoint[4, 0] - STIFFNESS, 4 * (midpoint[3, 0] - STIFFNESS), rtol=0.1
-)
+assert np.isclose(midpoint[4, 0] - STIFFNESS, 4 * (midpoint[3, 0] - STIFFNESS), rtol=0.1)
 
 # %% [markdown]
 # ## 1.4 A tetrahedron
@@ -677,16 +561,9 @@ SIDE = 0.10  # m
 DENSITY = 300.0  # kg/m³
 GRAVITY = 9.81  # m/s²
 corners = SIDE * np.array(
-    [
-        [0, 0, 0],
-        [1, 0, 0],
-        [0.5, np.sqrt(3) / 2, 0],
-        [0.5, np.sqrt(3) / 6, -np.sqrt(2 / 3)],
-    ]
+    [[0, 0, 0], [1, 0, 0], [0.5, np.sqrt(3) / 2, 0], [0.5, np.sqrt(3) / 6, -np.sqrt(2 / 3)]]
 )
-rest_edges = (
-    corners[:3] - corners[3]
-).T  # columns: from the free corner to the held corners
+rest_edges = (corners[:3] - corners[3]).T  # columns: from the free corner to the held corners
 volume = abs(np.linalg.det(rest_edges)) / 6
 corner_mass = DENSITY * volume / 4
 
@@ -697,12 +574,8 @@ mu = ca.SX.sym("mu")
 gamma_r = ca.SX.sym("gamma_r")
 F = (P[:, :3] - ca.repmat(P[:, 3], 1, 3)) @ np.linalg.inv(rest_edges)
 log_j = ca.log(ca.det(F))
-energy = volume * (
-    lam * log_j**2 / 2 - mu * log_j + mu * (ca.sumsqr(F) - 3) / 2
-)
-print(
-    f"volume {1e6 * volume:.0f} cm³, lumped mass of a corner {1e3 * corner_mass:.1f} g"
-)
+energy = volume * (lam * log_j**2 / 2 - mu * log_j + mu * (ca.sumsqr(F) - 3) / 2)
+print(f"volume {1e6 * volume:.0f} cm³, lumped mass of a corner {1e3 * corner_mass:.1f} g")
 
 # %% [markdown]
 # ### Force, stiffness matrix and Rayleigh damping
@@ -751,36 +624,22 @@ def elastic_force_of(positions):
 
 
 slope = -np.sum(elastic_force_of(deformed).full() * direction)
-force_change = (
-    -stiffness_at(deformed, *TRUE_CONSTANTS).full() @ direction.T.ravel()
-)
+force_change = -stiffness_at(deformed, *TRUE_CONSTANTS).full() @ direction.T.ravel()
 sizes = np.geomspace(1e-9, 1e-3, 13)
 force_errors = []
 stiffness_errors = []
 for h in sizes:
-    force_errors.append(
-        abs(central_difference(energy_of, h) / slope - 1).item()
-    )
-    difference = (
-        central_difference(elastic_force_of, h).T.ravel() - force_change
-    )
-    stiffness_errors.append(
-        np.linalg.norm(difference) / np.linalg.norm(force_change)
-    )
+    force_errors.append(abs(central_difference(energy_of, h) / slope - 1).item())
+    difference = central_difference(elastic_force_of, h).T.ravel() - force_change
+    stiffness_errors.append(np.linalg.norm(difference) / np.linalg.norm(force_change))
 assert min(force_errors) < 1e-8
 assert min(stiffness_errors) < 1e-8
 
 # %%
 figure, axes = plt.subplots(figsize=(3.8, 2.6))
 axes.loglog(sizes, force_errors, "o-", color=BLUE, label="force")
-axes.loglog(
-    sizes, stiffness_errors, "o-", color=VERMILION, label="stiffness matrix"
-)
-axes.set(
-    title="Verification by central differences",
-    xlabel="h [m]",
-    ylabel="relative difference",
-)
+axes.loglog(sizes, stiffness_errors, "o-", color=VERMILION, label="stiffness matrix")
+axes.set(title="Verification by central differences", xlabel="h [m]", ylabel="relative difference")
 axes.legend()
 plt.show()
 
@@ -794,9 +653,7 @@ moduli = {"lambda_pa": TRUE_CONSTANTS[0], "mu_pa": TRUE_CONSTANTS[1]}
 toolbox_force = body.elastic_force(deformed.T, **moduli)
 toolbox_stiffness = body.stiffness(deformed.T, **moduli).toarray()
 assert np.allclose(toolbox_force, elastic_force_of(deformed).full().T)
-assert np.allclose(
-    toolbox_stiffness, stiffness_at(deformed, *TRUE_CONSTANTS).full()
-)
+assert np.allclose(toolbox_stiffness, stiffness_at(deformed, *TRUE_CONSTANTS).full())
 
 # %% [markdown]
 # ### Sign of the damping force
@@ -819,12 +676,8 @@ def released_energy(sign, steps=600, dt=0.0005):
         positions[:, 3] = position
         velocities = np.zeros((3, 4))
         velocities[:, 3] = sign * velocity
-        energies.append(
-            float(energy_of(positions)) + corner_mass * velocity @ velocity / 2
-        )
-        corner_force = force_at(positions, velocities, *TRUE_CONSTANTS).full()[
-            :, 3
-        ]
+        energies.append(float(energy_of(positions)) + corner_mass * velocity @ velocity / 2)
+        corner_force = force_at(positions, velocities, *TRUE_CONSTANTS).full()[:, 3]
         velocity = velocity + dt * corner_force / corner_mass
         position = position + dt * velocity
     return np.array(energies)
@@ -832,35 +685,17 @@ def released_energy(sign, steps=600, dt=0.0005):
 
 dissipating = released_energy(+1)
 literal = released_energy(-1)
-print(
-    f"energy after 0.3 s, −γ_r ∂²Ψ/∂x² v: {dissipating[-1] / dissipating[0]:.3f} of the initial"
-)
-print(
-    f"energy after 0.3 s, +γ_r ∂²Ψ/∂x² v: {literal[-1] / literal[0]:.0f} times the initial"
-)
+print(f"energy after 0.3 s, −γ_r ∂²Ψ/∂x² v: {dissipating[-1] / dissipating[0]:.3f} of the initial")
+print(f"energy after 0.3 s, +γ_r ∂²Ψ/∂x² v: {literal[-1] / literal[0]:.0f} times the initial")
 assert dissipating[-1] < 0.2 * dissipating[0]
 assert literal[-1] > 5 * literal[0]
 
 # %%
 figure, axes = plt.subplots(figsize=(3.8, 2.6))
 release_times = 0.0005 * np.arange(600)
-axes.semilogy(
-    release_times,
-    1e6 * literal,
-    color=VERMILION,
-    label=r"$+\gamma_r\,\Psi_{xx}\,v$",
-)
-axes.semilogy(
-    release_times,
-    1e6 * dissipating,
-    color=BLUE,
-    label=r"$-\gamma_r\,\Psi_{xx}\,v$",
-)
-axes.set(
-    title="Energy after release",
-    xlabel="time [s]",
-    ylabel="Ψ + kinetic energy [µJ]",
-)
+axes.semilogy(release_times, 1e6 * literal, color=VERMILION, label=r"$+\gamma_r\,\Psi_{xx}\,v$")
+axes.semilogy(release_times, 1e6 * dissipating, color=BLUE, label=r"$-\gamma_r\,\Psi_{xx}\,v$")
+axes.set(title="Energy after release", xlabel="time [s]", ylabel="Ψ + kinetic energy [µJ]")
 axes.legend()
 plt.show()
 
@@ -881,12 +716,8 @@ weight_n = np.array([0, 0, -corner_mass * GRAVITY])
 def held_corners(t):
     """Return the positions (3, 3) of the held corners at time t, one column each [m]."""
     share = 1 - np.cos(2 * np.pi * 2.5 * t)
-    turn = Rotation.from_rotvec(
-        [0.25 * share, 0.35 * np.sin(9 * t) * share, 0.0]
-    )
-    return turn.apply(corners[:3]).T + np.outer(
-        [0.02, -0.015, 0.025], [share] * 3
-    )
+    turn = Rotation.from_rotvec([0.25 * share, 0.35 * np.sin(9 * t) * share, 0.0])
+    return turn.apply(corners[:3]).T + np.outer([0.02, -0.015, 0.025], [share] * 3)
 
 
 def state_derivative(t, state):
@@ -894,9 +725,7 @@ def state_derivative(t, state):
     held_velocity = (held_corners(t + 1e-6) - held_corners(t - 1e-6)) / 2e-6
     positions = np.column_stack([held_corners(t), state[:3]])
     velocities = np.column_stack([held_velocity, state[3:]])
-    total = (
-        force_at(positions, velocities, *TRUE_CONSTANTS).full()[:, 3] + weight_n
-    )
+    total = force_at(positions, velocities, *TRUE_CONSTANTS).full()[:, 3] + weight_n
     return np.concatenate([state[3:], total / corner_mass])
 
 
@@ -909,16 +738,9 @@ equilibrium = root(acceleration_at_rest, corners[3]).x
 times = np.arange(81) * 0.005
 initial_state = np.append(equilibrium, np.zeros(3))
 reference = solve_ivp(
-    state_derivative,
-    (0, times[-1]),
-    initial_state,
-    method="DOP853",
-    t_eval=times,
-    rtol=1e-8,
+    state_derivative, (0, times[-1]), initial_state, method="DOP853", t_eval=times, rtol=1e-8
 ).y[:3]
-measured = reference + CORNER_SIGMA * np.random.default_rng(4).normal(
-    size=reference.shape
-)
+measured = reference + CORNER_SIGMA * np.random.default_rng(4).normal(size=reference.shape)
 
 # %% [markdown]
 # ### Nonlinear program
@@ -942,8 +764,7 @@ def sponge_program(times):
     theta = [ca.exp(q[i]) for i in range(3)]
     states = [ca.horzcat(held_corners(t), X[:, i]) for i, t in enumerate(times)]
     forces = [
-        force_at((before + after) / 2, (after - before) / dt, *theta)[:, 3]
-        + weight_n
+        force_at((before + after) / 2, (after - before) / dt, *theta)[:, 3] + weight_n
         for before, after in pairwise(states)
     ]
     inertia = corner_mass / dt**2
@@ -951,34 +772,23 @@ def sponge_program(times):
     rows.append(forces[0] / 2 - inertia * (X[:, 1] - X[:, 0]))
     for i in range(2, steps):
         mean_force = (forces[i - 1] + forces[i - 2]) / 2
-        rows.append(
-            mean_force - inertia * (X[:, i] - 2 * X[:, i - 1] + X[:, i - 2])
-        )
+        rows.append(mean_force - inertia * (X[:, i] - 2 * X[:, i - 1] + X[:, i - 2]))
     loss = ca.sumsqr((X - Y) / CORNER_SIGMA)
-    return {
-        "x": ca.vertcat(q, ca.vec(Z)),
-        "p": ca.vec(Y),
-        "f": loss,
-        "g": ca.vertcat(*rows),
-    }
+    return {"x": ca.vertcat(q, ca.vec(Z)), "p": ca.vec(Y), "f": loss, "g": ca.vertcat(*rows)}
 
 
 sponge = sponge_program(times)
 sponge_solver = ca.nlpsol("sponge", "ipopt", sponge, ipopt_options())
 
 # %%
-start = np.concatenate(
-    [np.log([400.0, 150.0, 0.02]), measured.T.ravel() / SIDE]
-)
+start = np.concatenate([np.log([400.0, 150.0, 0.02]), measured.T.ravel() / SIDE])
 start_time = perf_counter()
 result = sponge_solver(x0=start, p=measured.T.ravel(), lbg=0, ubg=0)
 elapsed_s = perf_counter() - start_time
 stats = sponge_solver.stats()
 assert stats["success"]
 sponge_z = result["x"].full().ravel()
-print(
-    f"{len(sponge_z)} unknowns, {stats['iter_count']} iterations, {elapsed_s:.2f} s"
-)
+print(f"{len(sponge_z)} unknowns, {stats['iter_count']} iterations, {elapsed_s:.2f} s")
 
 # %% [markdown]
 # As for the spring, the standard errors follow from the null space of the constraint Jacobian.
@@ -993,25 +803,17 @@ sponge_covariance = N[:3] @ np.linalg.inv(weighted.T @ weighted) @ N[:3].T
 relative_errors = np.sqrt(np.diag(sponge_covariance))
 for i, name in enumerate(("λ [Pa]", "μ [Pa]", "γ_r [s]")):
     value = np.exp(sponge_z[i])
-    print(
-        f"{name:8}{value:9.4g} ± {100 * relative_errors[i]:.1f} %, true {TRUE_CONSTANTS[i]:g}"
-    )
+    print(f"{name:8}{value:9.4g} ± {100 * relative_errors[i]:.1f} %, true {TRUE_CONSTANTS[i]:g}")
 assert N.shape[1] == 3
-assert np.all(
-    np.abs(sponge_z[:3] - np.log(TRUE_CONSTANTS)) < 4 * relative_errors + 0.02
-)
+assert np.all(np.abs(sponge_z[:3] - np.log(TRUE_CONSTANTS)) < 4 * relative_errors + 0.02)
 
 # %%
 figure, axes = plt.subplots(figsize=(4.7, 2.6))
 fitted = SIDE * sponge_z[3:].reshape(-1, 3).T
 for i, colour in enumerate((BLUE, VERMILION, GREEN)):
     axes.plot(times, 1e3 * (measured[i] - corners[3, i]), ".", color=colour)
-    axes.plot(
-        times, 1e3 * (fitted[i] - corners[3, i]), color=colour, label="xyz"[i]
-    )
-axes.set(
-    title="Free corner: measured (dots), fitted (lines)", xlabel="time [s]"
-)
+    axes.plot(times, 1e3 * (fitted[i] - corners[3, i]), color=colour, label="xyz"[i])
+axes.set(title="Free corner: measured (dots), fitted (lines)", xlabel="time [s]")
 axes.set_ylabel("displacement [mm]")
 axes.legend()
 plt.show()
@@ -1033,9 +835,7 @@ axes.axvline(2.5, color=VERMILION, lw=0.8)
 for i in range(1, 8):
     axes.axhline(3 * i - 0.5, color="#B0B0B0", lw=0.4)
     axes.axvline(3 * i + 2.5, color="#B0B0B0", lw=0.4)
-axes.set_xticks(
-    [1, *(3 * i + 4 for i in range(8))], ["θ", *(f"$x_{i}$" for i in range(8))]
-)
+axes.set_xticks([1, *(3 * i + 4 for i in range(8))], ["θ", *(f"$x_{i}$" for i in range(8))])
 axes.set_yticks([3 * i + 1 for i in range(8)], [f"$c_{i}$" for i in range(8)])
 axes.xaxis.set_ticks_position("bottom")
 axes.set_title("Constraint Jacobian of eight time steps")
@@ -1069,9 +869,7 @@ plt.show()
 for h in (0.05, 0.2, 1.0):
     midpoint_roots = np.roots([1 + h**2 / 4, -2 + h**2 / 2, 1 + h**2 / 4])
     euler_roots = np.roots([1 + h**2, -2, 1])
-    print(
-        f"h = {h:4}: |z| midpoint {abs(midpoint_roots[0]):.6f}, Euler {abs(euler_roots[0]):.4f}"
-    )
+    print(f"h = {h:4}: |z| midpoint {abs(midpoint_roots[0]):.6f}, Euler {abs(euler_roots[0]):.4f}")
     assert np.allclose(abs(midpoint_roots), 1)
     assert np.allclose(abs(euler_roots), 1 / np.sqrt(1 + h**2))
 
@@ -1084,17 +882,12 @@ for h in (0.05, 0.2, 1.0):
 # %% jupyter={"source_hidden": true}
 N = null_space_at((k_estimate, c_estimate), trajectory)
 factors = {}
-for name, kept in (
-    ("every second sample", np.arange(len(t)) % 2 == 0),
-    ("first half", t <= 0.5),
-):
+for name, kept in (("every second sample", np.arange(len(t)) % 2 == 0), ("first half", t <= 0.5)):
     weighted = PULL * N[2:][kept] / SIGMA
     covariance = N[:2] @ np.linalg.inv(weighted.T @ weighted) @ N[:2].T
     factors[name] = np.sqrt(np.diag(covariance)) / std_errors
     k_factor, c_factor = factors[name]
-    print(
-        f"{name:19}: standard error of k × {k_factor:.2f}, of c × {c_factor:.2f}"
-    )
+    print(f"{name:19}: standard error of k × {k_factor:.2f}, of c × {c_factor:.2f}")
 assert np.allclose(factors["every second sample"], np.sqrt(2), rtol=0.05)
 assert factors["first half"][0] > factors["first half"][1] > 2
 
@@ -1115,13 +908,7 @@ def identify_hardening_spring(pull, k3=4000.0, dt=0.005):
         return [velocity, total / MASS]
 
     exact = solve_ivp(
-        derivative,
-        (0, 1),
-        [pull, 0.0],
-        method="DOP853",
-        t_eval=times,
-        rtol=1e-9,
-        atol=1e-12,
+        derivative, (0, 1), [pull, 0.0], method="DOP853", t_eval=times, rtol=1e-9, atol=1e-12
     ).y[0]
     measured = exact + SIGMA * np.random.default_rng(6).normal(size=len(times))
     theta = ca.SX.sym("theta", 3)
@@ -1132,19 +919,13 @@ def identify_hardening_spring(pull, k3=4000.0, dt=0.005):
     middle = (X[1:] + X[:-1]) / 2
     F = -stiff * middle - cubic * middle**3 - damp * (X[1:] - X[:-1]) / dt
     first = F[0] / 2 - MASS * (X[1] - X[0]) / dt**2
-    others = (F[1:] + F[:-1]) / 2 - MASS * (
-        X[2:] - 2 * X[1:-1] + X[:-2]
-    ) / dt**2
+    others = (F[1:] + F[:-1]) / 2 - MASS * (X[2:] - 2 * X[1:-1] + X[:-2]) / dt**2
     unknowns = ca.vertcat(theta, Z)
     rows = ca.vertcat(first, others)
     nlp = {"x": unknowns, "f": ca.sumsqr((X - measured) / SIGMA), "g": rows}
     guess = np.concatenate([[3.0, 1.0, 1.0], measured / pull])
-    z = ca.nlpsol("s", "ipopt", nlp, ipopt_options())(x0=guess, lbg=0, ubg=0)[
-        "x"
-    ]
-    N = null_space(
-        ca.Function("J", [unknowns], [ca.jacobian(rows, unknowns)])(z).full()
-    )
+    z = ca.nlpsol("s", "ipopt", nlp, ipopt_options())(x0=guess, lbg=0, ubg=0)["x"]
+    N = null_space(ca.Function("J", [unknowns], [ca.jacobian(rows, unknowns)])(z).full())
     weighted = pull * N[3:] / SIGMA
     covariance = N[:3] @ np.linalg.inv(weighted.T @ weighted) @ N[:3].T
     return float(z[2]) * scale[2], np.sqrt(covariance[2, 2]) * scale[2]
@@ -1155,9 +936,7 @@ for pull in (0.05, 0.01):
     k3_estimate, k3_error = identify_hardening_spring(pull)
     k3_errors.append(k3_error)
     assert abs(k3_estimate - 4000) < 4 * k3_error
-    print(
-        f"displacement {1e3 * pull:.0f} mm: k₃ = {k3_estimate:.0f} ± {k3_error:.0f} N/m³"
-    )
+    print(f"displacement {1e3 * pull:.0f} mm: k₃ = {k3_estimate:.0f} ± {k3_error:.0f} N/m³")
 assert k3_errors[1] > 10 * k3_errors[0]
 
 # %% [markdown]

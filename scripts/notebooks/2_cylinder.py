@@ -71,9 +71,7 @@ plt.rcParams.update(
     }
 )
 FOLDERS = [Path.cwd(), *Path.cwd().parents]
-PROBLEMS = next(
-    path / "problems" for path in FOLDERS if (path / "problems").is_dir()
-)
+PROBLEMS = next(path / "problems" for path in FOLDERS if (path / "problems").is_dir())
 CYLINDER = PROBLEMS / "foam_cylinder"
 
 # %% [markdown]
@@ -100,10 +98,7 @@ run = cs.run(problem, "reduced-space")
 solution = run.solution
 assert solution.status.converged
 mesh = problem.bodies[0].mesh
-assert (len(problem.bodies[0].nodes_m), len(problem.bodies[0].cells)) == (
-    84,
-    198,
-)
+assert (len(problem.bodies[0].nodes_m), len(problem.bodies[0].cells)) == (84, 198)
 print(solution.message)
 print(f"{solution.iterations} iterations, {solution.timing.total:.1f} s")
 
@@ -140,16 +135,12 @@ def print_estimates(run):
     for name, estimate in run.estimates.items():
         error = statistical_error(run, name)
         text = "not identified" if np.isnan(error) else f"± {error:.2g}"
-        print(
-            f"{name:12}{estimate.value:10.4g} {text:15} true value {TRUE_VALUES[name]:.4g}"
-        )
+        print(f"{name:12}{estimate.value:10.4g} {text:15} true value {TRUE_VALUES[name]:.4g}")
 
 
 print_estimates(run)
 for name, estimate in run.estimates.items():
-    assert abs(estimate.value - TRUE_VALUES[name]) < 4 * statistical_error(
-        run, name
-    ), name
+    assert abs(estimate.value - TRUE_VALUES[name]) < 4 * statistical_error(run, name), name
 
 # %% [markdown]
 # The values `± …` are statistical standard errors: they describe the effect of the noise. Part 3
@@ -166,22 +157,15 @@ held_nodes = cylinder.grasps[0].nodes
 spacing_mm = 270.0
 
 figure, axes = plt.subplots(figsize=(7.1, 2.3))
-for column, step in enumerate(
-    np.linspace(0, len(positions_mm) - 1, 6).astype(int)
-):
+for column, step in enumerate(np.linspace(0, len(positions_mm) - 1, 6).astype(int)):
     sample = round(step / substeps)
     shape = positions_mm[step] + [spacing_mm * column, 0, 0]
     points = markers_mm[sample] + [spacing_mm * column, 0, 0]
     axes.triplot(shape[:, 0], shape[:, 2], mesh.surface, lw=0.3, color=SKY)
     axes.plot(shape[held_nodes, 0], shape[held_nodes, 2], "k.", ms=3)
     axes.plot(points[:, 0], points[:, 2], ".", color=VERMILION, ms=6)
-    axes.text(
-        spacing_mm * column, 60, f"{cylinder.t_s[sample]:.2f} s", ha="center"
-    )
-axes.set(
-    title="Side view: mesh, held nodes (black), markers (orange)",
-    ylabel="z [mm]",
-)
+    axes.text(spacing_mm * column, 60, f"{cylinder.t_s[sample]:.2f} s", ha="center")
+axes.set(title="Side view: mesh, held nodes (black), markers (orange)", ylabel="z [mm]")
 axes.set(aspect="equal", ylim=(-200, 90), xticks=[])
 axes.grid(False)
 plt.show()
@@ -193,9 +177,7 @@ tip = cylinder.markers.names.index("tip_1")
 figure, panels = plt.subplots(1, 3, figsize=(7.1, 2.3), sharex=True)
 for i, axes in enumerate(panels):
     axes.plot(cylinder.t_s, 1e3 * measured_m[:, tip, i], "k.", label="measured")
-    axes.plot(
-        cylinder.t_s, 1e3 * fitted_m[:, tip, i], color=BLUE, label="fitted"
-    )
+    axes.plot(cylinder.t_s, 1e3 * fitted_m[:, tip, i], color=BLUE, label="fitted")
     axes.set(title=f"Marker tip_1, {'xyz'[i]}", xlabel="time [s]")
 panels[0].set_ylabel("position [mm]")
 panels[0].legend()
@@ -227,19 +209,9 @@ width = 3 * len(problem.bodies[0].nodes_m)
 height = collocation.transcriptions[0].constraints_per_time
 jacobian = collocation.jacobian(solution.z)
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.1, 3.1))
-left.spy(
-    jacobian[: 4 * height, : 4 + 4 * width],
-    markersize=0.25,
-    color=BLUE,
-    aspect="auto",
-)
-left.set(
-    title="First four time steps",
-    xlabel="parameters (first four columns) and positions",
-)
-right.spy(
-    jacobian[:height, 4 : 4 + width], markersize=0.6, color=BLUE, aspect="auto"
-)
+left.spy(jacobian[: 4 * height, : 4 + 4 * width], markersize=0.25, color=BLUE, aspect="auto")
+left.set(title="First four time steps", xlabel="parameters (first four columns) and positions")
+right.spy(jacobian[:height, 4 : 4 + width], markersize=0.6, color=BLUE, aspect="auto")
 right.set(title="One block", xlabel="positions at one time")
 for axes in (left, right):
     axes.set_ylabel("equations of motion")
@@ -248,9 +220,7 @@ for axes in (left, right):
 plt.show()
 rows = collocation.constraint_count
 columns = collocation.variable_count
-print(
-    f"{rows} × {columns}, {100 * jacobian.nnz / rows / columns:.2f} % nonzero"
-)
+print(f"{rows} × {columns}, {100 * jacobian.nnz / rows / columns:.2f} % nonzero")
 
 # %% [markdown]
 # ## 2.3 Verification by forward simulation
@@ -268,9 +238,7 @@ noise_mm = 1e3 * np.sqrt(3) * 0.0005
 print(f"fit                   {1e3 * solution.rms_m:.3f} mm RMS")
 print(f"forward simulation    {1e3 * rollout.rms_m:.3f} mm RMS")
 print(f"√3 times the noise    {noise_mm:.3f} mm")
-print(
-    f"largest residual of the equations of motion {solution.max_violation_n:.1e} N"
-)
+print(f"largest residual of the equations of motion {solution.max_violation_n:.1e} N")
 assert abs(1e3 * solution.rms_m / noise_mm - 1) < 0.1
 assert rollout.rms_m < 1.1 * solution.rms_m
 
@@ -283,38 +251,25 @@ assert rollout.rms_m < 1.1 * solution.rms_m
 
 # %%
 solutions = {}
-for scheme, substeps in (
-    ("backward-euler", 1),
-    ("backward-euler", 4),
-    ("midpoint", 2),
-):
+for scheme, substeps in (("backward-euler", 1), ("backward-euler", 4), ("midpoint", 2)):
     variant = replace(problem, scheme=scheme, substeps=substeps)
     solutions[scheme, substeps] = cs.solve(variant, "reduced-space")
 
-print(
-    f"{'scheme, steps':18}{'E [Pa]':>8}{'ν':>8}{'γ_r [s]':>10}{'γ_m [1/s]':>11}{'RMS [mm]':>10}"
-)
+print(f"{'scheme, steps':18}{'E [Pa]':>8}{'ν':>8}{'γ_r [s]':>10}{'γ_m [1/s]':>11}{'RMS [mm]':>10}")
 for (scheme, substeps), each in solutions.items():
     lambda_pa, mu_pa, gamma_r, gamma_m = each.parameters.values()
     young = youngs_modulus(lambda_pa, mu_pa)
     poisson = poissons_ratio(lambda_pa, mu_pa)
     print(f"{scheme + f', {substeps}':18}{young:8.0f}{poisson:8.3f}", end="")
     print(f"{gamma_r:10.5f}{gamma_m:11.3f}{1e3 * each.rms_m:10.2f}")
-print(
-    f"{'true values':18}{TRUE_VALUES['young_pa']:8.0f}{TRUE_VALUES['poisson']:8.3f}",
-    end="",
-)
+print(f"{'true values':18}{TRUE_VALUES['young_pa']:8.0f}{TRUE_VALUES['poisson']:8.3f}", end="")
 print(f"{0.006:10.5f}{1.5:11.3f}{noise_mm:10.2f}")
 
 # %%
-lambda_pa, mu_pa, gamma_r, gamma_m = solutions[
-    "backward-euler", 1
-].parameters.values()
+lambda_pa, mu_pa, gamma_r, gamma_m = solutions["backward-euler", 1].parameters.values()
 assert gamma_r < 2e-5  # its lower bound is 1e-5
 assert gamma_m < 2e-3  # its lower bound is 1e-3
-assert (
-    abs(youngs_modulus(lambda_pa, mu_pa) / TRUE_VALUES["young_pa"] - 1) > 0.02
-)
+assert abs(youngs_modulus(lambda_pa, mu_pa) / TRUE_VALUES["young_pa"] - 1) > 0.02
 assert solutions["backward-euler", 1].rms_m > 1.5e-3 * noise_mm
 assert solutions["backward-euler", 4].parameters["gamma_r_s"] < 0.9 * 0.006
 assert solutions["backward-euler", 4].rms_m < 1.05e-3 * noise_mm
@@ -424,18 +379,9 @@ else:
 # %%
 (folder / "problem.toml").write_text(MY_PROBLEM)
 command = [sys.executable, "-m", "collocation_sysid", "check", "problem.toml"]
-plain_output = os.environ | {
-    "FORCE_COLOR": "",
-    "COLUMNS": "100",
-    "PYTHONIOENCODING": "utf-8",
-}
+plain_output = os.environ | {"FORCE_COLOR": "", "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}
 checked = subprocess.run(
-    command,
-    cwd=folder,
-    env=plain_output,
-    capture_output=True,
-    encoding="utf-8",
-    check=False,
+    command, cwd=folder, env=plain_output, capture_output=True, encoding="utf-8", check=False
 )
 print(checked.stdout)
 assert checked.returncode == 0, checked.stderr
@@ -450,10 +396,7 @@ my_problem = cs.Problem.read(folder / "problem.toml")
 my_run = cs.run(my_problem)
 print_estimates(my_run)
 my_run.save(folder / "run")
-print(
-    "run folder:",
-    ", ".join(sorted(path.name for path in (folder / "run").iterdir())),
-)
+print("run folder:", ", ".join(sorted(path.name for path in (folder / "run").iterdir())))
 
 # %%
 print(my_run)
@@ -502,9 +445,7 @@ for substeps in (1, 2, 4):
 changes = {}
 for few, many in ((1, 2), (2, 4)):
     changes[few] = (logarithms[many] - logarithms[few]) / std_errors
-    print(
-        f"{few} → {many} substeps: change of (λ, μ, γ_r, γ_m) {changes[few].round(2)}"
-    )
+    print(f"{few} → {many} substeps: change of (λ, μ, γ_r, γ_m) {changes[few].round(2)}")
 assert np.max(np.abs(changes[1])) > 2
 assert np.max(np.abs(changes[2])) < 1.5
 
@@ -524,12 +465,8 @@ last = MY_PROBLEM.index("[transcription]")
 sigma = "sigma_m = 0.0005\n"
 texts = {
     "exact": MY_PROBLEM,
-    "known to 0.1 mm": MY_PROBLEM.replace(
-        sigma, sigma + "reference_sigma_m = 0.0001\n"
-    ),
-    "known to 1 mm": MY_PROBLEM.replace(
-        sigma, sigma + "reference_sigma_m = 0.001\n"
-    ),
+    "known to 0.1 mm": MY_PROBLEM.replace(sigma, sigma + "reference_sigma_m = 0.0001\n"),
+    "known to 1 mm": MY_PROBLEM.replace(sigma, sigma + "reference_sigma_m = 0.001\n"),
     "unknown": MY_PROBLEM[:first] + MY_PROBLEM[last:],
 }
 young_errors = []
@@ -538,9 +475,7 @@ for name, text in texts.items():
     each = cs.run(cs.Problem.read(folder / "problem.toml"), seek_causes=False)
     young_pa = each.parameters["young_pa"]
     young_errors.append(statistical_error(each, "young_pa"))
-    print(
-        f"positions {name:16}: RMS {1e3 * each.solution.rms_m:.2f} mm, ", end=""
-    )
+    print(f"positions {name:16}: RMS {1e3 * each.solution.rms_m:.2f} mm, ", end="")
     print(f"E = {young_pa:.0f} ± {young_errors[-1]:.1f} Pa")
     assert 1e3 * each.solution.rms_m < 1.05 * noise_mm
     assert abs(young_pa - TRUE_VALUES["young_pa"]) < 1.96 * young_errors[-1]

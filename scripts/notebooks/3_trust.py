@@ -66,9 +66,7 @@ plt.rcParams.update(
     }
 )
 FOLDERS = [Path.cwd(), *Path.cwd().parents]
-PROBLEMS = next(
-    path / "problems" for path in FOLDERS if (path / "problems").is_dir()
-)
+PROBLEMS = next(path / "problems" for path in FOLDERS if (path / "problems").is_dir())
 
 # %% [markdown]
 # ## 3.1 Correlation of the estimates
@@ -99,9 +97,7 @@ def print_estimates(run):
     for name, estimate in run.estimates.items():
         error = statistical_error(run, name)
         text = "not identified" if np.isnan(error) else f"± {error:.2g}"
-        print(
-            f"{name:12}{estimate.value:10.4g} {text:15} true value {TRUE_VALUES[name]:.4g}"
-        )
+        print(f"{name:12}{estimate.value:10.4g} {text:15} true value {TRUE_VALUES[name]:.4g}")
 
 
 problem = cs.Problem.read(PROBLEMS / "foam_cylinder" / "problem.toml")
@@ -120,18 +116,12 @@ print_estimates(run)
 # nearly the same $E$. Poisson's ratio ν affects only the small lateral deformations.
 
 # %%
-moduli = np.array(
-    [run.solution.parameters[name] for name in ("lambda_pa", "mu_pa")]
-)
+moduli = np.array([run.solution.parameters[name] for name in ("lambda_pa", "mu_pa")])
 # `covariance` is that of the logarithms of the parameters.
 moduli_covariance = uncertainty.covariance[:2, :2] * np.outer(moduli, moduli)
 relative_errors = np.sqrt(np.diag(uncertainty.covariance))
-young_error = (
-    statistical_error(run, "young_pa") / run.estimates["young_pa"].value
-)
-print(
-    f"relative standard errors of λ and μ: {(100 * relative_errors[:2]).round(2)} %"
-)
+young_error = statistical_error(run, "young_pa") / run.estimates["young_pa"].value
+print(f"relative standard errors of λ and μ: {(100 * relative_errors[:2]).round(2)} %")
 print(f"relative standard error of E: {100 * young_error:.2f} %")
 assert np.allclose(100 * relative_errors[:2], [3.8, 0.7], atol=0.3)
 assert young_error < 0.004
@@ -142,34 +132,21 @@ def ellipse(mean, covariance, deviations=2.448):
     """Return points (100, 2) on the 95 % region of a bivariate normal distribution."""
     angle = np.linspace(0, 2 * np.pi, 100)
     circle = np.array([np.cos(angle), np.sin(angle)])
-    return (
-        np.array(mean)[:, None]
-        + deviations * np.linalg.cholesky(covariance) @ circle
-    ).T
+    return (np.array(mean)[:, None] + deviations * np.linalg.cholesky(covariance) @ circle).T
 
 
 SYMBOLS = [r"$\lambda$", r"$\mu$", r"$\gamma_r$", r"$\gamma_m$"]
-lambda_grid, mu_grid = np.meshgrid(
-    np.linspace(650, 900, 50), np.linspace(580, 650, 50)
-)
+lambda_grid, mu_grid = np.meshgrid(np.linspace(650, 900, 50), np.linspace(580, 650, 50))
 young_grid = mu_grid * (3 * lambda_grid + 2 * mu_grid) / (lambda_grid + mu_grid)
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.1, 2.8))
 levels = np.arange(1475, 1700, 25)
-lines = left.contour(
-    lambda_grid, mu_grid, young_grid, levels, colors="#909090", linewidths=0.6
-)
+lines = left.contour(lambda_grid, mu_grid, young_grid, levels, colors="#909090", linewidths=0.6)
 left.clabel(lines, fmt="E = %.0f Pa", fontsize=6)
-left.plot(
-    *ellipse(moduli, moduli_covariance).T, color=BLUE, label="95 % region"
-)
+left.plot(*ellipse(moduli, moduli_covariance).T, color=BLUE, label="95 % region")
 left.plot(*moduli, "o", color=BLUE, label="estimate")
 left.plot(800, 600, "+", color=VERMILION, ms=10, mew=1.5, label="true values")
-left.set(
-    title="Errors of λ and μ, lines of constant E",
-    xlabel="λ [Pa]",
-    ylabel="μ [Pa]",
-)
+left.set(title="Errors of λ and μ, lines of constant E", xlabel="λ [Pa]", ylabel="μ [Pa]")
 left.legend()
 correlation = uncertainty.correlation
 right.imshow(correlation, vmin=-1, vmax=1, cmap="RdBu_r")
@@ -203,9 +180,7 @@ plt.show()
 # %%
 is_kept = np.array(markers.names) == "middle_1"
 added_sigma_m = np.sqrt(0.003**2 - 0.0005**2)
-noisy_m = measured_m + added_sigma_m * np.random.default_rng(0).normal(
-    size=measured_m.shape
-)
+noisy_m = measured_m + added_sigma_m * np.random.default_rng(0).normal(size=measured_m.shape)
 poor_markers = replace(
     markers,
     positions_m=np.where(is_kept[:, None], noisy_m, np.nan),
@@ -239,23 +214,11 @@ nu = np.linspace(profile.values.min(), profile.values.max(), 100)
 increase = profile.losses - profile.losses.min()
 
 figure, axes = plt.subplots(figsize=(5.6, 2.8))
-axes.plot(
-    nu,
-    (np.log(nu / best) / deviation) ** 2,
-    "--",
-    color=ORANGE,
-    label="quadratic in ln ν",
-)
+axes.plot(nu, (np.log(nu / best) / deviation) ** 2, "--", color=ORANGE, label="quadratic in ln ν")
 axes.plot(profile.values, increase, "o-", color=BLUE, label="profile")
 axes.axhline(profile.threshold, color="black", lw=0.6, label="3.84")
-axes.axvline(
-    TRUE_VALUES["poisson"], color=VERMILION, lw=0.8, ls=":", label="true value"
-)
-axes.set(
-    title="Profile likelihood of ν, one marker",
-    xlabel="ν",
-    ylabel="increase of the loss",
-)
+axes.axvline(TRUE_VALUES["poisson"], color=VERMILION, lw=0.8, ls=":", label="true value")
+axes.set(title="Profile likelihood of ν, one marker", xlabel="ν", ylabel="increase of the loss")
 axes.set_ylim(0, 16)
 axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
 plt.show()
@@ -287,9 +250,7 @@ shifted_m = measured_m.copy()
 tip = markers.names.index("tip_1")
 shifted_m[:, tip, 0] += 0.004
 shifted = replace(cylinder, markers=replace(markers, positions_m=shifted_m))
-with_offsets = replace(
-    shifted, nuisance=cs.Nuisance.none(camera_offset_m=0.005)
-)
+with_offsets = replace(shifted, nuisance=cs.Nuisance.none(camera_offset_m=0.005))
 stated_noise = replace(problem.uncertainty, noise="given", errors="independent")
 offset_runs = {
     "stated noise": cs.run(
@@ -297,27 +258,17 @@ offset_runs = {
         "reduced-space",
         seek_causes=False,
     ),
-    "default": cs.run(
-        replace(problem, experiments=(shifted,)),
-        "reduced-space",
-        seek_causes=False,
-    ),
+    "default": cs.run(replace(problem, experiments=(shifted,)), "reduced-space", seek_causes=False),
     "offsets estimated": cs.run(
-        replace(problem, experiments=(with_offsets,)),
-        "reduced-space",
-        seek_causes=False,
+        replace(problem, experiments=(with_offsets,)), "reduced-space", seek_causes=False
     ),
 }
 for name, each in offset_runs.items():
     print(f"{name}: {1e3 * each.solution.rms_m:.2f} mm RMS, ", end="")
     print(f"{1e3 * each.compute_noise_rms_m():.2f} mm expected")
     print_estimates(each)
-offset_m = offset_runs["offsets estimated"].nuisance(
-    "camera offset of tip_1, x"
-)
-print(
-    f"estimated offset of tip_1 along x: {1e3 * offset_m:.2f} mm, true value 4 mm"
-)
+offset_m = offset_runs["offsets estimated"].nuisance("camera offset of tip_1, x")
+print(f"estimated offset of tip_1 along x: {1e3 * offset_m:.2f} mm, true value 4 mm")
 assert abs(offset_m - 0.004) < 0.0005
 
 
@@ -333,23 +284,14 @@ def relative_deviations(run):
 
 figure, axes = plt.subplots(figsize=(5, 2.8))
 colours = (VERMILION, ORANGE, BLUE)
-for shift, colour, (name, each) in zip(
-    (-0.2, 0, 0.2), colours, offset_runs.items(), strict=True
-):
+for shift, colour, (name, each) in zip((-0.2, 0, 0.2), colours, offset_runs.items(), strict=True):
     deviations, errors = relative_deviations(each)
     axes.errorbar(
-        np.arange(4) + shift,
-        100 * deviations,
-        196 * errors,
-        fmt="o",
-        color=colour,
-        label=name,
+        np.arange(4) + shift, 100 * deviations, 196 * errors, fmt="o", color=colour, label=name
     )
 axes.axhline(0, color="black", lw=0.6)
 axes.set_xticks(range(4), SYMBOLS)
-axes.set(
-    title="Deviation from the true value, statistical 95 % interval", ylabel="%"
-)
+axes.set(title="Deviation from the true value, statistical 95 % interval", ylabel="%")
 axes.legend()
 plt.show()
 
@@ -384,9 +326,7 @@ print(offset_runs["default"].diagnoses[tip].sentence)
 # %%
 MASS = 0.1  # kg
 t = 0.01 * np.arange(101)
-spring_parameters = np.array(
-    [40.0, 0.08, 0.05]
-)  # k [N/m], c [N s/m], displacement [m]
+spring_parameters = np.array([40.0, 0.08, 0.05])  # k [N/m], c [N s/m], displacement [m]
 
 
 def spring_position(parameters):
@@ -394,11 +334,7 @@ def spring_position(parameters):
     stiffness, damping, pull = parameters
     decay = damping / (2 * MASS)
     damped = np.sqrt(stiffness / MASS - decay**2)
-    return (
-        pull
-        * np.exp(-decay * t)
-        * (np.cos(damped * t) + decay / damped * np.sin(damped * t))
-    )
+    return pull * np.exp(-decay * t) * (np.cos(damped * t) + decay / damped * np.sin(damped * t))
 
 
 columns = []
@@ -416,16 +352,10 @@ for phi in coefficients:
     factors.append(np.sqrt(np.diag(A @ noise_correlation @ A.T)) / independent)
 
 figure, axes = plt.subplots(figsize=(3.8, 2.6))
-for each, name, colour in zip(
-    np.transpose(factors), "kc", (BLUE, VERMILION), strict=True
-):
+for each, name, colour in zip(np.transpose(factors), "kc", (BLUE, VERMILION), strict=True):
     axes.plot(coefficients, each, "o-", color=colour, label=name)
 axes.axhline(1, color="black", lw=0.6)
-axes.set(
-    title="Standard error relative to independent noise",
-    xlabel="φ",
-    ylabel="factor",
-)
+axes.set(title="Standard error relative to independent noise", xlabel="φ", ylabel="factor")
 axes.set_ylim(bottom=0)
 axes.legend()
 plt.show()
@@ -442,9 +372,7 @@ assert np.max(factors) > 2
 # %%
 phi = 0.9
 innovations = np.random.default_rng(5).normal(size=(300, *measured_m.shape[1:]))
-process = lfilter(
-    [1], [1, -phi], 0.001 * np.sqrt(1 - phi**2) * innovations, axis=0
-)
+process = lfilter([1], [1, -phi], 0.001 * np.sqrt(1 - phi**2) * innovations, axis=0)
 correlated_markers = replace(
     markers,
     positions_m=measured_m + process[-len(cylinder.t_s) :],
@@ -500,14 +428,7 @@ print(run.table())
 # `cs.Assumptions.exact()` excludes all of these effects.
 
 # %%
-names = [
-    "young_pa",
-    "mu_pa",
-    "lambda_pa",
-    "poisson",
-    "gamma_r_s",
-    "gamma_m_1_s",
-]
+names = ["young_pa", "mu_pa", "lambda_pa", "poisson", "gamma_r_s", "gamma_m_1_s"]
 labels = ["$E$", r"$\mu$", r"$\lambda$", r"$\nu$", r"$\gamma_r$", r"$\gamma_m$"]
 MAIN_EFFECTS = {  # label and colour by name in the budget
     "noise": ("noise", VERMILION),
@@ -520,44 +441,22 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(7.1, 2.8))
 for row, name in enumerate(names):
     estimate = run.estimates[name]
     low, high = run.interval(name)
-    left.plot(
-        [low / estimate.value, high / estimate.value],
-        [row, row],
-        color=BLUE,
-        lw=2,
-    )
+    left.plot([low / estimate.value, high / estimate.value], [row, row], color=BLUE, lw=2)
     low, high = estimate.statistical95 or (np.nan, np.nan)
-    left.plot(
-        [low / estimate.value, high / estimate.value],
-        [row, row],
-        color=VERMILION,
-        lw=5,
-    )
+    left.plot([low / estimate.value, high / estimate.value], [row, row], color=VERMILION, lw=5)
     left.plot(TRUE_VALUES[name] / estimate.value, row, "k|", ms=12)
-left.set(
-    title="95 % intervals: combined (blue), statistical (orange)", xscale="log"
-)
+left.set(title="95 % intervals: combined (blue), statistical (orange)", xscale="log")
 left.set(xlabel="value / estimate (black: true value)")
 left.set_xticks([0.25, 0.5, 1, 2, 4], ["0.25", "0.5", "1", "2", "4"])
 left.set_xticks([], minor=True)
 sums = np.zeros(len(names))
 for effect, (label, colour) in MAIN_EFFECTS.items():
-    shares = np.array(
-        [run.budget[name].shares.get(effect, 0.0) for name in names]
-    )
+    shares = np.array([run.budget[name].shares.get(effect, 0.0) for name in names])
     right.barh(range(len(names)), shares, left=sums, color=colour, label=label)
     sums = sums + shares
-right.barh(
-    range(len(names)),
-    1 - sums,
-    left=sums,
-    color="#C0C0C0",
-    label="other effects",
-)
+right.barh(range(len(names)), 1 - sums, left=sums, color="#C0C0C0", label="other effects")
 right.set(title="Shares of the combined variance", xlim=(0, 1))
-right.legend(
-    loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False
-)
+right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
 for axes in (left, right):
     axes.set_yticks(range(len(names)), labels)
     axes.invert_yaxis()
@@ -615,13 +514,9 @@ single = {}
 for marker in markers.names:
     is_kept = np.array(markers.names) == marker
     positions_m = np.where(is_kept[:, None], measured_m, np.nan)
-    one_marker = replace(
-        cylinder, markers=replace(markers, positions_m=positions_m)
-    )
+    one_marker = replace(cylinder, markers=replace(markers, positions_m=positions_m))
     each = cs.run(
-        replace(
-            problem, experiments=(one_marker,), parameters=young_and_poisson
-        ),
+        replace(problem, experiments=(one_marker,), parameters=young_and_poisson),
         "reduced-space",
         seek_causes=False,
     )
@@ -651,9 +546,7 @@ for name in ("young_pa", "lambda_pa"):
     after = measured_run.std_error(name)
     shares = measured_run.budget[name].shares
     largest = max(shares, key=lambda effect: shares[effect])
-    print(
-        f"{name}: ± {before:.0f} → ± {after:.0f} Pa, largest contribution {largest}"
-    )
+    print(f"{name}: ± {before:.0f} → ± {after:.0f} Pa, largest contribution {largest}")
     assert after < 0.9 * before
 print("verdict:", measured_run.trust.verdict)
 assert measured_run.trust.verdict == "check"

@@ -27,10 +27,7 @@ def execute(name: str) -> None:
         cell["id"] = f"cell-{number}"
     resources = {"metadata": {"path": str(HERE)}}
     client = NotebookClient(
-        notebook,
-        timeout=CELL_TIMEOUT_S,
-        record_timing=False,
-        resources=resources,
+        notebook, timeout=CELL_TIMEOUT_S, record_timing=False, resources=resources
     )
     start_s = time.perf_counter()
     client.execute()

@@ -35,12 +35,7 @@ from rich.console import Console
 
 import collocation_sysid as cs
 from collocation_sysid import cli, pipeline
-from collocation_sysid.cli import (
-    COMMAND_GROUPS,
-    command_options,
-    command_sources,
-    common,
-)
+from collocation_sysid.cli import COMMAND_GROUPS, command_options, command_sources, common
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.problem.problem_reading import read_problem_file
@@ -85,9 +80,7 @@ def frames_in(listing: Path) -> list[Path]:
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("three")
-    file = write_problem(
-        folder, {"swing": 8, "nod": 12, "twist": 6}, validation="twist"
-    )
+    file = write_problem(folder, {"swing": 8, "nod": 12, "twist": 6}, validation="twist")
     began_s = time.perf_counter()
     with pictures_drawn():
         outcome = run_command("solve", file, "--out", folder / "run")
@@ -95,12 +88,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     with np.load(run / "trajectory.npz") as stored:
         arrays = dict(stored)
     return SimpleNamespace(
-        file=file,
-        outcome=outcome,
-        run=run,
-        result=result_in(run),
-        arrays=arrays,
-        took_s=took_s,
+        file=file, outcome=outcome, run=run, result=result_in(run), arrays=arrays, took_s=took_s
     )
 
 
@@ -108,22 +96,13 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 def test_the_answer_is_on_stdout_alone(solved):
     assert solved.outcome.code == 0
     assert solved.outcome.err == ""
-    for words in (
-        "Converged",
-        "λ Pa",
-        "300",
-        "forward simulation 'swing'",
-        "validation 'twist'",
-    ):
+    for words in ("Converged", "λ Pa", "300", "forward simulation 'swing'", "validation 'twist'"):
         assert words in solved.outcome.out
     assert f"written to {solved.run}\n" in solved.outcome.out
 
 
 def test_exact_data_give_the_exact_parameters(solved):
-    found = {
-        name: item["optimum"]
-        for name, item in solved.result["parameters"].items()
-    }
+    found = {name: item["optimum"] for name, item in solved.result["parameters"].items()}
     assert found == pytest.approx(TRUTH, rel=1e-5)
     assert solved.result["fit"]["rms_m"] < 1e-8
     assert solved.result["dynamics"]["max_violation_relative"] < 1e-6
@@ -155,10 +134,7 @@ def test_the_result_has_every_promised_key(solved):
 
 def test_every_experiment_is_reported(solved):
     fitted = solved.result["fit"]["experiments"]
-    assert {name: item["samples"] for name, item in fitted.items()} == {
-        "swing": 27,
-        "nod": 39,
-    }
+    assert {name: item["samples"] for name, item in fitted.items()} == {"swing": 27, "nod": 39}
     predicted = solved.result["rollout"]["experiments"]
     assert {n: item["fitted"] for n, item in predicted.items()} == {
         "swing": True, "nod": True, "twist": False,
@@ -177,19 +153,11 @@ def test_the_trajectory_holds_every_fitted_experiment(solved):
         }
         for key, shape in shapes.items():
             assert solved.arrays[f"{name}/{key}"].shape == shape
-        difference = (
-            solved.arrays[f"{name}/markers_m"]
-            - solved.arrays[f"{name}/measured_m"]
-        )
-        np.testing.assert_array_equal(
-            solved.arrays[f"{name}/residuals_m"], difference
-        )
+        difference = solved.arrays[f"{name}/markers_m"] - solved.arrays[f"{name}/measured_m"]
+        np.testing.assert_array_equal(solved.arrays[f"{name}/residuals_m"], difference)
     of_validation = {key for key in solved.arrays if key.startswith("twist/")}
     assert "twist/rolled_out_m" in of_validation
-    assert (
-        not {"twist/positions_m", "twist/markers_m", "twist/residuals_m"}
-        & of_validation
-    )
+    assert not {"twist/positions_m", "twist/markers_m", "twist/residuals_m"} & of_validation
 
 
 def test_frames_open_with_the_fitted_positions(solved):
@@ -197,21 +165,13 @@ def test_frames_open_with_the_fitted_positions(solved):
         frames = frames_in(solved.run / name / "trajectory.pvd")
         assert len(frames) == rows
         last = meshio.read(frames[-1])
-        np.testing.assert_array_equal(
-            last.points, solved.arrays[f"{name}/positions_m"][-1]
-        )
+        np.testing.assert_array_equal(last.points, solved.arrays[f"{name}/positions_m"][-1])
         assert len(last.cells_dict["tetra"]) == 72
 
 
 def test_plots_are_pictures(solved):
     names = {file.stem for file in solved.run.glob("*.png")}
-    assert {
-        "convergence",
-        "tracks_swing",
-        "tracks_nod",
-        "error_swing",
-        "error_nod",
-    } <= names
+    assert {"convergence", "tracks_swing", "tracks_nod", "error_swing", "error_nod"} <= names
     for file in solved.run.glob("*.png"):
         assert imread(file).std() > 0.01
 
@@ -223,12 +183,8 @@ def test_search_checks_and_pictures_are_timed_separately(solved):
     assert sum(elapsed_s.values()) < solved.took_s
     told = "time: search {search:.1f} s, checks {checks:.1f} s\n"
     assert told.format(**elapsed_s) in solved.outcome.out
-    assert solved.outcome.out.endswith(
-        "\npictures drawn in {pictures:.1f} s\n".format(**elapsed_s)
-    )
-    assert (
-        run_command("report", solved.run, "--to", solved.run / "a.md").code == 0
-    )
+    assert solved.outcome.out.endswith("\npictures drawn in {pictures:.1f} s\n".format(**elapsed_s))
+    assert run_command("report", solved.run, "--to", solved.run / "a.md").code == 0
     told = "search {search:.1f} s, checks {checks:.1f} s, pictures {pictures:.1f} s"
     assert told.format(**elapsed_s) in (solved.run / "a.md").read_text()
 
@@ -262,59 +218,41 @@ def test_a_lone_experiment_needs_no_folder_of_its_own(tiny):
 
 def test_settings_change_the_run(tiny):
     fixed = settings("parameters.gamma_m_1_s={ fixed = 0.5 }", "title=Other")
-    outcome = run_command(
-        "solve", "problem.toml", "--json", "--out", "run", *fixed
-    )
+    outcome = run_command("solve", "problem.toml", "--json", "--out", "run", *fixed)
     result = json.loads(outcome.out)
     assert result["parameters"]["gamma_m_1_s"]["value"] == 0.5
     assert result["parameters"]["gamma_m_1_s"]["statistical_std_error"] is None
-    assert result["parameters"]["gamma_r_s"]["value"] != pytest.approx(
-        TRUTH["gamma_r_s"], rel=1e-3
-    )
+    assert result["parameters"]["gamma_r_s"]["value"] != pytest.approx(TRUTH["gamma_r_s"], rel=1e-3)
     assert 'title = "Other"' in (tiny / "run" / "problem.toml").read_text()
     assert json.loads(outcome.out)["title"] == "Other"
 
 
 @pytest.mark.long
-def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlier_one(
-    tiny,
-):
+def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlier_one(tiny):
     with pictures_drawn():
         assert run_command("solve", "problem.toml", "--out", "run").code == 0
     assert (tiny / "run" / "budget.png").exists()
     short = settings(
-        "solver.interior-point.max_iterations=2",
-        "solver.interior-point.initial=simulation",
+        "solver.interior-point.max_iterations=2", "solver.interior-point.initial=simulation"
     )
     with pictures_drawn():
-        outcome = run_command(
-            "solve", "problem.toml", "--out", "run", "--verbose", *short
-        )
+        outcome = run_command("solve", "problem.toml", "--out", "run", "--verbose", *short)
     assert outcome.code == 1
     assert "iteration limit" in outcome.out
     assert "Largest violations" in outcome.out
     assert len(outcome.err.splitlines()) >= 3
-    assert re.search(
-        r"^drawing picture 2 of \d+: \w+\.png$", outcome.err, re.MULTILINE
-    )
+    assert re.search(r"^drawing picture 2 of \d+: \w+\.png$", outcome.err, re.MULTILINE)
     result = result_in(tiny / "run")
     assert (result["status"], result["converged"]) == ("iteration-limit", False)
     assert result["parameters"]["mu_pa"]["statistical_std_error"] is None
     written = set(contents(tiny / "run"))
-    assert {
-        "trajectory.npz",
-        "trajectory.pvd",
-        "convergence.png",
-        "problem.toml",
-    } <= written
+    assert {"trajectory.npz", "trajectory.pvd", "convergence.png", "problem.toml"} <= written
     assert "budget.png" not in written
 
 
 def test_pictures_may_be_left_out(tiny):
     with pictures_drawn():
-        outcome = run_command(
-            "solve", "problem.toml", "--out", "run", "--no-pictures"
-        )
+        outcome = run_command("solve", "problem.toml", "--out", "run", "--no-pictures")
     assert outcome.code == 0
     assert "pictures" not in outcome.out
     assert not [*(tiny / "run").glob("*.png")]
@@ -324,9 +262,7 @@ def test_pictures_may_be_left_out(tiny):
 
 def test_the_time_of_checks_is_none_of_the_search(tiny, monkeypatch):
     wait_s = 1.5
-    monkeypatch.setattr(
-        pipeline, "find_misspecifications", lambda _: time.sleep(wait_s) or ()
-    )
+    monkeypatch.setattr(pipeline, "find_misspecifications", lambda _: time.sleep(wait_s) or ())
     began_s = time.perf_counter()
     assert run_command("solve", "problem.toml", "--out", "run").code == 0
     took_s = time.perf_counter() - began_s
@@ -336,9 +272,7 @@ def test_the_time_of_checks_is_none_of_the_search(tiny, monkeypatch):
 
 
 @pytest.mark.long
-def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(
-    tiny, monkeypatch
-):
+def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatch):
     shown = []
 
     def interrupt(*_: object, **__: object) -> None:
@@ -354,17 +288,10 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(
     assert outcome.code == 130
     assert "the result is kept in run" in outcome.err
     assert "collocation-sysid plot run" in outcome.err
-    assert (
-        json.loads(run_command("solve", "problem.toml", "--json").out)[
-            "elapsed_s"
-        ]["checks"]
-        > 0
-    )
+    assert json.loads(run_command("solve", "problem.toml", "--json").out)["elapsed_s"]["checks"] > 0
 
 
-def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(
-    tiny, monkeypatch
-):
+def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(tiny, monkeypatch):
     def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device", "run")
 
@@ -377,17 +304,11 @@ def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(
     assert not (tiny / "run").exists()
 
 
-def test_an_interrupt_while_the_folder_is_written_loses_nothing(
-    tiny, monkeypatch
-):
+def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatch):
     monkeypatch.setattr(
-        run_record,
-        "write_all_frames",
-        lambda *_, **__: signal.raise_signal(signal.SIGTERM),
+        run_record, "write_all_frames", lambda *_, **__: signal.raise_signal(signal.SIGTERM)
     )
-    monkeypatch.setattr(
-        run_record, "write_pictures", lambda *_, **__: time.sleep(60)
-    )
+    monkeypatch.setattr(run_record, "write_pictures", lambda *_, **__: time.sleep(60))
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Verdict: check" in outcome.out
@@ -395,20 +316,14 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(
     assert result_in(tiny / "run")["status"] == "converged"
 
 
-def test_another_result_in_the_folder_is_left_alone_when_the_pictures_are_drawn(
-    tiny, monkeypatch
-):
+def test_another_result_in_the_folder_is_left_alone_when_the_pictures_are_drawn(tiny, monkeypatch):
     file = tiny / "run" / "result.json"
     monkeypatch.setattr(
-        run_record,
-        "write_pictures",
-        lambda *_, **__: file.write_text('{"another": 1}'),
+        run_record, "write_pictures", lambda *_, **__: file.write_text('{"another": 1}')
     )
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 2
-    assert (
-        "result.json was changed while the pictures were drawn" in outcome.err
-    )
+    assert "result.json was changed while the pictures were drawn" in outcome.err
     assert file.read_text() == '{"another": 1}'
 
 
@@ -420,9 +335,7 @@ def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
 
     monkeypatch.setattr(progress_shown.SolveProgress, "iteration", interrupt)
     monkeypatch.setattr(
-        pipeline,
-        "find_misspecifications",
-        lambda _: pytest.fail("nobody waits for this"),
+        pipeline, "find_misspecifications", lambda _: pytest.fail("nobody waits for this")
     )
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
@@ -433,9 +346,7 @@ def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
     assert (tiny / "run" / "trajectory.npz").is_file()
 
 
-def test_an_interruption_before_the_first_iterate_writes_nothing(
-    tiny, monkeypatch
-):
+def test_an_interruption_before_the_first_iterate_writes_nothing(tiny, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
@@ -453,16 +364,11 @@ def test_an_interruption_of_the_scan_is_told(tiny, monkeypatch):
     before = contents(tiny)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert (
-        "interrupted: no result could be kept; nothing was written to run"
-        in outcome.err
-    )
+    assert "interrupted: no result could be kept; nothing was written to run" in outcome.err
     assert contents(tiny) == before
 
 
-def test_a_failed_search_survives_an_interrupt_of_the_scan_that_follows(
-    tiny, monkeypatch
-):
+def test_a_failed_search_survives_an_interrupt_of_the_scan_that_follows(tiny, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
@@ -483,19 +389,14 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     monkeypatch.setattr(forward_simulation, "simulate", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert (
-        "Verdict: doubtful\n  interrupted: the result has no error bars"
-        in outcome.out
-    )
+    assert "Verdict: doubtful\n  interrupted: the result has no error bars" in outcome.out
     result = result_in(tiny / "run")
     assert result["status"] == "converged"
     assert result["rollout"]["rms_m"] is None
     assert "no error bars" in result["missing"]
 
 
-@pytest.mark.parametrize(
-    "late", ["find_misspecifications", "profile_likelihoods"]
-)
+@pytest.mark.parametrize("late", ["find_misspecifications", "profile_likelihoods"])
 def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
     def interrupt(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
@@ -503,19 +404,14 @@ def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
     monkeypatch.setattr(pipeline, late, interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert (
-        "interrupted: the steps after the error bars were skipped"
-        in outcome.out
-    )
+    assert "interrupted: the steps after the error bars were skipped" in outcome.out
     result = result_in(tiny / "run")
     assert result["trust"]["verdict"] == "doubtful"
     assert result["rollout"]["rms_m"] is not None
     assert run_command("report", "run").code == 0
 
 
-def test_an_interrupt_of_a_second_start_keeps_the_first_answer(
-    tiny, monkeypatch
-):
+def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch):
     found = []
 
     def solved(solver, collocation, watch, start=None):
@@ -526,27 +422,19 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(
 
     monkeypatch.setattr(solving, "solve_with_renewed_correspondences", solved)
     monkeypatch.setattr(
-        solving,
-        "second_start",
-        lambda first: SecondStart(first.collocation.parameters, "again"),
+        solving, "second_start", lambda first: SecondStart(first.collocation.parameters, "again")
     )
     method = settings("solver.method=reduced-space")
     outcome = run_command("solve", "problem.toml", *method, "--out", "run")
     assert (outcome.code, len(found)) == (130, 2)
     result = result_in(tiny / "run")
     assert result["status"] == "interrupted"
-    assert (
-        result["parameters"]["mu_pa"]["value"] == found[0].parameters["mu_pa"]
-    )
+    assert result["parameters"]["mu_pa"]["value"] == found[0].parameters["mu_pa"]
 
 
 @pytest.mark.long
 def test_a_real_process_keeps_its_streams_apart(tiny):
-    program = [
-        sys.executable,
-        "-c",
-        "from collocation_sysid.cli import main; main()",
-    ]
+    program = [sys.executable, "-c", "from collocation_sysid.cli import main; main()"]
     done = subprocess.run(
         [*program, "check", "problem.toml", "--json", "--quiet"],
         capture_output=True, text=True, check=False,
@@ -568,9 +456,7 @@ def test_the_module_is_the_command_line():
 def test_a_terminal_shows_iterations_as_they_come(tiny):
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
-    with progress_shown.SolveProgress(
-        console, cs.Problem.read("problem.toml")
-    ) as progress:
+    with progress_shown.SolveProgress(console, cs.Problem.read("problem.toml")) as progress:
         progress.iteration(Iteration(3, 1.0, 2.5e-3, 1e-4, TRUTH, 0.5))
         progress.say("checking")
     assert "violation N" in screen.getvalue()
@@ -579,9 +465,7 @@ def test_a_terminal_shows_iterations_as_they_come(tiny):
 
 
 def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
-    monkeypatch.setattr(
-        "collocation_sysid.result.solve_progress.FIRST_LINE_S", 0.01
-    )
+    monkeypatch.setattr("collocation_sysid.result.solve_progress.FIRST_LINE_S", 0.01)
     told, lines = threading.Event(), []
 
     class Log(io.StringIO):
@@ -594,27 +478,18 @@ def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
         progress.say("simulating the first samples")
         assert told.wait(30.0)
     assert (
-        "searching for an initial guess" in lines[0]
-        or "simulating the first samples" in lines[0]
+        "searching for an initial guess" in lines[0] or "simulating the first samples" in lines[0]
     )
     assert "s so far)" in lines[0]
-    with progress_shown.SolveProgress(
-        Console(file=Log()), quiet=True
-    ) as progress:
+    with progress_shown.SolveProgress(Console(file=Log()), quiet=True) as progress:
         assert progress._heartbeat is None
-    assert not any(
-        thread.name == Heartbeat.NAME for thread in threading.enumerate()
-    )
+    assert not any(thread.name == Heartbeat.NAME for thread in threading.enumerate())
 
 
-@pytest.mark.parametrize(
-    ("options", "shown"), [([], True), (["--quiet"], False)]
-)
+@pytest.mark.parametrize(("options", "shown"), [([], True), (["--quiet"], False)])
 def test_notes_on_the_data_go_to_stderr(tiny, options, shown):
     resampled = settings("experiment.0.resample_hz=200")
-    outcome = run_command(
-        "simulate", "problem.toml", "--out", "s", *resampled, *options
-    )
+    outcome = run_command("simulate", "problem.toml", "--out", "s", *resampled, *options)
     assert ("note: experiment 'swing': resample_hz" in outcome.err) == shown
 
 
@@ -624,51 +499,28 @@ def test_notes_on_the_data_go_to_stderr(tiny, options, shown):
 def test_simulation_writes_what_a_laboratory_would(tiny):
     remove("swing_markers.csv")(tiny)
     expected = cs.simulate(
-        cs.Problem.read("problem.toml", AT_TRUTH, simulation=True).experiments[
-            0
-        ],
-        TRUTH,
+        cs.Problem.read("problem.toml", AT_TRUTH, simulation=True).experiments[0], TRUTH
     )
     outcome = run_command(
-        "simulate",
-        "problem.toml",
-        "--out",
-        "data",
-        "--frames",
-        *settings(*AT_TRUTH),
+        "simulate", "problem.toml", "--out", "data", "--frames", *settings(*AT_TRUTH)
     )
     assert (outcome.code, outcome.err) == (0, "")
-    files = [
-        "data/swing_markers.csv",
-        "data/swing_poses.csv",
-        "data/swing/trajectory.pvd",
-    ]
+    files = ["data/swing_markers.csv", "data/swing_poses.csv", "data/swing/trajectory.pvd"]
     assert outcome.out.split() == files
     table = read_markers(tiny / files[0])
     assert table.names == ("low", "mid", "side")
-    np.testing.assert_allclose(
-        table.positions_m, expected.markers_m, atol=1e-11
-    )
-    poses, given = (
-        read_poses(tiny / files[1]),
-        read_poses(tiny / "swing_motion.csv"),
-    )
-    np.testing.assert_allclose(
-        poses.quaternions_xyzw, given.quaternions_xyzw, atol=1e-10
-    )
+    np.testing.assert_allclose(table.positions_m, expected.markers_m, atol=1e-11)
+    poses, given = (read_poses(tiny / files[1]), read_poses(tiny / "swing_motion.csv"))
+    np.testing.assert_allclose(poses.quaternions_xyzw, given.quaternions_xyzw, atol=1e-10)
     assert len(frames_in(tiny / files[2])) == 9
 
 
-@pytest.mark.parametrize(
-    "name", ["chapter.tex", "swing_markers.csv", "deep/chapter.tex"]
-)
+@pytest.mark.parametrize("name", ["chapter.tex", "swing_markers.csv", "deep/chapter.tex"])
 def test_a_simulation_adds_nothing_to_a_foreign_folder(tiny: Path, name: str):
     (tiny / "data" / name).parent.mkdir(parents=True)
     (tiny / "data" / name).write_text("precious")
     before = contents(tiny)
-    outcome = run_command(
-        "simulate", "problem.toml", "--out", "data", *settings(*AT_TRUTH)
-    )
+    outcome = run_command("simulate", "problem.toml", "--out", "data", *settings(*AT_TRUTH))
     assert outcome.code == 2
     assert name in outcome.err
     assert "this program" in outcome.err
@@ -679,9 +531,7 @@ def test_a_simulation_adds_nothing_to_a_foreign_folder(tiny: Path, name: str):
 def test_a_simulation_is_not_written_through_a_link(tiny: Path):
     (tiny / "theirs").mkdir()
     (tiny / "data").symlink_to("theirs")
-    outcome = run_command(
-        "simulate", "problem.toml", "--out", "data", *settings(*AT_TRUTH)
-    )
+    outcome = run_command("simulate", "problem.toml", "--out", "data", *settings(*AT_TRUTH))
     assert outcome.code == 2
     assert "data: this is a link to theirs" in outcome.err
     assert not list((tiny / "theirs").iterdir())
@@ -708,53 +558,28 @@ def test_a_simulation_beside_the_problem_keeps_what_others_wrote(tiny: Path):
     recording.write_text("precious")
     refusal = run_command(*simulate)
     assert refusal.code == 2
-    assert (
-        "swing_markers.csv: this file exists and was not written by this program"
-        in refusal.err
-    )
+    assert "swing_markers.csv: this file exists and was not written by this program" in refusal.err
     assert recording.read_text() == "precious"
 
 
 @pytest.mark.long
 def test_noise_follows_the_seed(tiny):
     def tracks(name: str, *options: str) -> np.ndarray:
-        outcome = run_command(
-            "simulate", "problem.toml", "--out", name, "--json", *options
-        )
+        outcome = run_command("simulate", "problem.toml", "--out", name, "--json", *options)
         file, _ = json.loads(outcome.out)
         return read_markers(file).positions_m
 
     exact = tracks("exact")
     noisy = tracks("a", "--noise-m", "0.001", "--seed", "3")
     assert 0.5e-3 < (noisy - exact).std() < 2e-3
-    np.testing.assert_array_equal(
-        noisy, tracks("b", "--noise-m", "0.001", "--seed", "3")
-    )
-    assert not np.allclose(
-        noisy, tracks("c", "--noise-m", "0.001", "--seed", "4"), atol=1e-5
-    )
+    np.testing.assert_array_equal(noisy, tracks("b", "--noise-m", "0.001", "--seed", "3"))
+    assert not np.allclose(noisy, tracks("c", "--noise-m", "0.001", "--seed", "4"), atol=1e-5)
 
 
 def test_the_integrator_is_chosen(tiny):
     options = ["--quiet", *settings(*AT_TRUTH, "transcription.substeps=1")]
-    run_command(
-        "simulate",
-        "problem.toml",
-        "--out",
-        "a",
-        "--integrator",
-        "midpoint",
-        *options,
-    )
-    run_command(
-        "simulate",
-        "problem.toml",
-        "--out",
-        "b",
-        "--timestep-s",
-        "0.0005",
-        *options,
-    )
+    run_command("simulate", "problem.toml", "--out", "a", "--integrator", "midpoint", *options)
+    run_command("simulate", "problem.toml", "--out", "b", "--timestep-s", "0.0005", *options)
     measured = read_markers(tiny / "swing_markers.csv").positions_m
     exact = read_markers(tiny / "a" / "swing_markers.csv").positions_m
     other = read_markers(tiny / "b" / "swing_markers.csv").positions_m
@@ -796,9 +621,7 @@ def test_check_reports_sizes_and_derivatives(tiny):
 
 
 def test_check_fails_where_derivatives_do_not_agree(tiny, monkeypatch):
-    monkeypatch.setattr(
-        "collocation_sysid.runs.check.DERIVATIVE_TOLERANCE", 0.0
-    )
+    monkeypatch.setattr("collocation_sysid.runs.check.DERIVATIVE_TOLERANCE", 0.0)
     outcome = run_command("check", "problem.toml")
     assert outcome.code == 1
     assert "do not agree" in outcome.out
@@ -831,8 +654,7 @@ def test_a_new_problem_without_a_recording_has_no_settings_of_a_simulated_one(
     run_command("new", "mine")
     run_command("new", "example", "--kind", "swing")
     mine, example = (
-        read_problem_file(Path(name) / "problem.toml")[0]
-        for name in ("mine", "example")
+        read_problem_file(Path(name) / "problem.toml")[0] for name in ("mine", "example")
     )
     assert example.environment.air_density_kg_m3 == "none"
     assert mine.environment.air_density_kg_m3 == usual_air_density()
@@ -842,9 +664,7 @@ def test_a_new_problem_without_a_recording_has_no_settings_of_a_simulated_one(
     assert "simulated" not in Path("mine/problem.toml").read_text()
 
 
-def test_the_template_has_a_wrench_that_can_be_uncommented(
-    tmp_path, monkeypatch
-):
+def test_the_template_has_a_wrench_that_can_be_uncommented(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_command("new", "mine", "--kind", "swing")
     file = tmp_path / "mine" / "problem.toml"
@@ -874,23 +694,13 @@ def test_the_template_names_only_what_there_is(tmp_path, monkeypatch):
     text = (tmp_path / "mine" / "problem.toml").read_text()
     lines = text.splitlines()
     commented = [
-        line
-        for line in lines
-        if line.startswith("# ") and (" = " in line or "# [" in line)
+        line for line in lines if line.startswith("# ") and (" = " in line or "# [" in line)
     ]
     assert len(commented) >= 25
-    whole = [
-        line.removeprefix("# ") if line in commented else line for line in lines
-    ]
+    whole = [line.removeprefix("# ") if line in commented else line for line in lines]
     # A surface takes the place of a mesh, a gripper's markers that of its poses or displacement; a
     # motion that of equilibria.
-    left_out = (
-        "mesh =",
-        "poses =",
-        "displacement =",
-        "gripper_to_body =",
-        "kind =",
-    )
+    left_out = ("mesh =", "poses =", "displacement =", "gripper_to_body =", "kind =")
     text = "\n".join(line for line in whole if not line.startswith(left_out))
     (tmp_path / "all.toml").write_text(text)
     file, _ = read_problem_file(tmp_path / "all.toml")
@@ -905,18 +715,9 @@ def test_help_imports_nothing_that_solves():
         "try: main()\n"
         "finally: assert not sys.modules.keys() & {'casadi', 'scipy', 'matplotlib'}"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(
-        r"^  report +Write a report of a run or a study",
-        done.stdout,
-        re.MULTILINE,
-    )
+    assert re.search(r"^  report +Write a report of a run or a study", done.stdout, re.MULTILINE)
 
 
 def test_every_command_is_in_exactly_one_group_of_the_help():
@@ -924,15 +725,10 @@ def test_every_command_is_in_exactly_one_group_of_the_help():
     assert sorted(names) == sorted(command_sources())
     words = [title.split()[0] for title in COMMAND_GROUPS]
     assert words == ["Identify", "Inspect", "Extend", "Exchange", "Reference"]
-    sections = re.split(
-        r"^(\w.*):$", run_command("--help").out, flags=re.MULTILINE
-    )
+    sections = re.split(r"^(\w.*):$", run_command("--help").out, flags=re.MULTILINE)
     listed = dict(zip(sections[1::2], sections[2::2], strict=True))
     for title, group in COMMAND_GROUPS.items():
-        assert (
-            tuple(re.findall(r"^  ([a-z-]+)  ", listed[title], re.MULTILINE))
-            == group
-        )
+        assert tuple(re.findall(r"^  ([a-z-]+)  ", listed[title], re.MULTILINE)) == group
 
 
 def test_version_and_help():
@@ -952,8 +748,7 @@ def test_an_output_that_cannot_be_written_is_explained(tiny, monkeypatch):
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 2
     assert (
-        outcome.err
-        == f"error: {tiny / 'run'}: this cannot be written: No space left on device\n"
+        outcome.err == f"error: {tiny / 'run'}: this cannot be written: No space left on device\n"
     )
     assert not (tiny / "run").exists()
     assert not list(tiny.glob(".run*"))
@@ -967,9 +762,7 @@ def test_the_same_from_python(tiny):
     solution = cs.solve(problem, cs.InteriorPoint(tolerance=1e-10))
     assert solution.status.converged
     assert solution.parameters == pytest.approx(TRUTH, rel=1e-5)
-    trajectory = cs.simulate(
-        problem.experiments[0], solution.parameters, "midpoint", substeps=1
-    )
+    trajectory = cs.simulate(problem.experiments[0], solution.parameters, "midpoint", substeps=1)
     measured = problem.experiments[0].markers.positions_m
     np.testing.assert_allclose(trajectory.markers_m, measured, atol=1e-8)
 
@@ -978,9 +771,7 @@ def test_a_method_is_given_with_its_options(tiny):
     problem = cs.Problem.read("problem.toml")
     seen: list[Iteration] = []
     solution = cs.solve(
-        problem,
-        cs.InteriorPoint(max_iterations=1, initial="simulation"),
-        seen.append,
+        problem, cs.InteriorPoint(max_iterations=1, initial="simulation"), seen.append
     )
     assert solution.status is cs.Status.ITERATION_LIMIT
     assert len(seen) == len(solution.history) == 2
@@ -990,22 +781,15 @@ def test_a_method_is_given_with_its_options(tiny):
 
 def test_reduced_space_is_the_method_unless_another_is_named(tiny):
     text = Path("problem.toml").read_text()
-    Path("problem.toml").write_text(
-        text.replace('method = "interior-point"', "")
-    )
-    named = cs.solve(
-        cs.Problem.read("problem.toml"), cs.InteriorPoint(tolerance=1e-10)
-    )
+    Path("problem.toml").write_text(text.replace('method = "interior-point"', ""))
+    named = cs.solve(cs.Problem.read("problem.toml"), cs.InteriorPoint(tolerance=1e-10))
     default = cs.solve(cs.Problem.read("problem.toml"))
     assert default.method == "reduced-space"
     np.testing.assert_allclose(default.theta, named.theta, rtol=1e-5)
 
 
 def test_each_method_has_the_options_of_its_own_table(tiny):
-    tables = [
-        "solver.interior-point.hessian=limited-memory",
-        "solver.reduced-space.ladder=[1.0]",
-    ]
+    tables = ["solver.interior-point.hessian=limited-memory", "solver.reduced-space.ladder=[1.0]"]
     problem = cs.Problem.read("problem.toml", tables)
     solution = cs.solve(problem, "reduced-space")
     assert solution.status.converged
@@ -1016,9 +800,7 @@ def test_each_method_has_the_options_of_its_own_table(tiny):
 def test_a_body_of_arrays_has_forces_and_stiffness(tiny_problem, rng):
     read = cs.TetMesh.read(tiny_problem / "body.vtu")
     mesh = cs.TetMesh(read.points_m, read.tetrahedra)
-    body = cs.Body(
-        mesh, material="neo-hookean", density_kg_m3=30.0, element="tet4"
-    )
+    body = cs.Body(mesh, material="neo-hookean", density_kg_m3=30.0, element="tet4")
     x = mesh.points_m + 1e-3 * rng.normal(size=mesh.points_m.shape)
     moduli = {"lambda_pa": 200.0, "mu_pa": 300.0}
     force = body.elastic_force(x, **moduli)
@@ -1036,9 +818,7 @@ def test_a_run_from_python_is_written_like_any_other(tiny):
     assert not (folder / "frames").exists()
 
 
-def test_a_terminal_is_told_what_is_waited_for_before_anything_heavy(
-    monkeypatch, tiny
-):
+def test_a_terminal_is_told_what_is_waited_for_before_anything_heavy(monkeypatch, tiny):
     screen = io.StringIO()
     terminal = PlainConsole(file=screen, force_terminal=True, width=100)
     for module in (cli, command_options):
@@ -1053,12 +833,8 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
     words = " ".join(["misfit"] * 20)
     for live, lines in ((True, 4), (False, 1)):
         file = io.StringIO()
-        shown = Console(
-            file=file, force_terminal=live, width=40, color_system=None
-        )
-        monkeypatch.setattr(
-            common, "PlainConsole", lambda shown=shown, **_: shown
-        )
+        shown = Console(file=file, force_terminal=live, width=40, color_system=None)
+        monkeypatch.setattr(common, "PlainConsole", lambda shown=shown, **_: shown)
         common.print_result(words)
         found = file.getvalue().splitlines()
         assert len(found) == lines
@@ -1067,7 +843,4 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
 
 def test_what_reads_runs_needs_no_solver_to_show_its_help():
     code = "import sys, collocation_sysid.cli.run_commands; sys.exit('casadi' in sys.modules)"
-    assert (
-        subprocess.run([sys.executable, "-c", code], check=False).returncode
-        == 0
-    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -11,13 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from kit.problem_files import (
-    TRUTH,
-    Outcome,
-    run_command,
-    state_vacuum,
-    write_problem,
-)
+from kit.problem_files import TRUTH, Outcome, run_command, state_vacuum, write_problem
 from kit.results import a_result
 from matplotlib.image import imread
 from rich.console import Console
@@ -28,11 +22,7 @@ from collocation_sysid.extras.studies import run_execution
 from collocation_sysid.extras.studies import study_progress as display
 from collocation_sysid.methods.solution import Iteration
 
-KNOWN = [
-    word
-    for name, value in TRUTH.items()
-    for word in ("--truth", f"{name}={value}")
-]
+KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
 METHODS = ("interior-point", "reduced-space")
 # Answers with the guess, as a run that did not move; the second start never ends.
 STAND_IN = """
@@ -59,9 +49,7 @@ record["result"]["parameters"] = {
 with open(out, "w") as file:
     json.dump(record, file)
 """
-HISTORY = tuple(
-    Iteration(k, 10.0 / k, 1e-3, 10.0**-k, {}, 0.1 * k, 1.0) for k in (1, 2)
-)
+HISTORY = tuple(Iteration(k, 10.0 / k, 1e-3, 10.0**-k, {}, 0.1 * k, 1.0) for k in (1, 2))
 
 
 @pytest.fixture
@@ -70,9 +58,7 @@ def stand_in(tmp_path, monkeypatch):
     script = tmp_path / "stand_in.py"
     script.write_text(STAND_IN)
     found = as_json(a_result(history=HISTORY))
-    monkeypatch.setattr(
-        run_execution, "COMMAND", (sys.executable, str(script), found)
-    )
+    monkeypatch.setattr(run_execution, "COMMAND", (sys.executable, str(script), found))
 
 
 def table(file: Path) -> list[dict[str, str]]:
@@ -107,14 +93,9 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     ]
     command += ["--workers", 2, "--out", out, *KNOWN]
     first = run_command(*command)
-    written = {
-        path.name: path.stat().st_mtime_ns for path in (out / "runs").iterdir()
-    }
+    written = {path.name: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
     return SimpleNamespace(
-        out=out,
-        first=first,
-        written=written,
-        again=run_command(*command, "--json"),
+        out=out, first=first, written=written, again=run_command(*command, "--json")
     )
 
 
@@ -138,26 +119,10 @@ def test_the_summary_has_a_row_for_each_method(compared):
     rows = table(compared.out / "summary.csv")
     assert [row["method"] for row in rows] == list(METHODS)
     for row in rows:
-        assert (row["runs"], row["successes"], row["success_rate"]) == (
-            "2",
-            "2",
-            "1.0",
-        )
+        assert (row["runs"], row["successes"], row["success_rate"]) == ("2", "2", "1.0")
         assert float(row["success_low"]) == pytest.approx(0.3424, abs=1e-4)
-        numbers = (
-            "violation_n",
-            "violation_relative",
-            "rms_m",
-            "rollout_rms_m",
-            "tip_max_m",
-        )
-        costs = (
-            "iterations",
-            "build_s",
-            "evaluations_s",
-            "linear_algebra_s",
-            "total_s",
-        )
+        numbers = ("violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m")
+        costs = ("iterations", "build_s", "evaluations_s", "linear_algebra_s", "total_s")
         assert all(float(row[name]) >= 0 for name in numbers + costs)
         assert all(float(row[f"error_{name}"]) < 1e-4 for name in TRUTH)
 
@@ -187,9 +152,7 @@ def test_progress_tells_the_time_left(compared):
 def test_finished_runs_are_not_done_again(compared):
     assert compared.again.err == "4 of 4 runs are finished already\n"
     runs = compared.out / "runs"
-    assert {
-        path.name: path.stat().st_mtime_ns for path in runs.iterdir()
-    } == compared.written
+    assert {path.name: path.stat().st_mtime_ns for path in runs.iterdir()} == compared.written
     content = json.loads(compared.again.out)
     assert content["truth"] == TRUTH
     assert [row["method"] for row in content["methods"]] == list(METHODS)
@@ -201,13 +164,7 @@ def test_finished_runs_are_not_done_again(compared):
 
 def compare(*more: object) -> Outcome:
     return run_command(
-        "compare-methods",
-        "problem.toml",
-        "--methods",
-        "reduced-space",
-        "--out",
-        "out",
-        *more,
+        "compare-methods", "problem.toml", "--methods", "reduced-space", "--out", "out", *more
     )
 
 
@@ -216,20 +173,12 @@ def test_a_late_run_is_a_row(tiny, stand_in):
     outcome = compare("--starts", 3, "--time-limit", 3, "--workers", 3, *KNOWN)
     assert outcome.code == 0
     rows = table(tiny / "out" / "runs.csv")
-    assert [row["status"] for row in rows] == [
-        "converged",
-        "timeout",
-        "converged",
-    ]
+    assert [row["status"] for row in rows] == ["converged", "timeout", "converged"]
     late = "reduced-space, start 1: timeout: ended at the time limit of 3 s"
     assert late in outcome.out
     assert late in (tiny / "out" / "summary.md").read_text()
     (summary,) = table(tiny / "out" / "summary.csv")
-    assert (summary["runs"], summary["converged"], summary["rms_m"]) == (
-        "3",
-        "2",
-        "0.001",
-    )
+    assert (summary["runs"], summary["converged"], summary["rms_m"]) == ("3", "2", "0.001")
 
 
 def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
@@ -243,28 +192,17 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
     outcome = compare("--starts", 2, "--workers", 2)
     assert outcome.code == 130
     assert outcome.out == ""
-    assert (
-        "interrupted: 1 of 2 runs are kept in out; continue with: "
-        in outcome.err
-    )
+    assert "interrupted: 1 of 2 runs are kept in out; continue with: " in outcome.err
     assert outcome.err.endswith("--out out --starts 2 --workers 2\n")
-    assert [row["status"] for row in table(tiny / "out" / "runs.csv")] == [
-        "converged",
-        "missing",
-    ]
-    assert (
-        "1 of 2 runs remain to be done."
-        in (tiny / "out" / "summary.md").read_text()
-    )
+    assert [row["status"] for row in table(tiny / "out" / "runs.csv")] == ["converged", "missing"]
+    assert "1 of 2 runs remain to be done." in (tiny / "out" / "summary.md").read_text()
 
 
 @pytest.mark.long
 def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
     shown = io.StringIO()
     monkeypatch.setattr(
-        study_commands,
-        "error_console",
-        Console(force_terminal=True, width=80, file=shown),
+        study_commands, "error_console", Console(force_terminal=True, width=80, file=shown)
     )
     monkeypatch.setenv("TERM", "xterm")
     assert compare().code == 0
@@ -293,9 +231,7 @@ def test_a_dry_run_only_lists_the_runs(tiny):
     listed = json.loads(compare("--starts", 2, "--dry-run", "--json").out)
     assert [run["start"] for run in listed] == [0, 1]
     assert len(listed[1]["overrides"]) == 5
-    assert {run["overrides"][0] for run in listed} == {
-        "transcription.substeps=1"
-    }
+    assert {run["overrides"][0] for run in listed} == {"transcription.substeps=1"}
     assert not listed[0]["finished"]
 
 
@@ -310,18 +246,9 @@ def test_a_dry_run_only_lists_the_runs(tiny):
             ["compare-methods", "nowhere.toml", "--methods", "reduced-space"],
             "there is no such file",
         ),
-        (
-            ["sweep", "problem.toml", "--over", "a=1:2"],
-            "error: --over: found 1:2 for a; expected",
-        ),
-        (
-            ["sweep", "problem.toml", "--over", "title=x", "--method", "nome"],
-            "error: --method: ",
-        ),
-        (
-            ["sweep", "problem.toml", "--over", "object.mesh=a.vtu,b.vtu"],
-            "a.vtu",
-        ),
+        (["sweep", "problem.toml", "--over", "a=1:2"], "error: --over: found 1:2 for a; expected"),
+        (["sweep", "problem.toml", "--over", "title=x", "--method", "nome"], "error: --method: "),
+        (["sweep", "problem.toml", "--over", "object.mesh=a.vtu,b.vtu"], "a.vtu"),
     ],
 )
 def test_bad_input_is_refused_before_anything_runs(tiny, arguments, message):
@@ -334,10 +261,7 @@ def test_bad_input_is_refused_before_anything_runs(tiny, arguments, message):
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        (
-            ("compare", "problem.toml", "--materials", "yeoh"),
-            ("compare-methods", "compare-models"),
-        ),
+        (("compare", "problem.toml", "--materials", "yeoh"), ("compare-methods", "compare-models")),
         (("topics", "trial.mcap"), ("log LOG",)),
     ],
 )
@@ -358,30 +282,16 @@ def test_a_sweep_tabulates_estimates_against_the_swept_values(tiny, stand_in):
     )  # fmt: skip
     assert outcome.code == 0
     rows = table(tiny / "out" / "runs.csv")
-    assert [
-        (row["parameters.mu_pa.guess"], row["transcription.substeps"])
-        for row in rows
-    ] == [(mu, m) for mu in ("50", "500", "5000") for m in ("1", "2")]
-    assert [float(row["value_mu_pa"]) for row in rows] == [
-        50,
-        50,
-        500,
-        500,
-        5000,
-        5000,
+    assert [(row["parameters.mu_pa.guess"], row["transcription.substeps"]) for row in rows] == [
+        (mu, m) for mu in ("50", "500", "5000") for m in ("1", "2")
     ]
+    assert [float(row["value_mu_pa"]) for row in rows] == [50, 50, 500, 500, 5000, 5000]
     assert "500 2 400 ± 40 500 ± 50" in " ".join(outcome.out.split())
     assert max(map(len, outcome.out.splitlines())) <= 80
     assert drawn(tiny / "out") == {"sweep"}
     content = json.loads((tiny / "out" / "summary.json").read_text())
-    assert content["varied_values"] == [
-        "parameters.mu_pa.guess",
-        "transcription.substeps",
-    ]
-    assert (
-        "| mu_pa.guess | substeps |"
-        in (tiny / "out" / "summary.md").read_text()
-    )
+    assert content["varied_values"] == ["parameters.mu_pa.guess", "transcription.substeps"]
+    assert "| mu_pa.guess | substeps |" in (tiny / "out" / "summary.md").read_text()
 
 
 def test_words_and_lists_can_be_swept(tiny, stand_in):
@@ -392,7 +302,5 @@ def test_words_and_lists_can_be_swept(tiny, stand_in):
     )  # fmt: skip
     assert (outcome.code, outcome.err) == (0, "")
     rows = json.loads(outcome.out)["runs"]
-    assert [row["method"] for row in rows] == [
-        m for m in METHODS for _ in range(2)
-    ]
+    assert [row["method"] for row in rows] == [m for m in METHODS for _ in range(2)]
     assert rows[1]["experiment.swing.gravity_m_s2"] == "[0, 0, 0]"

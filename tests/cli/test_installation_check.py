@@ -52,13 +52,7 @@ def test_required_packages_are_those_of_the_metadata(report):
 def test_the_command_prints_the_report_and_json(report):
     shown = run_command("doctor")
     assert (shown.code, shown.err) == (0, "")
-    for words in (
-        "casadi",
-        "mumps",
-        "kernel cache",
-        "Self test passed",
-        "pip install",
-    ):
+    for words in ("casadi", "mumps", "kernel cache", "Self test passed", "pip install"):
         assert words in shown.out
     data = json.loads(run_command("doctor", "--json").out)
     assert data["is_working"] is True
@@ -86,11 +80,7 @@ def test_a_version_is_compared_with_the_requirement(
 
     monkeypatch.setattr(installation_check.metadata, "version", version)
     found = installation_check._dependency(Requirement(requirement))
-    assert (found.name, found.installed, found.is_suitable) == (
-        "numpy",
-        installed,
-        is_suitable,
-    )
+    assert (found.name, found.installed, found.is_suitable) == ("numpy", installed, is_suitable)
 
 
 def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
@@ -107,9 +97,7 @@ def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
     outcome = run_command("doctor")
     assert outcome.code == 2
     assert f'pip install "scipy{scipy.required}"' in outcome.out
-    assert (
-        "Self test FAILED in 0.0 s: not attempted: scipy missing" in outcome.out
-    )
+    assert "Self test FAILED in 0.0 s: not attempted: scipy missing" in outcome.out
     assert "The installation does not work. Install scipy." in outcome.out
 
 
@@ -141,13 +129,10 @@ def test_solvers_are_those_that_solve_a_problem():
 
 def test_a_solver_that_crashes_does_not_end_the_check(monkeypatch):
     crashing = installation_check.SOLVER_PROGRAM.replace(
-        "    try:\n",
-        '    if name == "bad":\n        import os; os.abort()\n    try:\n',
+        "    try:\n", '    if name == "bad":\n        import os; os.abort()\n    try:\n'
     )
     monkeypatch.setattr(installation_check, "SOLVER_PROGRAM", crashing)
-    found = [
-        *installation_check._working_linear_solvers(["absent", "bad", "mumps"])
-    ]
+    found = [*installation_check._working_linear_solvers(["absent", "bad", "mumps"])]
     assert found == ["mumps"]
 
 
@@ -187,9 +172,7 @@ def test_a_cache_that_cannot_be_used_says_why(monkeypatch, tmp_path):
 
 
 def test_an_empty_cache_is_made(monkeypatch, tmp_path):
-    monkeypatch.setenv(
-        "COLLOCATION_SYSID_CACHE", str(tmp_path / "new" / "kernels")
-    )
+    monkeypatch.setenv("COLLOCATION_SYSID_CACHE", str(tmp_path / "new" / "kernels"))
     kernels = kernel_state()
     assert (kernels.fault, kernels.count, kernels.size_mb) == (None, 0, 0.0)
     jit.store_object("key", b"\0" * 2000)
@@ -212,9 +195,7 @@ def test_threads_and_what_determines_them(monkeypatch, value, count, source):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "module", ["casadi", "llvmlite", "packaging", "matplotlib"]
-)
+@pytest.mark.parametrize("module", ["casadi", "llvmlite", "packaging", "matplotlib"])
 def test_a_library_that_cannot_be_imported_is_a_finding(module):
     program = f"import sys; sys.modules[{module!r}] = None\n"
     program += "from collocation_sysid.cli import main; main()"

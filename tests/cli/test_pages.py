@@ -19,27 +19,22 @@ from collocation_sysid.result.run_sections import remedy_command, remedy_lines
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 
 ROOT = Path(__file__).parents[2]
-CONCERNS = (
-    Concern("residuals/persist"),
-    Concern("scheme/step"),
-    Concern("solve/no-start"),
-)
+CONCERNS = (Concern("residuals/persist"), Concern("scheme/step"), Concern("solve/no-start"))
 
 
 def test_topics_are_listed_with_a_line_each():
     lines = run_command("explain").out.splitlines()
     assert len(lines) == 1 + len(page_files())
-    assert next(line for line in lines if line.startswith("verdict")).split(
-        maxsplit=1
-    )[1].strip() == ("Reading the verdict")
+    assert next(line for line in lines if line.startswith("verdict")).split(maxsplit=1)[
+        1
+    ].strip() == ("Reading the verdict")
 
 
 def test_a_page_is_shown_with_its_links_as_topics():
     shown = run_command("explain", "trust").out
     assert shown.startswith("# When the answer can't be trusted\n")
-    assert (
-        "The verdict (`explain verdict`) of a run names the problems of its result."
-        in " ".join(shown.split())
+    assert "The verdict (`explain verdict`) of a run names the problems of its result." in " ".join(
+        shown.split()
     )
     for topic in page_files():
         assert ".md)" not in page_text(topic), topic
@@ -79,24 +74,12 @@ def test_every_key_of_the_problem_file_has_a_path_of_the_schema():
 
 def test_code_of_a_page_can_be_copied_from_a_narrow_terminal():
     file = io.StringIO()
-    console = PlainConsole(
-        file=file, width=40, force_terminal=True, color_system=None
-    )
-    console.print(
-        TerminalPage(page_text("forces"), hyperlinks=False), crop=False
-    )
-    (line,) = [
-        each
-        for each in page_text("forces").splitlines()
-        if each.startswith("wrench = {")
-    ]
+    console = PlainConsole(file=file, width=40, force_terminal=True, color_system=None)
+    console.print(TerminalPage(page_text("forces"), hyperlinks=False), crop=False)
+    (line,) = [each for each in page_text("forces").splitlines() if each.startswith("wrench = {")]
     assert len(line) > 40
     assert line in [each.strip() for each in file.getvalue().splitlines()]
-    prose = [
-        each
-        for each in file.getvalue().splitlines()
-        if each.startswith("Markers alone")
-    ]
+    prose = [each for each in file.getvalue().splitlines() if each.startswith("Markers alone")]
     assert all(len(each.rstrip()) <= 40 for each in prose)
 
 
@@ -123,12 +106,7 @@ def test_reports_link_to_the_documentation_that_the_project_states(
     if base is not None:
         stated["Project-URL"] = f"Documentation, {base}"
     monkeypatch.setattr(metadata, "metadata", lambda name: stated)
-    links = [
-        span.to
-        for cure in remedy_lines(CONCERNS)
-        for span in cure.to_spans()
-        if span.to
-    ]
+    links = [span.to for cure in remedy_lines(CONCERNS) for span in cure.to_spans() if span.to]
     if base is None:
         assert page_url("theory") is None
         assert links == []

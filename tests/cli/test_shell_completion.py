@@ -26,9 +26,7 @@ def need(shell: str) -> str:
 
 
 def run_shell(*words: object) -> str:
-    done = subprocess.run(
-        [*map(str, words)], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([*map(str, words)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 
@@ -48,20 +46,13 @@ def scripts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def complete_in_bash(script: Path, line: str) -> list[str]:
     words = line.split(" ")
     array = " ".join(f"'{word}'" for word in words)
-    program = (
-        f"source {script}; COMP_WORDS=({array}); COMP_CWORD={len(words) - 1}; "
-    )
+    program = f"source {script}; COMP_WORDS=({array}); COMP_CWORD={len(words) - 1}; "
     program += '_collocation_sysid; printf "%s\\n" "${COMPREPLY[@]}"'
     return run_shell(need("bash"), "--norc", "-c", program).split()
 
 
 def complete_in_fish(script: Path, line: str) -> list[str]:
-    shown = run_shell(
-        need("fish"),
-        "--no-config",
-        "-c",
-        f"source {script}; complete -C '{line}'",
-    )
+    shown = run_shell(need("fish"), "--no-config", "-c", f"source {script}; complete -C '{line}'")
     return [each.split("\t")[0] for each in shown.splitlines()]
 
 
@@ -76,10 +67,7 @@ COMPLETERS = {"bash": complete_in_bash, "fish": complete_in_fish}
         ("collocation-sysid doc", ["doctor"]),
         ("collocation-sysid solve --no-p", ["--no-pictures"]),
         ("collocation-sysid solve --method redu", ["reduced-space"]),
-        (
-            "collocation-sysid new silicone --kind ",
-            ["compression", "specimen", "swing", "tension"],
-        ),
+        ("collocation-sysid new silicone --kind ", ["compression", "specimen", "swing", "tension"]),
         ("collocation-sysid explain verd", ["verdict"]),
         ("collocation-sysid export runs/a --to usd", ["usd"]),
         ("collocation-sysid completion z", ["zsh"]),
@@ -90,9 +78,7 @@ def test_a_shell_completes(scripts, shell, line, expected):
 
 
 @pytest.mark.parametrize("shell", [*COMPLETERS])
-def test_files_are_completed_where_no_values_are_known(
-    scripts, shell, tmp_path, monkeypatch
-):
+def test_files_are_completed_where_no_values_are_known(scripts, shell, tmp_path, monkeypatch):
     (tmp_path / "problem.toml").write_text("")
     monkeypatch.chdir(tmp_path)
     found = COMPLETERS[shell](scripts[shell], "collocation-sysid solve prob")
@@ -111,23 +97,16 @@ def test_zsh_offers_commands_options_and_values(scripts):
         words = line.split(" ")
         array = " ".join(f"'{word}'" for word in words)
         program = f"{stubs} source {scripts['zsh']}; words=({array}); CURRENT={len(words)}; "
-        return run_shell(
-            zsh, "-f", "-c", program + "_collocation_sysid"
-        ).splitlines()
+        return run_shell(zsh, "-f", "-c", program + "_collocation_sysid").splitlines()
 
     commands = called("collocation-sysid so")
-    assert any(
-        each.startswith("solve:Identify the parameters") for each in commands
-    )
+    assert any(each.startswith("solve:Identify the parameters") for each in commands)
     options = called("collocation-sysid solve --m")
     (method,) = [each for each in options if each.startswith("*--method[")]
     assert method.endswith(":value:(" + method.rpartition("(")[2])
     assert "reduced-space" in method
     assert options[-1] == "*:argument:_files"
-    assert (
-        called("collocation-sysid completion ")[-1]
-        == "*:argument:(bash zsh fish)"
-    )
+    assert called("collocation-sysid completion ")[-1] == "*:argument:(bash zsh fish)"
 
 
 def test_every_option_of_every_command_is_in_every_script(scripts):
@@ -136,9 +115,7 @@ def test_every_option_of_every_command_is_in_every_script(scripts):
         shown = run_command(words, "--help")
         if shown.code:
             continue
-        options = {
-            w.strip(",") for w in shown.out.split() if w.startswith("--")
-        } - {"--"}
+        options = {w.strip(",") for w in shown.out.split() if w.startswith("--")} - {"--"}
         for option in options:
             assert option in texts["bash"], option
             assert f"*{option}[" in texts["zsh"], option
@@ -148,22 +125,14 @@ def test_every_option_of_every_command_is_in_every_script(scripts):
 TRICKY = CompletedCommand(
     "new",
     "It's [a] 50 % 'test': of $HOME, \\ and `pwd`",
-    (
-        CompletedOption(
-            ("--to", "-t"), 'the body\'s "place" [m]: $x', True, ("a", "b")
-        ),
-    ),
+    (CompletedOption(("--to", "-t"), 'the body\'s "place" [m]: $x', True, ("a", "b")),),
     (),
 )
 
 
 @pytest.mark.parametrize(
     ("shell", "script", "check"),
-    [
-        ("bash", bash_script, "-n"),
-        ("zsh", zsh_script, "-n"),
-        ("fish", fish_script, "--no-execute"),
-    ],
+    [("bash", bash_script, "-n"), ("zsh", zsh_script, "-n"), ("fish", fish_script, "--no-execute")],
 )
 def test_descriptions_are_quoted(shell, script, check, tmp_path):
     file = tmp_path / "script"

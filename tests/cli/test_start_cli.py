@@ -56,9 +56,7 @@ def test_the_scan_is_reported(folder):
     result = result_of(folder / "run")
     scan = result["scan"]
     assert len(scan["young_pa"]) == len(scan["misfit"])
-    assert scan["misfit"][scan["best"]] == min(
-        m for m in scan["misfit"] if m is not None
-    )
+    assert scan["misfit"][scan["best"]] == min(m for m in scan["misfit"] if m is not None)
     assert scan["sentence"].startswith("no guess: started from E = ")
     assert scan["sentence"] in result["notes"]
     shear_pa = scan["young_pa"][scan["best"]] / 2.6
@@ -73,9 +71,7 @@ def test_the_scan_is_drawn_in_the_run_folder_and_on_the_page(folder):
     page = folder / "page.html"
     assert run_command("report", folder / "run", "--to", page).code == 0
     assert "Scan of the stiffness for an initial guess" in page.read_text()
-    assert (
-        run_command("plot", folder / "run", "--out", folder / "again").code == 0
-    )
+    assert run_command("plot", folder / "run", "--out", folder / "again").code == 0
     assert np.array_equal(imread(folder / "again" / "scan.png"), image)
 
 
@@ -93,33 +89,20 @@ def test_check_finds_a_start(folder):
 
 
 def test_simulate_asks_for_a_value(folder):
-    keep = settings(
-        *(f"parameters.{name}={{}}" for name in TRUTH if name != "lambda_pa")
-    )
-    outcome = run_command(
-        "simulate", folder / "problem.toml", "--out", folder / "x", *keep
-    )
+    keep = settings(*(f"parameters.{name}={{}}" for name in TRUTH if name != "lambda_pa"))
+    outcome = run_command("simulate", folder / "problem.toml", "--out", folder / "x", *keep)
     assert outcome.code == 2
     assert "parameters.mu_pa" in outcome.err
-    assert "expected --set parameters.mu_pa.guess=VALUE" in " ".join(
-        outcome.err.split()
-    )
+    assert "expected --set parameters.mu_pa.guess=VALUE" in " ".join(outcome.err.split())
     assert not (folder / "x").exists()
 
 
 def test_starts_need_something_to_spread_about(folder):
-    command = (
-        "compare-methods",
-        folder / "problem.toml",
-        "--methods",
-        "reduced-space",
-        *UNGUESSED,
-    )
+    command = ("compare-methods", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
     outcome = run_command(*command, "--starts", 2, "--dry-run")
     assert outcome.code == 2
     assert (
-        "parameters.lambda_pa: this parameter has neither a guess nor a true value"
-        in outcome.err
+        "parameters.lambda_pa: this parameter has neither a guess nor a true value" in outcome.err
     )
     alone = run_command(*command, "--dry-run")
     assert (alone.code, "– – – –" in alone.out) == (0, True)
@@ -127,21 +110,9 @@ def test_starts_need_something_to_spread_about(folder):
 
 def test_a_comparison_without_a_guess_tells_where_it_started(folder):
     out = folder / "compared"
-    command = (
-        "compare-methods",
-        folder / "problem.toml",
-        "--methods",
-        "reduced-space",
-        *UNGUESSED,
-    )
-    truth = [
-        word
-        for name, value in TRUTH.items()
-        for word in ("--truth", f"{name}={value}")
-    ]
-    outcome = run_command(
-        *command, *truth, "--out", out, "--json", "--workers", 1
-    )
+    command = ("compare-methods", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
+    truth = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
+    outcome = run_command(*command, *truth, "--out", out, "--json", "--workers", 1)
     assert outcome.code == 0, outcome.err
     (row,) = json.loads(outcome.out)["runs"]
     assert row["success"] is True
@@ -168,18 +139,10 @@ def test_an_earlier_answer_is_a_start(folder):
 
 def test_other_names_of_the_moduli_match(folder):
     """The earlier run had λ and μ; E and ν follow from them."""
-    given = {
-        "young_pa": cs.Unknown(),
-        "poisson": cs.Unknown(),
-        "gamma_r_s": 0.01,
-    }
+    given = {"young_pa": cs.Unknown(), "poisson": cs.Unknown(), "gamma_r_s": 0.01}
     problem = cs.Problem.read(folder / "problem.toml")
     other = cs.Problem(problem.experiments, {**given, "gamma_m_1_s": 1.0})
-    guesses = (
-        WarmStart.read(folder / "run")
-        .apply_to_problem(other)
-        .parameters.guesses
-    )
+    guesses = WarmStart.read(folder / "run").apply_to_problem(other).parameters.guesses
     assert guesses["young_pa"] == pytest.approx(720.0, rel=1e-3)
     assert guesses["poisson"] == pytest.approx(0.2, rel=1e-3)
     assert guesses["gamma_r_s"] == 0.01
@@ -212,9 +175,7 @@ def test_nuisance_parameters_are_taken_over(folder):
     ],
     ids=["no-run", "damaged", "other-parameters"],
 )
-def test_what_is_no_start_is_refused_before_anything_is_solved(
-    folder, tmp_path, content, said
-):
+def test_what_is_no_start_is_refused_before_anything_is_solved(folder, tmp_path, content, said):
     if content == "other-parameters":
         result = result_of(folder / "run")
         result["parameters"] = {"x_pa": result["parameters"]["mu_pa"]}
@@ -223,12 +184,7 @@ def test_what_is_no_start_is_refused_before_anything_is_solved(
         (tmp_path / "result.json").write_text(content)
     before = contents(folder)
     outcome = run_command(
-        "solve",
-        folder / "problem.toml",
-        "--out",
-        folder / "none",
-        "--start",
-        tmp_path,
+        "solve", folder / "problem.toml", "--out", folder / "none", "--start", tmp_path
     )
     assert outcome.code == 2
     assert said in outcome.err

@@ -31,27 +31,15 @@ from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.errors import printable
 
 NUMBERS = Table(
-    "Estimates",
-    ("", "value", ""),
-    (("E Pa", "1500", "a|b"), ("ν", "0.3", "")),
-    texts=1,
+    "Estimates", ("", "value", ""), (("E Pa", "1500", "a|b"), ("ν", "0.3", "")), texts=1
 )
 REPORT = TitledParts(
     "Foam & <silicone>",
     (
-        Line(
-            (
-                Span("Verdict: check", "strong"),
-                Span(", see "),
-                Span("why", to="#cure"),
-            ),
-            "check",
-        ),
+        Line((Span("Verdict: check", "strong"), Span(", see "), Span("why", to="#cure")), "check"),
         Cards((("E", "1500 Pa", "±3"),)),
         NUMBERS,
-        TitledParts(
-            "Notes", (Items(("one", "two")), Listing("The file", "a = 1"))
-        ),
+        TitledParts("Notes", (Items(("one", "two")), Listing("The file", "a = 1"))),
     ),
     level=1,
 )
@@ -75,71 +63,44 @@ def test_plain_text_is_returned_also_in_jupyter_and_where_colours_are_forced(
     assert plain_text(REPORT) == expected
 
 
-ADDRESS = (
-    "trial.mcap#/a/topic/with/a/long/name/of_its_own#a_base_frame>a_tool_frame"
-)
+ADDRESS = "trial.mcap#/a/topic/with/a/long/name/of_its_own#a_base_frame>a_tool_frame"
 
 
 def shown_in(width: int, part: Shown, *, terminal: bool) -> list[str]:
     file = io.StringIO()
-    console = PlainConsole(
-        file=file, width=width, force_terminal=terminal, color_system=None
-    )
+    console = PlainConsole(file=file, width=width, force_terminal=terminal, color_system=None)
     console.print(on_terminal(part), crop=False)
     return [line.rstrip() for line in file.getvalue().splitlines()]
 
 
 def test_a_terminal_breaks_no_word_that_is_longer_than_its_lines():
-    table = Table(
-        "",
-        ("topic", "Hz", ""),
-        (("/tf", "100", f"write {ADDRESS} there"),),
-        texts=1,
-    )
-    for part in (
-        f"write {ADDRESS} there",
-        table,
-        Items((f"write {ADDRESS} there",)),
-    ):
+    table = Table("", ("topic", "Hz", ""), (("/tf", "100", f"write {ADDRESS} there"),), texts=1)
+    for part in (f"write {ADDRESS} there", table, Items((f"write {ADDRESS} there",))):
         lines = shown_in(40, part, terminal=True)
         assert any(ADDRESS in line for line in lines), part
-    assert shown_in(40, f"write {ADDRESS} there", terminal=True) == [
-        "write",
-        ADDRESS,
-        "there",
-    ]
-    assert shown_in(12, "  two words and more", terminal=True) == [
-        "  two words",
-        "and more",
-    ]
+    assert shown_in(40, f"write {ADDRESS} there", terminal=True) == ["write", ADDRESS, "there"]
+    assert shown_in(12, "  two words and more", terminal=True) == ["  two words", "and more"]
 
 
 def test_rows_are_lines_where_no_terminal_shows_them():
     table = Table(
-        "",
-        ("", "mooney-rivlin", *"abcde"),
-        (("solver.key", *"12345", "above 0\nWhat it is."),),
+        "", ("", "mooney-rivlin", *"abcde"), (("solver.key", *"12345", "above 0\nWhat it is."),)
     )
     head, row = plain_text(table, width=100_000).splitlines()
     assert "mooney-rivlin" in head
     assert row.split()[0] == "solver.key"
     assert row.endswith("above 0; What it is.")
-    assert (
-        len(shown_in(200, table, terminal=True)) == 4
-    )  # two lines of heads, two of the row
+    assert len(shown_in(200, table, terminal=True)) == 4  # two lines of heads, two of the row
 
 
 def test_a_page_escapes_texts_and_leads_to_names():
     page = as_html(REPORT)
     assert "<h1>Foam &amp; &lt;silicone&gt;</h1>" in page
     assert (
-        '<p class="check"><strong>Verdict: check</strong>, see <a href="#cure">why</a></p>'
-        in page
+        '<p class="check"><strong>Verdict: check</strong>, see <a href="#cure">why</a></p>' in page
     )
     assert '<tr><td>E Pa</td><td class="n">1500</td><td>a|b</td></tr>' in page
-    assert (
-        "<details><summary>The file</summary><pre>a = 1</pre></details>" in page
-    )
+    assert "<details><summary>The file</summary><pre>a = 1</pre></details>" in page
 
 
 def test_markdown_keeps_cells_apart():
@@ -147,10 +108,7 @@ def test_markdown_keeps_cells_apart():
     assert text.startswith(
         "# Foam & \\<silicone>\n\n**Verdict: check**, see why\n\n- E: 1500 Pa (±3)\n"
     )
-    assert (
-        "## Estimates\n\n|  | value |  |\n| --- | ---: | --- |\n| E Pa | 1500 | a\\|b |"
-        in text
-    )
+    assert "## Estimates\n\n|  | value |  |\n| --- | ---: | --- |\n| E Pa | 1500 | a\\|b |" in text
     assert "## Notes\n\n- one\n- two\n\nThe file:\n\n```\na = 1\n```" in text
 
 
@@ -180,13 +138,7 @@ HOSTILE = [
 def markdown_tokens(name: str) -> list[Token]:
     """What a reader of Markdown finds where one text is everywhere in a description."""
     parts = (
-        Line(
-            (
-                Span(name, "strong"),
-                Span(f" {name} ", "quiet"),
-                Span(name, "code"),
-            )
-        ),
+        Line((Span(name, "strong"), Span(f" {name} ", "quiet"), Span(name, "code"))),
         name,
         Items((name, name)),
         Cards(((name, name, name),)),
@@ -203,18 +155,12 @@ def markdown_tokens(name: str) -> list[Token]:
 def test_markdown_shows_names_as_they_are(name: str):
     def structure(name: str) -> list[tuple[str, int]]:
         tokens = markdown_tokens(name)
-        return [
-            (each.type, each.level)
-            for each in tokens
-            if not each.type.startswith("text")
-        ]
+        return [(each.type, each.level) for each in tokens if not each.type.startswith("text")]
 
     assert structure(name) == structure("a name")
     line = " ".join(printable(name).split())
     texts = [
-        " ".join(
-            "".join(child.content for child in each.children or ()).split()
-        )
+        " ".join("".join(child.content for child in each.children or ()).split())
         for each in markdown_tokens(name)
         if each.type == "inline"
     ]
@@ -228,8 +174,6 @@ def test_a_page_has_no_control_characters():
 
 def test_json_has_what_was_described():
     assert read(Table, json.loads(as_json(NUMBERS))) == NUMBERS
-    assert content(labelled("Body", {"mesh": "8 nodes"}))["rows"] == [
-        ["  mesh ", "8 nodes"]
-    ]
+    assert content(labelled("Body", {"mesh": "8 nodes"}))["rows"] == [["  mesh ", "8 nodes"]]
     with pytest.raises(ValueError, match="rows of another length"):
         Table("", ("a", "b"), (("1",),))

@@ -27,10 +27,7 @@ def fail(with_index: int) -> None:
 
 
 def content(error: Exception) -> dict[str, object]:
-    return {
-        k: v.tolist() if isinstance(v, np.ndarray) else v
-        for k, v in vars(error).items()
-    }
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(error).items()}
 
 
 @pytest.mark.parametrize("error", EXCEPTIONS, ids=lambda e: type(e).__name__)

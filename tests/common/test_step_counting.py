@@ -25,10 +25,7 @@ from collocation_sysid.common.step_counting import (
 )
 from collocation_sysid.fem.kernels import map_experiments
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
-from collocation_sysid.program.forward.newton_solver import (
-    NewtonOptions,
-    NewtonSolver,
-)
+from collocation_sysid.program.forward.newton_solver import NewtonOptions, NewtonSolver
 from collocation_sysid.result import solve_progress
 
 
@@ -62,9 +59,7 @@ def test_nobody_is_told_outside_of_a_phase_and_without_a_listener():
 def test_threads_of_experiments_count_in_the_same_phase():
     shares = []
     with listen_to_shares(shares.append), counted_phase(StepUnit.SIMULATION, 2):
-        map_experiments(
-            lambda _: complete_steps(StepUnit.SIMULATION), ["a", "b"], threads=2
-        )
+        map_experiments(lambda _: complete_steps(StepUnit.SIMULATION), ["a", "b"], threads=2)
     assert shares[0] == 0.0
     assert max(shares[1:-1]) == 1.0
     assert shares[-1] is None
@@ -96,9 +91,7 @@ def test_a_scan_has_a_share(tmp_path):
     file = write_problem(tmp_path, {"swing": 8})
     text = file.read_text()
     problem = cs.Problem.read(file)
-    problem = cs.Problem.read(
-        file, [f"parameters.{n}={{}}" for n in problem.parameters.names]
-    )
+    problem = cs.Problem.read(file, [f"parameters.{n}={{}}" for n in problem.parameters.names])
     assert text == file.read_text()
     shares: list[float | None] = []
     with listen_to_shares(shares.append):
@@ -111,26 +104,20 @@ def test_a_scan_has_a_share(tmp_path):
 def test_the_remaining_time_follows_from_the_share(monkeypatch):
     now_s = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
-    progress = solve_progress.SolveProgress(
-        Console(file=io.StringIO()), quiet=True
-    )
+    progress = solve_progress.SolveProgress(Console(file=io.StringIO()), quiet=True)
     with progress:
         progress.say("finding the error bars")
         progress.share(0.0)
         now_s = 100.5
         progress.share(0.01)
-        assert (
-            progress._activity_with_iterations() == "finding the error bars: 1%"
-        )
+        assert progress._activity_with_iterations() == "finding the error bars: 1%"
         now_s = 104.0
         progress.share(0.25)
         shown = progress._activity_with_iterations()
         assert shown == "finding the error bars: 25%, about 12 s left"
         now_s = 110.0
         progress.share(0.02)  # the next phase: its time begins here
-        assert (
-            progress._activity_with_iterations() == "finding the error bars: 2%"
-        )
+        assert progress._activity_with_iterations() == "finding the error bars: 2%"
         now_s = 120.0
         progress.share(0.04)
         shown = progress._activity_with_iterations()
@@ -153,38 +140,23 @@ def test_a_terminal_shows_the_remaining_time(monkeypatch):
     assert "drawing the pictures: 25%, about 0 s left" in screen.getvalue()
 
 
-def test_a_terminal_shows_the_elapsed_time_of_a_phase_without_a_share(
-    monkeypatch,
-):
+def test_a_terminal_shows_the_elapsed_time_of_a_phase_without_a_share(monkeypatch):
     now_s = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
-    progress = solve_progress.SolveProgress(
-        Console(file=io.StringIO()), quiet=True
-    )
+    progress = solve_progress.SolveProgress(Console(file=io.StringIO()), quiet=True)
     progress.say("looking for causes of the misfit")
     now_s = 101.0
     assert progress._activity_with_time() == "looking for causes of the misfit"
     now_s = 104.0
-    assert (
-        progress._activity_with_time()
-        == "looking for causes of the misfit (4 s so far)"
-    )
-    progress.say(
-        "looking for causes of the misfit"
-    )  # the same activity goes on
+    assert progress._activity_with_time() == "looking for causes of the misfit (4 s so far)"
+    progress.say("looking for causes of the misfit")  # the same activity goes on
     now_s = 105.0
-    assert (
-        progress._activity_with_time()
-        == "looking for causes of the misfit (5 s so far)"
-    )
+    assert progress._activity_with_time() == "looking for causes of the misfit (5 s so far)"
     progress.say("finding the error bars")
     assert progress._activity_with_time() == "finding the error bars"
     progress.share(0.5)
     now_s = 109.0
-    assert (
-        progress._activity_with_time()
-        == "finding the error bars: 50%, about 5 s left"
-    )
+    assert progress._activity_with_time() == "finding the error bars: 50%, about 5 s left"
 
 
 def test_a_terminal_shows_the_state_of_a_long_iteration(monkeypatch):
@@ -213,11 +185,7 @@ def test_an_equilibrium_reports_its_load_steps_and_residuals():
     number = r"(\S+)"
     form = rf"equilibrium at {number}% of the load, residual {number} N"
     loads, residuals = zip(
-        *(
-            map(float, re.fullmatch(form, state).groups())
-            for state in states[:-1]
-        ),
-        strict=True,
+        *(map(float, re.fullmatch(form, state).groups()) for state in states[:-1]), strict=True
     )
     assert states[-1] == ""  # the search has ended
     assert loads[-1] == 100.0
@@ -244,9 +212,7 @@ def test_the_first_activity_is_shown_at_once():
 
 
 def test_after_a_part_the_whole_is_shown_again():
-    with solve_progress.SolveProgress(
-        Console(file=io.StringIO()), quiet=True
-    ) as progress:
+    with solve_progress.SolveProgress(Console(file=io.StringIO()), quiet=True) as progress:
         with search_activity("coarse start"):
             assert progress._activity_with_time() == "coarse start"
         assert progress._activity_with_time() == "solving"
@@ -265,9 +231,7 @@ def test_reading_a_problem_counts_its_recordings(tmp_path):
 
 
 @pytest.mark.long
-def test_all_phases_of_a_run_are_announced_and_those_of_known_length_counted(
-    tmp_path,
-):
+def test_all_phases_of_a_run_are_announced_and_those_of_known_length_counted(tmp_path):
     file = write_problem(tmp_path, {"swing": 8})
     changes = [
         'solver.method="reduced-space"',

@@ -36,17 +36,11 @@ class Storm:
 def storm(start: float, name: str) -> Storm:
     heights = start + np.arange(4.0)
     tides = (Tide(heights, name), Tide(2 * heights, name))
-    return Storm(
-        start + np.arange(8.0).reshape(2, 4),
-        weight_n=start,
-        tides=tides,
-        main=tides[0],
-    )
+    return Storm(start + np.arange(8.0).reshape(2, 4), weight_n=start, tides=tides, main=tides[0])
 
 
 @pytest.mark.parametrize(
-    "rows",
-    [slice(1, 3), np.array([1, 2]), np.array([False, True, True, False])],
+    "rows", [slice(1, 3), np.array([1, 2]), np.array([False, True, True, False])]
 )
 def test_times_are_selected_along_the_marked_axis_of_all_parts(rows):
     whole = storm(1.0, "a")
@@ -74,9 +68,7 @@ def test_arrays_are_interpolated_and_all_else_is_that_of_the_later_one():
     after = storm(4.0, "b")
     between = interpolate_in_time(before, after, share=0.25)
     np.testing.assert_allclose(between.wind_n, before.wind_n + 1.0)
-    np.testing.assert_allclose(
-        between.tides[1].height_m, before.tides[1].height_m + 2.0
-    )
+    np.testing.assert_allclose(between.tides[1].height_m, before.tides[1].height_m + 2.0)
     assert between.weight_n == 4.0
     assert between.tides[1].name == "b"
 

@@ -39,17 +39,14 @@ def folder(written: Path, tmp_path: Path) -> Path:
     copy = Path(shutil.copytree(written, tmp_path / "bodies"))
     for body, recording in ((RUBBER, "biaxial"), (FOAM, "swing")):
         shutil.copyfile(
-            copy / body / f"{recording}_simulated.csv",
-            copy / body / f"{recording}_prediction.csv",
+            copy / body / f"{recording}_simulated.csv", copy / body / f"{recording}_prediction.csv"
         )
     return copy
 
 
 def table(file: Path) -> tuple[list[str], np.ndarray]:
     header, *rows = csv.reader(file.read_text().splitlines())
-    return header, np.array(
-        [[float(cell or "nan") for cell in row] for row in rows]
-    )
+    return header, np.array([[float(cell or "nan") for cell in row] for row in rows])
 
 
 def write_table(file: Path, header: list[str], values: np.ndarray) -> None:
@@ -67,9 +64,7 @@ def test_a_prediction_equal_to_our_simulation_gets_its_score(folder: Path):
     scores = score_benchmark(folder)
     for body in (RUBBER, FOAM):
         own = by_source(scores, body)
-        assert own["prediction"] == replace(
-            own["collocation_sysid"], source="prediction"
-        )
+        assert own["prediction"] == replace(own["collocation_sysid"], source="prediction")
         assert own["prediction"].rms < 0.2 * own["undeformed body"].rms
 
 
@@ -99,9 +94,7 @@ def test_a_shift_is_the_error_and_is_no_error_without_offsets(folder: Path):
 def test_an_error_of_loads_is_relative_to_the_largest_load(folder: Path):
     header, measured = table(folder / RUBBER / "biaxial_measured.csv")
     shifted = measured + np.array([0.0, 5e3, -5e3])
-    write_table(
-        folder / RUBBER / "biaxial_prediction.csv", header, values=shifted
-    )
+    write_table(folder / RUBBER / "biaxial_prediction.csv", header, values=shifted)
     own = by_source(score_benchmark(folder, RUBBER), RUBBER)["prediction"]
     assert own.rms == pytest.approx(5e3, rel=1e-9)
     largest = np.abs(measured[:, 1:]).max()
@@ -113,9 +106,7 @@ def test_an_error_of_loads_is_relative_to_the_largest_load(folder: Path):
 
 
 def test_samples_that_were_not_measured_are_not_scored(written: Path):
-    from collocation_sysid.extras.benchmark.benchmark_content import (
-        BenchmarkContent,
-    )
+    from collocation_sysid.extras.benchmark.benchmark_content import BenchmarkContent
     from collocation_sysid.extras.benchmark.scores import score
 
     recording = BenchmarkContent.read(written).recordings[1]
@@ -123,8 +114,7 @@ def test_samples_that_were_not_measured_are_not_scored(written: Path):
     gaps = signals.measured.values.copy()
     gaps[3:7, :3] = np.nan
     partial = replace(
-        recording,
-        signals=replace(signals, measured=signals.measured.with_values(gaps)),
+        recording, signals=replace(signals, measured=signals.measured.with_values(gaps))
     )
     complete = score(recording, "prediction", predicted=signals.simulated)
     own = score(partial, "prediction", predicted=signals.simulated)
@@ -152,9 +142,7 @@ def test_further_rows_and_columns_are_ignored(folder: Path):
     between = values + 0.3 * (values[1, 0] - values[0, 0])
     rows = np.vstack([between, values])[:, ::-1]
     write_table(
-        file,
-        [*header[::-1], "energy_j"],
-        values=np.column_stack([rows, np.zeros(len(rows))]),
+        file, [*header[::-1], "energy_j"], values=np.column_stack([rows, np.zeros(len(rows))])
     )
     assert score_benchmark(folder) == expected
 
@@ -186,9 +174,7 @@ def with_hole(header: list[str], values: np.ndarray):
         (with_hole, "line 4, column 'tip_1_z': found 'nan'; expected a finite"),
     ],
 )
-def test_an_invalid_table_is_refused_with_one_message(
-    folder: Path, damage, message: str
-):
+def test_an_invalid_table_is_refused_with_one_message(folder: Path, damage, message: str):
     file = folder / FOAM / "swing_prediction.csv"
     write_table(file, *damage(*table(file)))
     before = contents(folder)
@@ -209,9 +195,7 @@ def test_an_invalid_table_is_refused_with_one_message(
         (b"t_s;tip_1_x\n0;1\n", "separated by commas"),
     ],
 )
-def test_a_file_that_is_no_table_is_refused(
-    folder: Path, content: bytes, message: str
-):
+def test_a_file_that_is_no_table_is_refused(folder: Path, content: bytes, message: str):
     (folder / FOAM / "swing_prediction.csv").write_bytes(content)
     with pytest.raises(InputError, match=message):
         score_benchmark(folder, FOAM)
@@ -223,14 +207,8 @@ def test_a_file_that_is_no_table_is_refused(
         ({"values": np.zeros((3, 18))}, "the array 't_s' is missing"),
         ({"t_s": np.zeros(3), "values": np.zeros((3, 4))}, "found t_s"),
         ({"t_s": np.zeros(0), "values": np.zeros((0, 18))}, "has no rows"),
-        (
-            {"t_s": np.zeros(3), "values": np.full((3, 18), np.inf)},
-            "not finite numbers",
-        ),
-        (
-            {"t_s": np.array(["a"] * 3), "values": np.zeros((3, 18))},
-            "not finite numbers",
-        ),
+        ({"t_s": np.zeros(3), "values": np.full((3, 18), np.inf)}, "not finite numbers"),
+        ({"t_s": np.array(["a"] * 3), "values": np.zeros((3, 18))}, "not finite numbers"),
     ],
 )
 def test_an_invalid_archive_is_refused(folder: Path, arrays, message: str):
@@ -257,10 +235,7 @@ def test_missing_predictions_are_listed(written: Path):
 
 
 def test_two_predictions_of_a_recording_are_refused(folder: Path):
-    shutil.copyfile(
-        folder / FOAM / "swing_prediction.csv",
-        folder / FOAM / "swing_prediction.npz",
-    )
+    shutil.copyfile(folder / FOAM / "swing_prediction.csv", folder / FOAM / "swing_prediction.npz")
     with pytest.raises(InputError, match="expected one of them"):
         score_benchmark(folder)
 
@@ -303,13 +278,9 @@ def test_options_that_do_not_fit_are_refused(
     assert not any(tmp_path.iterdir())
 
 
-def test_a_body_without_data_names_the_script(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_body_without_data_names_the_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(benchmark_bodies, "CHECKOUT", tmp_path)
-    outcome = run_command(
-        "benchmark", tmp_path / "new", "--write", "--body", "silicone_beam"
-    )
+    outcome = run_command("benchmark", tmp_path / "new", "--write", "--body", "silicone_beam")
     assert outcome.code == 2
     assert "scripts/get_srl_beam.py" in outcome.err
     assert not (tmp_path / "new").exists()
@@ -332,9 +303,7 @@ def test_the_files_describe_the_body_without_this_package(written: Path):
     mesh = TetMesh.read(folder / "mesh.vtu")
     np.testing.assert_allclose(mesh.points_m, nodes, atol=1e-12)
     np.testing.assert_array_equal(mesh.tetrahedra, tetrahedra)
-    _, *rows = csv.reader(
-        (folder / "swing_markers.csv").read_text().splitlines()
-    )
+    _, *rows = csv.reader((folder / "swing_markers.csv").read_text().splitlines())
     for row in rows:
         place, element, weights = (
             np.array(row[1:4], dtype=float),

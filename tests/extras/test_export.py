@@ -19,13 +19,7 @@ import numpy as np
 import pytest
 from kit.materials import HYPERFOAM, OGDEN, term_constants
 from kit.problem_files import run_command, write_problem
-from kit.problems import (
-    IDEAL,
-    nodes_where,
-    smooth_poses,
-    times,
-    vertex_markers,
-)
+from kit.problems import IDEAL, nodes_where, smooth_poses, times, vertex_markers
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
@@ -39,10 +33,7 @@ from collocation_sysid.extras.export import (
 )
 from collocation_sysid.extras.export.export_target import equilibria
 from collocation_sysid.extras.export.identified import without_obstacles
-from collocation_sysid.extras.export.obstacle_shapes import (
-    Facets,
-    faceted_obstacles,
-)
+from collocation_sysid.extras.export.obstacle_shapes import Facets, faceted_obstacles
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
@@ -63,9 +54,7 @@ from collocation_sysid.recording import (
     Wrench,
 )
 
-needs_ccx = pytest.mark.skipif(
-    shutil.which("ccx") is None, reason="CalculiX is not installed"
-)
+needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(
     importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed"
 )
@@ -80,13 +69,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     problem = write_problem(folder, {"swing": 8})
     assert (
         run_command(
-            "solve",
-            problem,
-            "--out",
-            folder / "run",
-            "-q",
-            "--method",
-            "reduced-space",
+            "solve", problem, "--out", folder / "run", "-q", "--method", "reduced-space"
         ).code
         == 0
     )
@@ -106,27 +89,15 @@ def held_bar(
     mesh = box_mesh(BAR_M, DIVISIONS)
     body = Body(mesh, material, 900.0, element, damping=damping, prony=prony)
     t_s = times(8)
-    poses = (
-        smooth_poses(t_s, sway_m=(0.004, 0.002, 0.003))
-        if moving
-        else PoseSequence.fixed()
-    )
+    poses = smooth_poses(t_s, sway_m=(0.004, 0.002, 0.003)) if moving else PoseSequence.fixed()
     still = Grasp(nodes_where(body, 0, 0.0), poses)
-    grasps = (
-        [still]
-        if axes == "xyz"
-        else [still, Grasp([5], PoseSequence.fixed(), axes=axes)]
-    )
+    grasps = [still] if axes == "xyz" else [still, Grasp([5], PoseSequence.fixed(), axes=axes)]
     markers = vertex_markers(body, nodes_where(body, 0, BAR_M[0]), t_s)
     kind = "dynamic" if moving else "static"
-    experiment = Experiment(
-        body, t_s, grasps, markers, nuisance=IDEAL, kind=kind
-    )
+    experiment = Experiment(body, t_s, grasps, markers, nuisance=IDEAL, kind=kind)
     theta = body.theta_from_values({**OTHERS, **values})
     shapes = simulate(experiment, theta).positions_m if moving else None
-    return IdentifiedBody(
-        "a bar", "good", (), {}, body, theta, experiment, shapes
-    )
+    return IdentifiedBody("a bar", "good", (), {}, body, theta, experiment, shapes)
 
 
 def exported(body: IdentifiedBody, to: str, folder: Path) -> Path:
@@ -139,9 +110,7 @@ def numbers_in(text: str | None) -> np.ndarray:
     return np.array(text.split(), dtype=float)
 
 
-def test_a_run_without_a_problem_file_is_exported_from_python(
-    run_folder, tmp_path
-):
+def test_a_run_without_a_problem_file_is_exported_from_python(run_folder, tmp_path):
     problem = cs.Problem.read(run_folder.parent / "problem.toml")
     run = cs.run(replace(problem, origin=None), "reduced-space")
     run.save(tmp_path / "run", pictures=False)
@@ -151,13 +120,9 @@ def test_a_run_without_a_problem_file_is_exported_from_python(
     found = IdentifiedBody.from_run(run)
     write_export(found, "mujoco", tmp_path / "deck")
     expected = IdentifiedBody.read(run_folder)
-    assert found.regions[0].young_pa == pytest.approx(
-        expected.regions[0].young_pa, rel=1e-3
-    )
+    assert found.regions[0].young_pa == pytest.approx(expected.regions[0].young_pa, rel=1e-3)
     assert found.simulated_m is not None
-    np.testing.assert_allclose(
-        found.simulated_m, expected.simulated_m, atol=1e-4
-    )
+    np.testing.assert_allclose(found.simulated_m, expected.simulated_m, atol=1e-4)
     with pytest.raises(InputError, match="expected one of swing"):
         IdentifiedBody.from_run(run, "other")
 
@@ -166,54 +131,30 @@ def test_a_run_without_a_problem_file_is_exported_from_python(
 
 
 def test_the_json_holds_what_was_identified(run_folder, tmp_path):
-    assert (
-        run_command(
-            "export", run_folder, "--to", "json", "--out", tmp_path / "out"
-        ).code
-        == 0
-    )
+    assert run_command("export", run_folder, "--to", "json", "--out", tmp_path / "out").code == 0
     found = json.loads((tmp_path / "out" / "identified.json").read_text())
     result = json.loads((run_folder / "result.json").read_text())
     (region,) = found["regions"]
-    assert (
-        region["constants"]["mu_pa"] == result["parameters"]["mu_pa"]["value"]
-    )
-    assert region["young_pa"] == pytest.approx(
-        result["derived"]["young_pa"]["value"]
-    )
-    assert sum(found["node_mass_kg"]) == pytest.approx(
-        30.0 * 0.06 * 0.06 * 0.09
-    )
+    assert region["constants"]["mu_pa"] == result["parameters"]["mu_pa"]["value"]
+    assert region["young_pa"] == pytest.approx(result["derived"]["young_pa"]["value"])
+    assert sum(found["node_mass_kg"]) == pytest.approx(30.0 * 0.06 * 0.06 * 0.09)
     held = np.array(found["nodes_m"])[found["grasps"][0]["nodes"]]
     np.testing.assert_allclose(held[:, 2], 0.09)
-    poses = np.loadtxt(
-        tmp_path / "out" / "poses_1.csv", delimiter=",", skiprows=1
-    )
+    poses = np.loadtxt(tmp_path / "out" / "poses_1.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(poses[:, 0], found["grasps"][0]["pose_t_s"])
 
 
 def test_a_run_without_a_guess_is_exported_too(run_folder, tmp_path):
     folder = Path(shutil.copytree(run_folder, tmp_path / "run"))
     problem = folder / "problem.toml"
-    problem.write_text(
-        re.sub(r"(?m)^mu_pa .*", "mu_pa = {}", problem.read_text())
-    )
+    problem.write_text(re.sub(r"(?m)^mu_pa .*", "mu_pa = {}", problem.read_text()))
     assert Problem.read(
         problem, folder=run_folder.parent
     ).parameters.list_names_without_guess() == ("mu_pa",)
-    assert (
-        run_command(
-            "export", folder, "--to", "json", "--out", tmp_path / "out"
-        ).code
-        == 0
-    )
-    (region,) = json.loads((tmp_path / "out" / "identified.json").read_text())[
-        "regions"
-    ]
+    assert run_command("export", folder, "--to", "json", "--out", tmp_path / "out").code == 0
+    (region,) = json.loads((tmp_path / "out" / "identified.json").read_text())["regions"]
     result = json.loads((folder / "result.json").read_text())
-    assert (
-        region["constants"]["mu_pa"] == result["parameters"]["mu_pa"]["value"]
-    )
+    assert region["constants"]["mu_pa"] == result["parameters"]["mu_pa"]["value"]
 
 
 def test_mujoco_gets_nodes_cells_and_the_flex(run_folder, tmp_path):
@@ -226,9 +167,7 @@ def test_mujoco_gets_nodes_cells_and_the_flex(run_folder, tmp_path):
     assert float(elasticity.get("young", "")) == region.young_pa
     assert float(elasticity.get("poisson", "")) == region.poisson
     assert float(elasticity.get("damping", "")) == region.gamma_r_s
-    np.testing.assert_array_equal(
-        numbers_in(flex.get("element")).reshape(-1, 4), body.body.cells
-    )
+    np.testing.assert_array_equal(numbers_in(flex.get("element")).reshape(-1, 4), body.body.cells)
     masses = [
         float(node.get("mass", ""))
         for each in model.iterfind(".//worldbody/body")
@@ -257,34 +196,23 @@ def test_sofa_gets_moduli_damping_and_the_grasp(run_folder, tmp_path):
     assert float(solver.get("rayleighStiffness", "")) == region.gamma_r_s
     assert float(solver.get("rayleighMass", "")) == region.gamma_m_1_s
     np.testing.assert_array_equal(
-        numbers_in(fixed.get("indices")),
-        np.flatnonzero(body.is_prescribed.any(axis=1)),
+        numbers_in(fixed.get("indices")), np.flatnonzero(body.is_prescribed.any(axis=1))
     )
 
 
 def test_sofa_gets_the_mesh_the_masses_and_the_weight(run_folder, tmp_path):
     body = IdentifiedBody.read(run_folder)
-    scene = ElementTree.parse(
-        exported(body, "sofa", tmp_path) / "body.scn"
-    ).getroot()
+    scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn").getroot()
     given = {each.tag: each.attrib for each in scene.iter()}
     mesh = given["TetrahedronSetTopologyContainer"]
-    np.testing.assert_array_equal(
-        numbers_in(mesh["position"]).reshape(-1, 3), body.nodes_m
-    )
-    np.testing.assert_array_equal(
-        numbers_in(mesh["tetrahedra"]).reshape(-1, 4), body.body.cells
-    )
+    np.testing.assert_array_equal(numbers_in(mesh["position"]).reshape(-1, 3), body.nodes_m)
+    np.testing.assert_array_equal(numbers_in(mesh["tetrahedra"]).reshape(-1, 4), body.body.cells)
     masses_kg = numbers_in(given["DiagonalMass"]["vertexMass"])
     assert masses_kg.sum() == pytest.approx(30.0 * 0.06 * 0.06 * 0.09)
     assert len(masses_kg) == len(body.nodes_m)
-    np.testing.assert_array_equal(
-        numbers_in(scene.get("gravity")), body.experiment.gravity_m_s2
-    )
+    np.testing.assert_array_equal(numbers_in(scene.get("gravity")), body.experiment.gravity_m_s2)
     assert 0 < float(scene.get("dt", "")) < body.experiment.timestep_s
-    order = [
-        each.tag for each in scene.iter()
-    ]  # components find those that stand before them
+    order = [each.tag for each in scene.iter()]  # components find those that stand before them
     assert order.index("MechanicalObject") < order.index("DiagonalMass")
 
 
@@ -308,50 +236,31 @@ def stage_of(folder: Path):
 def test_usd_gets_mesh_material_masses_and_weight(tmp_path):
     body = held_bar(values={**MODULI, "gamma_r_s": 0.004})
     stage = stage_of(exported(body, "usd", tmp_path))
-    mesh, material = map(
-        stage.GetPrimAtPath, ("/World/Body/Mesh", "/World/Materials/body")
-    )
+    mesh, material = map(stage.GetPrimAtPath, ("/World/Body/Mesh", "/World/Materials/body"))
 
     def told(prim, name):
         return np.array(prim.GetAttribute(name).Get())
 
     np.testing.assert_allclose(told(mesh, "points"), body.nodes_m, atol=1e-8)
-    np.testing.assert_array_equal(
-        told(mesh, "tetVertexIndices"), body.body.cells
-    )
-    assert told(mesh, "physics:masses").sum() == pytest.approx(
-        body.node_mass_kg.sum(), rel=1e-6
-    )
-    for name, value in (
-        ("youngsModulus", 5e4),
-        ("poissonsRatio", 0.3),
-        ("density", 900.0),
-    ):
+    np.testing.assert_array_equal(told(mesh, "tetVertexIndices"), body.body.cells)
+    assert told(mesh, "physics:masses").sum() == pytest.approx(body.node_mass_kg.sum(), rel=1e-6)
+    for name, value in (("youngsModulus", 5e4), ("poissonsRatio", 0.3), ("density", 900.0)):
         assert told(material, f"physics:{name}") == pytest.approx(value)
     assert told(material, "collocationSysid:gammaR_s") == pytest.approx(0.004)
-    assert mesh.GetRelationship("material:binding:physics").GetTargets() == [
-        material.GetPath()
-    ]
+    assert mesh.GetRelationship("material:binding:physics").GetTargets() == [material.GetPath()]
     scene = stage.GetPrimAtPath("/World/Physics")
     assert told(scene, "physics:gravityMagnitude") == pytest.approx(9.81)
-    np.testing.assert_allclose(
-        told(scene, "physics:gravityDirection"), (0, 0, -1)
-    )
+    np.testing.assert_allclose(told(scene, "physics:gravityDirection"), (0, 0, -1))
     outside = told(mesh, "surfaceFaceVertexIndices")
-    assert {tuple(sorted(f)) for f in outside} == {
-        tuple(sorted(f)) for f in body.body.mesh.surface
-    }
+    assert {tuple(sorted(f)) for f in outside} == {tuple(sorted(f)) for f in body.body.mesh.surface}
 
 
 def test_usd_gets_the_motion_of_the_gripper_and_what_it_holds(tmp_path):
     body = held_bar(moving=True)
     stage = stage_of(exported(body, "usd", tmp_path))
-    gripper, grasp = map(
-        stage.GetPrimAtPath, ("/World/Gripper_1", "/World/Gripper_1/Grasp")
-    )
+    gripper, grasp = map(stage.GetPrimAtPath, ("/World/Gripper_1", "/World/Gripper_1/Grasp"))
     np.testing.assert_array_equal(
-        grasp.GetAttribute("physics:indices0").Get(),
-        np.flatnonzero(body.is_node_prescribed),
+        grasp.GetAttribute("physics:indices0").Get(), np.flatnonzero(body.is_node_prescribed)
     )
     from pxr import UsdGeom
 
@@ -359,21 +268,13 @@ def test_usd_gets_the_motion_of_the_gripper_and_what_it_holds(tmp_path):
     local = np.array(grasp.GetAttribute("physics:coords1").Get())
     for k, t in enumerate(body.experiment.t_s):
         # USD's matrices act on rows.
-        matrix = np.array(
-            UsdGeom.Xformable(gripper).ComputeLocalToWorldTransform(t * rate_hz)
-        )
+        matrix = np.array(UsdGeom.Xformable(gripper).ComputeLocalToWorldTransform(t * rate_hz))
         there = local @ matrix[:3, :3] + matrix[3, :3]
-        held = body.experiment.prescribed_displacements([t])[1][0][
-            body.is_node_prescribed
-        ]
-        np.testing.assert_allclose(
-            there, held, atol=1e-7, err_msg=f"sample {k}"
-        )
+        held = body.experiment.prescribed_displacements([t])[1][0][body.is_node_prescribed]
+        np.testing.assert_allclose(there, held, atol=1e-7, err_msg=f"sample {k}")
 
 
-def test_usd_plays_the_motion_of_the_body_at_the_rate_of_the_recording(
-    tmp_path,
-):
+def test_usd_plays_the_motion_of_the_body_at_the_rate_of_the_recording(tmp_path):
     body = held_bar(moving=True)
     stage = stage_of(exported(body, "usd", tmp_path))
     points = stage.GetPrimAtPath("/World/Body/Mesh").GetAttribute("points")
@@ -383,14 +284,11 @@ def test_usd_plays_the_motion_of_the_body_at_the_rate_of_the_recording(
     codes = points.GetTimeSamples()
     np.testing.assert_allclose(np.array(codes) / rate_hz, t_s, atol=1e-12)
     np.testing.assert_allclose(
-        [stage.GetStartTimeCode(), stage.GetEndTimeCode()],
-        np.array(codes)[[0, -1]],
+        [stage.GetStartTimeCode(), stage.GetEndTimeCode()], np.array(codes)[[0, -1]]
     )
     assert body.simulated_m is not None
     for code, shape_m in zip(codes, body.simulated_m, strict=True):
-        np.testing.assert_allclose(
-            np.array(points.Get(code)), shape_m, atol=1e-7
-        )
+        np.testing.assert_allclose(np.array(points.Get(code)), shape_m, atol=1e-7)
     assert np.ptp(body.simulated_m, axis=0).max() > 1e-3  # and it moves
     placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
     np.testing.assert_allclose(np.array(points.Get()), placed_m, atol=1e-7)
@@ -403,43 +301,24 @@ def test_usd_says_that_gravity_is_tilted_and_that_nothing_moves(tmp_path):
     assert any("no forward simulation" in limit for limit in limits)
     angle = np.radians(0.5)
     tilted = replace(
-        body.experiment,
-        gravity_m_s2=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]),
+        body.experiment, gravity_m_s2=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
     )
-    limits = write_export(
-        replace(body, experiment=tilted), "usd", tmp_path / "tilted"
-    ).limitations
+    limits = write_export(replace(body, experiment=tilted), "usd", tmp_path / "tilted").limitations
     assert any("gravity points 0.5° away from −z" in limit for limit in limits)
     assert "0.5°" in (tmp_path / "tilted" / "body.usda").read_text()
 
 
-def test_usd_gets_a_material_for_each_region_and_says_what_simulators_make_of_them(
-    tmp_path,
-):
+def test_usd_gets_a_material_for_each_region_and_says_what_simulators_make_of_them(tmp_path):
     bar = box_mesh(BAR_M, DIVISIONS)
-    regions = [
-        Region("soft-end", np.arange(6)),
-        Region("grip", np.arange(6, 30)),
-    ]
+    regions = [Region("soft-end", np.arange(6)), Region("grip", np.arange(6, 30))]
     body = Body(bar, "neo-hookean", 900.0, regions=regions)
     still = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
     t_s = times(8)
     markers = vertex_markers(body, nodes_where(body, 0, BAR_M[0]), t_s)
     experiment = Experiment(body, t_s, [still], markers, nuisance=IDEAL)
-    values = {
-        f"{r.name}.{n}": v
-        for r in regions
-        for n, v in {**MODULI, **OTHERS}.items()
-    }
+    values = {f"{r.name}.{n}": v for r in regions for n, v in {**MODULI, **OTHERS}.items()}
     body_ = IdentifiedBody(
-        "a bar",
-        "good",
-        (),
-        {},
-        body,
-        body.theta_from_values(values),
-        experiment,
-        None,
+        "a bar", "good", (), {}, body, body.theta_from_values(values), experiment, None
     )
     stage = stage_of(exported(body_, "usd", tmp_path))
     subset = stage.GetPrimAtPath("/World/Body/Mesh/soft_end")
@@ -449,78 +328,46 @@ def test_usd_gets_a_material_for_each_region_and_says_what_simulators_make_of_th
 
 
 def test_febio_gets_energy_and_memory(tmp_path):
-    values = {
-        "c10_pa": 4e3,
-        "c01_pa": 1e3,
-        "kappa_pa": 1e5,
-        "prony_1.share": 0.4,
-    }
-    body = held_bar(
-        "mooney-rivlin", {**values, "prony_1.tau_s": 0.2}, prony=("prony_1",)
-    )
+    values = {"c10_pa": 4e3, "c01_pa": 1e3, "kappa_pa": 1e5, "prony_1.share": 0.4}
+    body = held_bar("mooney-rivlin", {**values, "prony_1.tau_s": 0.2}, prony=("prony_1",))
     model = ElementTree.parse(exported(body, "febio", tmp_path) / "body.feb")
     material = model.find(".//Material/material")
     assert material is not None
     assert material.get("type") == "uncoupled viscoelastic"
     inner = {each.tag: each.text for each in material.iter() if each.text}
-    for tag, value in {
-        "g1": 0.4,
-        "t1": 0.2,
-        "c1": 4e3,
-        "c2": 1e3,
-        "k": 1e5,
-    }.items():
+    for tag, value in {"g1": 0.4, "t1": 0.2, "c1": 4e3, "c2": 1e3, "k": 1e5}.items():
         assert float(inner[tag] or "") == value
     assert len(model.findall(".//elem")) == len(body.body.cells)
-    nodes = [
-        numbers_in((node.text or "").replace(",", " "))
-        for node in model.iterfind(".//node")
-    ]
+    nodes = [numbers_in((node.text or "").replace(",", " ")) for node in model.iterfind(".//node")]
     np.testing.assert_array_equal(nodes, body.nodes_m)
 
 
 def scaled_terms(terms, kappa_pa: float | None = None) -> dict[str, float]:
     """Constants of terms for a shear modulus of 300 Pa, scaled to 20 kPa."""
     scale = 20e3 / 300
-    values = {
-        n: v * scale if n.endswith("_pa") else v
-        for n, v in term_constants(terms).items()
-    }
+    values = {n: v * scale if n.endswith("_pa") else v for n, v in term_constants(terms).items()}
     return values if kappa_pa is None else {**values, "kappa_pa": kappa_pa}
 
 
-OGDEN_TERMS = {
-    count: scaled_terms(terms, 5e4) for count, terms in OGDEN.items()
-}
+OGDEN_TERMS = {count: scaled_terms(terms, 5e4) for count, terms in OGDEN.items()}
 FOAM_TERMS = {count: scaled_terms(terms) for count, terms in HYPERFOAM.items()}
 
 
 def card_values(folder: Path, keyword: str) -> list[float]:
     """Numbers of the card of a material in the deck of CalculiX."""
     lines = (folder / "body.inp").read_text().splitlines()
-    start = (
-        next(k for k, line in enumerate(lines) if line.startswith(keyword)) + 1
-    )
-    stop = next(
-        k for k, line in enumerate(lines) if k > start and line.startswith("*")
-    )
-    return [
-        float(value) for line in lines[start:stop] for value in line.split(",")
-    ]
+    start = next(k for k, line in enumerate(lines) if line.startswith(keyword)) + 1
+    stop = next(k for k, line in enumerate(lines) if k > start and line.startswith("*"))
+    return [float(value) for line in lines[start:stop] for value in line.split(",")]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_calculix_gets_the_terms_of_ogdens_law(count, tmp_path):
-    folder = exported(
-        held_bar(f"ogden-{count}", OGDEN_TERMS[count]), "calculix", tmp_path
-    )
+    folder = exported(held_bar(f"ogden-{count}", OGDEN_TERMS[count]), "calculix", tmp_path)
     values = card_values(folder, f"*HYPERELASTIC,OGDEN,N={count}")
     c = OGDEN_TERMS[count]
     # 2μ/α² there is μ/α here.
-    pairs = [
-        (c[f"mu_{p}_pa"] * c[f"alpha_{p}"] / 2, c[f"alpha_{p}"])
-        for p in range(1, count + 1)
-    ]
+    pairs = [(c[f"mu_{p}_pa"] * c[f"alpha_{p}"] / 2, c[f"alpha_{p}"]) for p in range(1, count + 1)]
     np.testing.assert_allclose(values[: 2 * count], np.ravel(pairs), rtol=1e-10)
     assert values[2 * count] == pytest.approx(2 / 5e4)
     assert values[2 * count + 1 :] == [1e20] * (count - 1)
@@ -528,15 +375,11 @@ def test_calculix_gets_the_terms_of_ogdens_law(count, tmp_path):
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_calculix_gets_the_terms_of_the_foam(count, tmp_path):
-    folder = exported(
-        held_bar(f"hyperfoam-{count}", FOAM_TERMS[count]), "calculix", tmp_path
-    )
+    folder = exported(held_bar(f"hyperfoam-{count}", FOAM_TERMS[count]), "calculix", tmp_path)
     values = card_values(folder, f"*HYPERFOAM,N={count}")
     c = FOAM_TERMS[count]
     pairs = [(c[f"mu_{p}_pa"], c[f"alpha_{p}"]) for p in range(1, count + 1)]
-    poisson = [
-        c[f"beta_{p}"] / (1 + 2 * c[f"beta_{p}"]) for p in range(1, count + 1)
-    ]
+    poisson = [c[f"beta_{p}"] / (1 + 2 * c[f"beta_{p}"]) for p in range(1, count + 1)]
     np.testing.assert_allclose(values, [*np.ravel(pairs), *poisson], rtol=1e-10)
 
 
@@ -551,23 +394,17 @@ def test_calculix_gets_the_terms_of_the_foam(count, tmp_path):
         ("ogden-1", OGDEN_TERMS[1], "mujoco"),
     ],
 )
-def test_what_has_no_such_material_says_what_becomes_of_it(
-    material, values, target, tmp_path
-):
-    exported_files = write_export(
-        held_bar(material, values), target, tmp_path / target
-    )
+def test_what_has_no_such_material_says_what_becomes_of_it(material, values, target, tmp_path):
+    exported_files = write_export(held_bar(material, values), target, tmp_path / target)
     assert any(
-        material in limit
-        and ("neo-Hookean" in limit or "same E and ν" in limit)
+        material in limit and ("neo-Hookean" in limit or "same E and ν" in limit)
         for limit in exported_files.limitations
     )
 
 
 def test_febio_gets_the_terms_of_ogdens_law(tmp_path):
     model = ElementTree.parse(
-        exported(held_bar("ogden-2", OGDEN_TERMS[2]), "febio", tmp_path)
-        / "body.feb"
+        exported(held_bar("ogden-2", OGDEN_TERMS[2]), "febio", tmp_path) / "body.feb"
     )
     material = model.find(".//Material/material")
     assert material is not None
@@ -575,9 +412,7 @@ def test_febio_gets_the_terms_of_ogdens_law(tmp_path):
     found = {each.tag: float(each.text or "") for each in material}
     c = OGDEN_TERMS[2]
     for p in (1, 2):  # c/m² there is μ/α here
-        assert found[f"c{p}"] == pytest.approx(
-            c[f"mu_{p}_pa"] * c[f"alpha_{p}"]
-        )
+        assert found[f"c{p}"] == pytest.approx(c[f"mu_{p}_pa"] * c[f"alpha_{p}"])
         assert found[f"m{p}"] == c[f"alpha_{p}"]
     assert found["k"] == pytest.approx(5e4)
     assert found["pressure_model"] == 2
@@ -591,16 +426,12 @@ def test_sofa_gets_ogdens_law_of_one_term(tmp_path):
     assert force.get("materialName") == "Ogden"
     c = OGDEN_TERMS[1]
     expected = [c["mu_1_pa"] * c["alpha_1"], c["alpha_1"], 5e4]
-    np.testing.assert_allclose(
-        numbers_in(force.get("ParameterSet") or ""), expected
-    )
+    np.testing.assert_allclose(numbers_in(force.get("ParameterSet") or ""), expected)
     assert "½ κ ln² J" in (folder / "body.scn").read_text()
 
 
 def in_febio(body: IdentifiedBody, folder: Path) -> ElementTree.Element:
-    return ElementTree.parse(
-        exported(body, "febio", folder) / "body.feb"
-    ).getroot()
+    return ElementTree.parse(exported(body, "febio", folder) / "body.feb").getroot()
 
 
 def indices_in(text: str | None) -> np.ndarray:
@@ -615,28 +446,13 @@ def test_febio_gets_moduli_grasp_and_weight(run_folder, tmp_path):
     (region,) = body.regions
     (material,) = model.iterfind("Material/material")
     assert material.get("type") == "neo-Hookean"
-    for tag, value in {
-        "density": 30.0,
-        "E": region.young_pa,
-        "v": region.poisson,
-    }.items():
+    for tag, value in {"density": 30.0, "E": region.young_pa, "v": region.poisson}.items():
         assert float(material.findtext(tag, "")) == pytest.approx(value)
-    (domain,), (elements,) = (
-        model.iterfind("MeshDomains/*"),
-        model.iterfind("Mesh/Elements"),
-    )
-    assert (domain.get("name"), domain.get("mat")) == (
-        elements.get("name"),
-        material.get("name"),
-    )
-    sets = {
-        each.get("name"): indices_in(each.text)
-        for each in model.iterfind("Mesh/NodeSet")
-    }
+    (domain,), (elements,) = (model.iterfind("MeshDomains/*"), model.iterfind("Mesh/Elements"))
+    assert (domain.get("name"), domain.get("mat")) == (elements.get("name"), material.get("name"))
+    sets = {each.get("name"): indices_in(each.text) for each in model.iterfind("Mesh/NodeSet")}
     for axis, held in zip("xyz", body.is_prescribed.T, strict=True):
-        np.testing.assert_array_equal(
-            sets[f"held_{axis}"], np.flatnonzero(held)
-        )
+        np.testing.assert_array_equal(sets[f"held_{axis}"], np.flatnonzero(held))
     conditions = list(model.iterfind("Boundary/bc"))
     assert {each.get("node_set") for each in conditions} == set(sets)
     assert {each.get("type") for each in conditions} == {"zero displacement"}
@@ -644,9 +460,7 @@ def test_febio_gets_moduli_grasp_and_weight(run_folder, tmp_path):
     assert force is not None
     against = numbers_in((force.text or "").replace(",", " "))
     np.testing.assert_array_equal(against, -body.experiment.gravity_m_s2)
-    controllers = {
-        each.get("id") for each in model.iterfind("LoadData/load_controller")
-    }
+    controllers = {each.get("id") for each in model.iterfind("LoadData/load_controller")}
     assert force.get("lc") in controllers
 
 
@@ -658,9 +472,7 @@ def test_mid_nodes_stand_in_febios_order(tmp_path):
     edges = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)])
     for element in elements:
         places = body.nodes_m[indices_in(element.text)]
-        np.testing.assert_allclose(
-            places[4:], places[edges].mean(axis=1), atol=1e-12
-        )
+        np.testing.assert_allclose(places[4:], places[edges].mean(axis=1), atol=1e-12)
 
 
 def test_calculix_gets_mesh_material_and_grasp(run_folder, tmp_path):
@@ -669,16 +481,13 @@ def test_calculix_gets_mesh_material_and_grasp(run_folder, tmp_path):
     (region,) = body.regions
     card = deck.split("*HYPERELASTIC,NEO HOOKE\n")[1].splitlines()[0]
     np.testing.assert_allclose(
-        np.array(card.split(","), dtype=float),
-        [region.mu_pa / 2, 2 / region.kappa_pa],
+        np.array(card.split(","), dtype=float), [region.mu_pa / 2, 2 / region.kappa_pa]
     )
     boundary = deck.split("*BOUNDARY\n")[1].split("*")[0].splitlines()
     assert len(boundary) == body.is_prescribed.sum()
     nodes = deck.split("*NODE,NSET=ALL\n")[1].split("*")[0].split()
     rows = np.array([row.split(",") for row in nodes], dtype=float)
-    np.testing.assert_allclose(
-        rows[:, 1:], body.nodes_m, rtol=1e-11, atol=1e-15
-    )
+    np.testing.assert_allclose(rows[:, 1:], body.nodes_m, rtol=1e-11, atol=1e-15)
 
 
 def test_no_number_of_a_deck_is_longer_than_calculix_reads(tmp_path):
@@ -698,9 +507,7 @@ def test_no_number_of_a_deck_is_longer_than_calculix_reads(tmp_path):
         ("febio", "point masses on nodes are not exported"),
     ],
 )
-def test_a_point_mass_that_ends_has_one_sentence_by_target(
-    to, expected, tmp_path
-):
+def test_a_point_mass_that_ends_has_one_sentence_by_target(to, expected, tmp_path):
     bar = held_bar(moving=True)
     t_s = bar.experiment.t_s
     mass = PointMass([5], 0.004, until_s=float(t_s[4]))
@@ -710,20 +517,11 @@ def test_a_point_mass_that_ends_has_one_sentence_by_target(
     assert expected in sentence
 
 
-@pytest.mark.parametrize(
-    "to", ["mujoco", "newton", "calculix", "sofa", "febio"]
-)
-def test_air_that_is_not_exported_is_said_and_is_not_in_our_equilibrium(
-    to, tmp_path
-):
+@pytest.mark.parametrize("to", ["mujoco", "newton", "calculix", "sofa", "febio"])
+def test_air_that_is_not_exported_is_said_and_is_not_in_our_equilibrium(to, tmp_path):
     bar = held_bar()
-    in_air = replace(
-        bar, experiment=replace(bar.experiment, air_density_kg_m3=1.2)
-    )
-    said = [
-        write_export(each, to, tmp_path / to).limitations
-        for each in (bar, in_air)
-    ]
+    in_air = replace(bar, experiment=replace(bar.experiment, air_density_kg_m3=1.2))
+    said = [write_export(each, to, tmp_path / to).limitations for each in (bar, in_air)]
     assert set(said[1]) - set(said[0]) == {
         "buoyancy, added mass and drag of the air are not exported"
     }
@@ -736,10 +534,7 @@ def test_memory_that_is_lost_is_said(to, tmp_path):
     limits = write_export(
         held_bar(values=values, prony=("prony_1",)), to, tmp_path / to
     ).limitations
-    assert any(
-        "memory is not supported" in said and "1.5 times" in said
-        for said in limits
-    )
+    assert any("memory is not supported" in said and "1.5 times" in said for said in limits)
 
 
 @pytest.mark.parametrize("to", TARGETS)
@@ -747,11 +542,7 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
     run = tmp_path / "run"
     shutil.copytree(run_folder, run)
     result = json.loads((run / "result.json").read_text())
-    swings = {
-        "code": "residuals/shared",
-        "grade": "doubtful",
-        "data": {},
-    }
+    swings = {"code": "residuals/shared", "grade": "doubtful", "data": {}}
     result["trust"] = {"concerns": [swings]}
     result["parameters"]["mu_pa"] |= {"at_bound": True, "value": 300.0}
     (run / "result.json").write_text(json.dumps(result))
@@ -770,21 +561,13 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
 HOSTILE = "a --- b --> \"<&'\x00\x1b[2J\x0c\ufffe\n"
 
 
-@pytest.mark.parametrize(
-    "to", ["mujoco", "febio", "calculix", "sofa", "newton", "usd"]
-)
-def test_any_title_or_name_is_written_in_the_form_of_the_target(
-    to: str, tmp_path: Path
-):
+@pytest.mark.parametrize("to", ["mujoco", "febio", "calculix", "sofa", "newton", "usd"])
+def test_any_title_or_name_is_written_in_the_form_of_the_target(to: str, tmp_path: Path):
     bar = box_mesh(BAR_M, DIVISIONS)
     cells = np.arange(len(bar.tetrahedra))
-    names = (
-        ["a-²"] if to == "sofa" else ["a-²", "a_²"]
-    )  # nothing else may be in one
+    names = ["a-²"] if to == "sofa" else ["a-²", "a_²"]  # nothing else may be in one
     parts = np.array_split(cells, len(names))
-    regions = [
-        Region(name, part) for name, part in zip(names, parts, strict=True)
-    ]
+    regions = [Region(name, part) for name, part in zip(names, parts, strict=True)]
     body = Body(bar, "neo-hookean", 900.0, regions=regions)
     still = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
     t_s = times(8)
@@ -792,15 +575,9 @@ def test_any_title_or_name_is_written_in_the_form_of_the_target(
     wall = Obstacle(shape=Plane(point_m=(0.0, 0.0, -1.0)), name=HOSTILE)
     experiment = Experiment(body, t_s, [still], markers, nuisance=IDEAL)
     touching = experiment.with_obstacles([wall])
-    values = {
-        f"{name}.{n}": v
-        for name in names
-        for n, v in {**MODULI, **OTHERS}.items()
-    }
+    values = {f"{name}.{n}": v for name in names for n, v in {**MODULI, **OTHERS}.items()}
     theta, words = body.theta_from_values(values), (HOSTILE, "good", (HOSTILE,))
-    identified = IdentifiedBody(
-        *words, {}, body, theta, experiment, None, touching
-    )
+    identified = IdentifiedBody(*words, {}, body, theta, experiment, None, touching)
     folder = exported(identified, to, tmp_path)
     for file in folder.iterdir():
         text = file.read_text(encoding="utf-8")
@@ -823,9 +600,7 @@ def test_a_pure_energy_is_exported_without_reserve(tmp_path):
 
 
 def test_an_unknown_target_writes_nothing(run_folder, tmp_path):
-    ended = run_command(
-        "export", run_folder, "--to", "mujco", "--out", tmp_path / "out"
-    )
+    ended = run_command("export", run_folder, "--to", "mujco", "--out", tmp_path / "out")
     assert ended.code == 2
     assert "did you mean 'mujoco'" in ended.err
     assert not (tmp_path / "out").exists()
@@ -840,9 +615,7 @@ def test_other_files_are_left_alone(run_folder, tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
-def test_an_export_is_not_written_through_a_link(
-    run_folder: Path, tmp_path: Path
-):
+def test_an_export_is_not_written_through_a_link(run_folder: Path, tmp_path: Path):
     run, theirs = tmp_path / "run", tmp_path / "theirs"
     shutil.copytree(run_folder, run)
     theirs.mkdir()
@@ -852,10 +625,7 @@ def test_an_export_is_not_written_through_a_link(
     ended = run_command("export", run, "--to", "json")
     assert ended.code == 2
     assert f"export-json: this is a link to {theirs}" in ended.err
-    assert sorted(file.name for file in theirs.iterdir()) == [
-        "identified.json",
-        "recording.csv",
-    ]
+    assert sorted(file.name for file in theirs.iterdir()) == ["identified.json", "recording.csv"]
     (run / "export-json").unlink()
     for _ in range(2):
         assert run_command("export", run, "--to", "json").code == 0
@@ -863,12 +633,7 @@ def test_an_export_is_not_written_through_a_link(
 
 def test_an_earlier_export_is_replaced(run_folder, tmp_path):
     for to in ("sofa", "json"):
-        assert (
-            run_command(
-                "export", run_folder, "--to", to, "--out", tmp_path / "out"
-            ).code
-            == 0
-        )
+        assert run_command("export", run_folder, "--to", to, "--out", tmp_path / "out").code == 0
     assert not (tmp_path / "out" / "body.scn").exists()
 
 
@@ -882,22 +647,10 @@ def test_a_file_gets_the_format_of_its_suffix(run_folder, tmp_path):
     said = json.loads(ended.out)
     assert (said["folder"], said["file"]) == (str(file.parent), str(file))
     names = ["swing.inp", "swing_identified.json", "swing_poses_1.csv"]
-    assert sorted(f.name for f in file.parent.iterdir()) == [
-        ".collocation-sysid.json",
-        *names,
-    ]
-    assert (
-        run_command(
-            "export", run_folder, "--to", "calculix", "--out", tmp_path / "b"
-        ).code
-        == 0
-    )
-    for name, same in zip(
-        names, ("body.inp", "identified.json", "poses_1.csv"), strict=True
-    ):
-        assert (file.parent / name).read_bytes() == (
-            tmp_path / "b" / same
-        ).read_bytes()
+    assert sorted(f.name for f in file.parent.iterdir()) == [".collocation-sysid.json", *names]
+    assert run_command("export", run_folder, "--to", "calculix", "--out", tmp_path / "b").code == 0
+    for name, same in zip(names, ("body.inp", "identified.json", "poses_1.csv"), strict=True):
+        assert (file.parent / name).read_bytes() == (tmp_path / "b" / same).read_bytes()
 
 
 @pytest.mark.parametrize("to", MAIN_FILES)
@@ -906,59 +659,31 @@ def test_every_format_is_found_by_its_name_and_by_its_suffix(to: str):
     suffix = Path(MAIN_FILES[to]).suffix
     by_name = parse_destination(to, MAIN_FILES, run)
     assert (by_name.format_name, by_name.folder) == (to, run / f"export-{to}")
-    assert parse_destination(to, MAIN_FILES, run, Path("out")).folder == Path(
-        "out"
-    )
+    assert parse_destination(to, MAIN_FILES, run, Path("out")).folder == Path("out")
     by_suffix = parse_destination(f"a/b{suffix.upper()}", MAIN_FILES, run)
     assert (by_suffix.format_name, by_suffix.is_folder) == (to, False)
     for folder in (f"a/{to}", f"export-{to}"):
         found = parse_destination(folder, MAIN_FILES, run)
-        assert (found.format_name, found.folder, found.is_folder) == (
-            to,
-            Path(folder),
-            True,
-        )
+        assert (found.format_name, found.folder, found.is_folder) == (to, Path(folder), True)
 
 
 def test_newton_finds_its_numbers_under_any_name(run_folder, tmp_path):
-    assert (
-        run_command("export", run_folder, "--to", tmp_path / "foam.py").code
-        == 0
-    )
-    assert {"nodes_m", "cells"} <= json.loads(
-        (tmp_path / "foam.json").read_text()
-    ).keys()
-    assert (
-        'Path(__file__).with_suffix(".json")'
-        in (tmp_path / "foam.py").read_text()
-    )
+    assert run_command("export", run_folder, "--to", tmp_path / "foam.py").code == 0
+    assert {"nodes_m", "cells"} <= json.loads((tmp_path / "foam.json").read_text()).keys()
+    assert 'Path(__file__).with_suffix(".json")' in (tmp_path / "foam.py").read_text()
 
 
 @needs_mujoco
 def test_a_file_is_verified_like_a_folder(run_folder, tmp_path):
-    ended = run_command(
-        "export",
-        run_folder,
-        "--to",
-        tmp_path / "swing.xml",
-        "--verify",
-        "--json",
-    )
+    ended = run_command("export", run_folder, "--to", tmp_path / "swing.xml", "--verify", "--json")
     assert ended.code == 0, ended.err
-    assert all(
-        abs(each["relative"]) < 0.1
-        for each in json.loads(ended.out)["verified"]
-    )
+    assert all(abs(each["relative"]) < 0.1 for each in json.loads(ended.out)["verified"])
     assert json.loads(ended.out)["verified"]
 
 
 @pytest.mark.parametrize("to", ["body.stl", "body", "out/body", "mujco"])
-def test_an_unknown_destination_is_refused_with_all_formats(
-    run_folder, to: str, tmp_path
-):
-    ended = run_command(
-        "export", run_folder, "--to", to if to == "mujco" else tmp_path / to
-    )
+def test_an_unknown_destination_is_refused_with_all_formats(run_folder, to: str, tmp_path):
+    ended = run_command("export", run_folder, "--to", to if to == "mujco" else tmp_path / to)
     assert ended.code == 2
     said = " ".join(ended.err.split())
     for name, file in MAIN_FILES.items():
@@ -968,17 +693,13 @@ def test_an_unknown_destination_is_refused_with_all_formats(
 
 def test_a_suffix_of_several_formats_needs_the_name():
     several = {**MAIN_FILES, "abaqus": "model.inp"}
-    with pytest.raises(
-        InputError, match="suffix of calculix and abaqus; write the name"
-    ) as error:
+    with pytest.raises(InputError, match="suffix of calculix and abaqus; write the name") as error:
         parse_destination("deck.inp", several, Path("run"))
     assert error.value.where == "--to"
 
 
 def test_a_destination_is_named_once(run_folder, tmp_path):
-    ended = run_command(
-        "export", run_folder, "--to", "body.inp", "--out", tmp_path / "out"
-    )
+    ended = run_command("export", run_folder, "--to", "body.inp", "--out", tmp_path / "out")
     assert (ended.code, "leave out --out" in ended.err) == (2, True)
     assert [*tmp_path.iterdir()] == []
 
@@ -993,9 +714,7 @@ def test_a_file_replaces_only_files_of_an_earlier_export(run_folder, tmp_path):
     (tmp_path / "swing.json").unlink()
     ended = run_command(*words)
     assert ended.code == 2
-    assert (
-        "swing_poses_1.csv: this file exists and was not written" in ended.err
-    )
+    assert "swing_poses_1.csv: this file exists and was not written" in ended.err
     assert (tmp_path / "swing_poses_1.csv").read_text() == "edited"
     assert not (tmp_path / "swing.json").exists()
 
@@ -1007,26 +726,16 @@ def test_a_file_is_not_written_through_a_link(run_folder, tmp_path):
     ended = run_command("export", run_folder, "--to", tmp_path / "swing.json")
     assert (ended.code, (tmp_path / "theirs.json").read_text()) == (2, "{}")
     (tmp_path / "linked").symlink_to(tmp_path)
-    ended = run_command(
-        "export", run_folder, "--to", tmp_path / "linked" / "other.json"
-    )
-    assert (ended.code, "nothing is written through links" in ended.err) == (
-        2,
-        True,
-    )
+    ended = run_command("export", run_folder, "--to", tmp_path / "linked" / "other.json")
+    assert (ended.code, "nothing is written through links" in ended.err) == (2, True)
     assert not (tmp_path / "other.json").exists()
     (tmp_path / "folder.json").mkdir()
     ended = run_command("export", run_folder, "--to", tmp_path / "folder.json")
-    assert (ended.code, "is a folder; expected a file" in ended.err) == (
-        2,
-        True,
-    )
+    assert (ended.code, "is a folder; expected a file" in ended.err) == (2, True)
 
 
 def test_an_experiment_that_is_not_there_is_refused(run_folder, tmp_path):
-    ended = run_command(
-        "export", run_folder, "--to", "json", "--experiment", "sway"
-    )
+    ended = run_command("export", run_folder, "--to", "json", "--experiment", "sway")
     assert ended.code == 2
     assert "expected one of swing" in ended.err
 
@@ -1037,9 +746,7 @@ def test_what_a_target_cannot_hold_is_refused(tmp_path):
     with pytest.raises(InputError, match="one region of linear tetrahedra"):
         write_export(held_bar(element="tet10"), "sofa", tmp_path / "out")
     with pytest.raises(InputError, match="cannot be run by this program"):
-        verify_export(
-            held_bar(), "sofa", exported(held_bar(), "sofa", tmp_path)
-        )
+        verify_export(held_bar(), "sofa", exported(held_bar(), "sofa", tmp_path))
     assert not (tmp_path / "out").exists()
 
 
@@ -1069,9 +776,7 @@ SAME_ENERGY = {
 @pytest.mark.parametrize("material", SAME_ENERGY)
 def test_calculix_sags_alike_with_the_same_energy(material, tmp_path):
     body = held_bar(material, SAME_ENERGY[material])
-    (sag,) = verify_export(
-        body, "calculix", exported(body, "calculix", tmp_path)
-    )
+    (sag,) = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
     assert sag.ours > 0.05 * BAR_M[0]  # not small
     assert abs(sag.compute_relative_difference()) < 1e-4
 
@@ -1080,9 +785,7 @@ def test_calculix_sags_alike_with_the_same_energy(material, tmp_path):
 @pytest.mark.parametrize("material", ["neo-hookean", "stable-neo-hookean"])
 def test_calculix_sags_alike_at_small_strain(material, tmp_path):
     body = held_bar(material, {"young_pa": 5e5, "poisson": 0.3})
-    (sag,) = verify_export(
-        body, "calculix", exported(body, "calculix", tmp_path)
-    )
+    (sag,) = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
     assert sag.ours > 0
     assert abs(sag.compute_relative_difference()) < 0.02
 
@@ -1090,9 +793,7 @@ def test_calculix_sags_alike_at_small_strain(material, tmp_path):
 @needs_ccx
 def test_quadratic_elements_sag_alike_in_calculix(tmp_path):
     body = held_bar(element="tet10")
-    (sag,) = verify_export(
-        body, "calculix", exported(body, "calculix", tmp_path)
-    )
+    (sag,) = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
     assert abs(sag.compute_relative_difference()) < 0.02
 
 
@@ -1102,9 +803,7 @@ def test_an_error_of_calculix_is_told(tmp_path):
     folder = exported(body, "calculix", tmp_path)
     deck = folder / "body.inp"
     deck.write_text(deck.read_text().replace("*STATIC", "*STATIK"))
-    with pytest.raises(
-        InputError, match="CalculiX could not compute the exported model"
-    ):
+    with pytest.raises(InputError, match="CalculiX could not compute the exported model"):
         verify_export(body, "calculix", folder)
 
 
@@ -1132,9 +831,7 @@ def test_the_flex_of_mujoco_has_the_damping_law_in_material_form(tmp_path, rng):
     found = passive[0] - passive[1]
     off = {}
     for law in ("material", "kelvin-voigt"):
-        body = Body(
-            identified.body.mesh, "st-venant-kirchhoff", 900.0, damping=law
-        )
+        body = Body(identified.body.mesh, "st-venant-kirchhoff", 900.0, damping=law)
         x = identified.nodes_m.copy()
         v = np.zeros_like(x)
         x[free] += moved
@@ -1142,17 +839,13 @@ def test_the_flex_of_mujoco_has_the_damping_law_in_material_form(tmp_path, rng):
         state = x.reshape(1, -1)
         force = body.force(state, v.reshape(1, -1), identified.theta)
         force -= body.force(state, np.zeros_like(state), identified.theta)
-        expected = force.reshape(-1, 3)[free].ravel() + _mass_damping(
-            identified, free, velocity
-        )
+        expected = force.reshape(-1, 3)[free].ravel() + _mass_damping(identified, free, velocity)
         off[law] = np.abs(found - expected).max() / np.abs(expected).max()
     assert off["material"] < 1e-5
     assert off["kelvin-voigt"] > 1e-2
 
 
-def _mass_damping(
-    identified: IdentifiedBody, free: np.ndarray, velocity: np.ndarray
-) -> np.ndarray:
+def _mass_damping(identified: IdentifiedBody, free: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     """γ_m M v, which MuJoCo does not have, to be added to our force."""
     gamma_m = identified.regions[0].gamma_m_1_s
     return (gamma_m * identified.node_mass_kg[free][:, None] * velocity).ravel()
@@ -1162,10 +855,7 @@ def test_the_law_of_mujoco_needs_no_note(tmp_path):
     """A body that is damped in material form is exported as it is."""
     write_export(held_bar(), "mujoco", tmp_path / "kelvin")
     write_export(held_bar(damping="material"), "mujoco", tmp_path / "own")
-    told = [
-        (folder / "body.xml").read_text()
-        for folder in (tmp_path / "kelvin", tmp_path / "own")
-    ]
+    told = [(folder / "body.xml").read_text() for folder in (tmp_path / "kelvin", tmp_path / "own")]
     assert 'the law "material"' in told[0]
     assert 'the law "material"' not in told[1]
 
@@ -1173,57 +863,33 @@ def test_the_law_of_mujoco_needs_no_note(tmp_path):
 @needs_mujoco
 def test_mujoco_swings_alike(tmp_path):
     body = held_bar(moving=True)
-    frequency, motion = verify_export(
-        body, "mujoco", exported(body, "mujoco", tmp_path)
-    )
+    frequency, motion = verify_export(body, "mujoco", exported(body, "mujoco", tmp_path))
     assert frequency.ours > 1.0
-    assert (
-        abs(frequency.compute_relative_difference()) < 1e-6
-    )  # the same energy, mesh and masses
+    assert abs(frequency.compute_relative_difference()) < 1e-6  # the same energy, mesh and masses
     assert motion.ours > 1e-3
     assert abs(motion.compute_relative_difference()) < 0.03
 
 
-def test_an_older_mujoco_that_makes_bodies_stiffer_is_refused(
-    tmp_path, monkeypatch
-):
+def test_an_older_mujoco_that_makes_bodies_stiffer_is_refused(tmp_path, monkeypatch):
     body = held_bar(moving=True)
     folder = exported(body, "mujoco", tmp_path)
-    monkeypatch.setitem(
-        sys.modules, "mujoco", SimpleNamespace(__version__="3.17.0")
-    )
-    with pytest.raises(
-        InputError, match=r"found MuJoCo 3\.17\.0, .* expected 4 or newer"
-    ):
+    monkeypatch.setitem(sys.modules, "mujoco", SimpleNamespace(__version__="3.17.0"))
+    with pytest.raises(InputError, match=r"found MuJoCo 3\.17\.0, .* expected 4 or newer"):
         verify_export(body, "mujoco", folder)
 
 
 def laid_block(shape: Solid) -> IdentifiedBody:
     """A block let go a millimetre above something, as if a run had identified it."""
-    block = Body(
-        box_mesh((0.04, 0.04, 0.04), (2, 2, 2)), "st-venant-kirchhoff", 300.0
-    )
+    block = Body(box_mesh((0.04, 0.04, 0.04), (2, 2, 2)), "st-venant-kirchhoff", 300.0)
     t_s = np.linspace(0.0, 0.3, 31)
     table = Obstacle(shape=shape, name="table", friction=0.5)
     seen = vertex_markers(block, np.array([0]), t_s)
-    fallen = Experiment(
-        block, t_s, [table], seen, start="undeformed", nuisance=IDEAL
-    )
-    values = {
-        "young_pa": 1e4,
-        "poisson": 0.3,
-        "gamma_r_s": 0.02,
-        "gamma_m_1_s": 0.0,
-    }
+    fallen = Experiment(block, t_s, [table], seen, start="undeformed", nuisance=IDEAL)
+    values = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.02, "gamma_m_1_s": 0.0}
     motion = simulate(fallen, values, "bdf2", substeps=4).positions_m
     still = without_obstacles(fallen)
-    theta, shapes = (
-        still.body.theta_from_values(values),
-        motion[:, : len(block.nodes_m)],
-    )
-    return IdentifiedBody(
-        "b", "good", (), {}, still.body, theta, still, shapes, fallen
-    )
+    theta, shapes = (still.body.theta_from_values(values), motion[:, : len(block.nodes_m)])
+    return IdentifiedBody("b", "good", (), {}, still.body, theta, still, shapes, fallen)
 
 
 LAID_ON = {
@@ -1238,9 +904,7 @@ def test_a_block_rests_as_high_on_what_mujoco_gets(name, tmp_path):
     import mujoco
 
     body = laid_block(LAID_ON[name])
-    model = mujoco.MjModel.from_xml_path(
-        str(exported(body, "mujoco", tmp_path) / "body.xml")
-    )
+    model = mujoco.MjModel.from_xml_path(str(exported(body, "mujoco", tmp_path) / "body.xml"))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     while data.time < 0.3:
@@ -1249,9 +913,7 @@ def test_a_block_rests_as_high_on_what_mujoco_gets(name, tmp_path):
     assert body.simulated_m is not None
     fallen_m = body.nodes_m[:, 2].mean() - body.simulated_m[-1, :, 2].mean()
     assert fallen_m > 1e-3
-    assert height_m == pytest.approx(
-        body.simulated_m[-1, :, 2].mean(), abs=0.05 * fallen_m
-    )
+    assert height_m == pytest.approx(body.simulated_m[-1, :, 2].mean(), abs=0.05 * fallen_m)
 
 
 def test_all_solids_are_geoms_and_what_a_geom_lacks_is_said(tmp_path):
@@ -1262,23 +924,13 @@ def test_all_solids_are_geoms_and_what_a_geom_lacks_is_said(tmp_path):
         Cylinder(0.005, ends, 0.001),
         Capsule(0.005, ends),
     ]
-    others = [
-        replace(body.obstacles[0], shape=s, name=f"it {k}")
-        for k, s in enumerate(solids)
-    ]
+    others = [replace(body.obstacles[0], shape=s, name=f"it {k}") for k, s in enumerate(solids)]
     assert body.experiment_with_obstacles is not None
-    touching = body.experiment_with_obstacles.with_obstacles(
-        (*body.obstacles, *others)
-    )
+    touching = body.experiment_with_obstacles.with_obstacles((*body.obstacles, *others))
     several = replace(body, experiment_with_obstacles=touching)
     model = exported(several, "mujoco", tmp_path)
     geoms = ElementTree.parse(model / "body.xml").findall(".//geom")
-    assert [geom.get("type") for geom in geoms] == [
-        "plane",
-        "sphere",
-        "cylinder",
-        "capsule",
-    ]
+    assert [geom.get("type") for geom in geoms] == ["plane", "sphere", "cylinder", "capsule"]
     assert {geom.get("friction") for geom in geoms} == {"0.5 0 0"}
     told = json.loads((model / "identified.json").read_text())
     assert told["obstacles"][1]["shape"]["sphere_m"]["radius_m"] == 0.01
@@ -1291,12 +943,8 @@ SOLIDS = {
     "plane": Plane(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 0.0401])),
     "sphere": Sphere(0.02, np.array([0.02, 0.02, 0.0601])),
     "box": Cuboid(np.array([(0.01, 0.01, 0.0401), (0.03, 0.03, 0.06)]), 0.004),
-    "cylinder": Cylinder(
-        0.008, np.array([(0.02, 0.02, 0.0401), (0.02, 0.02, 0.06)]), 0.002
-    ),
-    "capsule": Capsule(
-        0.0099, np.array([(0.02, -0.01, 0.05), (0.02, 0.05, 0.05)])
-    ),
+    "cylinder": Cylinder(0.008, np.array([(0.02, 0.02, 0.0401), (0.02, 0.02, 0.06)]), 0.002),
+    "capsule": Capsule(0.0099, np.array([(0.02, -0.01, 0.05), (0.02, 0.05, 0.05)])),
 }
 
 
@@ -1312,42 +960,26 @@ def pressed_block(
         Obstacle(shape=shape, name=f"it {k}", friction=friction, poses=poses)  # pyright: ignore
         for k, shape in enumerate(shapes)
     ]
-    grasps = [
-        Grasp(nodes_where(block, 2, 0.0), PoseSequence.fixed()),
-        *pressing,
-    ]
+    grasps = [Grasp(nodes_where(block, 2, 0.0), PoseSequence.fixed()), *pressing]
     seen = vertex_markers(block, np.array([0]), t_s)
     whole = Experiment(block, t_s, grasps, seen, nuisance=IDEAL, kind="static")
     still = without_obstacles(whole)
-    values = {
-        "young_pa": 1e4,
-        "poisson": 0.3,
-        "gamma_r_s": 0.0,
-        "gamma_m_1_s": 0.0,
-    }
+    values = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
     theta = still.body.theta_from_values(values)
-    return IdentifiedBody(
-        "b", "good", (), {}, still.body, theta, still, None, whole
-    )
+    return IdentifiedBody("b", "good", (), {}, still.body, theta, still, None, whole)
 
 
 @pytest.mark.parametrize("name", SOLIDS)
 def test_facets_lie_on_the_surface_of_their_solid_and_look_out_of_it(name):
     solid, about_m = SOLIDS[name], np.array([0.02, 0.02, 0.02])
     facets = Facets.from_solid(solid, about_m, 0.1, tolerance_m=2e-5)
-    gap = ca.Function(
-        "gap", [place := ca.SX.sym("p", 3)], [solid.signed_distance(place)]
-    )
+    gap = ca.Function("gap", [place := ca.SX.sym("p", 3)], [solid.signed_distance(place)])
     corners = facets.points_m[facets.triangles]
     middles = corners.mean(axis=1)
     gaps = np.array(gap(np.vstack([corners.reshape(-1, 3), middles]).T))
     assert np.abs(gaps).max() < 3e-4 * (name != "plane") + 1e-9
-    normals = np.cross(
-        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    )
-    outside = (
-        middles + 1e-3 * normals / np.linalg.norm(normals, axis=1)[:, None]
-    )
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outside = middles + 1e-3 * normals / np.linalg.norm(normals, axis=1)[:, None]
     assert np.array(gap(outside.T)).min() > 5e-4
     assert float(np.array(gap(facets.points_m[-1])).squeeze()) < -1e-3
     seen = facets.facing(about_m[None])
@@ -1359,9 +991,7 @@ def test_facets_lie_on_the_surface_of_their_solid_and_look_out_of_it(name):
 @needs_ccx
 def test_calculix_is_pressed_with_the_same_force(tmp_path):
     body = pressed_block(SOLIDS["plane"], friction=0.2)
-    moved, force = verify_export(
-        body, "calculix", exported(body, "calculix", tmp_path)
-    )
+    moved, force = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
     assert moved.ours > 2.5e-3
     assert force.ours > 0.5
     assert abs(moved.compute_relative_difference()) < 5e-3
@@ -1373,10 +1003,7 @@ def test_a_body_of_which_only_a_force_was_measured_is_exported(tmp_path):
     assert body.experiment_with_obstacles is not None
     (tip,) = body.obstacles
     felt = replace(
-        tip,
-        wrench=Wrench(
-            body.experiment_with_obstacles.t_s, np.zeros((3, 6)), 0.01, 1.0
-        ),
+        tip, wrench=Wrench(body.experiment_with_obstacles.t_s, np.zeros((3, 6)), 0.01, 1.0)
     )
     whole = replace(
         body.experiment_with_obstacles,
@@ -1384,12 +1011,8 @@ def test_a_body_of_which_only_a_force_was_measured_is_exported(tmp_path):
         markers=None,
     )
     still = without_obstacles(whole)
-    np.testing.assert_array_equal(
-        still.is_prescribed([0.0])[0], body.is_prescribed
-    )
-    lone = replace(
-        body, experiment=still, body=still.body, experiment_with_obstacles=whole
-    )
+    np.testing.assert_array_equal(still.is_prescribed([0.0])[0], body.is_prescribed)
+    lone = replace(body, experiment=still, body=still.body, experiment_with_obstacles=whole)
     decks = [
         (exported(each, "calculix", tmp_path / str(k)) / "body.inp").read_text()
         for k, each in enumerate((body, lone))
@@ -1403,23 +1026,15 @@ def test_febio_gets_what_is_touched_as_rigid_facets(tmp_path):
     ids = [node.get("id") for node in model.iterfind("Mesh/Nodes/node")]
     assert ids == [str(k) for k in range(1, len(ids) + 1)]
     places = numbers_in(
-        " ".join(
-            n.text or "" for n in model.iterfind("Mesh/Nodes/node")
-        ).replace(",", " ")
+        " ".join(n.text or "" for n in model.iterfind("Mesh/Nodes/node")).replace(",", " ")
     )
     places = places.reshape(-1, 3)
     for k, pair in enumerate(model.iterfind("Mesh/SurfacePair")):
-        surfaces = {
-            each.get("name"): each for each in model.iterfind("Mesh/Surface")
-        }
+        surfaces = {each.get("name"): each for each in model.iterfind("Mesh/Surface")}
         wall = surfaces[pair.findtext("secondary", "")]
         corners = places[[indices_in(each.text) for each in wall]]
-        assert (
-            corners[..., 2].min() > 0.04 - 5e-5
-        )  # it is further out by half of the width
-        normals = np.cross(
-            corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        )
+        assert corners[..., 2].min() > 0.04 - 5e-5  # it is further out by half of the width
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         assert (normals[:, 2] < 0).any()
         cells = [
             numbers
@@ -1434,38 +1049,25 @@ def test_febio_gets_what_is_touched_as_rigid_facets(tmp_path):
         assert float(contact.findtext("fric_coeff", "")) == 0.2
         assert float(contact.findtext("penalty", "")) > 1e7
     down = model.findall("Rigid/rigid_bc[dof='z']/value")
-    assert [float(each.text or "") for each in down] == pytest.approx(
-        [-0.0014] * 2, abs=5e-5
-    )
+    assert [float(each.text or "") for each in down] == pytest.approx([-0.0014] * 2, abs=5e-5)
 
 
 def test_sofa_gets_planes_and_balls_and_says_what_else_there_is(tmp_path):
     body = pressed_block(*SOLIDS.values(), friction=0.2)
     scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn")
-    plane, ball = (
-        scene.find(".//PlaneForceField"),
-        scene.find(".//SphereForceField"),
-    )
+    plane, ball = (scene.find(".//PlaneForceField"), scene.find(".//SphereForceField"))
     assert plane is not None
     assert ball is not None
-    np.testing.assert_allclose(
-        numbers_in(plane.get("normal")), (0, 0, -1), atol=1e-12
-    )
+    np.testing.assert_allclose(numbers_in(plane.get("normal")), (0, 0, -1), atol=1e-12)
     # Their surface is as far out as that at which the pressure begins: by half of the width.
     out_m = faceted_obstacles(body)[0].width_m / 2
     assert out_m > 1e-6
     assert float(plane.get("d", "")) == pytest.approx(-0.0386 + out_m, rel=1e-9)
-    np.testing.assert_allclose(
-        numbers_in(ball.get("center")), (0.02, 0.02, 0.0586)
-    )
+    np.testing.assert_allclose(numbers_in(ball.get("center")), (0.02, 0.02, 0.0586))
     ball_m = SOLIDS["sphere"]
     assert isinstance(ball_m, Sphere)
-    assert float(ball.get("radius", "")) == pytest.approx(
-        ball_m.radius_m + out_m, rel=1e-9
-    )
-    told = json.loads((tmp_path / "sofa" / "identified.json").read_text())[
-        "not_expressed"
-    ]
+    assert float(ball.get("radius", "")) == pytest.approx(ball_m.radius_m + out_m, rel=1e-9)
+    told = json.loads((tmp_path / "sofa" / "identified.json").read_text())["not_expressed"]
     for said in (
         "it 0: friction is not exported",
         "it 2: an obstacle of the kind",
@@ -1483,26 +1085,15 @@ def test_usd_gets_solids_their_motion_and_friction(tmp_path):
         solid = stage.GetPrimAtPath(f"/World/Obstacle_{k}/Shape")
         assert solid.GetTypeName() == {"box": "Cube"}.get(name, name.title())
         assert solid.HasAPI(UsdPhysics.CollisionAPI)
-        material, _ = UsdShade.MaterialBindingAPI(solid).ComputeBoundMaterial(
-            "physics"
-        )
-        assert UsdPhysics.MaterialAPI(
-            material
-        ).GetDynamicFrictionAttr().Get() == pytest.approx(0.2)
+        material, _ = UsdShade.MaterialBindingAPI(solid).ComputeBoundMaterial("physics")
+        assert UsdPhysics.MaterialAPI(material).GetDynamicFrictionAttr().Get() == pytest.approx(0.2)
         # USD's matrices act on rows; the last row is where its middle is.
-        at = [
-            UsdGeom.Xformable(solid).ComputeLocalToWorldTransform(t)
-            for t in (0.0, 1.0)
-        ]
+        at = [UsdGeom.Xformable(solid).ComputeLocalToWorldTransform(t) for t in (0.0, 1.0)]
         assert at[1][3][2] - at[0][3][2] == pytest.approx(-0.0015)
     box = np.array(
-        UsdGeom.Xformable(
-            stage.GetPrimAtPath("/World/Obstacle_3/Shape")
-        ).GetLocalTransformation()
+        UsdGeom.Xformable(stage.GetPrimAtPath("/World/Obstacle_3/Shape")).GetLocalTransformation()
     )
-    np.testing.assert_allclose(
-        np.abs(box[:3, :3]), np.diag([0.01, 0.01, 0.00995]), atol=1e-9
-    )
+    np.testing.assert_allclose(np.abs(box[:3, :3]), np.diag([0.01, 0.01, 0.00995]), atol=1e-9)
     capsule = UsdGeom.Capsule(stage.GetPrimAtPath("/World/Obstacle_5/Shape"))
     assert capsule.GetHeightAttr().Get() == pytest.approx(0.06)
     assert capsule.GetRadiusAttr().Get() == pytest.approx(0.0099)
@@ -1511,9 +1102,7 @@ def test_usd_gets_solids_their_motion_and_friction(tmp_path):
 @needs_mujoco
 def test_mujoco_has_the_frequency_of_other_energies(tmp_path):
     body = held_bar("neo-hookean")
-    (frequency,) = verify_export(
-        body, "mujoco", exported(body, "mujoco", tmp_path)
-    )
+    (frequency,) = verify_export(body, "mujoco", exported(body, "mujoco", tmp_path))
     assert abs(frequency.compute_relative_difference()) < 0.03
 
 
@@ -1529,14 +1118,8 @@ def test_newton_says_where_obstacles_touch_differently(tmp_path):
     unlike = replace(alike, experiment_with_obstacles=whole)
     for body, count in ((alike, 0), (unlike, 1)):
         folder = exported(body, "newton", tmp_path / str(count))
-        told = json.loads((folder / "identified.json").read_text())[
-            "not_expressed"
-        ]
-        said = [
-            each
-            for each in told
-            if "obstacles differ in friction, but a soft body" in each
-        ]
+        told = json.loads((folder / "identified.json").read_text())["not_expressed"]
+        said = [each for each in told if "obstacles differ in friction, but a soft body" in each]
         assert len(said) == count
         numbers = json.loads((folder / "body.json").read_text())
         assert numbers["contact_mu"] == 0.2
@@ -1561,13 +1144,9 @@ def test_newton_is_pressed_alike_from_the_stage_and_has_all_solids(tmp_path):
     (moved,) = verify_export(body, "usd", exported(body, "usd", tmp_path))
     assert moved.ours > 1e-3
     assert abs(moved.compute_relative_difference()) < 0.02
-    folder = exported(
-        pressed_block(*SOLIDS.values(), friction=0.2), "newton", tmp_path
-    )
+    folder = exported(pressed_block(*SOLIDS.values(), friction=0.2), "newton", tmp_path)
     build = runpy.run_path(str(folder / "body.py"))
     model = build["model"]("cpu")
-    kinds = [
-        newton.GeoType(kind).name.lower() for kind in model.shape_type.numpy()
-    ]
+    kinds = [newton.GeoType(kind).name.lower() for kind in model.shape_type.numpy()]
     assert kinds == list(SOLIDS)
     np.testing.assert_allclose(model.shape_material_mu.numpy(), 0.2)

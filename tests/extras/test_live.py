@@ -40,23 +40,14 @@ from collocation_sysid.extras.live import (
     estimator,
 )
 from collocation_sysid.extras.live.frame_buffer import FrameBuffer
-from collocation_sysid.extras.live.sources import (
-    paced_frames,
-    receive_datagrams,
-    update_as_json,
-)
+from collocation_sysid.extras.live.sources import paced_frames, receive_datagrams, update_as_json
 from collocation_sysid.extras.live.time_budget import TimeBudget
 from collocation_sysid.extras.live.window_pass import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem.gripper_transforms import gripper_transforms
 from collocation_sysid.program import streaming_model, streaming_sweep
-from collocation_sysid.recording import (
-    Markers,
-    Nuisance,
-    PoseSequence,
-    read_poses,
-)
+from collocation_sysid.recording import Markers, Nuisance, PoseSequence, read_poses
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 TWENTY = 20 * "9"
@@ -64,15 +55,10 @@ TWENTY = 20 * "9"
 
 def residuals(track: WindowPass, p: np.ndarray) -> list[np.ndarray]:
     """Of all readings, to first order at p."""
-    return [
-        said.evaluate_at(track.model.transformed(p))
-        for said in track.list_residuals()
-    ]
+    return [said.evaluate_at(track.model.transformed(p)) for said in track.list_residuals()]
 
 
-def with_time_every(
-    count: int, live: LiveEstimator, frames: list[Frame]
-) -> LiveUpdate:
+def with_time_every(count: int, live: LiveEstimator, frames: list[Frame]) -> LiveUpdate:
     """Take frames, and at every so manieth all the passes that are wanted."""
     for number, frame in enumerate(frames, start=1):
         live.budget_s = 1e-9 if number % count else np.inf
@@ -82,15 +68,8 @@ def with_time_every(
 
 OF_THE_USER = Nuisance.none(
     own=[
-        cs.NuisanceRow(
-            "growth",
-            "1",
-            0.02,
-            reading=lambda y, k, t_s, data: (1 + k * t_s) * y,
-        ),
-        cs.NuisanceRow(
-            "clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s
-        ),
+        cs.NuisanceRow("growth", "1", 0.02, reading=lambda y, k, t_s, data: (1 + k * t_s) * y),
+        cs.NuisanceRow("clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s),
     ]
 )
 
@@ -100,35 +79,22 @@ OF_THE_USER = Nuisance.none(
     [(IDEAL, 0.0), (IDEAL, 10.0), (Nuisance(), 0.0), (OF_THE_USER, 0.0)],
     ids=["ideal", "in dense air", "as in a laboratory", "a user's own"],
 )
-def test_frames_one_by_one_say_what_the_batch_says(
-    nuisance, air_density_kg_m3, monkeypatch
-):
+def test_frames_one_by_one_say_what_the_batch_says(nuisance, air_density_kg_m3, monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
-    problem, count = (
-        swing(nuisance=nuisance, air_density_kg_m3=air_density_kg_m3),
-        30,
-    )
+    problem, count = (swing(nuisance=nuisance, air_density_kg_m3=air_density_kg_m3), 30)
     live = streamed(problem, count)
     collocation = problem.collocation()
     horizon, p = (
-        Horizon(
-            collocation, [count], prior=streaming_model.WEAK_PRIOR_DEVIATION
-        ),
+        Horizon(collocation, [count], prior=streaming_model.WEAK_PRIOR_DEVIATION),
         collocation.guess_p,
     )
     reached, failure = horizon.simulate(p)
     assert failure is None
     point = horizon.evaluate(
-        p,
-        [
-            each.x + each.step
-            for each in horizon.evaluate(p, reached).trajectories
-        ],
+        p, [each.x + each.step for each in horizon.evaluate(p, reached).trajectories]
     )
     flat = live.model.transformed(p)
-    rows = np.column_stack(
-        [point.fit.jacobian, point.fit.residual - point.fit.jacobian @ flat]
-    )
+    rows = np.column_stack([point.fit.jacobian, point.fit.residual - point.fit.jacobian @ flat])
     batch = rows.T @ rows
     ours = normal_equations(live.first_pass.sweep.information.triangle)
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
@@ -143,10 +109,7 @@ def unknown(problem: cs.Problem) -> cs.Problem:
     (seen,) = problem.experiments
     known = seen.markers
     markers = Markers(known.t_s, known.positions_m, known.sigma_m, known.names)
-    free = {
-        name: cs.Unknown()
-        for name in ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
-    }
+    free = {name: cs.Unknown() for name in ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")}
     return cs.Problem([replace(seen, markers=markers)], free, substeps=1)
 
 
@@ -164,10 +127,7 @@ def test_when_frames_end_the_estimate_settles_where_the_batch_ends(problem):
     assert update is not None
     for name, estimate in update.estimates.items():
         known = batch.estimates[name]
-        assert (
-            abs(estimate.value - known.value)
-            < 1e-4 * known.statistical_std_error
-        )
+        assert abs(estimate.value - known.value) < 1e-4 * known.statistical_std_error
         assert estimate.statistical_std_error == pytest.approx(
             known.statistical_std_error, rel=1e-4
         )
@@ -191,37 +151,25 @@ def test_it_settles_at_the_batch_of_what_was_not_left_out():
     settled = live.finish()
     whole = replace(problem, experiments=[cs.with_markers(seen, tracks)])
     batch = cs.run(whole, seek_causes=False)
-    assert any(
-        "8 % of the marker samples are outliers" in why
-        for why in settled.trust.reasons
-    )
+    assert any("8 % of the marker samples are outliers" in why for why in settled.trust.reasons)
     for name, estimate in settled.estimates.items():
         assert estimate.value == pytest.approx(batch.parameters[name], rel=1e-6)
 
 
 @pytest.mark.parametrize("hidden", ["the start", "the grid"])
 def test_without_all_it_settles_within_some_passes(hidden, monkeypatch):
-    problem, options = (
-        swing(),
-        replace(NO_TIME, window_s=0.2 if hidden == "the start" else 3.0),
-    )
+    problem, options = (swing(), replace(NO_TIME, window_s=0.2 if hidden == "the start" else 3.0))
     live = LiveEstimator(problem, options)
     for frame in frames_of(problem, live):
         late_s = 2e-3 if hidden == "the grid" and frame.t_s > 0.1 else 0.0
         live.process_frame(replace(frame, t_s=frame.t_s + late_s))
     settled = live.finish()
-    assert settled.estimates["mu_pa"].value == pytest.approx(
-        TRUTH["mu_pa"], rel=0.2
-    )
+    assert settled.estimates["mu_pa"].value == pytest.approx(TRUTH["mu_pa"], rel=0.2)
     assert live.rows is None
     live.p = live.p + 0.5
     monkeypatch.setattr(estimator, "FINAL_PASSES", 1)
     monkeypatch.setattr(estimator, "REPEAT_DISTANCE", 0.0)
-    assert (
-        0
-        < live.finish().relinearised
-        <= len(live.log) + streaming_sweep.ROWS_PER_CHUNK
-    )
+    assert 0 < live.finish().relinearised <= len(live.log) + streaming_sweep.ROWS_PER_CHUNK
 
 
 def test_a_pass_that_turns_goes_on_to_first_order_and_says_so(monkeypatch):
@@ -232,8 +180,7 @@ def test_a_pass_that_turns_goes_on_to_first_order_and_says_so(monkeypatch):
     for size in (1e-3, 5e-4):
         p = live.first_pass.sweep.p + size
         whole, turned = (
-            WindowPass(live.model, at, live.prior, 99)
-            for at in (p, live.first_pass.sweep.p)
+            WindowPass(live.model, at, live.prior, 99) for at in (p, live.first_pass.sweep.p)
         )
         for number, row in enumerate(live.log):
             if number == half:
@@ -244,9 +191,7 @@ def test_a_pass_that_turns_goes_on_to_first_order_and_says_so(monkeypatch):
         assert turned.last_relinearised_row == half
         ends = (each.blocks[-1].stored_rows[-1].x for each in (turned, whole))
         errors.append(np.abs(np.subtract(*ends)).max())
-        assert_same_information(
-            turned.sweep.information, whole.sweep.information, atol=1e-2
-        )
+        assert_same_information(turned.sweep.information, whole.sweep.information, atol=1e-2)
     assert 0 < errors[1] < 0.3 * errors[0] < 1e-5  # of second order
 
 
@@ -259,17 +204,12 @@ def test_two_rows_passed_again_a_frame_follow_the_batch(scheme):
     solution = cs.solve(problem, ReducedSpace())
     batch = uncertainty_at(solution.collocation, solution.z).estimates
     for name, estimate in update.estimates.items():
-        assert (
-            abs(estimate.value - batch[name].value)
-            < 0.5 * batch[name].statistical_std_error
-        )
+        assert abs(estimate.value - batch[name].value) < 0.5 * batch[name].statistical_std_error
 
 
 def test_rows_are_begun_that_end_in_time():
     budget = TimeBudget.from_times(one_s=2.0, many_s=9.0, many=8)
-    assert [
-        budget.affordable_steps(left_s) for left_s in (0.0, 1.9, 2.1, 4.1)
-    ] == [0, 0, 1, 3]
+    assert [budget.affordable_steps(left_s) for left_s in (0.0, 1.9, 2.1, 4.1)] == [0, 0, 1, 3]
     budget.record_steps(3, 8.0)
     assert budget.affordable_steps(4.1) == 1
     for _ in range(9):
@@ -282,9 +222,7 @@ def test_rows_leave_time_for_what_follows_them():
     budget = TimeBudget.from_times(one_s=2.0, many_s=9.0, many=8)
     budget.record_remainder(1.0)
     budget.record_remainder(0.2)
-    assert [
-        budget.affordable_steps(left_s) for left_s in (0.9, 2.9, 3.1, 5.1)
-    ] == [0, 0, 1, 3]
+    assert [budget.affordable_steps(left_s) for left_s in (0.9, 2.9, 3.1, 5.1)] == [0, 0, 1, 3]
     for _ in range(60):
         budget.record_remainder(0.0)
     assert budget.affordable_steps(2.5) == 1
@@ -299,9 +237,7 @@ def test_a_stream_looks_through_nothing_old_for_garbage(tiny, monkeypatch):
         return take(live, frame)
 
     monkeypatch.setattr(LiveEstimator, "process_frame", counted)
-    assert (
-        run_command("replay", "problem.toml", "--rate", 0, "--json").code == 0
-    )
+    assert run_command("replay", "problem.toml", "--rate", 0, "--json").code == 0
     assert min(frozen) > 10_000
     assert gc.get_freeze_count() == 0
 
@@ -310,32 +246,20 @@ def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
-    track, log, whole = (
-        live.first_pass,
-        list(live.log),
-        live.first_pass.sweep.information,
-    )
+    track, log, whole = (live.first_pass, list(live.log), live.first_pass.sweep.information)
     track.relinearise_at(track.sweep.p)
     left = track.drop_oldest_block()
     assert 0 < left < len(log)
     assert len(track.linearisation_points_from(0)) == 2
     assert track.last_relinearised_row == len(log) - left
     assert track.sweep.information is whole
-    again = WindowPass(
-        live.model,
-        track.sweep.p,
-        track.prior,
-        live._block_rows,
-        track,
-    )
+    again = WindowPass(live.model, track.sweep.p, track.prior, live._block_rows, track)
     for row in log[left:]:
         again.repeat_rows([row])
     assert_same_information(again.sweep.information, whole, atol=1e-8)
 
 
-def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(
-    monkeypatch,
-):
+def test_a_pass_from_within_the_window_moves_its_first_state_along_its_slopes(monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
@@ -372,9 +296,7 @@ def test_residuals_follow_damping_by_mass_that_is_wrong_by_three():
     assert np.linalg.norm(off) < 0.03 * np.linalg.norm(change)
 
 
-def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(
-    monkeypatch,
-):
+def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
@@ -382,10 +304,7 @@ def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(
     for size in (1e-3, 5e-4):
         p = live.first_pass.sweep.p + size * way
         whole, together = (
-            WindowPass(
-                live.model, p, live.prior, live._block_rows, live.first_pass
-            )
-            for _ in "ab"
+            WindowPass(live.model, p, live.prior, live._block_rows, live.first_pass) for _ in "ab"
         )
         for row in live.log:
             whole.repeat_rows([row])
@@ -399,19 +318,12 @@ def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(
         assert together.sweep.needs_another_pass()
         ends = (t.blocks[-1].stored_rows[-1].x for t in (together, whole))
         errors.append(np.abs(np.subtract(*ends)).max())
-        assert (
-            together.sweep.information.row_count
-            == whole.sweep.information.row_count
-        )
-        assert_same_information(
-            together.sweep.information, whole.sweep.information, atol=1e-3
-        )
+        assert together.sweep.information.row_count == whole.sweep.information.row_count
+        assert_same_information(together.sweep.information, whole.sweep.information, atol=1e-3)
     assert 0 < errors[1] < 0.3 * errors[0] < 1e-6  # of second order
 
 
-@pytest.mark.parametrize(
-    ("scheme", "near"), [("midpoint", 1e-4), ("bdf2", 3e-4)]
-)
+@pytest.mark.parametrize(("scheme", "near"), [("midpoint", 1e-4), ("bdf2", 3e-4)])
 def test_a_row_far_from_its_guess_is_solved_alone(scheme, near):
     problem = replace(swing(), scheme=scheme)
     live = streamed(problem)
@@ -426,10 +338,7 @@ def test_a_row_far_from_its_guess_is_solved_alone(scheme, near):
     for row in live.log:
         whole.repeat_rows([row])
     assert (
-        np.abs(
-            again.blocks[-1].stored_rows[-1].x
-            - whole.blocks[-1].stored_rows[-1].x
-        ).max()
+        np.abs(again.blocks[-1].stored_rows[-1].x - whole.blocks[-1].stored_rows[-1].x).max()
         < near * live.model.body_size_m
     )
 
@@ -439,17 +348,12 @@ def test_a_stiffness_that_is_wrong_by_ten_is_found():
     far = GUESS.with_guess({"lambda_pa": 4000.0, "mu_pa": 3000.0})
     live = LiveEstimator(cs.Problem(problem.experiments, far), NO_TIME)
     update = with_time_every(6, live, frames_of(problem, live))
-    assert update.estimates["mu_pa"].value == pytest.approx(
-        TRUTH["mu_pa"], rel=0.1
-    )
+    assert update.estimates["mu_pa"].value == pytest.approx(TRUTH["mu_pa"], rel=0.1)
 
 
 def test_parameters_without_a_guess_are_sought():
     problem = swing()
-    free = {
-        name: cs.Unknown()
-        for name in ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
-    }
+    free = {name: cs.Unknown() for name in ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")}
     live = LiveEstimator(cs.Problem(problem.experiments, free), NO_TIME)
     assert live.search is not None
     update = with_time_every(6, live, frames_of(problem, live))
@@ -462,33 +366,22 @@ def test_parameters_without_a_guess_are_sought():
 
 def test_doubled_late_unordered_and_dropped_frames_are_told_and_change_little():
     problem = swing()
-    whole, live = (
-        LiveEstimator(problem, NO_TIME),
-        LiveEstimator(problem, NO_TIME),
-    )
+    whole, live = (LiveEstimator(problem, NO_TIME), LiveEstimator(problem, NO_TIME))
     frames = frames_of(problem, live)
     for frame in frames:
         expected = whole.process_frame(frame)
     order = [*range(12), 11, 13, 12, *range(14, 20), *range(22, 37), 5]
-    notes = [
-        note for k in order for note in live.process_frame(frames[k]).notes
-    ]
-    assert (
-        live.counts["doubled"] == 1 + 1
-    )  # one twice, and one long ago that was there
+    notes = [note for k in order for note in live.process_frame(frames[k]).notes]
+    assert live.counts["doubled"] == 1 + 1  # one twice, and one long ago that was there
     assert live.counts["unordered"] == 1
     assert live.counts["dropped"] == 1 + 2  # one of them came late
     assert any("is interpolated there" in note for note in notes)
     assert any("late" in note for note in notes)
     assert live.first_pass.rows == whole.first_pass.rows
-    for name, estimate in live._estimates_at(
-        live.first_pass.sweep.information, live.p
-    ).items():
+    for name, estimate in live._estimates_at(live.first_pass.sweep.information, live.p).items():
         error = expected.estimates[name].statistical_std_error
         if error is not None:
-            assert (
-                abs(estimate.value - expected.estimates[name].value) < 2 * error
-            )
+            assert abs(estimate.value - expected.estimates[name].value) < 2 * error
 
 
 def test_a_frame_that_is_too_late_is_left_out():
@@ -512,11 +405,7 @@ def test_missing_markers_say_nothing():
         tracks = frame.tracks_m.copy()
         if seen % 3:
             tracks[: 1 + seen % 2] = np.nan
-        before = (
-            live.first_pass.sweep.information.row_count
-            if live.first_pass
-            else stated
-        )
+        before = live.first_pass.sweep.information.row_count if live.first_pass else stated
         live.process_frame(replace(frame, tracks_m=tracks))
         found = live.first_pass.sweep.information.row_count - before
         assert found == np.isfinite(tracks).sum()
@@ -530,10 +419,7 @@ def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_told():
     for frame in [*frames[:10], *blind[10:13], frames[13]]:
         update = live.process_frame(frame)
     assert live.first_pass.rows == 14
-    assert (
-        live.first_pass.condense_measurements().row_count
-        == 14 * frames[0].tracks_m.size
-    )
+    assert live.first_pass.condense_measurements().row_count == 14 * frames[0].tracks_m.size
     for frame in blind[14:30]:
         update = live.process_frame(frame)
     assert update.trust.verdict == "doubtful"
@@ -552,11 +438,7 @@ def test_frames_whose_clock_was_set_back_begin_anew():
     frames = frames_of(problem, live)
     for frame in frames[:20]:
         live.process_frame(replace(frame, t_s=frame.t_s + 100.0))
-    notes = [
-        note
-        for frame in frames[:20]
-        for note in live.process_frame(frame).notes
-    ]
+    notes = [note for frame in frames[:20] for note in live.process_frame(frame).notes]
     assert sum("too late" in note for note in notes) == 10
     assert live.counts["begun anew"] == 1
     assert live.first_pass.rows == 10
@@ -567,9 +449,7 @@ def test_markers_without_poses_are_not_kept():
     live = LiveEstimator(problem, NO_TIME)
     frames = frames_of(problem, live)
     for k in range(40):
-        update = live.process_frame(
-            replace(frames[0], t_s=-1.0 + 0.01 * k, pose=None)
-        )
+        update = live.process_frame(replace(frames[0], t_s=-1.0 + 0.01 * k, pose=None))
         assert update.trust.verdict == "doubtful"
         assert not live.intake._waiting
     live.process_frame(frames[0])
@@ -584,20 +464,13 @@ def test_frames_at_rest_tell_nothing_of_damping_and_the_verdict_says_so():
     first = frames_of(problem, live)[0]
     noise = np.random.default_rng(3)
     for k in range(12):
-        tracks = first.tracks_m + noise.normal(
-            scale=NOISE_M, size=first.tracks_m.shape
-        )
-        update = live.process_frame(
-            replace(first, t_s=0.01 * k, tracks_m=tracks)
-        )
+        tracks = first.tracks_m + noise.normal(scale=NOISE_M, size=first.tracks_m.shape)
+        update = live.process_frame(replace(first, t_s=0.01 * k, tracks_m=tracks))
     damping = update.estimates["gamma_r_s"]
     assert damping.statistical_std_error is None
     assert damping.statistical95[1] > 100 * damping.statistical95[0]
     assert update.trust.verdict != "good"
-    assert any(
-        "gamma_r_s is not known yet" in reason
-        for reason in update.trust.reasons
-    )
+    assert any("gamma_r_s is not known yet" in reason for reason in update.trust.reasons)
 
 
 def test_a_track_that_jumps_is_left_out():
@@ -613,8 +486,7 @@ def test_a_track_that_jumps_is_left_out():
     update = live.process_frame(replace(frames[30], tracks_m=jumped))
     name = live.names[2]
     assert any(
-        note.startswith("markers ignored in this frame")
-        and note.endswith(f": {name}")
+        note.startswith("markers ignored in this frame") and note.endswith(f": {name}")
         for note in update.notes
     )
     assert live.counts["wild"] == 1
@@ -623,10 +495,7 @@ def test_a_track_that_jumps_is_left_out():
 @pytest.mark.parametrize("number", [0, 4])
 def test_what_is_nowhere_near_the_body_or_the_last_grasp_is_left_out(number):
     problem = swing()
-    live, without = (
-        LiveEstimator(problem, NO_TIME),
-        LiveEstimator(problem, NO_TIME),
-    )
+    live, without = (LiveEstimator(problem, NO_TIME), LiveEstimator(problem, NO_TIME))
     for k, frame in enumerate(frames_of(problem, live)[:12]):
         bad, blind = frame, frame
         if k == number:
@@ -641,14 +510,11 @@ def test_what_is_nowhere_near_the_body_or_the_last_grasp_is_left_out(number):
             bad = replace(frame, pose=(places_m + 1e6, turns))
         said, expected = live.process_frame(bad), without.process_frame(blind)
         ignored = any(
-            note.startswith("markers ignored in this frame")
-            and note.endswith(": m2")
+            note.startswith("markers ignored in this frame") and note.endswith(": m2")
             for note in said.notes
         )
         assert ignored == (k == number)
-        assert any(
-            "implausibly far from the last" in note for note in said.notes
-        ) == (k == 6)
+        assert any("implausibly far from the last" in note for note in said.notes) == (k == 6)
         assert said.estimates == expected.estimates
 
 
@@ -675,9 +541,7 @@ def test_rows_between_frames_take_poses_from_a_cubic():
     for k, t in enumerate(t_s):
         if k != 5:
             rows += intake.add_frame(
-                t,
-                (place(t), np.array([[0, 0, 0, 1.0]])),
-                tracks_m=np.zeros((1, 3)),
+                t, (place(t), np.array([[0, 0, 0, 1.0]])), tracks_m=np.zeros((1, 3))
             ).rows
     found = np.array([row.poses[0][1][0] for row in rows])
     assert len(found) == 15
@@ -696,19 +560,13 @@ def test_memory_is_bounded():
         sizes.append(
             (
                 len(live.log),
-                sum(
-                    len(b.stored_rows) + len(b.residuals)
-                    for b in live.first_pass.blocks
-                ),
+                sum(len(b.stored_rows) + len(b.residuals) for b in live.first_pass.blocks),
             )
         )
     most = 3 * live._blocks * live._block_rows
     assert max(logged for logged, _ in sizes) <= most
     assert max(kept for _, kept in sizes) <= 2 * most
-    assert (
-        live.first_pass.sweep.information.triangle.shape
-        == (len(live.p) + 1,) * 2
-    )
+    assert live.first_pass.sweep.information.triangle.shape == (len(live.p) + 1,) * 2
     assert len(live.intake._waiting) <= 4
     assert len(live.first_pass.sweep.read) <= 30
 
@@ -723,20 +581,12 @@ def felt(bias_m_s2: float = 0.3) -> cs.Problem:
     seen = replace(seen, markers=replace(seen.markers, sigma_m=1e-3))
     inner = np.linspace(seen.t_s[0] + 1e-3, seen.t_s[-1], 2 * len(seen.t_s))
     made = instrumented(seen, accelerometer(inner), strain_gauge(seen.t_s))
-    accelerations, strains = cs.simulate(
-        made, TRUTH, "midpoint", substeps=1
-    ).custom_sensor_values
+    accelerations, strains = cs.simulate(made, TRUTH, "midpoint", substeps=1).custom_sensor_values
     rng = np.random.default_rng(2)
-    accelerations = (
-        accelerations
-        + [0, 0, bias_m_s2]
-        + 0.05 * rng.normal(size=(len(inner), 3))
-    )
+    accelerations = accelerations + [0, 0, bias_m_s2] + 0.05 * rng.normal(size=(len(inner), 3))
     accelerations[5, 1] = accelerations[7] = np.nan
     strains = strains + 1e-4 * rng.normal(size=strains.shape)
-    return cs.Problem(
-        [cs.with_readings(made, [accelerations, strains])], GUESS, substeps=1
-    )
+    return cs.Problem([cs.with_readings(made, [accelerations, strains])], GUESS, substeps=1)
 
 
 def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
@@ -752,24 +602,15 @@ def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
     whole = cs.Problem([cs.with_readings(seen, taken)], GUESS)
     collocation = whole.collocation()
     horizon, p = (
-        Horizon(
-            collocation, [count], prior=streaming_model.WEAK_PRIOR_DEVIATION
-        ),
+        Horizon(collocation, [count], prior=streaming_model.WEAK_PRIOR_DEVIATION),
         collocation.guess_p,
     )
     reached, _ = horizon.simulate(p)
     point = horizon.evaluate(p, reached)
-    point = horizon.evaluate(
-        p, [each.x + each.step for each in point.trajectories]
-    )
+    point = horizon.evaluate(p, [each.x + each.step for each in point.trajectories])
     flat = live.model.transformed(p)
-    rows = np.column_stack(
-        [point.fit.jacobian, point.fit.residual - point.fit.jacobian @ flat]
-    )
-    batch, ours = (
-        rows.T @ rows,
-        normal_equations(live.first_pass.sweep.information.triangle),
-    )
+    rows = np.column_stack([point.fit.jacobian, point.fit.residual - point.fit.jacobian @ flat])
+    batch, ours = (rows.T @ rows, normal_equations(live.first_pass.sweep.information.triangle))
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
 
@@ -785,17 +626,9 @@ def test_truth_and_what_a_chip_does_not_know_of_itself_are_found_from_frames():
     for frame in frames_of(problem, live):
         without = alone.process_frame(replace(frame, instrument_samples=()))
     for name, estimate in update.estimates.items():
-        assert (
-            abs(estimate.value - TRUTH[name])
-            < 4 * estimate.statistical_std_error
-        )
-        assert (
-            estimate.statistical_std_error
-            < without.estimates[name].statistical_std_error
-        )
-    bias = (
-        live.p[live.model.collocation.nq :] * live.model.segment.nuisance.scales
-    )
+        assert abs(estimate.value - TRUTH[name]) < 4 * estimate.statistical_std_error
+        assert estimate.statistical_std_error < without.estimates[name].statistical_std_error
+    bias = live.p[live.model.collocation.nq :] * live.model.transcription.nuisance.scales
     assert bias[0] == pytest.approx(0.3, abs=0.05)
     settled, batch = live.finish(), cs.run(problem, seek_causes=False)
     for name, estimate in settled.estimates.items():
@@ -817,12 +650,8 @@ def test_truth_and_what_a_chip_does_not_know_of_itself_are_found_from_frames():
 )
 def test_frames_bring_readings_with_times_of_their_own(given, expected):
     reader = FrameReader([1], ["a"], gauges=felt().experiments[0].readings)
-    found = reader.read(
-        f'{{"t_s": 1.0, "readings": {given}}}'
-    ).instrument_samples
-    assert [(number, t_s) for number, t_s, _ in found] == [
-        each[:2] for each in expected
-    ]
+    found = reader.read(f'{{"t_s": 1.0, "readings": {given}}}').instrument_samples
+    assert [(number, t_s) for number, t_s, _ in found] == [each[:2] for each in expected]
     for (*_, values), (*_, numbers) in zip(found, expected, strict=True):
         np.testing.assert_array_equal(values, numbers)
 
@@ -830,13 +659,8 @@ def test_frames_bring_readings_with_times_of_their_own(given, expected):
 def test_tables_of_frames_have_readings_in_their_columns():
     reader = FrameReader([1], ["a"], gauges=felt().experiments[0].readings)
     names = [f"accelerometer_{k}" for k in (1, 2, 3)]
-    assert (
-        reader.read(",".join(["t_s,x_m,y_m,z_m,qx,qy,qz,qw", *names, "foil"]))
-        is None
-    )
-    ((number, t_s, values),) = reader.read(
-        "1,1,2,3,0,0,0,1,0.5,,0.7,"
-    ).instrument_samples
+    assert reader.read(",".join(["t_s,x_m,y_m,z_m,qx,qy,qz,qw", *names, "foil"])) is None
+    ((number, t_s, values),) = reader.read("1,1,2,3,0,0,0,1,0.5,,0.7,").instrument_samples
     assert (number, t_s) == (1, 1.0)
     np.testing.assert_array_equal(values, [0.5, np.nan, 0.7])
 
@@ -844,18 +668,9 @@ def test_tables_of_frames_have_readings_in_their_columns():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (
-            '{"chip": 1}',
-            "found a reading 'chip'; expected one of accelerometer, foil",
-        ),
-        (
-            '{"foil": [1, 2]}',
-            "the reading 'foil': found 2 numbers; expected 1 numbers",
-        ),
-        (
-            '{"foil": "much"}',
-            "the reading 'foil': found 'much'; expected 1 numbers",
-        ),
+        ('{"chip": 1}', "found a reading 'chip'; expected one of accelerometer, foil"),
+        ('{"foil": [1, 2]}', "the reading 'foil': found 2 numbers; expected 1 numbers"),
+        ('{"foil": "much"}', "the reading 'foil': found 'much'; expected 1 numbers"),
         (
             '{"foil": {"t_s": 1}}',
             "a sample of the reading 'foil' has the keys 't_s'; expected t_s and values",
@@ -876,9 +691,7 @@ def test_readings_that_are_none_are_told_with_their_line(given, said):
 def test_problems_that_cannot_be_live_are_refused_in_words():
     problem = swing()
     hung = problem.experiments[0]
-    still = replace(
-        hung, grasps=[replace(hung.grasps[0], poses=PoseSequence.fixed())]
-    )
+    still = replace(hung, grasps=[replace(hung.grasps[0], poses=PoseSequence.fixed())])
     for changed, said in (
         ([still], "never move"),
         ([hung, replace(hung, name="again")], "2 experiments"),
@@ -894,10 +707,7 @@ def test_problems_that_cannot_be_live_are_refused_in_words():
         (dict(t_s=0.0, pose=np.eye(3), markers=None), "4 × 4"),
         (dict(t_s=0.0, pose=([0, 0, 0], [0, 0, 0, 2]), markers=None), "norm"),
         (dict(t_s=0.0, pose=None, markers={"nobody": [0, 0, 0]}), "nobody"),
-        (
-            dict(t_s=0.0, pose=None, markers=np.zeros((1, 3))),
-            "expected 9 × 3 numbers",
-        ),
+        (dict(t_s=0.0, pose=None, markers=np.zeros((1, 3))), "expected 9 × 3 numbers"),
     ],
 )
 def test_what_is_no_frame_is_refused_and_changes_nothing(given, said):
@@ -913,13 +723,8 @@ def test_what_is_no_frame_is_refused_and_changes_nothing(given, said):
 
 def test_frames_are_read_from_json_and_from_tables():
     of_json = FrameReader([1], ["a", "b"])
-    line = {
-        "t_s": 1,
-        "pose": {"position_m": [1, 2, 3], "quaternion_xyzw": [0, 0, 0, 1]},
-    }
-    frame = of_json.read(
-        json.dumps(line | {"markers": {"b": [4, 5, 6], "a": None}})
-    )
+    line = {"t_s": 1, "pose": {"position_m": [1, 2, 3], "quaternion_xyzw": [0, 0, 0, 1]}}
+    frame = of_json.read(json.dumps(line | {"markers": {"b": [4, 5, 6], "a": None}}))
     of_rows = FrameReader([1], ["a", "b"])
     header = "t_s,x_m,y_m,z_m,qx,qy,qz,qw,a_x,a_y,a_z,b_x,b_y,b_z"
     assert of_rows.read(header) is None
@@ -941,24 +746,12 @@ def test_frames_are_read_from_json_and_from_tables():
         ('{"t_s": true}', "line 2: t_s is True"),
         ('{"t_s": 1, "pose": {"position_m": [0, 0, 0]}}', "no quaternion_xyzw"),
         ('{"t_s": 1, "markers": {"a": [1, 2]}}', "expected 3 numbers"),
-        (
-            f'{{"t_s": {TWENTY}}}',
-            f"t_s is {TWENTY}; expected a finite number of seconds",
-        ),
-        (
-            f'{{"t_s": 1, "markers": {{"a": [0, {15 * TWENTY}, 0]}}}}',
-            "numbers up to 1e.10",
-        ),
-        (
-            f'{{"t_s": 1, "markers": {{"a": [0, {20 * TWENTY}, 0]}}}}',
-            "expected 3 numbers",
-        ),
+        (f'{{"t_s": {TWENTY}}}', f"t_s is {TWENTY}; expected a finite number of seconds"),
+        (f'{{"t_s": 1, "markers": {{"a": [0, {15 * TWENTY}, 0]}}}}', "numbers up to 1e.10"),
+        (f'{{"t_s": 1, "markers": {{"a": [0, {20 * TWENTY}, 0]}}}}', "expected 3 numbers"),
         (f'{{"t_s": {250 * TWENTY}}}', "a number is too long"),
         (f'{{"t_s": {"[" * 100_000}', "brackets are nested too deeply"),
-        (
-            f'{{"t_s": 1, "markers": {{"a": {"[" * 300}{"]" * 300}}}}}',
-            "expected 3 numbers",
-        ),
+        (f'{{"t_s": 1, "markers": {{"a": {"[" * 300}{"]" * 300}}}}}', "expected 3 numbers"),
         ("[1, 2]", "the first line is neither a JSON object nor a header"),
     ],
 )
@@ -974,9 +767,7 @@ def test_bad_lines_are_named(line, said):
 def test_cells_of_a_row_that_are_no_numbers_are_named(cell):
     reader = FrameReader([1], ["a"], "input")
     reader.read("t_s,x_m,y_m,z_m,qx,qy,qz,qw,a_x,a_y,a_z")
-    with pytest.raises(
-        InputError, match=f"line 2: found '{cell}'; expected a number"
-    ):
+    with pytest.raises(InputError, match=f"line 2: found '{cell}'; expected a number"):
         reader.read(f"1,1,2,3,0,0,0,1,{cell},,")
 
 
@@ -989,9 +780,7 @@ def test_datagrams_are_read_until_an_empty_one():
         ready.set()
 
     found: list[str] = []
-    listener = threading.Thread(
-        target=lambda: found.extend(receive_datagrams(0, opened))
-    )
+    listener = threading.Thread(target=lambda: found.extend(receive_datagrams(0, opened)))
     listener.start()
     assert ready.wait(5)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -1008,9 +797,7 @@ def test_frames_are_paced_and_catch_up_when_late():
         waited.append(seconds)
         now[0] += seconds
 
-    for k, _ in enumerate(
-        paced_frames(iter(range(5)), 10.0, lambda: now[0], wait)
-    ):
+    for k, _ in enumerate(paced_frames(iter(range(5)), 10.0, lambda: now[0], wait)):
         now[0] += 0.25 if k == 1 else 0.01
     np.testing.assert_allclose(waited, [0.09, 0.03], atol=1e-12)
 
@@ -1022,22 +809,14 @@ def test_the_commands_stream_frames_to_estimates(tiny, monkeypatch):
     live = LiveEstimator(problem, NO_TIME)
     for frame in frames_of(problem, live):
         (position,), (quaternion,) = frame.pose
-        pose = {
-            "position_m": position.tolist(),
-            "quaternion_xyzw": quaternion.tolist(),
-        }
+        pose = {"position_m": position.tolist(), "quaternion_xyzw": quaternion.tolist()}
         markers = dict(zip(live.names, frame.tracks_m.tolist(), strict=True))
         line = json.dumps({"t_s": frame.t_s, "pose": pose, "markers": markers})
         lines.append(line.encode())
-    expected = [
-        json.loads(update_as_json(live.process_frame(f)))
-        for f in frames_of(problem, live)
-    ]
+    expected = [json.loads(update_as_json(live.process_frame(f))) for f in frames_of(problem, live)]
 
     def streamed_bytes(*lines: bytes) -> Outcome:
-        monkeypatch.setattr(
-            sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\n".join(lines)))
-        )
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\n".join(lines))))
         return run_command("live", "problem.toml", "--budget-ms", "1e-6")
 
     ended = streamed_bytes(*lines)
@@ -1046,33 +825,24 @@ def test_the_commands_stream_frames_to_estimates(tiny, monkeypatch):
     assert found[-1]["parameters"] == expected[-1]["parameters"]
     assert "final estimate after the last frame" in settled["notes"]
     assert ended.code == 0
-    bad = (
-        b"{",
-        lines[0].replace(b"0", b"\xff"),
-        b"\xff\xfe",
-        b'{"t_s":' + 10_000 * b"[",
-    )
+    bad = (b"{", lines[0].replace(b"0", b"\xff"), b"\xff\xfe", b'{"t_s":' + 10_000 * b"[")
     ended = streamed_bytes(*lines[:2], *bad, *lines[2:])
     assert ended.code == 2
     assert "standard input, line 3: this line is not valid JSON" in ended.err
     assert len(ended.err.splitlines()) == len(bad)
-    assert [
-        json.loads(line)["t_s"] for line in ended.out.splitlines()[:-1]
-    ] == [each["t_s"] for each in expected]
+    assert [json.loads(line)["t_s"] for line in ended.out.splitlines()[:-1]] == [
+        each["t_s"] for each in expected
+    ]
 
 
 @pytest.mark.long
 def test_a_recording_is_replayed_and_filmed(tiny):
-    ended = run_command(
-        "replay", "problem.toml", "--rate", 0, "--film", "swing.gif"
-    )
+    ended = run_command("replay", "problem.toml", "--rate", 0, "--film", "swing.gif")
     assert ended.code == 0
     assert "mu_pa" in ended.out
     assert "frames, latency" in ended.out
     assert imread("swing.gif").size > 0
-    assert (
-        run_command("replay", "problem.toml", "--film", "swing.mp4").code == 2
-    )
+    assert run_command("replay", "problem.toml", "--film", "swing.mp4").code == 2
     ended = run_command("replay", "problem.toml", "--rate", 1000, "--json")
     assert json.loads(ended.out.splitlines()[-1])["t_s"] == pytest.approx(0.08)
 
@@ -1080,14 +850,10 @@ def test_a_recording_is_replayed_and_filmed(tiny):
 def test_poses_of_frames_are_of_the_gripper_if_the_problem_says_so(tiny: Path):
     """As the poses of a file: both lead to the poses of the body in the recording."""
     file = tiny / "problem.toml"
-    transform = (
-        "position_m = [0.01, 0.0, 0.02], quaternion_xyzw = [0, 0.6, 0, 0.8]"
-    )
+    transform = "position_m = [0.01, 0.0, 0.02], quaternion_xyzw = [0, 0.6, 0, 0.8]"
     text = file.read_text()
     keys = 'poses = "swing_motion.csv"'
-    file.write_text(
-        text.replace(keys, f"{keys}, gripper_to_body = {{ {transform} }}")
-    )
+    file.write_text(text.replace(keys, f"{keys}, gripper_to_body = {{ {transform} }}"))
     problem = cs.Problem.read(file)
     (experiment,) = problem.experiments
     (matrix,) = gripper_transforms(problem, experiment.name, [0])

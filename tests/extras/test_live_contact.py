@@ -31,39 +31,25 @@ def touching(name: str, nuisance: cs.Nuisance) -> cs.Problem:
         held = cs.Grasp(nodes_where(body, 2, EDGE_M), moving)
         forces = cs.Wrench(t_s, np.zeros((16, 3)), SIGMA_N)
         shape, rubs = cs.Plane(UP, -0.001 * UP), "table_friction"
-        touched = cs.Obstacle(
-            shape=shape, name="table", friction=rubs, wrench=forces
-        )
+        touched = cs.Obstacle(shape=shape, name="table", friction=rubs, wrench=forces)
     else:
         held = cs.Grasp(nodes_where(body, 2, 0.0), cs.PoseSequence.fixed())
         ball = cs.Sphere(0.03, np.array([0.02, 0.02, EDGE_M + 0.031]))
         touched = cs.Obstacle(shape=ball, poses=moving, name="ball")
     seen = np.setdiff1d(np.arange(len(body.nodes_m)), held.nodes)
-    markers = cs.Markers(
-        t_s, np.zeros((16, len(seen), 3)), SIGMA_M, places_m=body.nodes_m[seen]
-    )
+    markers = cs.Markers(t_s, np.zeros((16, len(seen), 3)), SIGMA_M, places_m=body.nodes_m[seen])
     still = cs.Experiment(
-        body,
-        t_s,
-        [held, touched],
-        markers,
-        start="undeformed",
-        nuisance=nuisance,
-        name="touching",
+        body, t_s, [held, touched], markers, start="undeformed", nuisance=nuisance, name="touching"
     )
     own, sought = ({**RUBBING}, {**FRICTION}) if name == "table" else ({}, {})
     exact, rng = (
         cs.simulate(still, {**TRUTH, **own}, "bdf2", substeps=1),
         np.random.default_rng(0),
     )
-    tracks = exact.markers_m + rng.normal(
-        scale=SIGMA_M, size=exact.markers_m.shape
-    )
+    tracks = exact.markers_m + rng.normal(scale=SIGMA_M, size=exact.markers_m.shape)
     seen_there = cs.with_markers(still, tracks)
     if name == "table":
-        felt = exact.wrenches[-1][:, :3] + rng.normal(
-            scale=SIGMA_N, size=(16, 3)
-        )
+        felt = exact.wrenches[-1][:, :3] + rng.normal(scale=SIGMA_N, size=(16, 3))
         (table,) = seen_there.obstacles
         table = replace(table, wrench=replace(forces, values=felt))
         seen_there = seen_there.with_obstacles([table])
@@ -72,9 +58,7 @@ def touching(name: str, nuisance: cs.Nuisance) -> cs.Problem:
 
 
 CASES = {
-    "table": lambda: touching(
-        "table", cs.Nuisance.none(obstacle_offset_m=2e-4)
-    ),
+    "table": lambda: touching("table", cs.Nuisance.none(obstacle_offset_m=2e-4)),
     "ball": lambda: touching("ball", cs.Nuisance.none(obstacle_offset_m=2e-4)),
 }
 
@@ -100,15 +84,12 @@ def test_what_touches_the_body_is_followed_to_where_the_batch_ends(name: str):
         end = settled.estimates[parameter]
         assert abs(last.value - known.value) < 3 * known.statistical_std_error
         assert abs(end.value - known.value) < 1e-3 * known.statistical_std_error
-        assert end.statistical_std_error == pytest.approx(
-            known.statistical_std_error, rel=1e-3
-        )
+        assert end.statistical_std_error == pytest.approx(known.statistical_std_error, rel=1e-3)
 
 
 def test_an_obstacle_whose_delay_is_estimated_is_refused():
     problem = touching("ball", cs.Nuisance.none(obstacle_time_s=1e-3))
     with pytest.raises(
-        cs.InputError,
-        match="live estimates do not support an obstacle whose delay is estimated",
+        cs.InputError, match="live estimates do not support an obstacle whose delay is estimated"
     ):
         model_from_problem(problem)

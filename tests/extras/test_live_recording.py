@@ -53,9 +53,7 @@ def test_estimates_and_intervals_are_those_that_are_printed(recorded, lines):
         assert lower[-1] == pytest.approx(last["statistical95"][0])
 
 
-def test_the_surface_is_near_the_markers_at_the_estimate(
-    recorded, lines, problem_file
-):
+def test_the_surface_is_near_the_markers_at_the_estimate(recorded, lines, problem_file):
     """Residuals of markers on the surface are the distances of both entities."""
     (experiment,) = Problem.read(problem_file).experiments
     body = recorded["body"]
@@ -64,9 +62,7 @@ def test_the_surface_is_near_the_markers_at_the_estimate(
     (triangles,) = body["static triangle_indices"]
     nodes = np.unique(experiment.body.mesh.surface)
     assert (nodes[np.array(triangles)] == experiment.body.mesh.surface).all()
-    shapes_m = np.zeros(
-        (len(positions_m), len(experiment.body.nodes.points_m), 3)
-    )
+    shapes_m = np.zeros((len(positions_m), len(experiment.body.nodes.points_m), 3))
     shapes_m[:, nodes] = positions_m
     predicted_m = experiment.markers.predict_positions(shapes_m)
     measured_m = np.array(recorded["markers"]["positions"])
@@ -74,30 +70,20 @@ def test_the_surface_is_near_the_markers_at_the_estimate(
     placement = experiment.markers.placement
     is_drawn = [
         set(near[np.abs(weights) > 1e-9]) <= set(nodes)
-        for near, weights in zip(
-            placement.nodes, placement.weights, strict=True
-        )
+        for near, weights in zip(placement.nodes, placement.weights, strict=True)
     ]
     assert any(is_drawn)
     last_mm = np.array(
-        [
-            numbers(recorded[f"residuals_mm/{name}"])[-1]
-            for name in experiment.markers.names
-        ]
+        [numbers(recorded[f"residuals_mm/{name}"])[-1] for name in experiment.markers.names]
     )
     # Residuals are of the estimate before the last frame, the surface of that after it: 0.038 mm.
-    assert distances_mm[-1][is_drawn] == pytest.approx(
-        last_mm[is_drawn], abs=0.06
-    )
+    assert distances_mm[-1][is_drawn] == pytest.approx(last_mm[is_drawn], abs=0.06)
 
 
 def test_residuals_are_those_that_are_printed(recorded, lines, problem_file):
     (experiment,) = Problem.read(problem_file).experiments
     distances_mm = np.array(
-        [
-            numbers(recorded[f"residuals_mm/{name}"])
-            for name in experiment.markers.names
-        ]
+        [numbers(recorded[f"residuals_mm/{name}"]) for name in experiment.markers.names]
     )
     rms_mm = np.sqrt((distances_mm**2).mean(axis=0))
     printed_mm = np.array([1e3 * line["marker_rms_m"] for line in lines[:-1]])
@@ -111,9 +97,7 @@ def test_the_verdict_and_the_notes_are_texts(recorded, lines):
     assert "final estimate after the last frame" in notes
 
 
-def test_the_command_live_records_too(
-    problem_file, lines, tmp_path, monkeypatch
-):
+def test_the_command_live_records_too(problem_file, lines, tmp_path, monkeypatch):
     """The file is complete although a frame was invalid."""
     (experiment,) = Problem.read(problem_file).experiments
     (rotations, translations) = experiment.grasps[0].poses.at(experiment.t_s)
@@ -140,9 +124,7 @@ def test_the_command_live_records_too(
         for k, t_s in enumerate(experiment.t_s)
     ]
     text = "\n".join(["no frame", *frames]) + "\n"
-    monkeypatch.setattr(
-        sys, "stdin", io.TextIOWrapper(io.BytesIO(text.encode()))
-    )
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
     file = tmp_path / "live.rrd"
     outcome = run_command("live", problem_file, "--rerun", file)
     assert outcome.code == 2
@@ -155,10 +137,7 @@ def test_the_command_live_records_too(
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [
-        ("swing.gif", "--rerun: found '.gif'; expected .rrd"),
-        ("there.rrd", "not overwritten"),
-    ],
+    [("swing.gif", "--rerun: found '.gif'; expected .rrd"), ("there.rrd", "not overwritten")],
 )
 def test_a_file_that_cannot_be_written_is_refused_before_the_first_frame(
     problem_file, tmp_path, name: str, message: str

@@ -23,9 +23,7 @@ INTERVAL_S = 0.01
 REST_FRAMES = 400
 
 
-def rest_and_motion(
-    problem: cs.Problem, live: LiveEstimator, count: int
-) -> list[Frame]:
+def rest_and_motion(problem: cs.Problem, live: LiveEstimator, count: int) -> list[Frame]:
     """So many frames at rest with noise, and then those of the recording."""
     motion = frames_of(problem, live)
     equilibrium_m = cs.simulate(
@@ -36,33 +34,25 @@ def rest_and_motion(
         replace(
             motion[0],
             t_s=INTERVAL_S * k,
-            tracks_m=equilibrium_m
-            + noise.normal(scale=NOISE_M, size=equilibrium_m.shape),
+            tracks_m=equilibrium_m + noise.normal(scale=NOISE_M, size=equilibrium_m.shape),
         )
         for k in range(count)
     ]
-    return rest + [
-        replace(frame, t_s=frame.t_s + INTERVAL_S * count) for frame in motion
-    ]
+    return rest + [replace(frame, t_s=frame.t_s + INTERVAL_S * count) for frame in motion]
 
 
-def test_after_a_long_rest_the_estimate_is_that_of_a_stream_without_it(
-    monkeypatch,
-):
+def test_after_a_long_rest_the_estimate_is_that_of_a_stream_without_it(monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing()
     live, fresh = (LiveEstimator(problem, NO_TIME) for _ in range(2))
     frames = rest_and_motion(problem, live, 40)
-    notes = [
-        note for frame in frames for note in live.process_frame(frame).notes
-    ]
+    notes = [note for frame in frames for note in live.process_frame(frame).notes]
     (said,) = [note for note in notes if "after a long rest" in note]
     # The first frame of the motion is still at rest, and the second one hardly moves.
     (start,) = [
         k
         for k, frame in enumerate(frames)
-        if frame.t_s
-        == pytest.approx(frames[-1].t_s - INTERVAL_S * (len(live.log) - 1))
+        if frame.t_s == pytest.approx(frames[-1].t_s - INTERVAL_S * (len(live.log) - 1))
     ]
     assert 40 - REPLAYED_FRAMES <= start <= 42
     for frame in frames[start:]:
@@ -75,17 +65,11 @@ def test_after_a_long_rest_the_estimate_is_that_of_a_stream_without_it(
 def test_a_guess_that_is_wrong_by_a_hundred_is_corrected_after_a_long_rest():
     problem = swing(100)
     far = GUESS.with_guess({"lambda_pa": 2e4, "mu_pa": 3e4})
-    live = LiveEstimator(
-        cs.Problem(problem.experiments, far), LiveOptions(rows=8)
-    )
+    live = LiveEstimator(cs.Problem(problem.experiments, far), LiveOptions(rows=8))
     for frame in rest_and_motion(problem, live, REST_FRAMES):
         update = live.process_frame(frame)
-    assert update.estimates["mu_pa"].value == pytest.approx(
-        TRUTH["mu_pa"], rel=0.03
-    )
-    assert update.estimates["gamma_r_s"].value == pytest.approx(
-        TRUTH["gamma_r_s"], rel=0.05
-    )
+    assert update.estimates["mu_pa"].value == pytest.approx(TRUTH["mu_pa"], rel=0.03)
+    assert update.estimates["gamma_r_s"].value == pytest.approx(TRUTH["gamma_r_s"], rel=0.05)
 
 
 def still(t_s: float, shift_m: float = 0.0, marker_m: float = 0.0) -> Frame:
@@ -130,7 +114,5 @@ def test_noise_of_the_poses_is_not_a_motion():
 def test_a_body_that_swings_in_a_resting_grasp_is_not_at_rest():
     rest = detector()
     for k in range(100):
-        rest.frames_before_motion(
-            still(0.01 * k, marker_m=0.02 * np.sin(0.3 * k))
-        )
+        rest.frames_before_motion(still(0.01 * k, marker_m=0.02 * np.sin(0.3 * k)))
     assert not rest.frames_before_motion(still(1.0, shift_m=0.01))

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from collocation_sysid.extras.live.live_trust import (
-    ResidualScatter,
-    variance_factor,
-)
+from collocation_sysid.extras.live.live_trust import ResidualScatter, variance_factor
 from collocation_sysid.program.least_squares import SquareRootInformation
 
 WAVE = 2.0 * np.cos(np.pi / 4 * np.arange(33))
@@ -42,14 +39,10 @@ def test_it_does_not_depend_on_their_size(size):
 def test_what_is_missing_says_nothing_of_either():
     seen = samples(WAVE)
     gaps = [each if k % 7 else NONE for k, each in enumerate(seen)]
-    here = np.array(
-        [value if k % 7 else np.nan for k, value in enumerate(WAVE)]
-    )
+    here = np.array([value if k % 7 else np.nan for k, value in enumerate(WAVE)])
     found = ResidualScatter.from_residuals(gaps)
     assert found.rms == pytest.approx(np.sqrt(np.nanmean(here**2)))
-    assert found.lag1 == pytest.approx(
-        np.nanmean(here[1:] * here[:-1]) / np.nanmean(here**2)
-    )
+    assert found.lag1 == pytest.approx(np.nanmean(here[1:] * here[:-1]) / np.nanmean(here**2))
 
 
 TOO_LITTLE = {
@@ -68,9 +61,7 @@ def test_too_little_shows_no_autocorrelation(values):
 
 
 def test_ten_samples_are_enough_and_what_never_forgets_is_limited():
-    assert ResidualScatter.from_residuals(
-        samples(np.ones(10))
-    ) == ResidualScatter(1.0, 0.98)
+    assert ResidualScatter.from_residuals(samples(np.ones(10))) == ResidualScatter(1.0, 0.98)
 
 
 @pytest.mark.parametrize(("count", "matters"), [(30, False), (60, True)])
@@ -85,18 +76,13 @@ def test_only_what_is_more_than_chance_counts(rng):
     assert ResidualScatter.from_residuals([*white]).lag1 == 0.0
     weak = white.copy()
     weak[1:] += 0.15 * white[:-1]
-    assert ResidualScatter.from_residuals([*weak]).lag1 == pytest.approx(
-        0.147, abs=0.06
-    )
+    assert ResidualScatter.from_residuals([*weak]).lag1 == pytest.approx(0.147, abs=0.06)
     # As large, but of so few that it may be chance; and seen often, but too small to matter.
     assert ResidualScatter.from_residuals([*weak[:30]]).lag1 == 0.0
     slight = rng.normal(size=(8000, 2, 3))
     slight[1:] += 0.06 * slight[:-1]
     assert ResidualScatter.from_residuals([*slight]).lag1 == 0.0
-    assert (
-        ResidualScatter.from_residuals(samples(np.tile([1.0, -1.0], 20))).lag1
-        == 0.0
-    )
+    assert ResidualScatter.from_residuals(samples(np.tile([1.0, -1.0], 20))).lag1 == 0.0
 
 
 FITTED, ROWS = 2, 60
@@ -106,23 +92,16 @@ def known(size: float) -> tuple[SquareRootInformation, np.ndarray]:
     """Rows whose residuals are of a size, and the estimate."""
     slope = np.random.default_rng(0).normal(size=(ROWS, FITTED))
     p = np.array([0.3, -0.2])
-    return SquareRootInformation.empty(FITTED).with_rows(
-        np.full(ROWS, size), slope, p
-    ), p
+    return SquareRootInformation.empty(FITTED).with_rows(np.full(ROWS, size), slope, p), p
 
 
 @pytest.mark.parametrize("size", [0.5, 1.0, 1.1])
 def test_residuals_as_sigma_says_or_smaller_widen_nothing(size):
-    assert variance_factor(*known(size), FITTED, ResidualScatter(size)) == (
-        1.0,
-        1.96,
-    )
+    assert variance_factor(*known(size), FITTED, ResidualScatter(size)) == (1.0, 1.96)
 
 
 def test_larger_residuals_widen_by_their_variance_and_students_quantile():
-    factor, quantile = variance_factor(
-        *known(2.0), FITTED, ResidualScatter(2.0)
-    )
+    factor, quantile = variance_factor(*known(2.0), FITTED, ResidualScatter(2.0))
     assert factor == pytest.approx(4.0 * ROWS / (ROWS - FITTED))
     assert quantile == pytest.approx(student.ppf(0.975, ROWS - FITTED))
 

@@ -47,12 +47,7 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
-from collocation_sysid.recording import (
-    Experiment,
-    Markers,
-    Wrench,
-    write_poses_csv,
-)
+from collocation_sysid.recording import Experiment, Markers, Wrench, write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data
 from collocation_sysid.statistics.linearised import DerivedModuli
 
@@ -87,13 +82,9 @@ def soft_bar(folder: Path, material: str, steps: dict[str, int]) -> Path:
 
 def compared(file: Path) -> list[dict]:
     """The rows of a comparison, its runs done here."""
-    planned = plan_models(
-        Problem.read(file), variants(file, (), BOTH, (), TIMES_S)
-    )
+    planned = plan_models(Problem.read(file), variants(file, (), BOTH, (), TIMES_S))
     records = {
-        run.key: {
-            "model": fit_record(read(run), run.method, run.test_name or "")
-        }
+        run.key: {"model": fit_record(read(run), run.method, run.test_name or "")}
         for run in planned
     }
     return model_rows(planned, json.loads(json.dumps(records)))
@@ -115,9 +106,7 @@ def read(run: PlannedRun) -> Problem:
     ],
 )
 def test_yeohs_material_is_recognised_at_large_strain(steps, tmp_path: Path):
-    neo_hookean, yeoh = rows = compared(
-        soft_bar(tmp_path / "bar", "yeoh", steps)
-    )
+    neo_hookean, yeoh = rows = compared(soft_bar(tmp_path / "bar", "yeoh", steps))
     assert yeoh["chosen"]
     assert (yeoh["delta_aic"], yeoh["free"], neo_hookean["free"]) == (0, 6, 4)
     assert neo_hookean["delta_aic"] > 100
@@ -125,35 +114,25 @@ def test_yeohs_material_is_recognised_at_large_strain(steps, tmp_path: Path):
     assert neo_hookean["log_ratio"] > np.log(1.2)
     assert set(yeoh["predictions"]) == set(steps)
     said = advice(rows)
-    assert said.startswith(
-        "Use yeoh: its prediction error for held-out samples is"
-    )
+    assert said.startswith("Use yeoh: its prediction error for held-out samples is")
     assert "2 parameters more" in said
     assert said.endswith("The difference is significant.")
 
 
 @pytest.mark.long
 def test_yeohs_is_not_preferred_on_data_of_a_neo_hookean(tmp_path: Path):
-    neo_hookean, yeoh = rows = compared(
-        soft_bar(tmp_path / "bar", "neo-hookean", {"a": 40})
-    )
+    neo_hookean, yeoh = rows = compared(soft_bar(tmp_path / "bar", "neo-hookean", {"a": 40}))
     assert neo_hookean["chosen"]
     assert yeoh["delta_aic"] > 0
     # 0.5 mm in three directions
-    assert neo_hookean["held_out_rms"] == pytest.approx(
-        5e-4 * np.sqrt(3), rel=0.15
-    )
-    assert advice(rows).startswith(
-        "Use neo-hookean: its prediction error for held-out samples is"
-    )
+    assert neo_hookean["held_out_rms"] == pytest.approx(5e-4 * np.sqrt(3), rel=0.15)
+    assert advice(rows).startswith("Use neo-hookean: its prediction error for held-out samples is")
 
 
 # Forces alone -----------------------------------------------------------------------------------
 
 
-def pressed_block(
-    platen: str, name: str, z_m: np.ndarray, load_n: np.ndarray
-) -> Experiment:
+def pressed_block(platen: str, name: str, z_m: np.ndarray, load_n: np.ndarray) -> Experiment:
     """A block pressed between platens that hold it along some axes; its load alone is measured."""
     pressing = block(platen, np.arange(float(len(z_m))), z_m)
     values = np.full((len(z_m), 3), np.nan)
@@ -161,17 +140,14 @@ def pressed_block(
     lower, upper, *sides = pressing.grasps
     upper = replace(upper, wrench=Wrench(pressing.t_s, values, sigma_n=0.003))
     grasps = (lower, upper, *sides)
-    return replace(
-        pressing, name=name, grasps=grasps, markers=Markers.none(pressing.t_s)
-    )
+    return replace(pressing, name=name, grasps=grasps, markers=Markers.none(pressing.t_s))
 
 
 def load_n(experiment: Experiment) -> np.ndarray:
     """What the upper platen gives, by the truth."""
     collocation = fitted(experiment, Parameters.from_mapping(TRUTH))
     x = simulate_scheme(
-        experiment,
-        collocation.transcriptions[0].dynamics.with_theta(as_theta(TRUTH)),
+        experiment, collocation.transcriptions[0].dynamics.with_theta(as_theta(TRUTH))
     )
     (part,) = collocation.iterates_at(np.zeros(0), [x])
     return predicted_wrenches(part)[0][:, 2]
@@ -190,19 +166,14 @@ def test_forces_rank_the_platens_where_there_are_no_markers():
     models = []
     for platen, experiments in found.items():
         problem = Problem(experiments, TRUTH | {"mu_pa": Unknown(300.0)})
-        records = {
-            each: fit_record(problem, "reduced-space", each)
-            for each in ("", "a", "b")
-        }
+        records = {each: fit_record(problem, "reduced-space", each) for each in ("", "a", "b")}
         models.append({"model": platen, "found": records})
     sticking, sliding = rows = rows_of(*models)
     assert sticking["chosen"]
     assert sticking["held_out_rms"] == pytest.approx(0.003, rel=0.5)
     assert sliding["held_out_rms"] > 3 * sticking["held_out_rms"]
     assert sliding["delta_aic"] > 10
-    assert (
-        sliding["parameters"]["mu_pa"] > 1.05 * sticking["parameters"]["mu_pa"]
-    )
+    assert sliding["parameters"]["mu_pa"] > 1.05 * sticking["parameters"]["mu_pa"]
     assert re.search(
         r"^Use xyz: its prediction error for held-out samples is \S+ N, that of z is \S+ N",
         advice(rows),
@@ -210,14 +181,10 @@ def test_forces_rank_the_platens_where_there_are_no_markers():
 
 
 def test_of_one_pressing_the_end_of_its_load_is_held_out():
-    pressing = pressed_block(
-        "xyz", "a", np.linspace(0.0, -0.03, 9), np.zeros(9)
-    )
+    pressing = pressed_block("xyz", "a", np.linspace(0.0, -0.03, 9), np.zeros(9))
     left, start_s = reserve_test_data(Problem([pressing], TRUTH), "a")
     wrench = left.experiments[0].grasps[1].wrench
-    np.testing.assert_array_equal(
-        np.isnan(wrench.values[:, 2]), wrench.t_s > start_s
-    )
+    np.testing.assert_array_equal(np.isnan(wrench.values[:, 2]), wrench.t_s > start_s)
     assert 0 < np.isnan(wrench.values[:, 2]).sum() < 9
 
 
@@ -228,13 +195,9 @@ def test_files_with_other_data_are_no_models_of_one_another(tmp_path: Path):
     held = Problem.read(other, ["experiment.b.validation=true"])
     with pytest.raises(InputError, match="given twice"):
         file_variants([both, both], ())
-    with pytest.raises(
-        InputError, match=r"this file fits 'a' .* expected the same recordings"
-    ):
+    with pytest.raises(InputError, match=r"this file fits 'a' .* expected the same recordings"):
         file_variants([both, held], ())
-    assert [
-        each.label for each in file_variants([both, Problem.read(other)], ())
-    ] == [
+    assert [each.label for each in file_variants([both, Problem.read(other)], ())] == [
         "problem",
         "other",
     ]
@@ -246,10 +209,7 @@ def test_files_with_other_data_are_no_models_of_one_another(tmp_path: Path):
 def test_of_two_recordings_one_is_held_out(tmp_path: Path):
     several = Problem.read(write_problem(tmp_path, {"a": 6, "b": 7}))
     left, start_s = reserve_test_data(several, "b")
-    assert [(e.name, e.validation) for e in left.experiments] == [
-        ("a", False),
-        ("b", True),
-    ]
+    assert [(e.name, e.validation) for e in left.experiments] == [("a", False), ("b", True)]
     assert start_s == -np.inf
 
 
@@ -278,10 +238,7 @@ def changed(
     file: Path, label: str, materials=(), branches=(), overrides=(), region=None
 ) -> Problem:
     """The problem as one of its variants has it."""
-    found = {
-        v.label: v
-        for v in variants(file, overrides, materials, branches, TIMES_S, region)
-    }
+    found = {v.label: v for v in variants(file, overrides, materials, branches, TIMES_S, region)}
     return Problem.read(file, found[label].overrides)
 
 
@@ -293,26 +250,17 @@ def changed(
         ("mooney-rivlin", "lambda_pa gamma_r_s gamma_m_1_s c10_pa c01_pa"),
         ("gent", "lambda_pa mu_pa gamma_r_s gamma_m_1_s gent_limit"),
         ("ogden-1", "lambda_pa gamma_r_s gamma_m_1_s mu_1_pa alpha_1"),
-        (
-            "ogden-2",
-            "lambda_pa gamma_r_s gamma_m_1_s mu_1_pa alpha_1 mu_2_pa alpha_2",
-        ),
+        ("ogden-2", "lambda_pa gamma_r_s gamma_m_1_s mu_1_pa alpha_1 mu_2_pa alpha_2"),
     ],
 )
-def test_a_material_brings_its_constants_and_the_rest_stays_as_stated(
-    bar, material, expected
-):
+def test_a_material_brings_its_constants_and_the_rest_stays_as_stated(bar, material, expected):
     overrides = ("parameters.gamma_m_1_s=0.7",)
-    problem = changed(
-        bar, material, {material: 0, "linear": 0}, overrides=overrides
-    )
+    problem = changed(bar, material, {material: 0, "linear": 0}, overrides=overrides)
     assert problem.bodies[0].parts[0].material.name == material
     assert set(problem.parameters.names) == set(expected.split())
     fixed = [i.name for i in problem.parameters.items if i.is_fixed]
     assert fixed == ["gamma_m_1_s"]
-    given = {
-        i.name: (i.guess, i.lower, i.upper) for i in problem.parameters.items
-    }
+    given = {i.name: (i.guess, i.lower, i.upper) for i in problem.parameters.items}
     assert given["lambda_pa"] == (400.0, 10.0, 1e5)
 
 
@@ -323,28 +271,14 @@ def test_the_fixed_poisson_ratio_stays_whatever_the_material(bar):
         *("poisson", "gamma_r_s", "gamma_m_1_s", "c10_pa", "c20_pa", "c30_pa")
     }
     assert next(i.guess for i in problem.parameters.items if i.is_fixed) == 0.45
-    back = changed(
-        bar,
-        "neo-hookean",
-        BOTH,
-        overrides=(*_as_yeoh(), "object.density_kg_m3=40"),
-    )
-    assert set(back.parameters.names) == {
-        "kappa_pa",
-        "mu_pa",
-        "gamma_r_s",
-        "gamma_m_1_s",
-    }
+    back = changed(bar, "neo-hookean", BOTH, overrides=(*_as_yeoh(), "object.density_kg_m3=40"))
+    assert set(back.parameters.names) == {"kappa_pa", "mu_pa", "gamma_r_s", "gamma_m_1_s"}
 
 
 def test_a_foam_replaces_all_moduli(bar):
     problem = changed(bar, "hyperfoam-1", {"hyperfoam-1": 0, "linear": 0})
     constants = {"mu_1_pa", "alpha_1", "beta_1"}
-    assert set(problem.parameters.names) == {
-        "gamma_r_s",
-        "gamma_m_1_s",
-        *constants,
-    }
+    assert set(problem.parameters.names) == {"gamma_r_s", "gamma_m_1_s", *constants}
     # As stiff as the file's guess of μ = 200 Pa.
     guesses = problem.parameters.guesses
     assert guesses["mu_1_pa"] == pytest.approx(200.0)
@@ -366,9 +300,7 @@ def test_another_law_starts_as_stiff_as_the_powers_of_the_stretches(
 ):
     stated = f"parameters={{{constants}, gamma_r_s = {{}}, gamma_m_1_s = {{}}}}"
     overrides = (f"object.material={material}", stated)
-    problem = changed(
-        bar, "gent", {"gent": 0, material: 0}, overrides=overrides
-    )
+    problem = changed(bar, "gent", {"gent": 0, material: 0}, overrides=overrides)
     guesses = {item.name: item.guess for item in problem.parameters.items}
     assert guesses["mu_pa"] == pytest.approx(shear_pa)
 
@@ -381,20 +313,12 @@ def _as_yeoh() -> tuple[str, ...]:
 
 def test_branches_are_tables_with_a_share_and_a_time_constant_each(bar):
     none, one, two = variants(bar, (), (), (0, 1, 2), TIMES_S)
-    assert [v.label for v in (none, one, two)] == [
-        "no memory",
-        "1 branch",
-        "2 branches",
-    ]
+    assert [v.label for v in (none, one, two)] == ["no memory", "1 branch", "2 branches"]
     assert not any("prony" in setting for setting in none.overrides)
     assert 'object.prony=[{"name" = "prony_1"}]' in one.overrides
+    assert 'object.prony=[{"name" = "prony_1"}, {"name" = "prony_2"}]' in two.overrides
     assert (
-        'object.prony=[{"name" = "prony_1"}, {"name" = "prony_2"}]'
-        in two.overrides
-    )
-    assert (
-        '"prony_1.share" = {"guess" = 0.1}, "prony_1.tau_s" = {"guess" = 0.1}'
-        in one.overrides[-1]
+        '"prony_1.share" = {"guess" = 0.1}, "prony_1.tau_s" = {"guess" = 0.1}' in one.overrides[-1]
     )
     assert '"prony_1.tau_s" = {"guess" = 0.0464}' in two.overrides[-1]
     assert '"prony_2.tau_s" = {"guess" = 0.215}' in two.overrides[-1]
@@ -411,9 +335,7 @@ def test_materials_and_branches_are_combined(bar):
 
 
 def test_laws_of_damping_take_the_place_of_their_budget_entry(bar):
-    found = {
-        v.label: v for v in variants(bar, (), (), (), TIMES_S, dampings=LAWS)
-    }
+    found = {v.label: v for v in variants(bar, (), (), (), TIMES_S, dampings=LAWS)}
     assert tuple(found) == LAWS
     for law in LAWS:
         problem = Problem.read(bar, found[law].overrides)
@@ -438,9 +360,7 @@ def test_laws_of_damping_are_combined_with_materials(bar):
 
 def test_a_region_alone_may_have_the_laws_of_damping(bar, tiny):
     TWO_REGIONS(tiny)
-    found = {
-        v.label: v for v in variants(bar, (), (), (), TIMES_S, "stiff", LAWS)
-    }
+    found = {v.label: v for v in variants(bar, (), (), (), TIMES_S, "stiff", LAWS)}
     problem = Problem.read(bar, found["stiff: material"].overrides)
     laws = {part.name: part.damping.name for part in problem.bodies[0].parts}
     assert laws["stiff"] == "material"
@@ -462,11 +382,7 @@ def test_files_are_combined_with_materials(bar, tiny):
 
 
 def test_a_value_is_written_as_toml_reads_it():
-    value = {
-        "a.b": {"guess": 1e-5, "bounds": [1, -2.5]},
-        "text": 'a "quoted" ß',
-        "flag": True,
-    }
+    value = {"a.b": {"guess": 1e-5, "bounds": [1, -2.5]}, "text": 'a "quoted" ß', "flag": True}
     assert tomllib.loads(f"value = {as_inline_toml(value)}")["value"] == value
 
 
@@ -475,30 +391,19 @@ def test_bad_models_are_refused_in_one_line(bar, tiny):
         parse_materials("yeho,gent")
     with pytest.raises(InputError, match=r"'matrial'.*did you mean 'material'"):
         parse_dampings("kelvin-voigt,matrial")
-    with pytest.raises(
-        InputError, match=r"--damping: .*material alone; expected two or more"
-    ):
+    with pytest.raises(InputError, match=r"--damping: .*material alone; expected two or more"):
         models([Problem.read(bar)], (), dampings=("material",))
-    with pytest.raises(
-        InputError, match="whole numbers up to 20, such as 0,1,2"
-    ):
+    with pytest.raises(InputError, match="whole numbers up to 20, such as 0,1,2"):
         parse_branches("1,x")
     with pytest.raises(InputError, match="yeoh alone; expected two or more"):
         models([Problem.read(bar)], (), ("yeoh",))
-    with pytest.raises(
-        InputError,
-        match="found the region 'core', but the object has no regions",
-    ):
+    with pytest.raises(InputError, match="found the region 'core', but the object has no regions"):
         variants(bar, (), BOTH, (), TIMES_S, "core")
     TWO_REGIONS(tiny)
-    with pytest.raises(
-        InputError, match=r"'stif'; expected one of stiff.*did you mean 'stiff'"
-    ):
+    with pytest.raises(InputError, match=r"'stif'; expected one of stiff.*did you mean 'stiff'"):
         variants(bar, (), BOTH, (), TIMES_S, "stif")
     of_all = ('object.prony=[{"name" = "prony_1"}]',)
-    with pytest.raises(
-        InputError, match="all parts without their own; expected no --region"
-    ):
+    with pytest.raises(InputError, match="all parts without their own; expected no --region"):
         variants(bar, of_all, (), (0, 1), TIMES_S, "stiff")
 
 
@@ -510,30 +415,13 @@ OWN = "gamma_r_s gamma_m_1_s young_pa poisson"
     ("region", "material", "laws", "expected"),
     [
         (None, "neo-hookean", ["neo-hookean"] * 2, f"{OWN} stiff.mu_pa"),
-        (
-            None,
-            "gent",
-            ["gent"] * 2,
-            f"{OWN} gent_limit stiff.mu_pa stiff.gent_limit",
-        ),
+        (None, "gent", ["gent"] * 2, f"{OWN} gent_limit stiff.mu_pa stiff.gent_limit"),
         ("stiff", "neo-hookean", ["neo-hookean"] * 2, f"{OWN} stiff.mu_pa"),
-        (
-            "stiff",
-            "gent",
-            ["neo-hookean", "gent"],
-            f"{OWN} stiff.mu_pa stiff.gent_limit",
-        ),
-        (
-            "stiff",
-            "yeoh",
-            ["neo-hookean", "yeoh"],
-            f"{OWN} stiff.c10_pa stiff.c20_pa stiff.c30_pa",
-        ),
+        ("stiff", "gent", ["neo-hookean", "gent"], f"{OWN} stiff.mu_pa stiff.gent_limit"),
+        ("stiff", "yeoh", ["neo-hookean", "yeoh"], f"{OWN} stiff.c10_pa stiff.c20_pa stiff.c30_pa"),
     ],
 )
-def test_a_region_or_all_of_a_body_has_the_material(
-    bar, tiny, region, material, laws, expected
-):
+def test_a_region_or_all_of_a_body_has_the_material(bar, tiny, region, material, laws, expected):
     TWO_REGIONS(tiny)
     label = material if region is None else f"stiff: {material}"
     problem = changed(bar, label, {material: 0, "linear": 0}, region=region)
@@ -543,17 +431,10 @@ def test_a_region_or_all_of_a_body_has_the_material(
 
 def test_a_region_keeps_constants_of_its_own_where_it_has_some(bar, tiny):
     TWO_REGIONS(tiny)
-    own = (
-        "parameters.stiff.young_pa=900",
-        "object.region.0.material=neo-hookean",
-    )
+    own = ("parameters.stiff.young_pa=900", "object.region.0.material=neo-hookean")
     rid = "c10_pa", "c20_pa", "c30_pa"
     text = bar.read_text()
-    bar.write_text(
-        "".join(
-            s for s in text.splitlines(True) if not any(r in s for r in rid)
-        )
-    )
+    bar.write_text("".join(s for s in text.splitlines(True) if not any(r in s for r in rid)))
     problem = changed(bar, "gent", {"gent": 0, "linear": 0}, overrides=own)
     extra = "stiff.young_pa gent_limit stiff.gent_limit"
     assert set(problem.parameters.names) == {*OWN.split(), *extra.split()}
@@ -570,9 +451,7 @@ def test_branches_may_be_a_regions(bar, tiny):
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.6, 0.9])
-def test_measurements_are_worth_as_many_independent_as_the_mean_of_their_errors_tells(
-    phi: float,
-):
+def test_measurements_are_worth_as_many_independent_as_the_mean_of_their_errors_tells(phi: float):
     of = problem((400,), markers=4, offsets=False)
     found = []
     for seed in range(6):
@@ -585,19 +464,13 @@ def test_measurements_are_worth_as_many_independent_as_the_mean_of_their_errors_
 
 def test_errors_that_all_markers_share_count_once():
     of = problem((400,), markers=4, offsets=False)
-    errors = [
-        autoregressive(np.random.default_rng(0), 400, 4, 0.0, shared=0.98)
-    ]
+    errors = [autoregressive(np.random.default_rng(0), 400, 4, 0.0, shared=0.98)]
     evidence = evidence_from_fit(of.fit(errors, np.zeros(len(of.names)))[0])
     assert evidence.independent == pytest.approx(400, rel=0.2)  # of 4800
 
 
 def test_a_needless_parameter_costs_two_and_gains_one_on_average():
-    of, rng, changes = (
-        problem((60,), markers=2, offsets=False),
-        np.random.default_rng(0),
-        [],
-    )
+    of, rng, changes = (problem((60,), markers=2, offsets=False), np.random.default_rng(0), [])
     # The errors are all there is to fit: any parameter is needless.
     fewer = replace(
         of,
@@ -619,25 +492,14 @@ def test_a_needless_parameter_costs_two_and_gains_one_on_average():
 # The advice -------------------------------------------------------------------------------------
 
 
-def row_of(
-    model: str, free: int, blocks: dict, misfit: float, failure: str = ""
-) -> dict:
+def row_of(model: str, free: int, blocks: dict, misfit: float, failure: str = "") -> dict:
     """Records of a model: fitted, and each recording predicted with these Σ of squares by block."""
     evidence = {"misfit": misfit, "prior": 0.0, "fitted": float(free)}
     evidence |= {"measurements": 900, "independent": 300.0}
-    whole = {
-        "converged": True,
-        "status": "converged",
-        "free": ["p"] * free,
-        "rms": {"m": 1e-3},
-    }
+    whole = {"converged": True, "status": "converged", "free": ["p"] * free, "rms": {"m": 1e-3}}
     found = {"": whole | {"evidence": evidence, "parameters": {}}}
     for name, each in blocks.items():
-        missed = {
-            "rms": float(np.sqrt(np.sum(each) / 100)),
-            "unit": "m",
-            "samples": 100,
-        }
+        missed = {"rms": float(np.sqrt(np.sum(each) / 100)), "unit": "m", "samples": 100}
         found[name] = whole | {"prediction": missed | {"blocks": each}}
         if failure:
             found[name] = whole | {"prediction": None, "failure": failure}
@@ -651,13 +513,7 @@ def rows_of(*models: dict) -> list[dict]:
             key = f"{each['model']}/{held_out}"
             swept = {"model": each["model"]}
             planned.append(
-                PlannedRun(
-                    key,
-                    "problem.toml",
-                    "m",
-                    varied_values=swept,
-                    test_name=held_out,
-                )
+                PlannedRun(key, "problem.toml", "m", varied_values=swept, test_name=held_out)
             )
             records[key] = {"model": found}
     return model_rows(planned, records)
@@ -669,9 +525,7 @@ WAVY = STEADY * (1 + 0.3 * np.cos(np.arange(8)))
 
 def test_of_models_that_predict_alike_the_one_with_fewer_parameters_is_taken():
     small = row_of("small", 4, {"a": (1.01 * WAVY).tolist()}, 900)
-    large = row_of(
-        "large", 6, {"a": (WAVY + 1e-6 * np.sin(np.arange(8))).tolist()}, 899
-    )
+    large = row_of("large", 6, {"a": (WAVY + 1e-6 * np.sin(np.arange(8))).tolist()}, 899)
     rows = rows_of(small, large)
     assert rows[0]["chosen"]
     assert "hardly distinguish the models" in advice(rows)
@@ -702,24 +556,9 @@ def test_models_that_predict_alike_tell_what_they_disagree_about():
         found["found"][""]["parameters"] = {"young_pa": young_pa}
         return found
 
-    said = advice(
-        rows_of(
-            model("a", 1.001, 70e3),
-            model("b", 1.0, 100e3),
-            model("c", 2.0, 200e3),
-        )
-    )
-    assert (
-        "The models that predict equally well have E from 7e+04 to 1e+05 Pa"
-        in said
-    )
-    said = advice(
-        rows_of(
-            model("a", 1.001, 70e3),
-            model("b", 1.0, 71e3),
-            model("c", 2.0, 200e3),
-        )
-    )
+    said = advice(rows_of(model("a", 1.001, 70e3), model("b", 1.0, 100e3), model("c", 2.0, 200e3)))
+    assert "The models that predict equally well have E from 7e+04 to 1e+05 Pa" in said
+    said = advice(rows_of(model("a", 1.001, 70e3), model("b", 1.0, 71e3), model("c", 2.0, 200e3)))
     assert "have E" not in said
 
 
@@ -742,18 +581,12 @@ def test_a_constant_at_its_bound_is_marked_and_named(tmp_path):
     assert "bound" not in advice(rows_of(inside, other))
 
 
-@pytest.mark.parametrize(
-    ("c01_pa", "at_bound"), [(-2e4, {"c01_pa": "lower"}), (2e4, {})]
-)
-def test_a_fit_records_which_constants_end_at_bounds(
-    tmp_path, c01_pa, at_bound
-):
+@pytest.mark.parametrize(("c01_pa", "at_bound"), [(-2e4, {"c01_pa": "lower"}), (2e4, {})])
+def test_a_fit_records_which_constants_end_at_bounds(tmp_path, c01_pa, at_bound):
     stretch = np.linspace(1.05, 2.0, 12)
     stress_pa = 2 * (stretch - stretch**-2) * (8e4 + c01_pa / stretch)
     rows = [f"{a},{b}" for a, b in zip(stretch, stress_pa, strict=True)]
-    (tmp_path / "pull.csv").write_text(
-        "\n".join(["stretch,stress (Pa)", *rows]) + "\n"
-    )
+    (tmp_path / "pull.csv").write_text("\n".join(["stretch,stress (Pa)", *rows]) + "\n")
     (tmp_path / "problem.toml").write_text(
         """[object]
 material = "mooney-rivlin"
@@ -779,10 +612,7 @@ def test_the_law_is_a_source_of_the_chosen_ones_budget():
     found = {}
     for name, free, young_pa in (("a", 3, 70e3), ("b", 4, 100e3)):
         model = row_of(name, free, {"a": WAVY.tolist()}, 900)
-        model["found"][""]["parameters"] = {
-            "young_pa": young_pa,
-            "c10_pa": young_pa / 7,
-        }
+        model["found"][""]["parameters"] = {"young_pa": young_pa, "c10_pa": young_pa / 7}
         combined95 = (young_pa / 1.04, young_pa * 1.04)
         line = {
             "value": young_pa,
@@ -794,15 +624,11 @@ def test_the_law_is_a_source_of_the_chosen_ones_budget():
         model["found"][""]["budget"] = {"young_pa": line}
         found[name] = model
     rows = rows_of(found["a"], found["b"])
-    (told,) = law_disagreements(
-        rows
-    )  # constants of a law have no meaning in another
+    (told,) = law_disagreements(rows)  # constants of a law have no meaning in another
     assert told.values == {"a": 70e3, "b": 100e3}
     apart, known = np.log(100 / 70) / np.sqrt(2), np.log(1.04) / 1.96
     assert told.share == pytest.approx(apart**2 / (apart**2 + known**2))
-    assert told.combined95[1] == pytest.approx(
-        70e3 * np.exp(1.96 * np.hypot(apart, known))
-    )
+    assert told.combined95[1] == pytest.approx(70e3 * np.exp(1.96 * np.hypot(apart, known)))
     assert told.combined95[0] < 70e3 < 100e3 < told.combined95[1]
     assert (
         "if the choice of the law is included (99% of the variance), otherwise 6.73e+04 to 7.28e+04"
@@ -821,10 +647,8 @@ def test_every_law_has_a_stiffness_at_small_strain(law):
     body = Body(box().mesh, density_kg_m3=30.0, material=law)
     hung = replace(hung_cube(2), body=body)
     collocation = Collocation([hung], Parameters.from_mapping(values))
-    constants = (segment.constants for segment in collocation.transcriptions)
-    numbers = DerivedModuli.from_bodies(
-        constants, collocation.guess_p[: collocation.nq]
-    )
+    constants = (transcription.constants for transcription in collocation.transcriptions)
+    numbers = DerivedModuli.from_bodies(constants, collocation.guess_p[: collocation.nq])
     assert numbers.values["young_pa"] > 0
     assert numbers.derivatives["young_pa"].any()
 
@@ -839,24 +663,16 @@ def test_a_model_that_fits_better_but_predicts_worse_is_not_taken():
 
 
 def test_recordings_that_disagree_leave_it_open():
-    small = row_of(
-        "small", 4, {"a": (2 * STEADY).tolist(), "b": STEADY.tolist()}, 900
-    )
-    large = row_of(
-        "large", 6, {"a": STEADY.tolist(), "b": (1.5 * STEADY).tolist()}, 850
-    )
+    small = row_of("small", 4, {"a": (2 * STEADY).tolist(), "b": STEADY.tolist()}, 900)
+    large = row_of("large", 6, {"a": STEADY.tolist(), "b": (1.5 * STEADY).tolist()}, 850)
     rows = rows_of(small, large)
     assert rows[0]["log_ratio_error"] > rows[0]["log_ratio"] > 0
     assert rows[0]["chosen"]
 
 
 def test_a_model_that_cannot_be_simulated_elsewhere_is_named():
-    small = row_of(
-        "small", 4, {"a": STEADY.tolist(), "b": STEADY.tolist()}, 900
-    )
-    large = row_of(
-        "large", 6, {"a": [], "b": []}, 700, failure="time step 7 failed"
-    )
+    small = row_of("small", 4, {"a": STEADY.tolist(), "b": STEADY.tolist()}, 900)
+    large = row_of("large", 6, {"a": [], "b": []}, 700, failure="time step 7 failed")
     said = advice(rows_of(small, large))
     assert said.startswith(
         "Use small: no other model predicts the held-out samples. large does not predict"
@@ -871,21 +687,8 @@ def test_a_model_that_cannot_be_simulated_elsewhere_is_named():
 def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
     monkeypatch.chdir(tiny)
     monkeypatch.setenv("COLUMNS", "80")
-    words = (
-        "compare-models",
-        "problem.toml",
-        "--materials",
-        "neo-hookean,st-venant-kirchhoff",
-    )
-    words = (
-        *words,
-        "--method",
-        "reduced-space",
-        "--workers",
-        "2",
-        "--out",
-        "models",
-    )
+    words = ("compare-models", "problem.toml", "--materials", "neo-hookean,st-venant-kirchhoff")
+    words = (*words, "--method", "reduced-space", "--workers", "2", "--out", "models")
     done = run_command(*words, "--quiet")
     assert done.code == 0, done.err
     assert "Use " in done.out
@@ -893,25 +696,17 @@ def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
     summary = json.loads((tiny / "models" / "summary.json").read_text())
     assert summary["kind"] == "compare-models"
     assert summary["advice"] in done.out
-    assert [row["model"] for row in summary["runs"]] == [
-        "neo-hookean",
-        "st-venant-kirchhoff",
-    ]
+    assert [row["model"] for row in summary["runs"]] == ["neo-hookean", "st-venant-kirchhoff"]
     assert sum(row["chosen"] for row in summary["runs"]) == 1
     listed = run_command(*words, "--dry-run")
     assert listed.out.count("finished") == 4
     page = run_command("report", "models")
-    assert (
-        summary["advice"].split(":")[0]
-        in (tiny / "models" / "report.html").read_text()
-    )
+    assert summary["advice"].split(":")[0] in (tiny / "models" / "report.html").read_text()
     assert page.code == 0
 
 
 @pytest.mark.long
-def test_a_comparison_of_laws_of_damping_from_the_command_line(
-    tiny: Path, monkeypatch
-):
+def test_a_comparison_of_laws_of_damping_from_the_command_line(tiny: Path, monkeypatch):
     monkeypatch.chdir(tiny)
     words = (
         "compare-models",
@@ -924,45 +719,23 @@ def test_a_comparison_of_laws_of_damping_from_the_command_line(
     done = run_command(*words, "--quiet")
     assert done.code == 0, done.err
     summary = json.loads((tiny / "laws" / "summary.json").read_text())
-    assert [row["model"] for row in summary["runs"]] == [
-        "kelvin-voigt",
-        "material",
-    ]
+    assert [row["model"] for row in summary["runs"]] == ["kelvin-voigt", "material"]
     assert all("gamma_r_s" in row["parameters"] for row in summary["runs"])
     for row in summary["runs"]:
-        assert all(
-            "damping_law" not in line["shares"]
-            for line in row["budget"].values()
-        )
+        assert all("damping_law" not in line["shares"] for line in row["budget"].values())
 
 
 def test_there_must_be_something_to_compare(tiny: Path):
     nothing = run_command("compare-models", "problem.toml")
-    assert (
-        nothing.code,
-        "--materials, --damping, --prony or --with" in nothing.err,
-    ) == (2, True)
-    words = (
-        "compare-models",
-        "problem.toml",
-        "--materials",
-        "gent,yeoh",
-        "--method",
-    )
+    assert (nothing.code, "--materials, --damping, --prony or --with" in nothing.err) == (2, True)
+    words = ("compare-models", "problem.toml", "--materials", "gent,yeoh", "--method")
     refused = run_command(*words, "reduced-spaced")
     assert (refused.code, "--method: " in refused.err) == (2, True)
     assert "did you mean 'reduced-space'?" in refused.err
 
 
 def test_one_method_fits_all_models(tiny: Path):
-    words = (
-        "compare-models",
-        "problem.toml",
-        "--materials",
-        "gent,yeoh",
-        "--dry-run",
-        "--json",
-    )
+    words = ("compare-models", "problem.toml", "--materials", "gent,yeoh", "--dry-run", "--json")
     planned = json.loads(run_command(*words, "--method", "interior-point").out)
     assert planned
     assert {run["method"] for run in planned} == {"interior-point"}

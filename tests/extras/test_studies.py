@@ -12,14 +12,7 @@ import study_methods
 import study_mismatch
 import study_noise
 import study_table1
-from studies import (
-    PARAMETER_SYMBOLS,
-    TRUTH,
-    Variant,
-    markdown,
-    run_variants,
-    worst_error,
-)
+from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, run_variants, worst_error
 
 pytestmark = pytest.mark.long
 
@@ -28,28 +21,16 @@ SIGMA_M = 1e-3
 
 def cells(table: str) -> list[list[str]]:
     """Rows of a Markdown table, without its head and rule."""
-    return [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in table.split("\n")
-    ][2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.split("\n")][2:]
 
 
 def row(**changes) -> dict:
     """What a study knows of a run that found the truth."""
     found = {f"value_{name}": value for name, value in TRUTH.items()}
     errors = {f"error_{name}": 0.0 for name in TRUTH}
-    numbers = dict.fromkeys(
-        ("rms_m", "violation_n", "violation_relative", "tip_max_m"), 0.0
-    )
+    numbers = dict.fromkeys(("rms_m", "violation_n", "violation_relative", "tip_max_m"), 0.0)
     rest = {"iterations": 8, "total_s": 1.0, "wall_s": 3.0, "converged": True}
-    return {
-        **found,
-        **errors,
-        **numbers,
-        **rest,
-        "status": "converged",
-        **changes,
-    }
+    return {**found, **errors, **numbers, **rest, "status": "converged", **changes}
 
 
 # Starts -------------------------------------------------------------------------------------------
@@ -57,51 +38,29 @@ def row(**changes) -> dict:
 
 @pytest.fixture(scope="module")
 def small_problem(tmp_path_factory) -> Path:
-    return study_methods.write_problem(
-        tmp_path_factory.mktemp("starts"), 2, 10, 0.02
-    )
+    return study_methods.write_problem(tmp_path_factory.mktemp("starts"), 2, 10, 0.02)
 
 
 def test_a_variant_is_solved_from_every_start(small_problem):
     variants = [Variant("shooting", "shooting", {"gradient": "forward"})]
-    rows = run_variants(
-        small_problem, variants, small_problem.parent, starts=2, spread=1.5
-    )
+    rows = run_variants(small_problem, variants, small_problem.parent, starts=2, spread=1.5)
     (result,) = (study_methods.score(name, each) for name, each in rows.items())
-    assert (result.runs, result.successes, result.converged, result.misled) == (
-        2,
-        2,
-        2,
-        0,
-    )
+    assert (result.runs, result.successes, result.converged, result.misled) == (2, 2, 2, 0)
     (line,) = cells(study_methods.table([result]))
     assert line[:3] == ["shooting", "2 of 2", "100"]
 
 
 def test_a_slow_variant_gets_the_first_starts(small_problem, monkeypatch):
     monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
-    variants = [
-        Variant("all", "shooting"),
-        Variant("few", "penalty", share=0.25),
-    ]
-    rows = run_variants(
-        small_problem, variants, small_problem.parent / "none", starts=8
-    )
+    variants = [Variant("all", "shooting"), Variant("few", "penalty", share=0.25)]
+    rows = run_variants(small_problem, variants, small_problem.parent / "none", starts=8)
     assert [len(each) for each in rows.values()] == [8, 2]
-    guesses = [
-        [each[k][f"guess_{n}"] for n in TRUTH]
-        for each in rows.values()
-        for k in (0, 1)
-    ]
+    guesses = [[each[k][f"guess_{n}"] for n in TRUTH] for each in rows.values() for k in (0, 1)]
     assert guesses[:2] == guesses[2:]
 
 
 def test_a_run_without_an_answer_counts_as_a_failure():
-    lost = row(
-        total_s=None,
-        converged=False,
-        **{f"error_{name}": None for name in TRUTH},
-    )
+    lost = row(total_s=None, converged=False, **{f"error_{name}": None for name in TRUTH})
     far = row(error_mu_pa=0.5)
     result = study_methods.score("some", [row(), far, lost])
     assert (result.successes, result.converged, result.misled) == (1, 2, 1)
@@ -134,9 +93,7 @@ def test_table_1_names_options_that_the_methods_have(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def fits() -> dict[str, list[study_mismatch.SchemeFit]]:
-    experiment = study_mismatch.exact_recording(
-        layers=2, samples=15, fine_s=1e-3
-    )
+    experiment = study_mismatch.exact_recording(layers=2, samples=15, fine_s=1e-3)
     return {
         scheme: [study_mismatch.identify(experiment, scheme, m) for m in (2, 4)]
         for scheme in ("backward-euler", "midpoint")
@@ -151,31 +108,19 @@ def test_finer_steps_bias_the_parameters_less(fits):
 
 
 def test_the_midpoint_rule_biases_stiffness_by_the_square_of_the_step(fits):
-    assert study_mismatch.orders(fits["midpoint"])[1] == pytest.approx(
-        2, abs=0.4
-    )
+    assert study_mismatch.orders(fits["midpoint"])[1] == pytest.approx(2, abs=0.4)
 
 
 def test_steps_with_an_estimate_at_its_bound_say_nothing_of_the_order():
     fits = [
         study_mismatch.SchemeFit(
-            "midpoint",
-            h,
-            True,
-            np.full(4, -3 * h),
-            np.arange(4) == bounded,
-            0.0,
-            0.0,
+            "midpoint", h, True, np.full(4, -3 * h), np.arange(4) == bounded, 0.0, 0.0
         )
         for h, bounded in ((0.01, None), (0.02, None), (0.04, 2))
     ]
     assert study_mismatch.orders(fits) == pytest.approx(1)
     assert np.isnan(study_mismatch.orders(fits[1:])).all()
-    assert [line[4] for line in cells(study_mismatch.table(fits))] == [
-        "-3",
-        "-6",
-        "-12*",
-    ]
+    assert [line[4] for line in cells(study_mismatch.table(fits))] == ["-3", "-6", "-12*"]
     everything, finest = cells(study_mismatch.order_table(fits[1:]))
     assert everything[1:] == finest[1:] == ["–"] * 4
 
@@ -185,9 +130,7 @@ def test_steps_with_an_estimate_at_its_bound_say_nothing_of_the_order():
 
 def test_methods_turn_the_same_noise_into_the_same_error():
     expected = np.array(study_noise.predicted(SIGMA_M))
-    reduced, shooting = (
-        study_noise.run(case, SIGMA_M, 0) for case in study_noise.CASES[:2]
-    )
+    reduced, shooting = (study_noise.run(case, SIGMA_M, 0) for case in study_noise.CASES[:2])
     assert reduced.converged
     assert shooting.converged
     assert reduced.errors == pytest.approx(shooting.errors, abs=1e-4)
@@ -219,9 +162,7 @@ def test_a_twin_with_noisy_poses_is_identified_and_listed():
     found = study_faults.run("poses 0.1 mm, 0.06°, estimated", (0, 1))
     assert found.converged
     assert found.contains_truth.sum() >= 3
-    (line,) = cells(
-        f"{study_faults.table_head()}\n{study_faults.table_row('poses', [found])}"
-    )
+    (line,) = cells(f"{study_faults.table_head()}\n{study_faults.table_row('poses', [found])}")
     assert line[0] == "poses"
     assert float(line[13]) == pytest.approx(100 * found.relative[0], rel=0.05)
     assert line[-1] == "0"
@@ -241,30 +182,18 @@ def test_faults_are_as_large_as_they_are_called():
     speed = np.gradient(before, measured.timestep_s, axis=0)
     change = late.markers.positions_m - stated.markers.positions_m
     assert np.abs(change + 0.002 * speed).max() < 0.1 * np.abs(change).max()
-    actual, noisy = study_faults.FAULTS["poses 0.5 mm, 0.3°, given"](
-        measured, rng
-    )
+    actual, noisy = study_faults.FAULTS["poses 0.5 mm, 0.3°, given"](measured, rng)
     shaken, smooth = noisy.grasps[0].poses, actual.grasps[0].poses
-    assert (shaken.positions_m - smooth.positions_m).std() == pytest.approx(
-        5e-4, rel=0.2
-    )
+    assert (shaken.positions_m - smooth.positions_m).std() == pytest.approx(5e-4, rel=0.2)
     assert noisy.grasps[0].sigma_rad == pytest.approx(np.radians(0.3))
     moved, _ = study_faults.FAULTS["marker positions 1 mm"](measured, rng)
     offsets = moved.markers.positions_m - before
-    assert np.linalg.norm(offsets, axis=2).mean() == pytest.approx(
-        1.6e-3, rel=0.4
-    )
+    assert np.linalg.norm(offsets, axis=2).mean() == pytest.approx(1.6e-3, rel=0.4)
 
 
-@pytest.mark.parametrize(
-    ("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")]
-)
+@pytest.mark.parametrize(("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")])
 def test_shares_beyond_chance_are_starred(count, shown):
-    outcome = study_faults.FaultOutcome(
-        True, *(np.ones(6) for _ in range(4)), correlated=False
-    )
+    outcome = study_faults.FaultOutcome(True, *(np.ones(6) for _ in range(4)), correlated=False)
     missed = replace(outcome, contains_truth=np.zeros(6))
-    row = study_faults.table_row(
-        "none", [outcome] * count + [missed] * (200 - count)
-    )
+    row = study_faults.table_row("none", [outcome] * count + [missed] * (200 - count))
     assert cells(f"a\nb\n{row}")[0][1] == shown

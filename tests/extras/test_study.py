@@ -89,20 +89,13 @@ def a_scheduler():
     """The address of one."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=2,
-        processes=False,
-        protocol="tcp",
-        dashboard_address=":0",
+        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=":0"
     ) as there:
         yield there.scheduler_address
 
 
 def planned_runs(count: int) -> list[PlannedRun]:
-    return [
-        PlannedRun(f"key{k}", "problem.toml", "interior-point", k)
-        for k in range(count)
-    ]
+    return [PlannedRun(f"key{k}", "problem.toml", "interior-point", k) for k in range(count)]
 
 
 # The command line's words -------------------------------------------------------------------------
@@ -116,10 +109,7 @@ def planned_runs(count: int) -> list[PlannedRun]:
         ("a.b=0:1:3", ["0", "0.5", "1"]),
         ("a.b=1:4:lin:4", ["1", "2", "3", "4"]),
         ("a.b=0.1:0.3:3", ["0.1", "0.2", "0.3"]),
-        (
-            'a.b=[0, 1],{c = 1, d = 2},"x,y"',
-            ["[0, 1]", "{c = 1, d = 2}", '"x,y"'],
-        ),
+        ('a.b=[0, 1],{c = 1, d = 2},"x,y"', ["[0, 1]", "{c = 1, d = 2}", '"x,y"']),
         ("a.b=midpoint,bdf2", ["midpoint", "bdf2"]),
         ("a.b=7", ["7"]),
     ],
@@ -163,12 +153,8 @@ def test_methods_are_listed_once_and_misspelt_ones_recognised():
 
 def test_the_truth_is_a_file_or_values(tmp_path):
     file = tmp_path / "truth.toml"
-    file.write_text(
-        "[parameters]\nlambda_pa = 1\nmu_pa = 300.0\ngamma_r_s = 0.009\n"
-    )
-    truth = read_truth(
-        [str(file), "lambda_pa=200,gamma_m_1_s=1.0"], NAMES, NAMES
-    )
+    file.write_text("[parameters]\nlambda_pa = 1\nmu_pa = 300.0\ngamma_r_s = 0.009\n")
+    truth = read_truth([str(file), "lambda_pa=200,gamma_m_1_s=1.0"], NAMES, NAMES)
     assert truth == TRUTH
     assert read_truth([], NAMES, NAMES) == {}
 
@@ -194,9 +180,7 @@ def test_a_truth_that_cannot_be_used_is_refused(given, message):
 
 def test_every_method_has_the_same_starts(tiny):
     problem = Problem.read("problem.toml")
-    planned = plan_comparison(
-        problem, ["interior-point", "reduced-space"], (), Starts(3, seed=4)
-    )
+    planned = plan_comparison(problem, ["interior-point", "reduced-space"], (), Starts(3, seed=4))
     assert [run.make_label() for run in planned] == [
         f"{method}, start {start}"
         for start in range(3)
@@ -205,17 +189,12 @@ def test_every_method_has_the_same_starts(tiny):
     assert len({run.key for run in planned}) == 6
     for one, other in zip(planned[::2], planned[1::2], strict=True):
         assert one.guess == other.guess
-    assert planned[0].guess == {
-        item.name: item.guess for item in problem.parameters.free
-    }
+    assert planned[0].guess == {item.name: item.guess for item in problem.parameters.free}
 
 
 def test_more_starts_are_further_ones(tiny):
     problem = Problem.read("problem.toml")
-    few, many = (
-        plan_comparison(problem, ["reduced-space"], (), Starts(n))
-        for n in (2, 5)
-    )
+    few, many = (plan_comparison(problem, ["reduced-space"], (), Starts(n)) for n in (2, 5))
     assert many[:2] == few
     others = plan_comparison(problem, ["reduced-space"], (), Starts(2, seed=1))
     assert others[0] == few[0]
@@ -225,9 +204,7 @@ def test_more_starts_are_further_ones(tiny):
 def test_starts_lie_around_the_truth_within_the_bounds(tiny):
     problem = Problem.read("problem.toml", ["parameters.mu_pa.upper=310"])
     overrides = ["parameters.mu_pa.upper=310"]
-    planned = plan_comparison(
-        problem, ["reduced-space"], overrides, Starts(40, 2.0), TRUTH
-    )
+    planned = plan_comparison(problem, ["reduced-space"], overrides, Starts(40, 2.0), TRUTH)
     guesses = np.array([list(run.guess.values()) for run in planned[1:]])
     ratios = guesses / np.array(list(TRUTH.values()))
     assert ratios.min() >= 0.5
@@ -239,9 +216,7 @@ def test_starts_lie_around_the_truth_within_the_bounds(tiny):
 def test_starts_lie_around_the_guess_where_the_truth_is_unknown(tiny):
     problem = Problem.read("problem.toml")
     start = plan_comparison(problem, ["reduced-space"], (), Starts(2, 1.0))[1]
-    assert start.guess == pytest.approx(
-        {item.name: item.guess for item in problem.parameters.free}
-    )
+    assert start.guess == pytest.approx({item.name: item.guess for item in problem.parameters.free})
 
 
 def test_fixed_parameters_stay(tiny):
@@ -260,33 +235,20 @@ def test_other_data_are_other_runs(tiny):
     before = key()
     assert key() == before
     assert key("solver.reduced-space.tolerance=1e-6") != before
-    assert (
-        key("solver.shooting.tolerance=1e-6") == before
-    )  # an option of another method
-    assert (
-        key("solver.method=reduced-space") == before
-    )  # the method it had anyhow
+    assert key("solver.shooting.tolerance=1e-6") == before  # an option of another method
+    assert key("solver.method=reduced-space") == before  # the method it had anyhow
     markers = tiny / "swing_markers.csv"
     markers.write_text(markers.read_text() + "\n")
     assert key() != before
 
 
 def test_a_sweep_has_every_combination(tiny):
-    over = parse_varied_keys(
-        ["parameters.mu_pa.guess=100:400:log:3", "transcription.substeps=1,2"]
-    )
+    over = parse_varied_keys(["parameters.mu_pa.guess=100:400:log:3", "transcription.substeps=1,2"])
     planned = plan_sweep(Path("problem.toml"), over, method="reduced-space")
     assert [tuple(run.varied_values.values()) for run in planned] == [
         (mu, m) for mu in ("100", "200", "400") for m in ("1", "2")
     ]
-    assert [run.guess["mu_pa"] for run in planned] == [
-        100,
-        100,
-        200,
-        200,
-        400,
-        400,
-    ]
+    assert [run.guess["mu_pa"] for run in planned] == [100, 100, 200, 200, 400, 400]
     assert planned[1].make_label() == "mu_pa.guess=100, substeps=2"
     assert {run.method for run in planned} == {"reduced-space"}
 
@@ -294,10 +256,7 @@ def test_a_sweep_has_every_combination(tiny):
 def test_a_sweep_can_be_over_methods(tiny):
     over = parse_varied_keys(["solver.method=interior-point,reduced-space"])
     planned = plan_sweep(Path("problem.toml"), over)
-    assert [run.method for run in planned] == [
-        "interior-point",
-        "reduced-space",
-    ]
+    assert [run.method for run in planned] == ["interior-point", "reduced-space"]
 
 
 @pytest.mark.parametrize(
@@ -314,23 +273,14 @@ def test_swept_keys_the_problem_has_not_are_refused(tiny, over, message):
 
 
 def test_keys_are_shortened_while_they_differ():
-    keys = [
-        "parameters.mu_pa.guess",
-        "transcription.substeps",
-        "a.sigma_m",
-        "b.sigma_m",
-    ]
+    keys = ["parameters.mu_pa.guess", "transcription.substeps", "a.sigma_m", "b.sigma_m"]
     shorts = ["mu_pa.guess", "substeps", "a.sigma_m", "b.sigma_m"]
     assert list(shortened_keys(keys)) == list(zip(keys, shorts, strict=True))
 
 
 @pytest.mark.parametrize(
     ("options", "where"),
-    [
-        ({"starts": 0}, "starts"),
-        ({"spread": 0.5}, "spread"),
-        ({"seed": -1}, "seed"),
-    ],
+    [({"starts": 0}, "starts"), ({"spread": 0.5}, "spread"), ({"seed": -1}, "seed")],
 )
 def test_starts_that_cannot_be_are_refused(options, where):
     with pytest.raises(InputError, match=f"^{where}: found"):
@@ -351,11 +301,7 @@ def test_a_run_has_one_thread(stand_in):
 def test_a_process_that_dies_once_is_tried_again(stand_in):
     tries = stand_in("dies once")
     record = run_execution.execute(planned_runs(1)[0].as_dict())
-    assert (record["outcome"], record["attempts"], tries("key0")) == (
-        "finished",
-        2,
-        2,
-    )
+    assert (record["outcome"], record["attempts"], tries("key0")) == ("finished", 2, 2)
 
 
 def test_a_process_that_always_dies_is_a_record(stand_in):
@@ -367,9 +313,7 @@ def test_a_process_that_always_dies_is_a_record(stand_in):
 
 def test_a_late_run_is_killed(stand_in):
     tries = stand_in("hangs")
-    record = run_execution.execute(
-        planned_runs(1)[0].as_dict(), time_limit_s=0.5
-    )
+    record = run_execution.execute(planned_runs(1)[0].as_dict(), time_limit_s=0.5)
     assert (record["outcome"], tries("key0")) == ("timeout", 1)
     assert record["message"] == "ended at the time limit of 0.5 s"
 
@@ -391,15 +335,9 @@ def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
     ready = tmp_path / "ready"
     found = as_json(a_result(status="interrupted", converged=False))
     monkeypatch.setattr(
-        run_execution,
-        "COMMAND",
-        (sys.executable, "-c", OBEDIENT, found, str(ready)),
+        run_execution, "COMMAND", (sys.executable, "-c", OBEDIENT, found, str(ready))
     )
-    monkeypatch.setattr(
-        run_execution.time,
-        "monotonic",
-        lambda: 100.0 if ready.exists() else 0.0,
-    )
+    monkeypatch.setattr(run_execution.time, "monotonic", lambda: 100.0 if ready.exists() else 0.0)
     planned = planned_runs(1)[0]
     record = run_execution.execute(planned.as_dict(), time_limit_s=10.0)
     assert record["outcome"] == "timeout"
@@ -409,9 +347,7 @@ def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
 
 def test_a_stopped_study_ends_its_runs(stand_in):
     stand_in("hangs")
-    record = run_execution.execute(
-        planned_runs(1)[0].as_dict(), is_stopped=lambda: True
-    )
+    record = run_execution.execute(planned_runs(1)[0].as_dict(), is_stopped=lambda: True)
     assert record["outcome"] == "stopped"
 
 
@@ -420,16 +356,12 @@ def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
         raise ZeroDivisionError("nothing to divide by")
 
     monkeypatch.setattr(ReducedSpace, "__call__", __call__)
-    planned = plan_comparison(Problem.read("problem.toml"), ["reduced-space"])[
-        0
-    ].as_dict()
+    planned = plan_comparison(Problem.read("problem.toml"), ["reduced-space"])[0].as_dict()
     record = run_worker.record_of_run(planned)
     assert record["outcome"] == "error"
     assert record["message"] == "ZeroDivisionError: nothing to divide by"
     assert "in __call__" in record["traceback"]
-    refused = run_worker.record_of_run(
-        {**planned, "overrides": ["parameters.mu_pa.guess=1e9"]}
-    )
+    refused = run_worker.record_of_run({**planned, "overrides": ["parameters.mu_pa.guess=1e9"]})
     assert refused["outcome"] == "error"
     assert "mu_pa: guess = 1e+09" in refused["message"]
 
@@ -440,64 +372,38 @@ def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
 def assert_all_runs_are_kept(folder: Path, limits: RunOptions) -> None:
     store, seen = RunStore(folder), []
     runs = planned_runs(4)
-    run_all(
-        runs,
-        store,
-        limits,
-        lambda record, slots: seen.append((record["key"], slots)),
-    )
+    run_all(runs, store, limits, lambda record, slots: seen.append((record["key"], slots)))
     assert sorted(key for key, _ in seen) == [run.key for run in runs]
     assert all(store.load(run.key)["start"] == run.start for run in runs)
     assert {slots for _, slots in seen} == {limits.workers or 2}
 
 
-def test_runs_are_done_without_a_cluster(
-    stand_in, without_distributed, tmp_path
-):
+def test_runs_are_done_without_a_cluster(stand_in, without_distributed, tmp_path):
     stand_in("dies once")
     assert_all_runs_are_kept(tmp_path / "runs", RunOptions(workers=3))
 
 
-def test_runs_are_done_on_a_scheduler_by_its_address(
-    stand_in, a_scheduler, tmp_path
-):
+def test_runs_are_done_on_a_scheduler_by_its_address(stand_in, a_scheduler, tmp_path):
     stand_in("dies once")
-    assert_all_runs_are_kept(
-        tmp_path / "runs", RunOptions(scheduler=a_scheduler)
-    )
+    assert_all_runs_are_kept(tmp_path / "runs", RunOptions(scheduler=a_scheduler))
 
 
-def test_a_scheduler_without_the_library_names_the_extra(
-    without_distributed, tmp_path
-):
-    with pytest.raises(
-        InputError, match=r"pip install 'collocation-sysid\[cluster\]'"
-    ):
-        run_all(
-            planned_runs(1),
-            RunStore(tmp_path),
-            RunOptions(scheduler="tcp://127.0.0.1:1"),
-        )
+def test_a_scheduler_without_the_library_names_the_extra(without_distributed, tmp_path):
+    with pytest.raises(InputError, match=r"pip install 'collocation-sysid\[cluster\]'"):
+        run_all(planned_runs(1), RunStore(tmp_path), RunOptions(scheduler="tcp://127.0.0.1:1"))
 
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 0.5)
     with pytest.raises(
-        InputError,
-        match=r"found 'tcp://127\.0\.0\.1:1', where no scheduler answers",
+        InputError, match=r"found 'tcp://127\.0\.0\.1:1', where no scheduler answers"
     ):
-        run_all(
-            planned_runs(1),
-            RunStore(tmp_path),
-            RunOptions(scheduler="tcp://127.0.0.1:1"),
-        )
+        run_all(planned_runs(1), RunStore(tmp_path), RunOptions(scheduler="tcp://127.0.0.1:1"))
 
 
 @pytest.mark.parametrize("clustered", [True, False])
-def test_an_interrupted_study_keeps_what_is_finished(
-    stand_in, tmp_path, request, clustered
-):
+def test_an_interrupted_study_keeps_what_is_finished(stand_in, tmp_path, request, clustered):
     address = request.getfixturevalue("a_scheduler") if clustered else None
     stand_in("answers")
     store, runs = RunStore(tmp_path / "runs"), planned_runs(20)
@@ -506,12 +412,7 @@ def test_an_interrupted_study_keeps_what_is_finished(
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_all(
-            runs,
-            store,
-            RunOptions(None if clustered else 1, address),
-            interrupt,
-        )
+        run_all(runs, store, RunOptions(None if clustered else 1, address), interrupt)
     assert sum(store.load(run.key) is not None for run in runs) == 1
 
 
@@ -563,17 +464,11 @@ def test_limits_that_cannot_be_are_refused(options, where):
         (0, 0, (0.0, 1.0)),
     ],
 )
-def test_wilson_intervals_agree_with_published_ones(
-    successes, trials, interval
-):
-    assert wilson_interval(successes, trials) == pytest.approx(
-        interval, abs=6e-5
-    )
+def test_wilson_intervals_agree_with_published_ones(successes, trials, interval):
+    assert wilson_interval(successes, trials) == pytest.approx(interval, abs=6e-5)
 
 
-def answer(
-    run: PlannedRun, factor: float = 1.0, status: str = "converged"
-) -> dict:
+def answer(run: PlannedRun, factor: float = 1.0, status: str = "converged") -> dict:
     """A record as a run's process writes it, off by a factor."""
     values = {name: value(factor * true) for name, true in TRUTH.items()}
     found = a_result(
@@ -587,10 +482,7 @@ def answer(
 
 
 def test_success_needs_convergence_and_the_truth():
-    runs = [
-        PlannedRun(f"{k}", "p", "a", k, guess=dict.fromkeys(TRUTH, 1.0))
-        for k in range(5)
-    ]
+    runs = [PlannedRun(f"{k}", "p", "a", k, guess=dict.fromkeys(TRUTH, 1.0)) for k in range(5)]
     records = [
         answer(runs[0], 1.005),
         answer(runs[1], 1.02),
@@ -598,56 +490,27 @@ def test_success_needs_convergence_and_the_truth():
         {**runs[3].as_dict(), "outcome": "timeout", "message": "killed"},
         None,
     ]
-    rows = [
-        run_row(r, c, SuccessCriterion(TRUTH))
-        for r, c in zip(runs, records, strict=True)
-    ]
-    assert [row["success"] for row in rows] == [
-        True,
-        False,
-        False,
-        False,
-        False,
-    ]
-    assert [row["status"] for row in rows[2:]] == [
-        "iteration-limit",
-        "timeout",
-        "missing",
-    ]
+    rows = [run_row(r, c, SuccessCriterion(TRUTH)) for r, c in zip(runs, records, strict=True)]
+    assert [row["success"] for row in rows] == [True, False, False, False, False]
+    assert [row["status"] for row in rows[2:]] == ["iteration-limit", "timeout", "missing"]
     (summary,) = method_rows(rows)
-    assert (summary["runs"], summary["converged"], summary["successes"]) == (
-        4,
-        2,
-        1,
-    )
+    assert (summary["runs"], summary["converged"], summary["successes"]) == (4, 2, 1)
     assert summary["error_mu_pa"] == pytest.approx(0.005)
     assert summary["iterations"] == 7
-    assert run_row(runs[1], records[1], SuccessCriterion(TRUTH, within=0.05))[
-        "success"
-    ]
+    assert run_row(runs[1], records[1], SuccessCriterion(TRUTH, within=0.05))["success"]
     assert run_row(runs[1], records[1], SuccessCriterion())["success"]
 
 
 def test_the_time_left_follows_from_each_methods_runs():
     walls = {"fast": [1.0, 3.0], "slow": [10.0]}
-    assert remaining_time_s(
-        ["fast", "fast", "slow"], walls, worker_count=1
-    ) == pytest.approx(14.0)
-    assert remaining_time_s(
-        ["fast"] * 8, walls, worker_count=2
-    ) == pytest.approx(8.0)
-    assert remaining_time_s(["slow"], walls, worker_count=8) == pytest.approx(
-        10.0
-    )
-    assert remaining_time_s(
-        ["unknown"], {"fast": [2.0]}, worker_count=1
-    ) == pytest.approx(2.0)
+    assert remaining_time_s(["fast", "fast", "slow"], walls, worker_count=1) == pytest.approx(14.0)
+    assert remaining_time_s(["fast"] * 8, walls, worker_count=2) == pytest.approx(8.0)
+    assert remaining_time_s(["slow"], walls, worker_count=8) == pytest.approx(10.0)
+    assert remaining_time_s(["unknown"], {"fast": [2.0]}, worker_count=1) == pytest.approx(2.0)
     assert remaining_time_s(["fast"], {}, 1) is None
     assert remaining_time_s([], walls, 1) is None
 
 
 def test_records_are_json(tmp_path):
-    RunStore(tmp_path).save(
-        {"key": "a", "outcome": "finished", "loss": float("nan")}
-    )
+    RunStore(tmp_path).save({"key": "a", "outcome": "finished", "loss": float("nan")})
     assert json.loads((tmp_path / "a.json").read_text())["loss"] is None

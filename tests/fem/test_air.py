@@ -35,9 +35,7 @@ from collocation_sysid.model.forces import Forces
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changed_residuals,
-)
+from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
 from collocation_sysid.statistics.budget.uncertainty_budget import (
     BudgetLine,
@@ -70,9 +68,7 @@ def falling(air_density_kg_m3: float | str) -> Experiment:
 def fallen_m(experiment: Experiment, integrator: str) -> np.ndarray:
     """(T,) height of the centre of mass over that at the start."""
     positions_m = simulate(experiment, STIFF, integrator).positions_m
-    height_m = np.average(
-        positions_m[..., 2], axis=1, weights=experiment.body.node_mass
-    )
+    height_m = np.average(positions_m[..., 2], axis=1, weights=experiment.body.node_mass)
     return height_m - height_m[0]
 
 
@@ -85,34 +81,23 @@ def test_a_falling_cube_follows_the_equation_of_a_falling_point(integrator):
 
     def rate(_, state):
         velocity = state[1]
-        return [
-            velocity,
-            (weight_n - dragged * abs(velocity) * velocity) / inertia_kg,
-        ]
+        return [velocity, (weight_n - dragged * abs(velocity) * velocity) / inertia_kg]
 
     experiment = falling(AIR_KG_M3)
     t_s = experiment.t_s
-    exact = solve_ivp(
-        rate, (0.0, t_s[-1]), [0.0, 0.0], t_eval=t_s, rtol=1e-10, atol=1e-12
-    ).y[0]
+    exact = solve_ivp(rate, (0.0, t_s[-1]), [0.0, 0.0], t_eval=t_s, rtol=1e-10, atol=1e-12).y[0]
     fallen = fallen_m(experiment, integrator)
     np.testing.assert_allclose(fallen, exact, atol=1e-3 * abs(exact[-1]))
     in_vacuum = fallen_m(falling("none"), integrator)
-    assert in_vacuum[-1] == pytest.approx(
-        0.5 * GRAVITY_M_S2[2] * t_s[-1] ** 2, rel=1e-6
-    )
+    assert in_vacuum[-1] == pytest.approx(0.5 * GRAVITY_M_S2[2] * t_s[-1] ** 2, rel=1e-6)
     assert exact[-1] > 0.8 * in_vacuum[-1]
 
 
 def test_in_equilibrium_a_body_in_air_is_as_one_that_is_lighter_by_the_air():
     hanging = hung_cube(3, air_density_kg_m3=AIR_KG_M3, kind="static")
-    lighter = cs.Body(
-        hanging.body.mesh, density_kg_m3=DENSITY_KG_M3 - AIR_KG_M3
-    )
+    lighter = cs.Body(hanging.body.mesh, density_kg_m3=DENSITY_KG_M3 - AIR_KG_M3)
     in_vacuum = replace(hanging, body=lighter, air_density_kg_m3="none")
-    ours, theirs = (
-        simulate(each, TRUTH).positions_m for each in (hanging, in_vacuum)
-    )
+    ours, theirs = (simulate(each, TRUTH).positions_m for each in (hanging, in_vacuum))
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
     assert np.abs(ours - simulate(replace(hanging, air_density_kg_m3="none"), TRUTH).positions_m
                   ).max() > 1e-5  # fmt: skip
@@ -132,9 +117,7 @@ def test_point_masses_displace_no_air_and_no_air_is_damped_as_the_body_is():
     assert mass.inertia_kg.sum() == pytest.approx(body_kg + 1.5 * air_kg)
 
 
-def test_drag_is_the_slope_of_what_it_dissipates_and_acts_at_the_surface_alone(
-    rng,
-):
+def test_drag_is_the_slope_of_what_it_dissipates_and_acts_at_the_surface_alone(rng):
     forces = Forces.from_experiment(
         hung_cube(3, (3, 3, 3), air_density_kg_m3=AIR_KG_M3), [0.0, 0.1]
     )
@@ -145,9 +128,7 @@ def test_drag_is_the_slope_of_what_it_dissipates_and_acts_at_the_surface_alone(
     area_m2 = drag.placed.data[3]
 
     def potential(v: np.ndarray) -> float:
-        speed = np.linalg.norm(
-            v.reshape(2, -1, 3)[:, drag.points.nodes[:, 0]], axis=2
-        )
+        speed = np.linalg.norm(v.reshape(2, -1, 3)[:, drag.points.nodes[:, 0]], axis=2)
         cubed = (speed**2 + SMOOTH_BELOW_M_S**2) ** 1.5
         return float((0.125 * AIR_KG_M3 * area_m2 * cubed).sum()) / 3
 
@@ -186,9 +167,7 @@ def recorded(drag: float, stated: float | str) -> Problem:
 
     force = cs.NodeForce.from_law(more_drag)
     body = cs.Body(hung.body.mesh, density_kg_m3=DENSITY_KG_M3, forces=[force])
-    tracks = simulate(
-        replace(hung, body=body), TRUTH, "midpoint", substeps=1
-    ).markers_m
+    tracks = simulate(replace(hung, body=body), TRUTH, "midpoint", substeps=1).markers_m
     noise = NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     seen = with_markers(replace(hung, air_density_kg_m3=stated), tracks + noise)
     markers = replace(seen.markers, sigma_m=np.full(tracks.shape[1], NOISE_M))
@@ -203,22 +182,15 @@ class Estimated:
     line: BudgetLine
 
 
-def estimated(
-    described: Problem, deviations: Mapping[str, float] | None = None
-) -> Estimated:
+def estimated(described: Problem, deviations: Mapping[str, float] | None = None) -> Estimated:
     """Fit γ_m; deviations of the rows of the air are those of the table unless they are given."""
     solution = ReducedSpace(tolerance=1e-6)(described.collocation())
     collocation, z = solution.collocation, solution.z
     rows = [row for row in ASSUMPTIONS if row.name in OF_AIR]
     sizes = [(row, (deviations or {}).get(row.name, row.sigma)) for row in rows]
-    changes, found = (
-        changed_residuals(collocation, z, sizes),
-        uncertainty_at(collocation, z),
-    )
+    changes, found = (changed_residuals(collocation, z, sizes), uncertainty_at(collocation, z))
     fit = linearise_fit(collocation, z)
-    sources = VarianceSources.from_fit(
-        fit, changes, collocation.parameters, solution.q, found
-    )
+    sources = VarianceSources.from_fit(fit, changes, collocation.parameters, solution.q, found)
     line = budget(sources, found, {}, collocation.parameters)[GAMMA_M]
     interval = found.estimates[GAMMA_M].statistical95
     assert interval is not None
@@ -239,9 +211,7 @@ def test_the_combined_interval_is_half_of_what_it_is_where_all_air_may_be_missin
     found = estimated(described)
     as_if_missing = estimated(described, dict.fromkeys(OF_AIR, 1.0))
     assert holds(found.line.combined95)
-    assert width(found.line.combined95) <= 0.5 * width(
-        as_if_missing.line.combined95
-    )
+    assert width(found.line.combined95) <= 0.5 * width(as_if_missing.line.combined95)
     assert next(iter(found.line.shares)) == "air_drag"
 
 
@@ -278,11 +248,7 @@ def test_air_is_part_of_the_model_unless_it_is_said_otherwise():
         "print(hung.air_density_kg_m3, EnvironmentSection().air_density_kg_m3)\n"
     )
     found = subprocess.run(
-        [sys.executable, "-c", script],
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=120,
+        [sys.executable, "-c", script], check=False, capture_output=True, text=True, timeout=120
     )
     assert found.returncode == 0, found.stderr
     assert found.stdout.split() == ["1.2", "1.2"]
@@ -296,9 +262,7 @@ def with_air(folder: Path, value: str) -> Path:
     return file
 
 
-@pytest.mark.parametrize(
-    ("value", "density"), [('"none"', 0.0), ("1.05", 1.05), ("0.0", 0.0)]
-)
+@pytest.mark.parametrize(("value", "density"), [('"none"', 0.0), ("1.05", 1.05), ("0.0", 0.0)])
 def test_a_problem_file_states_the_air_of_all_experiments(tiny, value, density):
     problem = Problem.read(with_air(tiny, value))
     assert [e.air_density_kg_m3 for e in problem.experiments] == [density]
@@ -322,19 +286,13 @@ def test_air_that_cannot_be_is_refused(tiny, value, message):
 
 @pytest.mark.parametrize("value", [-1.0, np.nan, True, "vacuum"])
 def test_air_that_cannot_be_is_refused_in_python(value):
-    with pytest.raises(
-        InputError,
-        match=r"air_density_kg_m3 is .*; expected a density in kg/m³",
-    ):
+    with pytest.raises(InputError, match=r"air_density_kg_m3 is .*; expected a density in kg/m³"):
         hung_cube(3, air_density_kg_m3=value)
 
 
 def test_check_and_result_tell_what_air_is_in_the_model(tiny):
     with_air(tiny, "1.1")
-    assert (
-        "1.1 kg/m³ (buoyancy, added mass and drag)"
-        in run_command("check", "problem.toml").out
-    )
+    assert "1.1 kg/m³ (buoyancy, added mass and drag)" in run_command("check", "problem.toml").out
     ended = run_command("solve", "problem.toml", "--json", *settings(*AT_TRUTH))
     assert ended.code == 0, ended.err
     (experiment,) = json.loads(ended.out)["fit"]["experiments"].values()

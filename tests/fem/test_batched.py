@@ -31,10 +31,7 @@ from collocation_sysid.fem.kernels import (
     make_instance_evaluator,
     simd,
 )
-from collocation_sysid.fem.kernels.combine import (
-    combine_with_numpy,
-    compile_combiner,
-)
+from collocation_sysid.fem.kernels.combine import combine_with_numpy, compile_combiner
 from collocation_sysid.fem.laws.materials import MATERIALS, neo_hookean
 
 VARIABLE = "COLLOCATION_SYSID_EVALUATOR"
@@ -60,9 +57,7 @@ def cache(tmp_path, monkeypatch) -> Path:
     return folder
 
 
-def new_body(
-    mesh, material: str | Callable = "neo-hookean", evaluator: str = "auto"
-) -> Body:
+def new_body(mesh, material: str | Callable = "neo-hookean", evaluator: str = "auto") -> Body:
     """As in a process of its own."""
     jit.compile_function.cache_clear()
     return Body(mesh, material, 30.0, damping="rayleigh", evaluator=evaluator)
@@ -80,9 +75,7 @@ def test_vector_code_is_the_default():
 
 
 @pytest.mark.parametrize("name", ["simd", "casadi"])
-def test_evaluator_is_forced_by_argument_or_by_environment(
-    small_mesh, name, monkeypatch
-):
+def test_evaluator_is_forced_by_argument_or_by_environment(small_mesh, name, monkeypatch):
     assert new_body(small_mesh, evaluator=name).evaluator == name
     monkeypatch.setenv(VARIABLE, name)
     assert new_body(small_mesh).evaluator == name
@@ -94,34 +87,26 @@ def test_argument_wins_over_environment(small_mesh, monkeypatch):
 
 
 def test_unknown_evaluator_is_refused(small_mesh, monkeypatch):
-    with pytest.raises(
-        InputError, match="is 'gpu'; expected one of auto, simd, casadi"
-    ):
+    with pytest.raises(InputError, match="is 'gpu'; expected one of auto, simd, casadi"):
         new_body(small_mesh, evaluator="gpu")
     monkeypatch.setenv(VARIABLE, "fast")
     with pytest.raises(InputError, match="is 'fast'; expected one of"):
         new_body(small_mesh)
 
 
-def test_everything_works_without_llvmlite(
-    small_mesh, make_body, without_llvmlite
-):
+def test_everything_works_without_llvmlite(small_mesh, make_body, without_llvmlite):
     body = new_body(small_mesh)
     assert body.evaluator == "casadi"
     x = squeezed(small_mesh)
     expected = make_body("neo-hookean", "casadi").elastic_force(x, **ELASTIC)
     np.testing.assert_array_equal(body.elastic_force(x, **ELASTIC), expected)
-    assert make_combiner(
-        random_plan(np.random.default_rng(0))
-    ).__qualname__.startswith(combine_with_numpy.__name__)
+    assert make_combiner(random_plan(np.random.default_rng(0))).__qualname__.startswith(
+        combine_with_numpy.__name__
+    )
 
 
-def test_forcing_vector_code_without_llvmlite_names_the_remedy(
-    small_mesh, without_llvmlite
-):
-    with pytest.raises(
-        InputError, match="pip install llvmlite, or use 'casadi'"
-    ):
+def test_forcing_vector_code_without_llvmlite_names_the_remedy(small_mesh, without_llvmlite):
+    with pytest.raises(InputError, match="pip install llvmlite, or use 'casadi'"):
         new_body(small_mesh, evaluator="simd")
 
 
@@ -129,74 +114,48 @@ def test_forcing_vector_code_without_llvmlite_names_the_remedy(
 
 
 @pytest.mark.parametrize(
-    ("lanes", "quickly"),
-    [(1, True), (2, False), (4, True), (8, True), (8, False)],
+    ("lanes", "quickly"), [(1, True), (2, False), (4, True), (8, True), (8, False)]
 )
-def test_vectors_of_any_width_give_the_same(
-    small_mesh, make_body, lanes, quickly, monkeypatch
-):
+def test_vectors_of_any_width_give_the_same(small_mesh, make_body, lanes, quickly, monkeypatch):
     monkeypatch.setattr(simd, "vector_lanes", lambda: lanes)
     monkeypatch.setattr(simd, "OPTIMISED_FROM_POINTS", 10_000 if quickly else 0)
     x = squeezed(small_mesh)
-    body, reference = (
-        new_body(small_mesh, evaluator="simd"),
-        make_body("neo-hookean", "casadi"),
-    )
-    found, expected = (
-        each.elastic_force(x, **ELASTIC) for each in (body, reference)
-    )
+    body, reference = (new_body(small_mesh, evaluator="simd"), make_body("neo-hookean", "casadi"))
+    found, expected = (each.elastic_force(x, **ELASTIC) for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
-    found, expected = (
-        each.stiffness(x, **ELASTIC).toarray() for each in (body, reference)
-    )
+    found, expected = (each.stiffness(x, **ELASTIC).toarray() for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
 
 
-def test_code_that_was_compiled_quickly_is_not_taken_for_optimised_code(
-    small_mesh, cache
-):
-    new_body(small_mesh, evaluator="simd").elastic_force(
-        squeezed(small_mesh), **ELASTIC
-    )
+def test_code_that_was_compiled_quickly_is_not_taken_for_optimised_code(small_mesh, cache):
+    new_body(small_mesh, evaluator="simd").elastic_force(squeezed(small_mesh), **ELASTIC)
     quickly = set(cache.iterdir())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simd, "OPTIMISED_FROM_POINTS", 0)
-        new_body(small_mesh, evaluator="simd").elastic_force(
-            squeezed(small_mesh), **ELASTIC
-        )
+        new_body(small_mesh, evaluator="simd").elastic_force(squeezed(small_mesh), **ELASTIC)
     assert len(set(cache.iterdir()) - quickly) == len(quickly) > 0
 
 
 def distance_and_slopes() -> ca.Function:
     point, share = ca.SX.sym("point", 3), ca.SX.sym("share")
     distance = share * ca.sqrt(ca.sumsqr(point) + 1)
-    return ca.Function(
-        "distance", [point, share], [distance, ca.jacobian(distance, point)]
-    )
+    return ca.Function("distance", [point, share], [distance, ca.jacobian(distance, point)])
 
 
 @pytest.mark.parametrize("count", [1, 7, 32])
 def test_any_number_of_instances_gives_the_same_compiled(count):
     rng = np.random.default_rng(0)
     inputs = [rng.normal(size=(3, count)), rng.normal(size=(1, count))]
-    compiled = make_instance_evaluator(distance_and_slopes(), compiled=True)(
-        inputs
-    )
-    expected = make_instance_evaluator(distance_and_slopes(), compiled=False)(
-        inputs
-    )
+    compiled = make_instance_evaluator(distance_and_slopes(), compiled=True)(inputs)
+    expected = make_instance_evaluator(distance_and_slopes(), compiled=False)(inputs)
     assert [each.shape for each in compiled] == [(1, count), (3, count)]
     for each, other in zip(compiled, expected, strict=True):
         np.testing.assert_allclose(each, other, rtol=1e-14)
 
 
-def test_instances_are_evaluated_by_casadi_where_they_cannot_be_compiled(
-    broken_compiler, cache
-):
+def test_instances_are_evaluated_by_casadi_where_they_cannot_be_compiled(broken_compiler, cache):
     inputs = [np.ones((3, 4)), np.ones((1, 4))]
-    distance, _ = make_instance_evaluator(distance_and_slopes(), compiled=True)(
-        inputs
-    )
+    distance, _ = make_instance_evaluator(distance_and_slopes(), compiled=True)(inputs)
     np.testing.assert_array_equal(distance, np.full((1, 4), 2.0))
 
 
@@ -255,22 +214,14 @@ NUMBERS = [np.nan, *NUMBERS, *(-number for number in NUMBERS)]
 
 def kernel_of(function: Callable) -> ElementKernel:
     """A function of two numbers, which are coordinates of one node, as a kernel."""
-    x, geometry, theta = (
-        ca.SX.sym("x", 3),
-        ca.SX.sym("geometry", 4),
-        ca.SX.sym("theta", 3),
-    )
+    x, geometry, theta = (ca.SX.sym("x", 3), ca.SX.sym("geometry", 4), ca.SX.sym("theta", 3))
     value = geometry[3] * function(x[0], x[1])
     names = ["x", "geometry", "theta"]
-    pieces = ca.Function(
-        "value", [x, geometry, theta], [value], names, ["value"]
-    )
+    pieces = ca.Function("value", [x, geometry, theta], [value], names, ["value"])
     return ElementKernel(pieces, ("x",), {"value": "none"})
 
 
-def values(
-    kernel: ElementKernel, evaluator: str, x: np.ndarray, y: np.ndarray
-) -> np.ndarray:
+def values(kernel: ElementKernel, evaluator: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     count = len(x)
     cells = np.arange(count)[:, None]
     geometry = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (count, 1, 4))
@@ -281,21 +232,14 @@ def values(
     return found[0]
 
 
-def both_values(
-    function: Callable, x: np.ndarray, y: np.ndarray
-) -> list[np.ndarray]:
-    return [
-        values(kernel_of(function), evaluator, x, y)
-        for evaluator in ("simd", "casadi")
-    ]
+def both_values(function: Callable, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+    return [values(kernel_of(function), evaluator, x, y) for evaluator in ("simd", "casadi")]
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_operations_are_those_of_casadi(name):
     pieces = kernel_of(FUNCTIONS[name]).pieces
-    assert getattr(ca, name) in [
-        pieces.instruction_id(k) for k in range(pieces.n_instructions())
-    ]
+    assert getattr(ca, name) in [pieces.instruction_id(k) for k in range(pieces.n_instructions())]
     x, y = np.array(list(product(NUMBERS, NUMBERS))).T
     found, expected = both_values(FUNCTIONS[name], x, y)
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=0)
@@ -308,16 +252,11 @@ def test_derivatives_need_no_other_operations(name):
     value = ca.exp(function(z[0], z[1]))
     for _ in range(3):  # as many as a curvature kernel takes
         value = ca.sum1(ca.gradient(value, z))
-        instructions.require_supported_operations(
-            ca.Function("derivative", [z], [value])
-        )
+        instructions.require_supported_operations(ca.Function("derivative", [z], [value]))
 
 
 def test_every_operation_of_vector_code_is_tested():
-    known = {
-        instructions.operation_name(operation)
-        for operation in instructions.OPERATIONS
-    }
+    known = {instructions.operation_name(operation) for operation in instructions.OPERATIONS}
     assert known - set(FUNCTIONS) == {"OP_ASSIGN", "OP_ERFINV"}
 
 
@@ -342,9 +281,7 @@ def test_what_the_compiler_makes_other_calls_of_is_resolved(function):
 
 def test_branch_that_is_not_taken_is_not_felt():
     x = np.array([-1.0, 0.0, 1.0, 2.0, -3.0, 4.0, 0.0, 5.0, 6.0])
-    found, expected = both_values(
-        lambda x, y: ca.if_else(x > 0, ca.log(x), -1), x, x
-    )
+    found, expected = both_values(lambda x, y: ca.if_else(x > 0, ca.log(x), -1), x, x)
     np.testing.assert_allclose(found, expected, rtol=1e-13)
     assert (found[x <= 0] == -1).all()
 
@@ -357,23 +294,7 @@ def test_what_is_infinite_in_the_last_element_stays_so(count):
 
 
 def test_inverse_error_function_is_exact():
-    x = np.array(
-        [
-            -1.5,
-            -1.0,
-            -0.95,
-            -0.7,
-            -0.69,
-            -1e-9,
-            0.0,
-            0.3,
-            0.7,
-            0.95,
-            1.0,
-            2.0,
-            np.nan,
-        ]
-    )
+    x = np.array([-1.5, -1.0, -0.95, -0.7, -0.69, -1e-9, 0.0, 0.3, 0.7, 0.95, 1.0, 2.0, np.nan])
     found = values(kernel_of(lambda x, y: ca.erfinv(x)), "simd", x, x)
     np.testing.assert_allclose(found, scipy.special.erfinv(x), rtol=1e-13)
 
@@ -382,36 +303,18 @@ def branching(F, lambda_pa, mu_pa):
     """Softer in tension than in compression, with most of the functions there are."""
     j, stretch, shear = ca.det(F), ca.trace(F.T @ F) - 3, F[0, 1] + F[1, 0]
     volumetric = ca.if_else(j < 1, j - 1 - ca.log(j), ca.tanh(j - 1) ** 2 / 2)
-    limited = (
-        ca.erf(stretch)
-        + ca.atan2(stretch, j)
-        + ca.log1p(stretch**2)
-        + ca.erfinv(shear / 4)
-    )
-    clipped = (
-        ca.fmax(stretch, 0.1) ** 3
-        + ca.fmin(shear, 0.0) ** 2
-        + ca.hypot(shear, j)
-    )
-    either = ca.if_else(
-        ca.logic_or(shear > 0.1, stretch < 0), ca.cosh(shear), ca.exp(-stretch)
-    )
+    limited = ca.erf(stretch) + ca.atan2(stretch, j) + ca.log1p(stretch**2) + ca.erfinv(shear / 4)
+    clipped = ca.fmax(stretch, 0.1) ** 3 + ca.fmin(shear, 0.0) ** 2 + ca.hypot(shear, j)
+    either = ca.if_else(ca.logic_or(shear > 0.1, stretch < 0), ca.cosh(shear), ca.exp(-stretch))
     return lambda_pa * volumetric + mu_pa * (limited + clipped + either)
 
 
 @pytest.mark.parametrize("method", ["force", "linearise", "second_derivatives"])
-def test_energy_with_branches_is_the_same_by_both_evaluators(
-    small_mesh, method, rng
-):
+def test_energy_with_branches_is_the_same_by_both_evaluators(small_mesh, method, rng):
     # It is for the evaluators only: an undeformed body has stress.
     material = replace(MATERIALS["neo-hookean"], energy=branching)
-    bodies = [
-        new_body(small_mesh, material, evaluator)
-        for evaluator in ("simd", "casadi")
-    ]
-    x = small_mesh.points_m + 0.004 * rng.standard_normal(
-        (3, *small_mesh.points_m.shape)
-    )
+    bodies = [new_body(small_mesh, material, evaluator) for evaluator in ("simd", "casadi")]
+    x = small_mesh.points_m + 0.004 * rng.standard_normal((3, *small_mesh.points_m.shape))
     ratios = bodies[0].volume_ratios(x)
     assert ratios.min() < 1 < ratios.max()
     v, w = rng.standard_normal((2, *x.shape))
@@ -421,9 +324,7 @@ def test_energy_with_branches_is_the_same_by_both_evaluators(
     )
     found, expected = (getattr(body, method)(*states, theta) for body in bodies)
     for name in getattr(expected, "__dataclass_fields__", [None]):
-        pair = (
-            getattr(each, name) if name else each for each in (found, expected)
-        )
+        pair = (getattr(each, name) if name else each for each in (found, expected))
         assert relative_error(*pair) < 1e-12
 
 
@@ -434,23 +335,17 @@ def printing(F, lambda_pa, mu_pa):
     return ca.SX.printme(neo_hookean(F, lambda_pa, mu_pa), 0)
 
 
-def test_material_that_vector_code_lacks_yields_to_casadi_with_a_note(
-    small_mesh, make_body
-):
+def test_material_that_vector_code_lacks_yields_to_casadi_with_a_note(small_mesh, make_body):
     body = new_body(small_mesh, printing)
     assert body.evaluator == "casadi"
     (note,) = body.notes
     assert "CasADi's map, which is much slower" in note
     assert "no CasADi operation OP_PRINTME" in note
     x = squeezed(small_mesh)
-    assert body.energy(x, **ELASTIC) == make_body(
-        "neo-hookean", "casadi"
-    ).energy(x, **ELASTIC)
+    assert body.energy(x, **ELASTIC) == make_body("neo-hookean", "casadi").energy(x, **ELASTIC)
 
 
-def test_forced_vector_code_refuses_what_it_lacks_with_the_remedy(
-    small_mesh, monkeypatch
-):
+def test_forced_vector_code_refuses_what_it_lacks_with_the_remedy(small_mesh, monkeypatch):
     refusal = r"operation OP_PRINTME; choose evaluator = 'casadi'"
     with pytest.raises(InputError, match=refusal):
         new_body(small_mesh, printing, "simd")
@@ -466,9 +361,7 @@ def test_kernel_refuses_what_vector_code_lacks():
 
 
 @pytest.mark.parametrize("evaluator", ["simd", "casadi"])
-def test_there_is_no_note_where_the_evaluator_is_as_asked_for(
-    small_mesh, evaluator
-):
+def test_there_is_no_note_where_the_evaluator_is_as_asked_for(small_mesh, evaluator):
     assert new_body(small_mesh, evaluator=evaluator).notes == ()
     assert new_body(small_mesh).notes == ()
 
@@ -481,29 +374,18 @@ def broken_compiler(cache, monkeypatch):
     monkeypatch.setattr(jit, "compile_module", fail)
 
 
-def test_failing_compiler_yields_to_casadi_with_a_note(
-    small_mesh, make_body, broken_compiler
-):
+def test_failing_compiler_yields_to_casadi_with_a_note(small_mesh, make_body, broken_compiler):
     body = new_body(small_mesh)
     x = squeezed(small_mesh)
-    assert body.energy(x, **ELASTIC) == make_body(
-        "neo-hookean", "casadi"
-    ).energy(x, **ELASTIC)
+    assert body.energy(x, **ELASTIC) == make_body("neo-hookean", "casadi").energy(x, **ELASTIC)
     assert body.evaluator == "casadi"
-    assert (
-        "LLVM cannot compile the energy function of the material (no registers)"
-        in body.notes[0]
-    )
+    assert "LLVM cannot compile the energy function of the material (no registers)" in body.notes[0]
     combine = make_combiner(random_plan(np.random.default_rng(0)))
     assert combine.__qualname__.startswith(combine_with_numpy.__name__)
 
 
-def test_failing_compiler_is_an_error_where_vector_code_is_forced(
-    small_mesh, broken_compiler
-):
-    with pytest.raises(
-        InputError, match=r"\(no registers\); choose evaluator = 'casadi'"
-    ):
+def test_failing_compiler_is_an_error_where_vector_code_is_forced(small_mesh, broken_compiler):
+    with pytest.raises(InputError, match=r"\(no registers\); choose evaluator = 'casadi'"):
         evaluate(small_mesh)
 
 
@@ -543,9 +425,7 @@ def test_compiled_code_is_kept_and_used_again(small_mesh, cache, compiled):
     assert len(compiled) == 1
 
 
-def test_changed_sources_are_compiled_anew(
-    small_mesh, cache, tmp_path, monkeypatch
-):
+def test_changed_sources_are_compiled_anew(small_mesh, cache, tmp_path, monkeypatch):
     evaluate(small_mesh)
     sources = shutil.copytree(Path(jit.__file__).parent, tmp_path / "sources")
     with (sources / "erfinv.py").open("a") as file:
@@ -561,9 +441,7 @@ def test_changed_sources_are_compiled_anew(
 
 def test_another_material_gets_a_file_of_its_own(small_mesh, cache):
     evaluate(small_mesh)
-    new_body(small_mesh, "linear", "simd").energy(
-        squeezed(small_mesh), **ELASTIC
-    )
+    new_body(small_mesh, "linear", "simd").energy(squeezed(small_mesh), **ELASTIC)
     assert len(list(cache.iterdir())) == 2
 
 
@@ -575,9 +453,7 @@ def flip_a_bit(content: bytes) -> bytes:
     return content[:-100] + bytes([content[-100] ^ 1]) + content[-99:]
 
 
-@pytest.mark.parametrize(
-    "damage", [truncate, flip_a_bit, bytes.upper, lambda content: b""]
-)
+@pytest.mark.parametrize("damage", [truncate, flip_a_bit, bytes.upper, lambda content: b""])
 def test_damaged_file_is_compiled_again(small_mesh, cache, compiled, damage):
     first = evaluate(small_mesh)
     (file,) = cache.iterdir()
@@ -596,13 +472,9 @@ def test_deleted_file_is_compiled_again(small_mesh, cache, compiled):
     assert len(compiled) == 2
 
 
-def test_unusable_cache_folder_costs_only_time(
-    small_mesh, tmp_path, monkeypatch
-):
+def test_unusable_cache_folder_costs_only_time(small_mesh, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    monkeypatch.setenv(
-        "COLLOCATION_SYSID_CACHE", str(tmp_path / "file" / "kernels")
-    )
+    monkeypatch.setenv("COLLOCATION_SYSID_CACHE", str(tmp_path / "file" / "kernels"))
     assert evaluate(small_mesh) > 0
 
 
@@ -626,12 +498,7 @@ def random_plan(rng: np.random.Generator) -> RandomPlan:
     lengths = rng.integers(1, BLOCK_ENTRIES, 8)
     maps = list(zip(np.cumsum([0, *lengths[:-1]]), lengths, strict=True))
     tasks = [
-        (
-            block * BLOCK_ENTRIES,
-            *maps[rng.integers(len(maps))],
-            rng.integers(ROWS),
-            min(task, 1),
-        )
+        (block * BLOCK_ENTRIES, *maps[rng.integers(len(maps))], rng.integers(ROWS), min(task, 1))
         for block in range(COLUMN_BLOCKS)
         for task in range(3)
     ]
@@ -642,23 +509,17 @@ def random_plan(rng: np.random.Generator) -> RandomPlan:
         first_task=np.arange(0, len(tasks) + 1, 3),
         tasks=np.array(tasks, dtype=np.int64),
         coefficients=coefficients,
-        targets=np.concatenate(
-            [rng.permutation(BLOCK_ENTRIES)[:n] for n in lengths]
-        ).astype("i4"),
+        targets=np.concatenate([rng.permutation(BLOCK_ENTRIES)[:n] for n in lengths]).astype("i4"),
         sources=rng.integers(ENTRIES, size=lengths.sum()).astype(np.int32),
     )
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(
-    ("start", "stop"), [(0, COLUMN_BLOCKS), (2, 4), (3, 3)]
-)
+@pytest.mark.parametrize(("start", "stop"), [(0, COLUMN_BLOCKS), (2, 4), (3, 3)])
 def test_compiled_and_numpy_combinations_are_equal(seed, start, stop):
     rng = np.random.default_rng(seed)
     plan = random_plan(rng)
-    shared = rng.standard_normal(
-        (ROWS, 2 * ENTRIES + 7)
-    )  # as in `Linearisation`, one row of all
+    shared = rng.standard_normal((ROWS, 2 * ENTRIES + 7))  # as in `Linearisation`, one row of all
     a, b = shared[:, :ENTRIES], shared[:, ENTRIES : 2 * ENTRIES]
     before = rng.standard_normal(COLUMN_BLOCKS * BLOCK_ENTRIES)
     native, reference = before.copy(), before.copy()

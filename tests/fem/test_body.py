@@ -27,34 +27,26 @@ def body(request, make_body) -> Body:
     return make_body(request.param)
 
 
-def deformed(
-    body: Body, rng: np.random.Generator, states: int = 2
-) -> np.ndarray:
+def deformed(body: Body, rng: np.random.Generator, states: int = 2) -> np.ndarray:
     """Node positions some way from rest, (T, n, 3)."""
     shape = (states, *body.nodes_m.shape)
     return body.nodes_m + rng.uniform(-0.004, 0.004, shape)
 
 
-def velocities(
-    body: Body, rng: np.random.Generator, states: int = 2
-) -> np.ndarray:
+def velocities(body: Body, rng: np.random.Generator, states: int = 2) -> np.ndarray:
     return rng.standard_normal((states, 3 * len(body.nodes_m)))
 
 
 # Energy, force, stiffness ---------------------------------------------------------------------
 
 
-def test_stiffness_is_symmetric_on_the_mesh_graph_and_resists_every_strain_at_rest(
-    body,
-):
+def test_stiffness_is_symmetric_on_the_mesh_graph_and_resists_every_strain_at_rest(body):
     K = body.stiffness(body.nodes_m, **elastic(body))
     assert sp.issparse(K)
     assert abs(K - K.T).max() == 0.0
     assert K.nnz == 9 * (len(body.nodes_m) + 2 * len(body.mesh.edges))
     spectrum = np.linalg.eigvalsh(K.toarray())
-    assert (
-        abs(spectrum[:6]).max() < 1e-12 * spectrum[-1]
-    )  # three translations, three rotations
+    assert abs(spectrum[:6]).max() < 1e-12 * spectrum[-1]  # three translations, three rotations
     assert spectrum[6] > 1e-4 * spectrum[-1]
 
 
@@ -62,10 +54,7 @@ def test_translation_changes_nothing(body, rng):
     x = deformed(body, rng)[0]
     moved = x + np.array([3.0, -2.0, 1.0])
     constants = elastic(body)
-    energy, found = (
-        body.energy(moved, **constants),
-        body.elastic_force(moved, **constants),
-    )
+    energy, found = (body.energy(moved, **constants), body.elastic_force(moved, **constants))
     assert energy == pytest.approx(body.energy(x, **constants), rel=1e-12)
     assert relative_error(found, body.elastic_force(x, **constants)) < 1e-11
 
@@ -75,9 +64,7 @@ def test_rigid_motion_causes_no_force(make_body, material, rng):
     body = make_body(material)
     turn = Rotation.from_rotvec([0.5, -2.0, 1.0]).as_matrix()
     moved = body.nodes_m @ turn.T + [0.3, 0.2, -0.1]
-    scale = abs(
-        body.elastic_force(deformed(body, rng)[0], **elastic(body))
-    ).max()
+    scale = abs(body.elastic_force(deformed(body, rng)[0], **elastic(body))).max()
     assert abs(body.elastic_force(moved, **elastic(body))).max() < 1e-12 * scale
 
 
@@ -118,9 +105,7 @@ def test_rigid_rotation_is_not_slowed_by_stiffness_damping(body, rng):
 def test_translation_is_slowed_by_mass_damping_alone(body):
     v = np.tile([1.0, 2.0, 3.0], len(body.nodes_m))
     force = body.force(body.nodes_m, v, theta_for(body, 0.1, 2.0))[0]
-    np.testing.assert_allclose(
-        force, -2.0 * np.repeat(body.node_mass, 3) * v, atol=1e-14
-    )
+    np.testing.assert_allclose(force, -2.0 * np.repeat(body.node_mass, 3) * v, atol=1e-14)
 
 
 # Derivatives; `check_material` and `check_damping` compare them with the plain formula --------
@@ -134,9 +119,7 @@ def test_linearise_returns_the_force(body, rng):
 
 
 @pytest.mark.parametrize("material", ROTATION_INVARIANT)
-def test_slopes_of_the_damping_force_by_position_are_symmetric(
-    make_body, material, rng
-):
+def test_slopes_of_the_damping_force_by_position_are_symmetric(make_body, material, rng):
     """D_vK is a third derivative of the energy; only its lower triangle is ever computed."""
     body = make_body(material)
     x, v = deformed(body, rng, 1).reshape(1, -1), velocities(body, rng, 1)
@@ -144,17 +127,13 @@ def test_slopes_of_the_damping_force_by_position_are_symmetric(
 
     def damping(x: np.ndarray) -> np.ndarray:
         without, with_damping = (
-            body.force(
-                x, np.broadcast_to(v, x.shape), theta_for(body, gamma_r, 0.0)
-            )
+            body.force(x, np.broadcast_to(v, x.shape), theta_for(body, gamma_r, 0.0))
             for gamma_r in (0.0, 1.0)
         )
         return with_damping - without
 
     step_in_each_coordinate = LENGTH_M * np.eye(size)
-    D = directional_derivative(
-        damping, np.repeat(x, size, axis=0), step_in_each_coordinate
-    )
+    D = directional_derivative(damping, np.repeat(x, size, axis=0), step_in_each_coordinate)
     assert relative_error(D.T, D) < 1e-8
 
 
@@ -175,9 +154,7 @@ def test_force_is_linear_in_the_velocity(body, rng):
     """So that ∂²φ/∂v² is zero and not among the outputs."""
     theta = theta_for(body)
     x, v = deformed(body, rng), velocities(body, rng)
-    slopes = (
-        body.linearise(x, scale * v, theta).by_velocity for scale in (1.0, 5.0)
-    )
+    slopes = (body.linearise(x, scale * v, theta).by_velocity for scale in (1.0, 5.0))
     np.testing.assert_array_equal(*slopes)
 
 
@@ -187,23 +164,14 @@ def test_force_is_linear_in_the_velocity(body, rng):
 def test_mass_is_density_times_volume_shared_among_the_nodes(small_mesh):
     body = Body(small_mesh, density_kg_m3=30.0)
     assert body.mass_kg == pytest.approx(30.0 * small_mesh.volume_m3, rel=1e-14)
-    around = [
-        small_mesh.volumes_m3[(body.cells == i).any(axis=1)].sum()
-        for i in range(27)
-    ]
-    np.testing.assert_allclose(
-        body.node_mass, 30.0 * np.array(around) / 4, rtol=1e-13
-    )
+    around = [small_mesh.volumes_m3[(body.cells == i).any(axis=1)].sum() for i in range(27)]
+    np.testing.assert_allclose(body.node_mass, 30.0 * np.array(around) / 4, rtol=1e-13)
     assert (body.node_mass > 0).all()
-    np.testing.assert_array_equal(
-        body.dof_mass.reshape(-1, 3).T, [body.node_mass] * 3
-    )
+    np.testing.assert_array_equal(body.dof_mass.reshape(-1, 3).T, [body.node_mass] * 3)
 
 
 def test_weighed_mass_is_kept(small_mesh):
-    assert Body(small_mesh, mass_kg=0.024).mass_kg == pytest.approx(
-        0.024, rel=1e-14
-    )
+    assert Body(small_mesh, mass_kg=0.024).mass_kg == pytest.approx(0.024, rel=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -217,18 +185,9 @@ def test_weighed_mass_is_kept(small_mesh):
         ({"density_kg_m3": -30.0}, "density_kg_m3 is -30; expected a positive"),
         ({"mass_kg": 0.0}, "mass_kg is 0; expected a positive"),
         ({"mass_kg": np.nan}, "mass_kg is nan; expected a positive"),
-        (
-            {"mass_kg": 1.0, "material": "rubber"},
-            "no material 'rubber'; available: ",
-        ),
-        (
-            {"mass_kg": 1.0, "element": "hex8"},
-            "no element 'hex8'; available: tet4",
-        ),
-        (
-            {"mass_kg": 1.0, "evaluator": "gpu"},
-            "is 'gpu'; expected one of auto, simd, casadi",
-        ),
+        ({"mass_kg": 1.0, "material": "rubber"}, "no material 'rubber'; available: "),
+        ({"mass_kg": 1.0, "element": "hex8"}, "no element 'hex8'; available: tet4"),
+        ({"mass_kg": 1.0, "evaluator": "gpu"}, "is 'gpu'; expected one of auto, simd, casadi"),
     ],
 )
 def test_unusable_arguments_are_refused(small_mesh, given, message):
@@ -240,14 +199,9 @@ def test_fields_of_the_wrong_shape_are_refused(make_body):
     body = make_body()
     theta = theta_for(body)
     x = body.nodes_m
-    with pytest.raises(
-        InputError,
-        match=r"shapes \(26, 3\); expected \(27, 3\) or \(T, 27, 3\)",
-    ):
+    with pytest.raises(InputError, match=r"shapes \(26, 3\); expected \(27, 3\) or \(T, 27, 3\)"):
         body.energy(x[:-1], **elastic(body))
-    with pytest.raises(
-        InputError, match="positions at 2 times; expected those at one time"
-    ):
+    with pytest.raises(InputError, match="positions at 2 times; expected those at one time"):
         body.elastic_force(np.stack([x, x]), **elastic(body))
     with pytest.raises(InputError, match="with the same number T of times"):
         body.force(np.stack([x, x]), np.zeros_like(x), theta)
@@ -263,20 +217,14 @@ def test_volume_ratio_is_one_at_rest_and_the_cube_of_a_stretch(make_body):
 
 def test_volume_ratio_of_a_mirrored_body_is_negative(make_body):
     body = make_body()
-    np.testing.assert_allclose(
-        body.volume_ratios(-body.nodes_m), -1.0, rtol=1e-12
-    )
+    np.testing.assert_allclose(body.volume_ratios(-body.nodes_m), -1.0, rtol=1e-12)
 
 
-def test_pattern_finds_entries_of_either_triangle_and_nothing_outside(
-    make_body,
-):
+def test_pattern_finds_entries_of_either_triangle_and_nothing_outside(make_body):
     pattern = make_body().pattern
     found = pattern.positions_of(pattern.rows, pattern.columns)
     np.testing.assert_array_equal(found, np.arange(pattern.entry_count))
-    np.testing.assert_array_equal(
-        pattern.positions_of(pattern.columns, pattern.rows), found
-    )
+    np.testing.assert_array_equal(pattern.positions_of(pattern.columns, pattern.rows), found)
     full = pattern.matrix(np.ones(pattern.entry_count)).toarray()
     absent = np.argwhere(full == 0)
     for row, column in (absent[0], absent[-1]):
@@ -287,16 +235,12 @@ def test_pattern_finds_entries_of_either_triangle_and_nothing_outside(
 # Evaluators, threads, padding -----------------------------------------------------------------
 
 
-def assert_same(
-    a: Body, b: Body, rng: np.random.Generator, tolerance: float = 1e-12
-) -> None:
+def assert_same(a: Body, b: Body, rng: np.random.Generator, tolerance: float = 1e-12) -> None:
     x, v, w = deformed(a, rng, 3), velocities(a, rng, 3), velocities(a, rng, 3)
     theta, constants = theta_for(a), elastic(a)
     energy = b.energy(x[0], **constants)
     assert a.energy(x[0], **constants) == pytest.approx(energy, rel=tolerance)
-    assert (
-        relative_error(a.force(x, v, theta), b.force(x, v, theta)) <= tolerance
-    )
+    assert relative_error(a.force(x, v, theta), b.force(x, v, theta)) <= tolerance
     first, second = (
         [
             *vars(body.linearise(x, v, theta)).items(),
@@ -306,9 +250,7 @@ def assert_same(
     )
     for (name, found), (_, expected) in zip(first, second, strict=True):
         assert found.shape == expected.shape, name
-        error, size = (
-            abs(each).max(initial=0) for each in (found - expected, expected)
-        )
+        error, size = (abs(each).max(initial=0) for each in (found - expected, expected))
         assert error <= tolerance * size, name
 
 
@@ -321,9 +263,7 @@ def test_evaluators_agree(make_body, material, rng):
 @pytest.mark.parametrize("evaluator", EVALUATORS)
 def test_number_of_threads_does_not_change_a_bit(small_mesh, evaluator, rng):
     one, two = (
-        Body(
-            small_mesh, density_kg_m3=30.0, evaluator=evaluator, threads=threads
-        )
+        Body(small_mesh, density_kg_m3=30.0, evaluator=evaluator, threads=threads)
         for threads in (1, 2)
     )
     assert_same(one, two, rng, tolerance=0.0)
@@ -332,33 +272,19 @@ def test_number_of_threads_does_not_change_a_bit(small_mesh, evaluator, rng):
 @pytest.mark.parametrize("elements", [1, 3, 8, 9])
 def test_any_number_of_elements_fills_the_vectors(small_mesh, elements, rng):
     mesh = TetMesh(small_mesh.points_m, small_mesh.tetrahedra[:elements])
-    simd, reference = (
-        Body(mesh, density_kg_m3=30.0, evaluator=name) for name in EVALUATORS
-    )
+    simd, reference = (Body(mesh, density_kg_m3=30.0, evaluator=name) for name in EVALUATORS)
     assert_same(simd, reference, rng)
 
 
 @pytest.mark.parametrize("evaluator", EVALUATORS)
-def test_more_quadrature_points_sum_to_the_same(
-    small_mesh, evaluator, monkeypatch, rng
-):
+def test_more_quadrature_points_sum_to_the_same(small_mesh, evaluator, monkeypatch, rng):
     """A linear element's integrand is constant, however many points sample it."""
     a, b = 0.5854101966249685, 0.1381966011250105
-    four = replace(
-        ELEMENTS["tet4"],
-        points=b + (a - b) * np.eye(4),
-        weights=np.full(4, 0.25),
-    )
+    four = replace(ELEMENTS["tet4"], points=b + (a - b) * np.eye(4), weights=np.full(4, 0.25))
     monkeypatch.setitem(ELEMENTS, "tet4-four-points", four)
     one, many = (
-        Body(
-            small_mesh, density_kg_m3=30.0, element=element, evaluator=evaluator
-        )
+        Body(small_mesh, density_kg_m3=30.0, element=element, evaluator=evaluator)
         for element in ("tet4", "tet4-four-points")
     )
-    assert many.volume_ratios(small_mesh.points_m).shape == (
-        1,
-        len(many.cells),
-        4,
-    )
+    assert many.volume_ratios(small_mesh.points_m).shape == (1, len(many.cells), 4)
     assert_same(many, one, rng)

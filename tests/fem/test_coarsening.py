@@ -28,9 +28,7 @@ def test_a_coarse_box_is_the_same_box_with_fewer_nodes():
     coarse = coarsened(BOX, len(BOX.points_m) // 6)
     assert len(coarse.mesh.points_m) <= len(BOX.points_m) // 5
     assert coarse.mesh.volume_m3 == pytest.approx(BOX.volume_m3, rel=1e-9)
-    assert coarse.mesh.compute_bounds_m() == pytest.approx(
-        BOX.compute_bounds_m()
-    )
+    assert coarse.mesh.compute_bounds_m() == pytest.approx(BOX.compute_bounds_m())
     assert coarse.mesh.quality().quality_min >= 0.1
     assert not coarse.mesh.notes  # no element is inverted, all are connected
 
@@ -47,16 +45,11 @@ def test_every_node_is_kept_or_moved_onto_one_with_its_label():
     coarse = coarsened(BOX, len(BOX.points_m) // 6, labels)
     of_coarse = labels[coarse.kept_nodes]
     assert (of_coarse[coarse.coarse_nodes] == labels).all()
-    assert (
-        coarse.coarse_nodes[coarse.kept_nodes]
-        == np.arange(len(coarse.kept_nodes))
-    ).all()
+    assert (coarse.coarse_nodes[coarse.kept_nodes] == np.arange(len(coarse.kept_nodes))).all()
     kept_m = BOX.points_m[coarse.kept_nodes]
     assert (kept_m == coarse.mesh.points_m).all()
     held_m = coarse.mesh.points_m[of_coarse == 1]
-    assert np.ptp(held_m[:, 0]) == pytest.approx(
-        np.ptp(BOX.points_m[labels == 1, 0])
-    )
+    assert np.ptp(held_m[:, 0]) == pytest.approx(np.ptp(BOX.points_m[labels == 1, 0]))
 
 
 def test_a_mesh_that_cannot_be_coarser_stays_as_it_is():
@@ -91,9 +84,7 @@ def test_regions_keep_their_interface_densities_and_constants():
         assert coarse.mesh.volumes_m3[mine.cells].sum() == pytest.approx(
             body.mesh.volumes_m3[its.cells].sum()
         )
-    shared = np.intersect1d(
-        *(coarse.mesh.tetrahedra[part.cells] for part in coarse.parts)
-    )
+    shared = np.intersect1d(*(coarse.mesh.tetrahedra[part.cells] for part in coarse.parts))
     edge_m = body.mesh.points_m[
         np.intersect1d(*(body.mesh.tetrahedra[p.cells] for p in body.parts)), 0
     ]
@@ -122,7 +113,5 @@ def test_a_field_has_the_values_of_the_same_places():
 def test_phases_of_elements_are_refused():
     field = Field(0.05, modes=3, prior="two-phase")
     body = Body(BOX, density_kg_m3=1000.0, field=field)
-    with pytest.raises(
-        InputError, match="values that belong to the elements of its own mesh"
-    ):
+    with pytest.raises(InputError, match="values that belong to the elements of its own mesh"):
         coarsen_body(body, len(BOX.points_m) // 6, [])

@@ -1,4 +1,6 @@
-"""User-defined damping laws: refused laws, and constants with bounds, scale and usual value of their own."""
+"""User-defined damping laws: refused laws, and constants with bounds, scale and usual value of
+their own.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,7 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 
 ETA = cs.Constant("eta_pa_s", "η", "viscosity", bounds=(0.5, 50.0), usual=4.0)
-BETA = cs.Constant(
-    "growth", "β", bounds=(-2.0, 3.0), scale="linear", typical=0.1, at_least=-2
-)
+BETA = cs.Constant("growth", "β", bounds=(-2.0, 3.0), scale="linear", typical=0.1, at_least=-2)
 
 
 def viscous(F: ca.SX, rate: ca.SX, eta: ca.SX) -> ca.SX:
@@ -28,9 +28,7 @@ def linear(psi, F, rate, eta_pa_s):
 
 
 def growing(psi, F, rate, eta_pa_s, growth):
-    stress = ca.vec(
-        viscous(F, rate, eta_pa_s * (1 + growth * ca.det(ca.reshape(F, 3, 3))))
-    )
+    stress = ca.vec(viscous(F, rate, eta_pa_s * (1 + growth * ca.det(ca.reshape(F, 3, 3)))))
     return stress, ca.jacobian(stress, F)
 
 
@@ -83,15 +81,9 @@ def body_with(law: cs.DampingLaw) -> cs.Body:
             r"returns 1 expressions of the shapes \[\(9, 1\)\]; expected two",
         ),
         ({"stress": matrix_stress}, r"returns 2 .*\[\(3, 3\), \(9, 9\)\]"),
-        (
-            {"stress": misspelt},
-            r"'eta_pa_s'\); expected a function \(psi, F, rate, eta_pa_s\)",
-        ),
+        ({"stress": misspelt}, r"'eta_pa_s'\); expected a function \(psi, F, rate, eta_pa_s\)"),
         ({"potential": misspelt}, "the potential of .* cannot be evaluated"),
-        (
-            {"potential": vector_potential},
-            r"an expression of the shape \(9, 1\)",
-        ),
+        ({"potential": vector_potential}, r"an expression of the shape \(9, 1\)"),
     ],
 )
 def test_a_body_refuses_a_law(functions: dict, words: str):
@@ -99,15 +91,11 @@ def test_a_body_refuses_a_law(functions: dict, words: str):
         body_with(cs.DampingLaw("own", (ETA,), **functions))
 
 
-@pytest.mark.parametrize(
-    "names", [("mu_pa",), ("young_pa",), ("gamma_m_1_s",), ("growth",) * 2]
-)
+@pytest.mark.parametrize("names", [("mu_pa",), ("young_pa",), ("gamma_m_1_s",), ("growth",) * 2])
 def test_a_constant_needs_a_name_of_its_own(names: tuple[str, ...]):
     constants = tuple(cs.Constant(name) for name in names)
     law = cs.DampingLaw("own", constants, stress=linear)
-    with pytest.raises(
-        InputError, match=f"'{names[0]}', but another constant of the body"
-    ):
+    with pytest.raises(InputError, match=f"'{names[0]}', but another constant of the body"):
         body_with(law)
 
 
@@ -121,11 +109,7 @@ def test_an_admissible_law_is_accepted_in_a_body_and_in_a_region():
     assert "core.eta_pa_s" in body.constants
     fast = cs.DampingLaw("fast", (ETA,), stress=thickening)
     with pytest.raises(InputError, match=r"fast.*not linear"):
-        cs.Body(
-            mesh,
-            density_kg_m3=1000.0,
-            regions=[cs.Region("core", cells, damping=fast)],
-        )
+        cs.Body(mesh, density_kg_m3=1000.0, regions=[cs.Region("core", cells, damping=fast)])
 
 
 def test_a_law_needs_a_function_and_a_tuple_of_constants():
@@ -140,10 +124,7 @@ def test_a_law_needs_a_function_and_a_tuple_of_constants():
     [
         ({"bounds": (0.0, 1.0)}, "are 0 and 1; expected 0 < lower < upper"),
         ({"bounds": (3.0, 2.0)}, "are 3 and 2; expected 0 < lower < upper"),
-        (
-            {"bounds": (1.0, -1.0), "scale": "linear"},
-            "are 1 and -1; expected lower < upper$",
-        ),
+        ({"bounds": (1.0, -1.0), "scale": "linear"}, "are 1 and -1; expected lower < upper$"),
         ({"scale": "lin"}, "is 'lin'; expected one of log, linear"),
     ],
 )
@@ -156,11 +137,7 @@ def swung(law: cs.DampingLaw) -> cs.Experiment:
     """Return a swing of the box without measurements but markers at zero."""
     t_s = np.linspace(0.0, 0.2, 11)
     way_m = 0.02 * (1 - np.cos(20 * t_s))
-    hand = cs.PoseSequence(
-        t_s,
-        np.outer(way_m, [1, 0, 0]),
-        np.tile([0, 0, 0, 1.0], (len(t_s), 1)),
-    )
+    hand = cs.PoseSequence(t_s, np.outer(way_m, [1, 0, 0]), np.tile([0, 0, 0, 1.0], (len(t_s), 1)))
     body = body_with(law)
     low_m = body.nodes_m[body.nodes_m[:, 2] < 0.001]
     tracks = np.zeros((len(t_s), len(low_m), 3))
@@ -179,11 +156,7 @@ GROWING = cs.DampingLaw("growing", (ETA, BETA), stress=growing)
 
 
 def test_omitted_bounds_scale_and_guess_are_those_of_the_constant():
-    statements = {
-        **KNOWN,
-        "eta_pa_s": cs.Unknown(),
-        "growth": cs.Unknown(0.3, upper=1.0),
-    }
+    statements = {**KNOWN, "eta_pa_s": cs.Unknown(), "growth": cs.Unknown(0.3, upper=1.0)}
     problem = cs.Problem([swung(GROWING)], statements)
     items = {item.name: item for item in problem.parameters.scalars}
     eta = items["eta_pa_s"]
@@ -191,9 +164,7 @@ def test_omitted_bounds_scale_and_guess_are_those_of_the_constant():
     growth = items["growth"]
     assert (growth.lower, growth.upper) == (-2.0, 1.0)
     assert (growth.scale, growth.unit) == ("linear", 0.1)
-    made = cs.Parameters.from_mapping(
-        statements, definitions=problem.bodies[0].constants
-    )
+    made = cs.Parameters.from_mapping(statements, definitions=problem.bodies[0].constants)
     assert made.scalars == problem.parameters.scalars
 
 
@@ -214,14 +185,10 @@ def test_a_prior_of_the_constant_replaces_a_guess():
     assert item.guess is None
 
 
-@pytest.mark.parametrize(
-    "statement", [-2.5, cs.Unknown(0.1, lower=-3.0)], ids=["fixed", "lower"]
-)
+@pytest.mark.parametrize("statement", [-2.5, cs.Unknown(0.1, lower=-3.0)], ids=["fixed", "lower"])
 def test_values_that_a_constant_does_not_admit_are_refused(statement):
     with pytest.raises(InputError, match=r"growth: .*expected a number -2 <="):
-        cs.Problem(
-            [swung(GROWING)], {**KNOWN, "eta_pa_s": 2.0, "growth": statement}
-        )
+        cs.Problem([swung(GROWING)], {**KNOWN, "eta_pa_s": 2.0, "growth": statement})
 
 
 def test_a_linear_constant_may_be_negative_and_is_found():
@@ -241,7 +208,5 @@ def test_an_estimate_stops_at_the_bound_of_its_constant():
     swing = swung(law)
     motion = cs.simulate(swing, truth, "midpoint", substeps=1)
     seen = cs.with_markers(swing, motion.markers_m)
-    solution = cs.solve(
-        cs.Problem([seen], truth | {"eta_pa_s": cs.Unknown(5.0)})
-    )
+    solution = cs.solve(cs.Problem([seen], truth | {"eta_pa_s": cs.Unknown(5.0)}))
     assert solution.parameters["eta_pa_s"] == pytest.approx(50.0)

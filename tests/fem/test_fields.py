@@ -18,15 +18,9 @@ TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
 
 
 @cache
-def bar(
-    element: str = "tet4",
-    material: str = "neo-hookean",
-    evaluator: str = "auto",
-) -> Body:
+def bar(element: str = "tet4", material: str = "neo-hookean", evaluator: str = "auto") -> Body:
     mesh = box_mesh((0.2, 0.1, 0.1), (2, 1, 1))
-    return Body(
-        mesh, material, density_kg_m3=30.0, element=element, evaluator=evaluator
-    )
+    return Body(mesh, material, density_kg_m3=30.0, element=element, evaluator=evaluator)
 
 
 @cache
@@ -42,15 +36,11 @@ def deformed(body: Body, gradient) -> dict[str, np.ndarray]:
 
 
 @BOTH
-@pytest.mark.parametrize(
-    "material", ["neo-hookean", "mooney-rivlin", "st-venant-kirchhoff"]
-)
+@pytest.mark.parametrize("material", ["neo-hookean", "mooney-rivlin", "st-venant-kirchhoff"])
 def test_rigid_motion_is_not_felt(element, material):
     found = deformed(bar(element, material), TURN)
     np.testing.assert_allclose(found["det_f"], 1.0)
-    np.testing.assert_allclose(
-        found["energy_density_j_m3"], 0.0, atol=1e-12 * MU_PA
-    )
+    np.testing.assert_allclose(found["energy_density_j_m3"], 0.0, atol=1e-12 * MU_PA)
     np.testing.assert_allclose(found["von_mises_pa"], 0.0, atol=1e-7 * MU_PA)
 
 
@@ -60,16 +50,10 @@ def test_uniform_stretch_of_a_neo_hookean_body(element, stretch):
     """F = diag(s, 1, 1): σ = [μ (F Fᵀ − I) + λ ln J · I] / J, so von Mises is μ |s² − 1| / s."""
     found = deformed(bar(element), TURN @ np.diag([stretch, 1.0, 1.0]))
     log_j = np.log(stretch)
-    energy = (
-        0.5 * LAMBDA_PA * log_j**2
-        - MU_PA * log_j
-        + 0.5 * MU_PA * (stretch**2 - 1)
-    )
+    energy = 0.5 * LAMBDA_PA * log_j**2 - MU_PA * log_j + 0.5 * MU_PA * (stretch**2 - 1)
     np.testing.assert_allclose(found["det_f"], stretch)
     np.testing.assert_allclose(found["energy_density_j_m3"], energy)
-    np.testing.assert_allclose(
-        found["von_mises_pa"], MU_PA * abs(stretch**2 - 1) / stretch
-    )
+    np.testing.assert_allclose(found["von_mises_pa"], MU_PA * abs(stretch**2 - 1) / stretch)
 
 
 @BOTH
@@ -81,15 +65,9 @@ def test_swelling_has_energy_but_no_von_mises_stress(element):
 
 def test_small_shear_has_the_stress_of_linear_elasticity():
     shear = 1e-5
-    found = deformed(
-        bar(material="linear"), [[1.0, shear, 0], [0, 1, 0], [0, 0, 1]]
-    )
-    np.testing.assert_allclose(
-        found["von_mises_pa"], np.sqrt(3) * MU_PA * shear, rtol=1e-4
-    )
-    np.testing.assert_allclose(
-        found["energy_density_j_m3"], 0.5 * MU_PA * shear**2, rtol=1e-4
-    )
+    found = deformed(bar(material="linear"), [[1.0, shear, 0], [0, 1, 0], [0, 0, 1]])
+    np.testing.assert_allclose(found["von_mises_pa"], np.sqrt(3) * MU_PA * shear, rtol=1e-4)
+    np.testing.assert_allclose(found["energy_density_j_m3"], 0.5 * MU_PA * shear**2, rtol=1e-4)
 
 
 @BOTH

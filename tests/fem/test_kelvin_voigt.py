@@ -24,11 +24,7 @@ from collocation_sysid.recording import Experiment
 def of_a_user(F, lambda_pa, mu_pa):
     """Stiffer than Neo-Hooke's when sheared."""
     log_j, stretch = ca.log(ca.det(F)), ca.sumsqr(F) - 3
-    return (
-        0.5 * lambda_pa * log_j**2
-        - mu_pa * log_j
-        + mu_pa * (stretch / 2 + stretch**2 / 20)
-    )
+    return 0.5 * lambda_pa * log_j**2 - mu_pa * log_j + mu_pa * (stretch / 2 + stretch**2 / 20)
 
 
 @cache
@@ -39,19 +35,10 @@ def small_body(
     damping: str = "kelvin-voigt",
 ) -> Body:
     """Six elements, no two alike."""
-    return Body(
-        uneven_box(1),
-        material,
-        30.0,
-        element,
-        damping=damping,
-        evaluator=evaluator,
-    )
+    return Body(uneven_box(1), material, 30.0, element, damping=damping, evaluator=evaluator)
 
 
-def state(
-    body: Body, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def state(body: Body, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Positions some way from rest and any velocities, (1, 3n) each."""
     x = body.nodes_m + rng.uniform(-0.004, 0.004, body.nodes_m.shape)
     return x.reshape(1, -1), rng.standard_normal((1, x.size))
@@ -71,21 +58,14 @@ def test_stress_is_viscous_in_the_rate_of_deformation(rng):
     points = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
     body = Body(TetMesh(points, np.array([[0, 1, 2, 3]])), density_kg_m3=30.0)
     x, v = state(body, rng)
-    F, rate = (
-        (f.reshape(4, 3)[1:] - f.reshape(4, 3)[0]).T / 0.1 for f in (x, v)
-    )
+    F, rate = ((f.reshape(4, 3)[1:] - f.reshape(4, 3)[0]).T / 0.1 for f in (x, v))
     eta, zeta = 0.009 * 300.0, 0.009 * 200.0
     C_inverse, E_rate = np.linalg.inv(F.T @ F), (F.T @ rate + rate.T @ F) / 2
     S = 2 * eta * C_inverse @ E_rate @ C_inverse
     S += zeta * np.trace(C_inverse @ E_rate) * C_inverse
-    at_nodes = (
-        -body.mesh.volumes_m3[0] * F @ S / 0.1
-    )  # ∇N_a of the last three are e_a / 0.1
+    at_nodes = -body.mesh.volumes_m3[0] * F @ S / 0.1  # ∇N_a of the last three are e_a / 0.1
     expected = np.vstack([-at_nodes.sum(axis=1), at_nodes.T])
-    assert (
-        relative_error(damping_force(body, x, v)[0].reshape(4, 3), expected)
-        < 1e-12
-    )
+    assert relative_error(damping_force(body, x, v)[0].reshape(4, 3), expected) < 1e-12
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
@@ -102,35 +82,20 @@ def test_forces_balance_and_exert_no_torque(element, rng):
 @pytest.mark.parametrize("material", [*COMPILED, of_a_user])
 def test_undeformed_it_is_rayleighs(material, element, rng):
     """So that damping ratios of small oscillations are the same."""
-    bodies = [
-        small_body(material, element, "casadi", law)
-        for law in ("kelvin-voigt", "rayleigh")
-    ]
+    bodies = [small_body(material, element, "casadi", law) for law in ("kelvin-voigt", "rayleigh")]
     _, v = state(bodies[0], rng)
-    found, expected = (
-        damping_force(body, body.nodes_m.reshape(1, -1), v) for body in bodies
-    )
+    found, expected = (damping_force(body, body.nodes_m.reshape(1, -1), v) for body in bodies)
     assert relative_error(found, expected) < rounding(material)
 
 
 def test_a_linear_body_stays_linear(rng):
-    kelvin, rayleigh = (
-        small_body("linear", damping=law)
-        for law in ("kelvin-voigt", "rayleigh")
-    )
+    kelvin, rayleigh = (small_body("linear", damping=law) for law in ("kelvin-voigt", "rayleigh"))
     x, v = state(kelvin, rng)
-    assert (
-        relative_error(
-            damping_force(kelvin, x, v), damping_force(rayleigh, x, v)
-        )
-        < 1e-12
-    )
+    assert relative_error(damping_force(kelvin, x, v), damping_force(rayleigh, x, v)) < 1e-12
 
 
 def test_only_kelvin_voigt_pays_for_what_is_not_symmetric():
-    at = small_body(damping="rayleigh").linearise(
-        *np.zeros((2, 1, 24)), [1.0, 1.0, 1.0, 1.0]
-    )
+    at = small_body(damping="rayleigh").linearise(*np.zeros((2, 1, 24)), [1.0, 1.0, 1.0, 1.0])
     assert at.by_position_skew.shape == (1, 0)
 
 
@@ -138,22 +103,14 @@ def test_only_kelvin_voigt_pays_for_what_is_not_symmetric():
 
 
 def bar(damping: str) -> Body:
-    return Body(
-        box_mesh((0.06, 0.02, 0.02), (3, 1, 1)),
-        density_kg_m3=30.0,
-        damping=damping,
-    )
+    return Body(box_mesh((0.06, 0.02, 0.02), (3, 1, 1)), density_kg_m3=30.0, damping=damping)
 
 
 CONSTANTS = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_m_1_s": 0.0}
 
 
 def spun(
-    damping: str,
-    step_s: float,
-    time_s: float,
-    scheme: str = "midpoint",
-    stretch: float = 1.15,
+    damping: str, step_s: float, time_s: float, scheme: str = "midpoint", stretch: float = 1.15
 ) -> np.ndarray:
     """Positions (T, n, 3) of a free bar, stretched at first, that spins at 8.8 rad/s."""
     body, t_s = bar(damping), np.arange(round(time_s / step_s) + 1) * step_s
@@ -172,9 +129,7 @@ def spun(
         nuisance=IDEAL,
     )
     truth = CONSTANTS | {"gamma_r_s": 5e-3}
-    return simulate(experiment, truth, scheme, substeps=1).positions_m.reshape(
-        len(t_s), -1, 3
-    )
+    return simulate(experiment, truth, scheme, substeps=1).positions_m.reshape(len(t_s), -1, 3)
 
 
 def momenta(body: Body, x: np.ndarray, step_s: float) -> np.ndarray:
@@ -183,9 +138,7 @@ def momenta(body: Body, x: np.ndarray, step_s: float) -> np.ndarray:
     Marsden & West 2001, sec. 2.6: Σ x_t × p_t is what it keeps where no torque acts.
     """
     v, middle = np.diff(x, axis=0) / step_s, (x[1:] + x[:-1]) / 2
-    force = body.force(
-        middle, v, body.theta_from_values(CONSTANTS | {"gamma_r_s": 5e-3})
-    )
+    force = body.force(middle, v, body.theta_from_values(CONSTANTS | {"gamma_r_s": 5e-3}))
     return body.node_mass[:, None] * v + step_s / 2 * force.reshape(v.shape)
 
 
@@ -206,9 +159,7 @@ def test_other_schemes_keep_angular_momentum_to_their_order(scheme: str):
     for step_s in steps:
         x = spun("kelvin-voigt", step_s, 0.1, scheme=scheme, stretch=1.0)
         v = np.gradient(x, step_s, axis=0, edge_order=2)[-1]
-        momentum = np.cross(
-            x[-1], bar("kelvin-voigt").node_mass[:, None] * v
-        ).sum(axis=0)[2]
+        momentum = np.cross(x[-1], bar("kelvin-voigt").node_mass[:, None] * v).sum(axis=0)[2]
         lost.append(momentum)
     first, second = np.diff(lost)
     assert np.log2(first / second) > SCHEMES[scheme].order - 0.3

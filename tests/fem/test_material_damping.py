@@ -31,27 +31,17 @@ def damped_body(
 ) -> Body:
     """Six elements, no two alike."""
     return Body(
-        uneven_box(1),
-        material,
-        30.0,
-        element,
-        damping=damping,
-        evaluator=evaluator,
-        **changes,
+        uneven_box(1), material, 30.0, element, damping=damping, evaluator=evaluator, **changes
     )
 
 
-def moving_state(
-    body: Body, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def moving_state(body: Body, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Positions some way from rest and any velocities, (1, 3n) each."""
     x = body.nodes_m + rng.uniform(-0.004, 0.004, body.nodes_m.shape)
     return x.reshape(1, -1), rng.standard_normal((1, x.size))
 
 
-def damping_force(
-    body: Body, x: np.ndarray, v: np.ndarray, gamma_r_s: float = GAMMA_R_S
-):
+def damping_force(body: Body, x: np.ndarray, v: np.ndarray, gamma_r_s: float = GAMMA_R_S):
     """The damping force (1, 3n) of γ_r alone."""
     theta = theta_for(body, gamma_r_s, 0.0)
     return body.force(x, v, theta) - body.force(x, np.zeros_like(v), theta)
@@ -68,9 +58,7 @@ def potential_w(body: Body, x: np.ndarray, v: np.ndarray) -> float:
             for field in (x.reshape(-1, 3), v.reshape(-1, 3))
         )
         strain_rate = (F.T @ rate + rate.T @ F) / 2
-        density = LAME_PA * np.trace(strain_rate) ** 2 + 2 * SHEAR_PA * np.sum(
-            strain_rate**2
-        )
+        density = LAME_PA * np.trace(strain_rate) ** 2 + 2 * SHEAR_PA * np.sum(strain_rate**2)
         found += GAMMA_R_S * volume_m3 * density / 2
     return found
 
@@ -80,27 +68,14 @@ def potential_w(body: Body, x: np.ndarray, v: np.ndarray) -> float:
 
 def test_stress_is_viscous_in_the_rate_of_the_green_strain(rng):
     points = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
-    body = Body(
-        TetMesh(points, np.array([[0, 1, 2, 3]])),
-        density_kg_m3=30.0,
-        damping="material",
-    )
+    body = Body(TetMesh(points, np.array([[0, 1, 2, 3]])), density_kg_m3=30.0, damping="material")
     x, v = moving_state(body, rng)
-    F, rate = (
-        (f.reshape(4, 3)[1:] - f.reshape(4, 3)[0]).T / 0.1 for f in (x, v)
-    )
+    F, rate = ((f.reshape(4, 3)[1:] - f.reshape(4, 3)[0]).T / 0.1 for f in (x, v))
     E_rate = (F.T @ rate + rate.T @ F) / 2
-    S = GAMMA_R_S * (
-        LAME_PA * np.trace(E_rate) * np.eye(3) + 2 * SHEAR_PA * E_rate
-    )
-    at_nodes = (
-        -body.mesh.volumes_m3[0] * F @ S / 0.1
-    )  # ∇N_a of the last three are e_a / 0.1
+    S = GAMMA_R_S * (LAME_PA * np.trace(E_rate) * np.eye(3) + 2 * SHEAR_PA * E_rate)
+    at_nodes = -body.mesh.volumes_m3[0] * F @ S / 0.1  # ∇N_a of the last three are e_a / 0.1
     expected = np.vstack([-at_nodes.sum(axis=1), at_nodes.T])
-    assert (
-        relative_error(damping_force(body, x, v)[0].reshape(4, 3), expected)
-        < 1e-12
-    )
+    assert relative_error(damping_force(body, x, v)[0].reshape(4, 3), expected) < 1e-12
 
 
 @pytest.mark.parametrize("material", OBJECTIVE)
@@ -110,23 +85,16 @@ def test_force_is_the_slope_of_the_potential_by_the_velocities(material, rng):
     force = damping_force(body, x, v)
     for _ in range(2):
         direction = rng.standard_normal(v.shape)
-        slope = directional_derivative(
-            lambda v: potential_w(body, x, v), v, direction
-        )
+        slope = directional_derivative(lambda v: potential_w(body, x, v), v, direction)
         assert relative_error(-np.sum(force * direction), slope) < 1e-9
 
 
-def test_of_st_venant_and_kirchhoffs_material_it_is_the_rate_of_the_elastic_stress(
-    rng,
-):
+def test_of_st_venant_and_kirchhoffs_material_it_is_the_rate_of_the_elastic_stress(rng):
     """P_v = F γ_r Ṡ: γ_r times the rate of the elastic force, but for that of F alone."""
     body = damped_body("st-venant-kirchhoff")
     points = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
     body = Body(
-        TetMesh(points, np.array([[0, 1, 2, 3]])),
-        "st-venant-kirchhoff",
-        30.0,
-        damping="material",
+        TetMesh(points, np.array([[0, 1, 2, 3]])), "st-venant-kirchhoff", 30.0, damping="material"
     )
     x, v = moving_state(body, rng)
     theta = theta_for(body, 0.0, 0.0)
@@ -140,12 +108,7 @@ def test_of_st_venant_and_kirchhoffs_material_it_is_the_rate_of_the_elastic_stre
     F = (x.reshape(4, 3)[1:] - x.reshape(4, 3)[0]).T / 0.1
     rate = directional_derivative(second_piola, x, v, step=1e-4)
     expected = -body.mesh.volumes_m3[0] * F @ (GAMMA_R_S * rate) / 0.1
-    assert (
-        relative_error(
-            damping_force(body, x, v)[0].reshape(4, 3)[1:].T, expected
-        )
-        < 1e-7
-    )
+    assert relative_error(damping_force(body, x, v)[0].reshape(4, 3)[1:].T, expected) < 1e-7
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
@@ -161,14 +124,9 @@ def test_forces_balance_and_exert_no_torque(element, rng):
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("material", ["neo-hookean", "yeoh", "linear"])
 def test_undeformed_it_is_kelvin_and_voigts(material, element, rng):
-    bodies = [
-        damped_body(material, element, damping=law)
-        for law in ("material", "kelvin-voigt")
-    ]
+    bodies = [damped_body(material, element, damping=law) for law in ("material", "kelvin-voigt")]
     _, v = moving_state(bodies[0], rng)
-    found, expected = (
-        damping_force(body, body.nodes_m.reshape(1, -1), v) for body in bodies
-    )
+    found, expected = (damping_force(body, body.nodes_m.reshape(1, -1), v) for body in bodies)
     assert relative_error(found, expected) < 1e-12
 
 
@@ -190,9 +148,7 @@ def test_material_and_kelvin_voigt_differ_at_large_strain(rng):
         x = (body.nodes_m * [1.5, 1.0, 1.0]).reshape(1, -1)
         v = (body.nodes_m * [1.0, 0.0, 0.0]).reshape(1, -1)
         force = damping_force(body, x, v).reshape(-1, 3)
-        forces.append(
-            force[nodes_where(body, 0, body.nodes_m[:, 0].max()), 0].sum()
-        )
+        forces.append(force[nodes_where(body, 0, body.nodes_m[:, 0].max()), 0].sum())
     assert forces[0] / forces[1] == pytest.approx(1.5**4, rel=1e-9)
 
 
@@ -202,17 +158,10 @@ def test_a_memory_leaves_the_damping_force_as_it_is(rng):
     with_memory = damped_body(prony=["prony_1"])
     x, v = moving_state(plain, rng)
     theta = plain.theta_from_values(
-        {
-            "lambda_pa": LAME_PA,
-            "mu_pa": SHEAR_PA,
-            "gamma_r_s": GAMMA_R_S,
-            "gamma_m_1_s": 0.0,
-        }
+        {"lambda_pa": LAME_PA, "mu_pa": SHEAR_PA, "gamma_r_s": GAMMA_R_S, "gamma_m_1_s": 0.0}
     )
     values = dict(zip(plain.constants, theta, strict=True))
-    full = with_memory.theta_from_values(
-        values | {"prony_1.share": 0.5, "prony_1.tau_s": 0.1}
-    )
+    full = with_memory.theta_from_values(values | {"prony_1.share": 0.5, "prony_1.tau_s": 0.1})
     still = np.zeros_like(v)
     found = with_memory.force(x, v, full) - with_memory.force(x, still, full)
     assert relative_error(found, damping_force(plain, x, v)) < 1e-12
@@ -244,17 +193,9 @@ def test_a_bar_stretched_at_a_constant_rate_follows_the_closed_form():
         cs.Grasp(nodes_where(body, 0, 0.0), fixed, axes="x"),
         cs.Grasp(nodes_where(body, 1, 0.0), fixed, axes="y"),
     ]
-    markers = cs.Markers(
-        t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=body.nodes_m[-1:]
-    )
+    markers = cs.Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=body.nodes_m[-1:])
     experiment = cs.Experiment(
-        body,
-        t_s,
-        grasps,
-        markers,
-        start="undeformed",
-        gravity_m_s2=(0.0, 0.0, 0.0),
-        nuisance=IDEAL,
+        body, t_s, grasps, markers, start="undeformed", gravity_m_s2=(0.0, 0.0, 0.0), nuisance=IDEAL
     )
     constants = {
         "young_pa": young_pa,
@@ -266,27 +207,18 @@ def test_a_bar_stretched_at_a_constant_rate_follows_the_closed_form():
     stretch = 1 + rate_1_s * t_s
     strain = (stretch**2 - 1) / 2
     across = np.sqrt(1 - 2 * poisson * strain)
-    force_n = (
-        EDGE_M**2
-        * stretch
-        * young_pa
-        * (strain + GAMMA_R_S * stretch * rate_1_s)
-    )
+    force_n = EDGE_M**2 * stretch * young_pa * (strain + GAMMA_R_S * stretch * rate_1_s)
     theta = body.theta_from_values(constants)
     for k in range(2, len(t_s)):  # after the start, where the velocity jumps
         x = motion.positions_m[k].reshape(1, -1)
         expected = body.nodes_m * [across[k], across[k], stretch[k]]
-        np.testing.assert_allclose(
-            x.reshape(-1, 3), expected, atol=3e-3 * EDGE_M
-        )
+        np.testing.assert_allclose(x.reshape(-1, 3), expected, atol=3e-3 * EDGE_M)
         velocity = body.nodes_m * [
             -poisson * stretch[k] * rate_1_s / across[k],
             -poisson * stretch[k] * rate_1_s / across[k],
             rate_1_s,
         ]
-        exact = body.force(
-            expected.reshape(1, -1), velocity.reshape(1, -1), theta
-        )
+        exact = body.force(expected.reshape(1, -1), velocity.reshape(1, -1), theta)
         pull_n = -exact.reshape(-1, 3)[ends[1], 2].sum()
         assert pull_n == pytest.approx(force_n[k], rel=1e-9)
 
@@ -303,31 +235,20 @@ def test_a_stretched_body_spins_on_and_loses_no_angular_momentum():
         body,
         t_s,
         [],
-        cs.Markers(
-            t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=body.nodes_m[:1]
-        ),
+        cs.Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=body.nodes_m[:1]),
         start="given",
         start_positions_m=start,
         start_velocities_m_s=np.cross([0.0, 0.0, 8.8], start - middle),
         gravity_m_s2=(0.0, 0.0, 0.0),
         nuisance=IDEAL,
     )
-    constants = {
-        "lambda_pa": 200.0,
-        "mu_pa": 300.0,
-        "gamma_r_s": 5e-3,
-        "gamma_m_1_s": 0.0,
-    }
+    constants = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.0}
     x = cs.simulate(experiment, constants, "midpoint", substeps=1).positions_m
     velocity = np.diff(x, axis=0) / step_s
     between = ((x[1:] + x[:-1]) / 2).reshape(len(velocity), -1)
     force = body.force(
-        between,
-        velocity.reshape(len(velocity), -1),
-        body.theta_from_values(constants),
+        between, velocity.reshape(len(velocity), -1), body.theta_from_values(constants)
     )
-    momentum = body.node_mass[:, None] * velocity + step_s / 2 * force.reshape(
-        velocity.shape
-    )
+    momentum = body.node_mass[:, None] * velocity + step_s / 2 * force.reshape(velocity.shape)
     kept = np.cross(x[1:], momentum).sum(axis=1)[:, 2]
     np.testing.assert_allclose(kept / kept[0], 1.0, rtol=1e-7)

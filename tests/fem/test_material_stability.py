@@ -16,12 +16,7 @@ from collocation_sysid.fem.laws.material_stability import (
     principal_stretches,
     stability_margins,
 )
-from collocation_sysid.fem.laws.materials import (
-    MATERIALS,
-    Material,
-    as_material,
-    neo_hookean,
-)
+from collocation_sysid.fem.laws.materials import MATERIALS, Material, as_material, neo_hookean
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
@@ -30,9 +25,7 @@ from collocation_sysid.statistics.stability_concerns import (
     strain_stability_concerns,
 )
 
-EXAMINED = [
-    name for name, material in MATERIALS.items() if is_examined(material)
-]
+EXAMINED = [name for name, material in MATERIALS.items() if is_examined(material)]
 
 
 def margin(name: str, constants: dict[str, float], *stretches: float) -> float:
@@ -45,21 +38,15 @@ def margin(name: str, constants: dict[str, float], *stretches: float) -> float:
 def test_at_rest_the_margin_is_the_smaller_of_both_moduli(name):
     """The eigenvalues of ∂²ψ/∂ε∂ε are 2μ, twice, and 3κ."""
     constants = CONSTANTS.get(name, ELASTIC)
-    assert margin(name, constants, 1.0, 1.0, 1.0) == pytest.approx(
-        600.0, rel=1e-9
-    )
+    assert margin(name, constants, 1.0, 1.0, 1.0) == pytest.approx(600.0, rel=1e-9)
 
 
 def test_st_venant_kirchhoff_softens_below_a_stretch_of_one_over_root_two():
     """With λ = 0 the Kirchhoff stress of a stretch s is μ s² (s² − 1), least at s² = ½."""
     stretch = np.sqrt(0.5)
     constants = {"lambda_pa": 0.0, "mu_pa": 300.0}
-    assert (
-        margin("st-venant-kirchhoff", constants, stretch + 1e-6, 1.0, 1.0) > 0
-    )
-    assert (
-        margin("st-venant-kirchhoff", constants, stretch - 1e-6, 1.0, 1.0) < 0
-    )
+    assert margin("st-venant-kirchhoff", constants, stretch + 1e-6, 1.0, 1.0) > 0
+    assert margin("st-venant-kirchhoff", constants, stretch - 1e-6, 1.0, 1.0) < 0
 
 
 def test_foam_of_blatz_and_ko_softens_in_tension():
@@ -95,9 +82,7 @@ def test_stretches_of_a_homogeneous_deformation(element):
     theta = np.array([200.0, 3.0, 400.0, 0.0, 0.0])
     found = principal_stretches(body, x, theta)
     expected = np.sort(np.linalg.svd(F, compute_uv=False))
-    np.testing.assert_allclose(
-        found, np.broadcast_to(expected, found.shape), rtol=1e-12
-    )
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-12)
 
 
 def stretched_cube(values: dict[str, float], stretch: float) -> SimpleNamespace:
@@ -106,8 +91,8 @@ def stretched_cube(values: dict[str, float], stretch: float) -> SimpleNamespace:
     body = Body(hung.body.mesh, "ogden-2", 30.0)
     experiment = replace(hung, body=body)
     collocation = Collocation([experiment], Parameters.from_mapping(values))
-    (segment,) = collocation.transcriptions
-    count = int(segment.markers.observable.rows.max()) + 1
+    (transcription,) = collocation.transcriptions
+    count = int(transcription.markers.observable.rows.max()) + 1
     across = stretch**-0.5
     shapes = np.where(
         np.arange(count)[:, None, None] > count / 2,
@@ -115,11 +100,9 @@ def stretched_cube(values: dict[str, float], stretch: float) -> SimpleNamespace:
         body.nodes_m,
     )
     return SimpleNamespace(
-        segment=segment,
+        transcription=transcription,
         x=shapes.reshape(count, -1),
-        equations=SimpleNamespace(
-            dynamics=SimpleNamespace(theta=body.theta_from_values(values))
-        ),
+        equations=SimpleNamespace(dynamics=SimpleNamespace(theta=body.theta_from_values(values))),
     )
 
 
@@ -145,26 +128,17 @@ def test_an_unstable_material_is_named_with_time_and_stretches():
 
 
 @pytest.mark.parametrize(
-    ("changes", "stretch"),
-    [({}, 1.3), ({"mu_2_pa": 0.1}, 2.2), ({"mu_2_pa": 0.0}, 2.2)],
+    ("changes", "stretch"), [({}, 1.3), ({"mu_2_pa": 0.1}, 2.2), ({"mu_2_pa": 0.0}, 2.2)]
 )
 def test_a_stable_material_gives_no_concern(changes, stretch):
-    assert not list(
-        strain_stability_concerns(
-            [stretched_cube({**UNSTABLE, **changes}, stretch)]
-        )
-    )
+    assert not list(strain_stability_concerns([stretched_cube({**UNSTABLE, **changes}, stretch)]))
 
 
-@pytest.mark.parametrize(
-    ("alpha", "codes"), [(-3.0, ["stability/rest"]), (3.0, [])]
-)
+@pytest.mark.parametrize(("alpha", "codes"), [(-3.0, ["stability/rest"]), (3.0, [])])
 def test_a_negative_shear_modulus_is_named(alpha, codes):
     body = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), "ogden-1", 30.0)
     values = {"mu_1_pa": 200.0, "alpha_1": alpha, "kappa_pa": 400.0}
-    theta = body.theta_from_values(
-        {**values, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-    )
+    theta = body.theta_from_values({**values, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
     concerns = list(rest_stability_concerns(body, theta))
     assert [each.code for each in concerns] == codes
     for each in concerns:

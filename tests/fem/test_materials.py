@@ -8,14 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from kit.checks import relative_error
-from kit.materials import (
-    CONSTANTS,
-    ELASTIC,
-    ISOCHORIC,
-    KAPPA_PA,
-    LAME,
-    elastic,
-)
+from kit.materials import CONSTANTS, ELASTIC, ISOCHORIC, KAPPA_PA, LAME, elastic
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
@@ -76,12 +69,8 @@ def deformations(rng: np.random.Generator, count: int = 5) -> np.ndarray:
 # Every material -------------------------------------------------------------------------------
 
 
-def test_small_strain_limit_is_linear_elasticity_with_the_same_lame_parameters(
-    law,
-):
-    np.testing.assert_allclose(
-        law.at(np.eye(3))[2], linear_elasticity(), atol=1e-10
-    )
+def test_small_strain_limit_is_linear_elasticity_with_the_same_lame_parameters(law):
+    np.testing.assert_allclose(law.at(np.eye(3))[2], linear_elasticity(), atol=1e-10)
 
 
 @pytest.mark.parametrize("name", MATERIALS)
@@ -132,13 +121,9 @@ def slopes_by_invariants(name: str, first: float) -> tuple[float, float]:
     if name == "mooney-rivlin":
         return c["c10_pa"], c["c01_pa"]
     if name == "yeoh":
-        return c["c10_pa"] + 2 * c["c20_pa"] * past + 3 * c[
-            "c30_pa"
-        ] * past**2, 0.0
+        return c["c10_pa"] + 2 * c["c20_pa"] * past + 3 * c["c30_pa"] * past**2, 0.0
     if name == "gent":
-        return 0.5 * c["mu_pa"] * c["gent_limit"] / (
-            c["gent_limit"] - past
-        ), 0.0
+        return 0.5 * c["mu_pa"] * c["gent_limit"] / (c["gent_limit"] - past), 0.0
     # Arruda & Boyce: C Σ i α_i Ī₁^(i−1) / λ_m^(2i−2), and 2 ∂ψ/∂Ī₁ at rest is μ.
     n = c["chain_stretch"] ** 2
 
@@ -161,9 +146,7 @@ def test_uniaxial_stretch_at_constant_volume(name, stretch):
     first = stretch**2 + 2 / stretch
     by_first, by_second = slopes_by_invariants(name, first)
     expected = 2 * (stretch**2 - 1 / stretch) * (by_first + by_second / stretch)
-    stress = Law(name).cauchy_stress(
-        np.diag([stretch, stretch**-0.5, stretch**-0.5])
-    )
+    stress = Law(name).cauchy_stress(np.diag([stretch, stretch**-0.5, stretch**-0.5]))
     assert stress[0, 0] - stress[1, 1] == pytest.approx(expected, rel=1e-12)
     assert np.trace(stress) == pytest.approx(0.0, abs=1e-9)
 
@@ -176,57 +159,36 @@ def test_simple_shear(name, shear):
     F[0, 1] = shear
     by_first, by_second = slopes_by_invariants(name, 3 + shear**2)
     stress = Law(name).cauchy_stress(F)
-    assert stress[0, 1] == pytest.approx(
-        2 * (by_first + by_second) * shear, rel=1e-12
-    )
-    assert stress[0, 0] - stress[2, 2] == pytest.approx(
-        2 * by_first * shear**2, rel=1e-12
-    )
+    assert stress[0, 1] == pytest.approx(2 * (by_first + by_second) * shear, rel=1e-12)
+    assert stress[0, 0] - stress[2, 2] == pytest.approx(2 * by_first * shear**2, rel=1e-12)
     found = stress[2, 2] - stress[1, 1]
-    assert found == pytest.approx(
-        2 * by_second * shear**2, rel=1e-12, abs=1e-10
-    )
+    assert found == pytest.approx(2 * by_second * shear**2, rel=1e-12, abs=1e-10)
 
 
 @pytest.mark.parametrize("name", ISOCHORIC)
 def test_a_change_of_volume_alone_meets_the_bulk_modulus(name):
     stress = Law(name).cauchy_stress(1.1 * np.eye(3))
-    np.testing.assert_allclose(
-        stress, KAPPA_PA * (1.1**3 - 1) * np.eye(3), atol=1e-9
-    )
+    np.testing.assert_allclose(stress, KAPPA_PA * (1.1**3 - 1) * np.eye(3), atol=1e-9)
 
 
 def test_chains_of_any_length_tend_to_neo_hookean():
     F = np.diag([1.5, 1.5**-0.5, 1.5**-0.5])
     expected = Law("mooney-rivlin", c10_pa=150.0, c01_pa=0.0).at(F)[1]
     assert relative_error(Law("gent", gent_limit=1e9).at(F)[1], expected) < 1e-8
-    assert (
-        relative_error(
-            Law("arruda-boyce", chain_stretch=1e5).at(F)[1], expected
-        )
-        < 1e-8
-    )
-    assert (
-        relative_error(Law("yeoh", c20_pa=0.0, c30_pa=0.0).at(F)[1], expected)
-        < 1e-12
-    )
+    assert relative_error(Law("arruda-boyce", chain_stretch=1e5).at(F)[1], expected) < 1e-8
+    assert relative_error(Law("yeoh", c20_pa=0.0, c30_pa=0.0).at(F)[1], expected) < 1e-12
 
 
 def test_gents_material_stiffens_towards_its_limit():
     gent = Law("gent", gent_limit=1.0)
     stretches = np.array([1.2, 1.5, 1.65])  # Ī₁ − 3 is 1 at a stretch of 1.675
-    stresses = [
-        gent.cauchy_stress(np.diag([s, s**-0.5, s**-0.5]))[0, 0]
-        for s in stretches
-    ]
+    stresses = [gent.cauchy_stress(np.diag([s, s**-0.5, s**-0.5]))[0, 0] for s in stretches]
     stiffening = stresses / (stretches**2 - 1 / stretches)
     assert stiffening[2] > 5 * stiffening[1] > 5 * stiffening[0]
 
 
 def test_stable_neo_hookean_is_finite_where_an_element_is_inverted():
-    psi, stress, tangent = Law("stable-neo-hookean").at(
-        np.diag([-0.5, 1.0, 1.0])
-    )
+    psi, stress, tangent = Law("stable-neo-hookean").at(np.diag([-0.5, 1.0, 1.0]))
     assert psi > 0
     assert np.isfinite(stress).all()
     assert np.isfinite(tangent).all()
@@ -247,17 +209,11 @@ def test_energy_written_by_the_user_passes_the_checks():
 
 
 @pytest.mark.parametrize("evaluator", ["simd", "casadi"])
-def test_energy_written_by_the_user_has_the_small_strain_limit_of_the_table(
-    small_mesh, evaluator
-):
+def test_energy_written_by_the_user_has_the_small_strain_limit_of_the_table(small_mesh, evaluator):
     body = Body(small_mesh, stiffening, density_kg_m3=30.0, evaluator=evaluator)
     constants = elastic(body)
-    table = Body(
-        small_mesh, "neo-hookean", density_kg_m3=30.0, evaluator=evaluator
-    )
-    stiffness, expected = (
-        b.stiffness(small_mesh.points_m, **constants) for b in (body, table)
-    )
+    table = Body(small_mesh, "neo-hookean", density_kg_m3=30.0, evaluator=evaluator)
+    stiffness, expected = (b.stiffness(small_mesh.points_m, **constants) for b in (body, table))
     assert relative_error(stiffness.toarray(), expected.toarray()) < 1e-12
 
 
@@ -265,32 +221,17 @@ def test_constants_of_a_users_material_are_the_functions_arguments(small_mesh):
     def fung(F, mu_pa, growth, kappa_pa):
         J = ca.det(F)
         strain = ca.sumsqr(F) * J ** (-2 / 3) - 3
-        return (
-            0.5 * mu_pa / growth * (ca.exp(growth * strain) - 1)
-            + 0.5 * kappa_pa * (J - 1) ** 2
-        )
+        return 0.5 * mu_pa / growth * (ca.exp(growth * strain) - 1) + 0.5 * kappa_pa * (J - 1) ** 2
 
     growth = Constant("growth", "b", bounds=(0.01, 10.0))
     material = Material.from_energy(fung, "", growth)
     assert material.name == "fung"
-    assert [c.name for c in material.constants] == [
-        "mu_pa",
-        "growth",
-        "kappa_pa",
-    ]
+    assert [c.name for c in material.constants] == ["mu_pa", "growth", "kappa_pa"]
     assert [c.symbol for c in material.constants] == ["μ", "b", "κ"]
     assert material.constants[1] is growth
     body = Body(small_mesh, material, density_kg_m3=30.0)
-    assert [*body.constants] == [
-        "mu_pa",
-        "growth",
-        "kappa_pa",
-        "gamma_r_s",
-        "gamma_m_1_s",
-    ]
-    np.testing.assert_allclose(
-        material.lame([300.0, 2.0, KAPPA_PA]).full().ravel(), LAME
-    )
+    assert [*body.constants] == ["mu_pa", "growth", "kappa_pa", "gamma_r_s", "gamma_m_1_s"]
+    np.testing.assert_allclose(material.lame([300.0, 2.0, KAPPA_PA]).full().ravel(), LAME)
 
 
 def test_a_name_is_given_or_that_of_the_function():
@@ -325,18 +266,9 @@ def not_casadi(F, mu_pa):
             with_energy_at_rest,
             "'with-energy-at-rest' has the energy .* J/m³ in the undeformed state, .*mu_pa =",
         ),
-        (
-            with_stress_at_rest,
-            "'with-stress-at-rest' has the stress .* Pa in the undeformed state",
-        ),
-        (
-            without_constants,
-            "'without-constants' has no constants; expected a function",
-        ),
-        (
-            not_finite_at_rest,
-            "'not-finite-at-rest' has the energy .* in the undeformed state",
-        ),
+        (with_stress_at_rest, "'with-stress-at-rest' has the stress .* Pa in the undeformed state"),
+        (without_constants, "'without-constants' has no constants; expected a function"),
+        (not_finite_at_rest, "'not-finite-at-rest' has the energy .* in the undeformed state"),
         (not_casadi, "'not-casadi' cannot be evaluated"),
     ],
 )
@@ -346,9 +278,7 @@ def test_unusable_energies_are_refused(energy, message):
 
 
 def test_a_constant_told_but_not_used_is_refused_with_the_nearest():
-    with pytest.raises(
-        InputError, match=r"constant 'mu_p'; .*; did you mean 'mu_pa'"
-    ):
+    with pytest.raises(InputError, match=r"constant 'mu_p'; .*; did you mean 'mu_pa'"):
         Material.from_energy(stiffening, "stiffening", Constant("mu_p"))
 
 
@@ -358,9 +288,7 @@ def test_a_material_is_itself_and_names_are_looked_up():
 
 
 def test_unknown_material_is_refused_with_the_names_there_are():
-    with pytest.raises(
-        InputError, match="no material 'rubber'; available: neo-hookean, "
-    ):
+    with pytest.raises(InputError, match="no material 'rubber'; available: neo-hookean, "):
         as_material("rubber")
     with pytest.raises(InputError, match="did you mean 'mooney-rivlin'"):
         as_material("moony-rivlin")

@@ -12,14 +12,7 @@ import scipy.sparse as sp
 import skfem
 from kit.checks import observed_order, relative_error
 from kit.materials import COMPILED, ELASTIC, elastic, theta_for
-from kit.problems import (
-    box,
-    nodes_where,
-    point_markers,
-    smooth_poses,
-    times,
-    uneven_box,
-)
+from kit.problems import box, nodes_where, point_markers, smooth_poses, times, uneven_box
 from kit.scikit_fem import Library
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
@@ -41,34 +34,17 @@ P0 = "tet10-p0"
 def of_a_user(F, lambda_pa, mu_pa):
     """Stiffer than Neo-Hooke's when sheared, and split like none of the table's."""
     log_j, stretch = ca.log(ca.det(F)), ca.sumsqr(F) - 3
-    return (
-        0.5 * lambda_pa * log_j**2
-        - mu_pa * log_j
-        + mu_pa * (stretch / 2 + stretch**2 / 20)
-    )
+    return 0.5 * lambda_pa * log_j**2 - mu_pa * log_j + mu_pa * (stretch / 2 + stretch**2 / 20)
 
 
 @cache
-def small_body(
-    material: str | Callable = "neo-hookean", evaluator="auto", element=P0
-) -> Body:
+def small_body(material: str | Callable = "neo-hookean", evaluator="auto", element=P0) -> Body:
     """Six elements, no two alike."""
-    return Body(
-        uneven_box(1),
-        material,
-        30.0,
-        element,
-        damping="rayleigh",
-        evaluator=evaluator,
-    )
+    return Body(uneven_box(1), material, 30.0, element, damping="rayleigh", evaluator=evaluator)
 
 
-def deformed(
-    body: Body, rng: np.random.Generator, states: int = 1
-) -> np.ndarray:
-    return body.nodes_m + rng.uniform(
-        -0.003, 0.003, (states, *body.nodes_m.shape)
-    )
+def deformed(body: Body, rng: np.random.Generator, states: int = 1) -> np.ndarray:
+    return body.nodes_m + rng.uniform(-0.003, 0.003, (states, *body.nodes_m.shape))
 
 
 # Evaluators -----------------------------------------------------------------------------------
@@ -79,10 +55,7 @@ def deformed(
 def test_evaluators_agree(material, rng):
     simd, casadi = (small_body(material, name) for name in ("simd", "casadi"))
     assert simd.evaluator == "simd"
-    x, (v, w) = (
-        deformed(simd, rng, 2),
-        rng.standard_normal((2, 2, simd.nodes_m.size)),
-    )
+    x, (v, w) = (deformed(simd, rng, 2), rng.standard_normal((2, 2, simd.nodes_m.size)))
     assert simd.energy(x[0], **elastic(simd)) == pytest.approx(
         casadi.energy(x[0], **elastic(casadi)), rel=1e-12
     )
@@ -92,23 +65,17 @@ def test_evaluators_agree(material, rng):
         ("second_derivatives", (x, v, w)),
     ):
         found, expected = (
-            getattr(each, method)(*fields, theta_for(each))
-            for each in (simd, casadi)
+            getattr(each, method)(*fields, theta_for(each)) for each in (simd, casadi)
         )
         for name in getattr(expected, "__dataclass_fields__", [None]):
-            pair = (
-                getattr(each, name) if name else each
-                for each in (found, expected)
-            )
+            pair = (getattr(each, name) if name else each for each in (found, expected))
             assert relative_error(*pair) < 1e-12, name
 
 
 # The element ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "material", [name for name in COMPILED if name != "linear"]
-)
+@pytest.mark.parametrize("material", [name for name in COMPILED if name != "linear"])
 def test_rigid_motion_causes_no_force(material, rng):
     body = small_body(material)
     turn = Rotation.from_rotvec([0.5, -2.0, 1.0]).as_matrix()
@@ -121,20 +88,14 @@ def test_rigid_motion_causes_no_force(material, rng):
 def test_a_uniform_strain_is_felt_as_by_plain_elements(material, rng):
     body, plain = small_body(material), small_body(material, element="tet10")
     x = body.nodes_m @ (np.eye(3) + rng.uniform(-0.15, 0.15, (3, 3))).T
-    found, expected = (
-        each.elastic_force(x, **elastic(each)) for each in (body, plain)
-    )
+    found, expected = (each.elastic_force(x, **elastic(each)) for each in (body, plain))
     assert relative_error(found, expected) < 1e-12
-    found, expected = (
-        each.energy(x, **elastic(each)) for each in (body, plain)
-    )
+    found, expected = (each.energy(x, **elastic(each)) for each in (body, plain))
     assert found == pytest.approx(expected, rel=1e-12)
 
 
 def zero_modes(body: Body) -> int:
-    spectrum = np.linalg.eigvalsh(
-        body.stiffness(body.nodes_m, **ELASTIC).toarray()
-    )
+    spectrum = np.linalg.eigvalsh(body.stiffness(body.nodes_m, **ELASTIC).toarray())
     resisted = spectrum > 1e-12 * spectrum[-1]
     assert spectrum[resisted][0] > 1e-3 * spectrum[-1]
     return int((~resisted).sum())
@@ -146,10 +107,7 @@ def test_only_rigid_motion_is_without_energy(small_mesh):
 
 def test_a_single_element_lets_three_conformal_motions_pass():
     """Those of ε = (b·x) I, whose mean vanishes: 24 strains but 4 · 5 + 1 that are resisted."""
-    one = TetMesh(
-        [[0, 0, 0], [0.1, 0, 0], [0.02, 0.1, 0], [0.01, 0.03, 0.1]],
-        [[0, 1, 2, 3]],
-    )
+    one = TetMesh([[0, 0, 0], [0.1, 0, 0], [0.02, 0.1, 0], [0.01, 0.03, 0.1]], [[0, 1, 2, 3]])
     assert zero_modes(Body(one, density_kg_m3=30.0, element=P0)) == 9
 
 
@@ -159,9 +117,7 @@ def test_the_stiffness_matrix_has_the_pattern_of_plain_elements():
     np.testing.assert_array_equal(body.pattern.columns, plain.pattern.columns)
 
 
-def kinematics(
-    body: Body, x: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def kinematics(body: Body, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """F (E, q, 3, 3), J (E, q), the volumes V (E, q), and the mean dilatation (E, 1)."""
     gradients = body.geometry[..., :-1].reshape(len(body.cells), 4, 10, 3)
     F = np.einsum("eai,eqaj->eqij", x[body.cells], gradients)
@@ -181,9 +137,7 @@ def test_the_energy_is_isochoric_at_points_and_volumetric_in_the_mean(rng):
     c = elastic(body)
     isochoric = c["c10_pa"] * (first - 3) + c["c01_pa"] * (second - 3)
     volumetric = c["kappa_pa"] / 2 * (mean - 1) ** 2
-    assert body.energy(x, **c) == pytest.approx(
-        (V * (isochoric + volumetric)).sum(), rel=1e-12
-    )
+    assert body.energy(x, **c) == pytest.approx((V * (isochoric + volumetric)).sum(), rel=1e-12)
 
 
 def test_the_fields_are_those_that_the_material_feels(rng):
@@ -204,9 +158,7 @@ INCOMPRESSIBLE = 0.4999
 
 
 def lame(poisson: float) -> tuple[float, float]:
-    return YOUNG_PA * poisson / (
-        (1 + poisson) * (1 - 2 * poisson)
-    ), YOUNG_PA / (2 + 2 * poisson)
+    return YOUNG_PA * poisson / ((1 + poisson) * (1 - 2 * poisson)), YOUNG_PA / (2 + 2 * poisson)
 
 
 def stiffness(body: Body, poisson: float) -> sp.csc_array:
@@ -217,18 +169,12 @@ def deviator(u):
     return sym_grad(u) - eye(div(u) / 3, 3)
 
 
-def mixed_stiffness(
-    library: Library, poisson: float, pressure: skfem.Element
-) -> np.ndarray:
+def mixed_stiffness(library: Library, poisson: float, pressure: skfem.Element) -> np.ndarray:
     """Stiffness with the pressures condensed: ∫ 2μ dev ε:dev ε + p div u − p²/(2κ)."""
     lambda_pa, mu_pa = lame(poisson)
     pressures = library.basis.with_element(pressure)
-    shear = skfem.BilinearForm(
-        lambda u, v, w: 2 * mu_pa * ddot(deviator(u), deviator(v))
-    )
-    work = skfem.BilinearForm(lambda u, q, w: div(u) * q).assemble(
-        library.basis, pressures
-    )
+    shear = skfem.BilinearForm(lambda u, v, w: 2 * mu_pa * ddot(deviator(u), deviator(v)))
+    work = skfem.BilinearForm(lambda u, q, w: div(u) * q).assemble(library.basis, pressures)
     volume = skfem.BilinearForm(lambda p, q, w: p * q).assemble(pressures)
     pressed = np.linalg.solve(volume.toarray(), work.toarray())
     volumetric = (lambda_pa + 2 / 3 * mu_pa) * work.T @ pressed
@@ -238,9 +184,7 @@ def mixed_stiffness(
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3, INCOMPRESSIBLE])
 @pytest.mark.parametrize("material", ["neo-hookean", "linear"])
-def test_at_rest_it_is_the_mixed_element_of_constant_pressures(
-    small_mesh, material, poisson
-):
+def test_at_rest_it_is_the_mixed_element_of_constant_pressures(small_mesh, material, poisson):
     body = Body(small_mesh, material, 30.0, P0)
     library = Library(small_mesh, skfem.ElementTetP2(), intorder=2)
     expected = mixed_stiffness(library, poisson, skfem.ElementTetP0())
@@ -252,38 +196,27 @@ def sag_m(K: np.ndarray | sp.csc_array, body: Body) -> float:
     free = np.flatnonzero(np.repeat(body.nodes_m[:, 0] > 1e-9, 3))
     load, u = np.zeros((2, body.nodes_m.size))
     load[2::3] = -9.81 * body.node_mass
-    inner = (
-        K[np.ix_(free, free)] if isinstance(K, np.ndarray) else K[free][:, free]
-    )
-    u[free] = (np.linalg.solve if isinstance(K, np.ndarray) else spsolve)(
-        inner, load[free]
-    )
+    inner = K[np.ix_(free, free)] if isinstance(K, np.ndarray) else K[free][:, free]
+    u[free] = (np.linalg.solve if isinstance(K, np.ndarray) else spsolve)(inner, load[free])
     return -u[2::3][nodes_where(body, 0, body.nodes_m[:, 0].max())].mean()
 
 
 @cache
 def beam(element: str, cells_across: int) -> Body:
     m = cells_across
-    return Body(
-        box_mesh((0.10, 0.02, 0.02), (3 * m, m, m)), "linear", 30.0, element
-    )
+    return Body(box_mesh((0.10, 0.02, 0.02), (3 * m, m, m)), "linear", 30.0, element)
 
 
 @pytest.mark.parametrize(
     ("poisson", "plain_below", "linear_below"),
     [(0.3, 1.0, 0.65), (0.49, 0.95, 0.25), (INCOMPRESSIBLE, 0.92, 0.08)],
 )
-def test_a_beam_sags_as_with_taylor_and_hoods_element(
-    poisson, plain_below, linear_below
-):
+def test_a_beam_sags_as_with_taylor_and_hoods_element(poisson, plain_below, linear_below):
     averaging, plain, linear = (beam(name, 2) for name in (P0, "tet10", "tet4"))
     library = Library(plain.mesh, skfem.ElementTetP2(), intorder=4)
-    expected = sag_m(
-        mixed_stiffness(library, poisson, skfem.ElementTetP1()), plain
-    )
+    expected = sag_m(mixed_stiffness(library, poisson, skfem.ElementTetP1()), plain)
     found, stiff, locked = (
-        sag_m(stiffness(body, poisson), body) / expected
-        for body in (averaging, plain, linear)
+        sag_m(stiffness(body, poisson), body) / expected for body in (averaging, plain, linear)
     )
     assert found == pytest.approx(1.0, abs=0.09)
     assert stiff < plain_below
@@ -292,10 +225,7 @@ def test_a_beam_sags_as_with_taylor_and_hoods_element(
 
 def test_away_from_incompressibility_it_agrees_with_plain_elements_under_refinement():
     sags = [
-        [
-            sag_m(stiffness(body, 0.3), body)
-            for body in (beam(P0, m), beam("tet10", m))
-        ]
+        [sag_m(stiffness(body, 0.3), body) for body in (beam(P0, m), beam("tet10", m))]
         for m in (1, 2, 3)
     ]
     differences = [abs(averaging / plain - 1) for averaging, plain in sags]
@@ -316,19 +246,13 @@ def mean_error(element: str, divisions: int) -> float:
     def parts(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         (sx, sy, sz), (cx, cy, cz) = np.sin(k * x), np.cos(k * x)
         a = np.array([sx * cy * cz, -cx * sy * cz, 0 * sx])
-        return a, mu_pa * k * np.array(
-            [cx * sy * sz, sx * cy * sz, sx * sy * cz]
-        )
+        return a, mu_pa * k * np.array([cx * sy * sz, sx * cy * sz, sx * sy * cz])
 
     library = Library(mesh, skfem.ElementTetP2(), intorder=4)
 
     def work(v, w):
         a, gradient = parts(w["x"])
-        return (
-            3
-            * k**2
-            * dot(mu_pa * a + (1 + 2 * mu_pa / lambda_pa) * gradient, v)
-        )
+        return 3 * k**2 * dot(mu_pa * a + (1 + 2 * mu_pa / lambda_pa) * gradient, v)
 
     load = skfem.LinearForm(work).assemble(library.basis)[library.dofs]
     a, gradient = parts(body.nodes_m.T)
@@ -337,12 +261,8 @@ def mean_error(element: str, divisions: int) -> float:
     free = np.flatnonzero(np.repeat(inside, 3))
     held = np.flatnonzero(~np.repeat(inside, 3))
     K, u = stiffness(body, INCOMPRESSIBLE), exact.copy()
-    u[free] = spsolve(
-        K[free][:, free], load[free] - K[free][:, held] @ exact[held]
-    )
-    return float(
-        np.sqrt(body.dof_mass @ (u - exact) ** 2 / (body.dof_mass @ exact**2))
-    )
+    u[free] = spsolve(K[free][:, free], load[free] - K[free][:, held] @ exact[held])
+    return float(np.sqrt(body.dof_mass @ (u - exact) ** 2 / (body.dof_mass @ exact**2)))
 
 
 @pytest.mark.long
@@ -355,12 +275,7 @@ def test_near_incompressibility_the_displacement_converges_to_second_order():
 
 # Identification -------------------------------------------------------------------------------
 
-TRUTH = {
-    "young_pa": 2000.0,
-    "poisson": 0.499,
-    "gamma_r_s": 0.002,
-    "gamma_m_1_s": 1.0,
-}
+TRUTH = {"young_pa": 2000.0, "poisson": 0.499, "gamma_r_s": 0.002, "gamma_m_1_s": 1.0}
 GUESS = Parameters(
     (
         Parameter("young_pa", 1400.0, 10.0, 1e6),
@@ -379,9 +294,7 @@ def bar() -> Experiment:
     grasp = Grasp(nodes_where(body, 0, 0.0), gently)
     markers = point_markers(body, body.nodes_m[-5:], t_s)
     unseen = Experiment(body, t_s, (grasp,), markers)
-    return with_markers(
-        unseen, simulate(unseen, TRUTH, "midpoint", substeps=1).markers_m
-    )
+    return with_markers(unseen, simulate(unseen, TRUTH, "midpoint", substeps=1).markers_m)
 
 
 @pytest.mark.long
@@ -394,12 +307,8 @@ def test_reduced_space_finds_the_truth():
 @pytest.mark.long
 def test_with_noise_it_finds_an_optimum_of_the_whole_program(rng):
     tracks = bar().markers.positions_m
-    noisy = with_markers(
-        bar(), tracks + 1e-4 * rng.standard_normal(tracks.shape)
-    )
+    noisy = with_markers(bar(), tracks + 1e-4 * rng.standard_normal(tracks.shape))
     solution = ReducedSpace()(Collocation([noisy], GUESS))
     assert solution.status.converged
     assert solution.kkt_residual < 1e-8
-    assert solution.parameters["young_pa"] != pytest.approx(
-        TRUTH["young_pa"], rel=1e-5
-    )
+    assert solution.parameters["young_pa"] != pytest.approx(TRUTH["young_pa"], rel=1e-5)

@@ -40,18 +40,7 @@ def write_file(path: Path, points: np.ndarray, cells: Any) -> None:
 def test_edges_are_unique_and_sorted():
     edges = TetMesh(TWO_POINTS, TWO_TETS).edges
     np.testing.assert_array_equal(
-        edges,
-        [
-            [0, 1],
-            [0, 2],
-            [0, 3],
-            [1, 2],
-            [1, 3],
-            [1, 4],
-            [2, 3],
-            [2, 4],
-            [3, 4],
-        ],
+        edges, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
     )
 
 
@@ -70,13 +59,7 @@ def test_quality_of_a_flat_element_is_below_the_median():
 
 
 def test_arrays_are_read_only(box):
-    for array in (
-        box.points_m,
-        box.tetrahedra,
-        box.file_index,
-        box.volumes_m3,
-        box.surface,
-    ):
+    for array in (box.points_m, box.tetrahedra, box.file_index, box.volumes_m3, box.surface):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
 
@@ -113,9 +96,7 @@ def test_negative_elements_are_reoriented_and_noted(box):
     tetrahedra[[3, 70]] = tetrahedra[[3, 70]][:, [0, 2, 1, 3]]
     mesh = TetMesh(box.points_m, tetrahedra)
     assert (mesh.volumes_m3 > 0).all()
-    np.testing.assert_array_equal(
-        np.sort(mesh.tetrahedra), np.sort(box.tetrahedra)
-    )
+    np.testing.assert_array_equal(np.sort(mesh.tetrahedra), np.sort(box.tetrahedra))
     assert mesh.notes == (
         "2 of 120 elements had a negative volume and were re-oriented, which is harmless.",
     )
@@ -133,9 +114,7 @@ def test_unreferenced_nodes_are_dropped_with_their_values_and_noted():
 
 
 def test_unconnected_parts_are_noted_with_coincident_nodes():
-    far = TetMesh(
-        np.vstack([CORNERS, CORNERS + 5]), [[0, 1, 2, 3], [4, 5, 6, 7]]
-    )
+    far = TetMesh(np.vstack([CORNERS, CORNERS + 5]), [[0, 1, 2, 3], [4, 5, 6, 7]])
     assert "2 unconnected parts" in far.notes[0]
     assert "merge" not in far.notes[0]
     torn = TetMesh(np.vstack([CORNERS, -CORNERS]), [[0, 1, 2, 3], [4, 6, 5, 7]])
@@ -151,11 +130,7 @@ def test_unconnected_parts_are_noted_with_coincident_nodes():
         (CORNERS[:, :2], [[0, 1, 2, 3]], r"shape \(n, 3\), not \(4, 2\)"),
         (CORNERS, [[0, 1, 2]], r"shape \(E, 4\) with E > 0, not \(1, 3\)"),
         (CORNERS, np.empty((0, 4), int), r"E > 0"),
-        (
-            CORNERS,
-            [[0.0, 1.0, 2.0, 3.0]],
-            "integer node indices from 0, not float64",
-        ),
+        (CORNERS, [[0.0, 1.0, 2.0, 3.0]], "integer node indices from 0, not float64"),
         (
             CORNERS,
             [[0, 1, 2, 9]],
@@ -164,16 +139,8 @@ def test_unconnected_parts_are_noted_with_coincident_nodes():
         (CORNERS, [[0, 1, 2, -1]], "element 0 has nodes"),
         (CORNERS, [[1, 2, 3, 4]], "the indices seem to count from 1"),
         (CORNERS * [1, 1, np.nan], [[0, 1, 2, 3]], "node 0 lies at .*nan"),
-        (
-            TWO_POINTS,
-            [[0, 1, 2, 3], [3, 1, 0, 2]],
-            "element 1 has the same nodes .* as element 0",
-        ),
-        (
-            CORNERS * [1, 1, 1e-9],
-            [[0, 1, 2, 3]],
-            "element 0 .* is degenerate: its volume is 1.67e",
-        ),
+        (TWO_POINTS, [[0, 1, 2, 3], [3, 1, 0, 2]], "element 1 has the same nodes .* as element 0"),
+        (CORNERS * [1, 1, 1e-9], [[0, 1, 2, 3]], "element 0 .* is degenerate: its volume is 1.67e"),
         (CORNERS, [[0, 1, 2, 2]], "degenerate: its volume is 0 m³"),
     ],
 )
@@ -183,9 +150,7 @@ def test_bad_arrays_are_refused_with_the_reason(points, tets, message):
 
 
 def test_degeneracy_is_relative_to_the_elements_size():
-    assert TetMesh(CORNERS * 1e-6, [[0, 1, 2, 3]]).volume_m3 == pytest.approx(
-        1e-18 / 6
-    )
+    assert TetMesh(CORNERS * 1e-6, [[0, 1, 2, 3]]).volume_m3 == pytest.approx(1e-18 / 6)
 
 
 def test_point_arrays_must_have_a_value_per_node():
@@ -199,12 +164,7 @@ def test_cell_arrays_must_have_a_value_per_element():
 
 
 def test_cell_arrays_are_kept_and_read_only():
-    mesh = TetMesh(
-        TWO_POINTS,
-        TWO_TETS,
-        None,
-        {"core": [True, False], "stress": [[1, 2], [3, 4]]},
-    )
+    mesh = TetMesh(TWO_POINTS, TWO_TETS, None, {"core": [True, False], "stress": [[1, 2], [3, 4]]})
     np.testing.assert_array_equal(mesh.cell_arrays["core"], [True, False])
     assert mesh.cell_arrays["stress"].shape == (2, 2)
     with pytest.raises(ValueError, match="read-only"):
@@ -212,9 +172,7 @@ def test_cell_arrays_are_kept_and_read_only():
 
 
 def test_centres_are_the_means_of_the_corners(box):
-    np.testing.assert_allclose(
-        box.centres_m, box.points_m[box.tetrahedra].mean(axis=1)
-    )
+    np.testing.assert_allclose(box.centres_m, box.points_m[box.tetrahedra].mean(axis=1))
 
 
 # --- files
@@ -230,17 +188,14 @@ def test_a_written_mesh_reads_back(tmp_path, ending, box):
 
 def test_vtu_keeps_every_bit_and_the_point_arrays(tmp_path, box):
     grip = box.points_m[:, 0] == 0
-    TetMesh(box.points_m, box.tetrahedra, {"grip": grip}).write(
-        tmp_path / "box.vtu"
-    )
+    TetMesh(box.points_m, box.tetrahedra, {"grip": grip}).write(tmp_path / "box.vtu")
     again = TetMesh.read(tmp_path / "box.vtu")
     assert again.sha256 == box.sha256
     np.testing.assert_array_equal(again.point_arrays["grip"], grip)
 
 
 @pytest.mark.parametrize(
-    ("unit", "metres"),
-    [("m", 1), ("cm", 0.01), ("mm", 1e-3), ("um", 1e-6), ("in", 0.0254)],
+    ("unit", "metres"), [("m", 1), ("cm", 0.01), ("mm", 1e-3), ("um", 1e-6), ("in", 0.0254)]
 )
 def test_length_units_scale_to_metres(tmp_path, unit, metres):
     write_file(tmp_path / "tet.vtu", CORNERS, [("tetra", [[0, 1, 2, 3]])])
@@ -249,40 +204,26 @@ def test_length_units_scale_to_metres(tmp_path, unit, metres):
 
 
 def test_an_unknown_length_unit_lists_the_known_ones(tmp_path):
-    with pytest.raises(
-        InputError, match='\'ft\' is unknown; use one of "m", "cm", "mm"'
-    ):
+    with pytest.raises(InputError, match='\'ft\' is unknown; use one of "m", "cm", "mm"'):
         TetMesh.read(tmp_path / "tet.vtu", length_unit="ft")
 
 
 def test_mixed_cells_keep_the_tetrahedra_and_say_so(tmp_path):
-    cells = [
-        ("triangle", np.array([[0, 1, 2]])),
-        ("tetra", TWO_TETS[:1]),
-        ("tetra", TWO_TETS[1:]),
-    ]
+    cells = [("triangle", np.array([[0, 1, 2]])), ("tetra", TWO_TETS[:1]), ("tetra", TWO_TETS[1:])]
     write_file(tmp_path / "mixed.vtu", TWO_POINTS, cells)
     mesh = TetMesh.read(tmp_path / "mixed.vtu")
     assert len(mesh.tetrahedra) == 2
-    assert (
-        mesh.notes[0]
-        == "Cells other than tetrahedra were left out (1 triangle)."
-    )
+    assert mesh.notes[0] == "Cells other than tetrahedra were left out (1 triangle)."
 
 
 def test_left_out_solid_cells_are_called_missing(tmp_path):
     cells = [("tetra", [[0, 1, 2, 3]]), ("pyramid", [[0, 1, 2, 3, 4]])]
     write_file(tmp_path / "mixed.vtu", TWO_POINTS, cells)
-    assert (
-        "this part of the body is missing"
-        in TetMesh.read(tmp_path / "mixed.vtu").notes[0]
-    )
+    assert "this part of the body is missing" in TetMesh.read(tmp_path / "mixed.vtu").notes[0]
 
 
 def test_point_sets_of_the_file_can_be_selected(tmp_path):
-    mesh = meshio.Mesh(
-        CORNERS, [("tetra", [[0, 1, 2, 3]])], point_sets={"grip": [1, 3]}
-    )
+    mesh = meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 3]])], point_sets={"grip": [1, 3]})
     meshio.write(tmp_path / "tet.inp", mesh)
     read = TetMesh.read(tmp_path / "tet.inp")
     np.testing.assert_array_equal(read.select(Named("grip")), [1, 3])
@@ -291,9 +232,7 @@ def test_point_sets_of_the_file_can_be_selected(tmp_path):
 @pytest.mark.parametrize("ending", ["vtu", "vtk"])
 def test_cell_arrays_are_written_and_read_back(tmp_path, ending):
     arrays = {"core": np.array([True, False]), "modulus": np.array([2.5, 7.0])}
-    TetMesh(TWO_POINTS, TWO_TETS, None, arrays).write(
-        tmp_path / f"two.{ending}"
-    )
+    TetMesh(TWO_POINTS, TWO_TETS, None, arrays).write(tmp_path / f"two.{ending}")
     again = TetMesh.read(tmp_path / f"two.{ending}")
     np.testing.assert_array_equal(again.cell_arrays["core"], [1, 0])
     np.testing.assert_array_equal(again.cell_arrays["modulus"], [2.5, 7.0])
@@ -301,24 +240,14 @@ def test_cell_arrays_are_written_and_read_back(tmp_path, ending):
 
 
 def test_cell_arrays_are_those_of_the_tetrahedra_in_a_mixed_file(tmp_path):
-    cells = [
-        ("tetra", TWO_TETS[:1]),
-        ("triangle", [[0, 1, 2]]),
-        ("tetra", TWO_TETS[1:]),
-    ]
+    cells = [("tetra", TWO_TETS[:1]), ("triangle", [[0, 1, 2]]), ("tetra", TWO_TETS[1:])]
     tags = {"tag": [np.array([5]), np.array([9]), np.array([7])]}
-    meshio.write(
-        tmp_path / "mixed.vtu", meshio.Mesh(TWO_POINTS, cells, cell_data=tags)
-    )
-    np.testing.assert_array_equal(
-        TetMesh.read(tmp_path / "mixed.vtu").cell_arrays["tag"], [5, 7]
-    )
+    meshio.write(tmp_path / "mixed.vtu", meshio.Mesh(TWO_POINTS, cells, cell_data=tags))
+    np.testing.assert_array_equal(TetMesh.read(tmp_path / "mixed.vtu").cell_arrays["tag"], [5, 7])
 
 
 def test_cell_sets_of_the_file_can_be_selected(tmp_path):
-    mesh = meshio.Mesh(
-        TWO_POINTS, [("tetra", TWO_TETS)], cell_sets={"core": [[1]]}
-    )
+    mesh = meshio.Mesh(TWO_POINTS, [("tetra", TWO_TETS)], cell_sets={"core": [[1]]})
     meshio.write(tmp_path / "two.inp", mesh)
     read = TetMesh.read(tmp_path / "two.inp")
     np.testing.assert_array_equal(Named("core").resolve_cells(read), [1])
@@ -399,9 +328,7 @@ $EndElements
 
 
 @pytest.mark.parametrize("version", MSH_FILES)
-def test_physical_groups_are_cells_and_nodes_by_name_and_dimension(
-    tmp_path, version
-):
+def test_physical_groups_are_cells_and_nodes_by_name_and_dimension(tmp_path, version):
     (tmp_path / "two.msh").write_text(MSH_FILES[version])
     mesh = TetMesh.read(tmp_path / "two.msh")
     assert len(mesh.tetrahedra) == 2
@@ -411,10 +338,7 @@ def test_physical_groups_are_cells_and_nodes_by_name_and_dimension(
     np.testing.assert_array_equal(mesh.select(Named("skin")), [1, 2, 3, 4])
     # A group of faces has nodes only, though its tag is the one of a group of cells.
     np.testing.assert_array_equal(mesh.select(Named("floor")), [0, 1, 2])
-    with pytest.raises(
-        InputError,
-        match='no cell array or group "floor"; it has "core", "skin"',
-    ):
+    with pytest.raises(InputError, match='no cell array or group "floor"; it has "core", "skin"'):
         Named("floor").resolve_cells(mesh)
 
 
@@ -425,9 +349,7 @@ def test_groups_without_a_name_are_called_by_their_tag(tmp_path, version):
     np.testing.assert_array_equal(mesh.select(Named("physical_5")), [2, 3, 4])
 
 
-def write_clamped(
-    path: Path, file_format: str, names: dict[str, tuple[int, int]]
-) -> TetMesh:
+def write_clamped(path: Path, file_format: str, names: dict[str, tuple[int, int]]) -> TetMesh:
     """A bar whose end face is in a group of triangles, with a node in front that no cell has."""
     bar = box_mesh((0.1, 0.04, 0.03), (3, 2, 2))
     at_end = np.isclose(bar.points_m[bar.surface][:, :, 0], 0.0).all(axis=1)
@@ -439,10 +361,7 @@ def write_clamped(
         np.insert(bar.points_m, 0, 9.0, axis=0),
         list(zip(("triangle", "tetra"), cells, strict=True)),
         point_data={"gmsh:dim_tags": entities},
-        cell_data={
-            "gmsh:physical": tags,
-            "gmsh:geometrical": [np.ones_like(t) for t in tags],
-        },
+        cell_data={"gmsh:physical": tags, "gmsh:geometrical": [np.ones_like(t) for t in tags]},
         field_data={name: np.array(key) for name, key in names.items()},
     )
     meshio.write(path, mesh, file_format, binary=False)
@@ -468,25 +387,19 @@ def test_a_group_of_faces_can_be_clamped(tmp_path, file_format):
 
 
 @pytest.mark.parametrize("file_format", ["gmsh22", "gmsh"])
-def test_groups_of_two_dimensions_with_one_tag_and_no_name_are_told_apart(
-    tmp_path, file_format
-):
+def test_groups_of_two_dimensions_with_one_tag_and_no_name_are_told_apart(tmp_path, file_format):
     write_clamped(tmp_path / "bar.msh", file_format, {})
     mesh = TetMesh.read(tmp_path / "bar.msh")
     assert len(mesh.select(Named("physical_7_surface"))) == 9
     assert len(mesh.select(Named("physical_7_volume"))) == len(mesh.points_m)
-    with pytest.raises(
-        InputError, match='it has "physical_7_surface", "physical_7_volume"'
-    ):
+    with pytest.raises(InputError, match='it has "physical_7_surface", "physical_7_volume"'):
         mesh.select(Named("physical_7"))
 
 
 def test_a_cell_of_several_groups_is_in_all_of_them(tmp_path):
     entity = "1 0 0 0 1 1 1 {} 1 1\n"
     assert entity.format("1 1") in MSH_FILES["4.1"]
-    both = MSH_FILES["4.1"].replace(
-        entity.format("1 1"), entity.format("2 1 2")
-    )
+    both = MSH_FILES["4.1"].replace(entity.format("1 1"), entity.format("2 1 2"))
     (tmp_path / "two.msh").write_text(both)
     mesh = TetMesh.read(tmp_path / "two.msh")
     np.testing.assert_array_equal(Named("core").resolve_cells(mesh), [0])
@@ -496,26 +409,19 @@ def test_a_cell_of_several_groups_is_in_all_of_them(tmp_path):
 
 def test_a_file_without_tetrahedra_tells_what_it_holds(tmp_path):
     write_file(tmp_path / "shell.vtu", CORNERS, [("triangle", [[0, 1, 2]])])
-    with pytest.raises(
-        InputError,
-        match=r"found 1 triangle, but no tetrahedra; .*; a closed",
-    ):
+    with pytest.raises(InputError, match=r"found 1 triangle, but no tetrahedra; .*; a closed"):
         TetMesh.read(tmp_path / "shell.vtu")
 
 
 MIDDLES = [CORNERS[[a, b]].mean(axis=0) for a, b in EDGES]
 
 
-def write_quadratic(
-    path: Path, off: float = 0.0, cell: Any = range(10)
-) -> Path:
+def write_quadratic(path: Path, off: float = 0.0, cell: Any = range(10)) -> Path:
     """One quadratic tetrahedron, the last of its mid nodes off the middle."""
     points = np.vstack([CORNERS, MIDDLES])
     points[9] += [off, 0, 0]
     file_format = "gmsh" if path.suffix == ".msh" else None
-    meshio.write(
-        path, meshio.Mesh(points, [("tetra10", [list(cell)])]), file_format
-    )
+    meshio.write(path, meshio.Mesh(points, [("tetra10", [list(cell)])]), file_format)
     return path
 
 
@@ -533,24 +439,15 @@ def test_quadratic_tetrahedra_are_taken_by_their_corners(tmp_path, ending):
 def test_linear_and_quadratic_tetrahedra_may_be_in_one_file(tmp_path):
     points = np.vstack([CORNERS, MIDDLES, [[1, 1, 1]]])
     write_file(
-        tmp_path / "a.vtu",
-        points,
-        [("tetra10", [list(range(10))]), ("tetra", [[1, 2, 3, 10]])],
+        tmp_path / "a.vtu", points, [("tetra10", [list(range(10))]), ("tetra", [[1, 2, 3, 10]])]
     )
     mesh = TetMesh.read(tmp_path / "a.vtu")
-    np.testing.assert_array_equal(
-        np.sort(mesh.tetrahedra), [[0, 1, 2, 3], [1, 2, 3, 4]]
-    )
+    np.testing.assert_array_equal(np.sort(mesh.tetrahedra), [[0, 1, 2, 3], [1, 2, 3, 4]])
 
 
 def test_slightly_curved_sides_are_straightened_and_noted(tmp_path):
-    mesh = TetMesh.read(
-        write_quadratic(tmp_path / "a.vtu", off=0.03 * np.sqrt(2))
-    )
-    assert (
-        "1 mid nodes lie off the middle of their edges, by up to 0.03 of"
-        in mesh.notes[0]
-    )
+    mesh = TetMesh.read(write_quadratic(tmp_path / "a.vtu", off=0.03 * np.sqrt(2)))
+    assert "1 mid nodes lie off the middle of their edges, by up to 0.03 of" in mesh.notes[0]
 
 
 def test_strongly_curved_sides_are_refused_with_the_worst(tmp_path):
@@ -561,18 +458,14 @@ def test_strongly_curved_sides_are_refused_with_the_worst(tmp_path):
 
 
 def test_mid_nodes_in_another_order_are_refused(tmp_path):
-    file = write_quadratic(
-        tmp_path / "a.vtu", cell=[0, 1, 2, 3, 4, 6, 5, 7, 8, 9]
-    )
+    file = write_quadratic(tmp_path / "a.vtu", cell=[0, 1, 2, 3, 4, 6, 5, 7, 8, 9])
     with pytest.raises(InputError, match="mid node 6 lies"):
         TetMesh.read(file)
 
 
 def test_mid_nodes_that_are_not_there_are_refused(tmp_path):
     file = write_quadratic(tmp_path / "a.vtu", cell=[*range(9), 10])
-    with pytest.raises(
-        InputError, match=r"8, 10\]; expected indices from 0 to 9"
-    ):
+    with pytest.raises(InputError, match=r"8, 10\]; expected indices from 0 to 9"):
         TetMesh.read(file)
 
 
@@ -583,17 +476,11 @@ def test_mid_nodes_that_are_not_there_are_refused(tmp_path):
         ("notes.docx", b"hello", "Could not deduce file format"),
         ("broken.vtu", b"<VTKFile", "cannot be read as a mesh"),
         ("broken.msh", b"\x00\x01\x02", "cannot be read as a mesh"),
-        (
-            "broken.vtk",
-            b"# vtk DataFile Version 3.0\nx\nASCII\nnonsense",
-            "cannot be read",
-        ),
+        ("broken.vtk", b"# vtk DataFile Version 3.0\nx\nASCII\nnonsense", "cannot be read"),
         ("empty.inp", b"", "no cells at all|cannot be read|shape"),
     ],
 )
-def test_unreadable_files_give_one_error_and_print_nothing(
-    tmp_path, capfd, name, content, reason
-):
+def test_unreadable_files_give_one_error_and_print_nothing(tmp_path, capfd, name, content, reason):
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)

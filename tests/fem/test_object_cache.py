@@ -38,9 +38,7 @@ def test_folders_and_files_that_it_makes_are_the_users_alone(folder):
         file = entry(folder)
     finally:
         os.umask(old)
-    assert [
-        path.stat().st_mode & 0o777 for path in (folder, folder.parent)
-    ] == [0o700] * 2
+    assert [path.stat().st_mode & 0o777 for path in (folder, folder.parent)] == [0o700] * 2
     assert file.stat().st_mode & 0o777 == 0o600
 
 
@@ -75,9 +73,7 @@ def test_link_and_pipe_are_refused_at_once(folder):
 def test_folder_that_others_can_write_is_neither_read_nor_written(folder):
     entry(folder)
     folder.chmod(0o777)
-    with pytest.warns(
-        RuntimeWarning, match=r"kernels can be written by others; set .*COLLOC"
-    ):
+    with pytest.warns(RuntimeWarning, match=r"kernels can be written by others; set .*COLLOC"):
         assert jit.load_object("key") is None
     jit.store_object("another", CODE)
     assert len(list(folder.iterdir())) == 1
@@ -86,9 +82,7 @@ def test_folder_that_others_can_write_is_neither_read_nor_written(folder):
 def test_parent_that_others_can_write_is_refused_unless_sticky(folder):
     entry(folder)
     folder.parent.chmod(0o777)
-    with pytest.warns(
-        RuntimeWarning, match=r"deep, which .*kernels is in, can be written"
-    ):
+    with pytest.warns(RuntimeWarning, match=r"deep, which .*kernels is in, can be written"):
         assert jit.load_object("key") is None
     folder.parent.chmod(0o1777)
     assert jit.load_object("key") == CODE
@@ -105,11 +99,7 @@ def test_folder_of_another_user_is_refused(folder, monkeypatch):
 @pytest.mark.parametrize("given", ["file", "folder", "parent"])
 def test_what_is_really_another_users_is_not_loaded(folder, given):
     file = entry(folder)
-    os.chown(
-        {"file": file, "folder": folder, "parent": folder.parent}[given],
-        65534,
-        65534,
-    )
+    os.chown({"file": file, "folder": folder, "parent": folder.parent}[given], 65534, 65534)
     if given == "file":
         assert jit.load_object("key") is None
     else:
@@ -161,9 +151,7 @@ print(value[0])
 """
 
 
-@pytest.mark.skipif(
-    sys.platform != "linux", reason="it maps memory as Linux does"
-)
+@pytest.mark.skipif(sys.platform != "linux", reason="it maps memory as Linux does")
 def test_code_and_its_constants_may_be_mapped_far_apart(tmp_path):
     """As in a process with much else mapped, where a page is free here and another there."""
     done = subprocess.run(

@@ -33,9 +33,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.result.element_fields import ElementFields
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changes_of_assumptions,
-)
+from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.linearised import linearise_fit
 
@@ -46,13 +44,8 @@ ONE_STEP = {"substeps": 1}
 
 def scanned_body(element: str = "tet4", **changes) -> cs.Body:
     """A straight mesh that was made while the bar was clamped at one end, horizontally."""
-    mesh = box_mesh(
-        (0.12, 0.03, 0.03), (6, 2, 2) if element == "tet4" else (3, 1, 1)
-    )
-    settings = {
-        "density_kg_m3": DENSITY_KG_M3,
-        "rest_shape": as_scanned(mesh),
-    } | changes
+    mesh = box_mesh((0.12, 0.03, 0.03), (6, 2, 2) if element == "tet4" else (3, 1, 1))
+    settings = {"density_kg_m3": DENSITY_KG_M3, "rest_shape": as_scanned(mesh)} | changes
     return cs.Body(mesh, element=element, **settings)
 
 
@@ -64,9 +57,7 @@ def test_a_body_with_another_stress_free_shape_shares_no_gradients():
     assert body.shape_gradients.nnz
     twice = body.with_stress_free(2.0 * body.nodes_m)
     np.testing.assert_allclose(
-        2.0 * twice.shape_gradients.toarray(),
-        body.shape_gradients.toarray(),
-        atol=1e-9,
+        2.0 * twice.shape_gradients.toarray(), body.shape_gradients.toarray(), atol=1e-9
     )
 
 
@@ -87,12 +78,8 @@ def test_the_forward_equilibrium_of_the_stress_free_shape_is_the_mesh(element):
 
 def test_the_mesh_of_a_simulated_scan_leads_back_to_the_straight_bar():
     mesh = hung_mesh()
-    body = cs.Body(
-        mesh, mass_kg=straight_bar().mass_kg, rest_shape=as_scanned(mesh)
-    )
-    found = body.inverse_equilibrium.solve(
-        body.theta_from_values(TRUTH)
-    ).positions_m
+    body = cs.Body(mesh, mass_kg=straight_bar().mass_kg, rest_shape=as_scanned(mesh))
+    found = body.inverse_equilibrium.solve(body.theta_from_values(TRUTH)).positions_m
     straight_m = straight_bar().nodes_m
     sag_m = np.abs(mesh.points_m - straight_m).max()
     # Mass is distributed as the volume of the mesh is, not as that of the straight bar.
@@ -104,22 +91,13 @@ def test_forces_are_those_of_a_body_with_the_stress_free_mesh(damping):
     body = scanned_body(damping=damping)
     values = SOFT | {"gamma_m_1_s": 0.0}
     theta = body.theta_from_values(values)
-    other = cs.Body(
-        body.stress_free_mesh(theta),
-        density_kg_m3=DENSITY_KG_M3,
-        damping=damping,
-    )
+    other = cs.Body(body.stress_free_mesh(theta), density_kg_m3=DENSITY_KG_M3, damping=damping)
     rng = np.random.default_rng(0)
     x = body.nodes_m + 1e-3 * rng.standard_normal(body.nodes_m.shape)
     v = 0.1 * rng.standard_normal(x.shape)
-    assert (
-        relative_error(body.force(x, v, theta), other.force(x, v, theta))
-        < 1e-12
-    )
+    assert relative_error(body.force(x, v, theta), other.force(x, v, theta)) < 1e-12
     moduli = {name: SOFT[name] for name in ("young_pa", "poisson")}
-    assert body.energy(x, **moduli) == pytest.approx(
-        other.energy(x, **moduli), rel=1e-12
-    )
+    assert body.energy(x, **moduli) == pytest.approx(other.energy(x, **moduli), rel=1e-12)
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
@@ -131,21 +109,11 @@ def test_forces_follow_from_the_energy_and_the_constants(element):
     v = 0.1 * rng.standard_normal(x.shape)
     force = body.elastic_force(x, **moduli)
     assert_derivative(
-        lambda at: body.energy(at, **moduli),
-        lambda d: -np.sum(force * d),
-        x,
-        rng,
-        1e-6,
-        1e-4,
+        lambda at: body.energy(at, **moduli), lambda d: -np.sum(force * d), x, rng, 1e-6, 1e-4
     )
     by_theta = body.linearise(x, v, theta).by_theta[0].copy()
     assert_derivative(
-        lambda at: body.force(x, v, at)[0],
-        lambda d: by_theta @ d,
-        theta,
-        rng,
-        1e-7,
-        theta,
+        lambda at: body.force(x, v, at)[0], lambda d: by_theta @ d, theta, rng, 1e-7, theta
     )
 
 
@@ -153,22 +121,13 @@ def test_forces_follow_from_the_energy_and_the_constants(element):
 def test_the_shape_follows_the_constants_of_every_region_and_a_free_density():
     mesh = box_mesh((0.12, 0.03, 0.03), (6, 2, 2))
     core = cs.Region("core", np.arange(40), density_kg_m3=800.0)
-    body = cs.Body(
-        mesh, density_kg_m3=1000.0, regions=[core], rest_shape=as_scanned(mesh)
-    )
+    body = cs.Body(mesh, density_kg_m3=1000.0, regions=[core], rest_shape=as_scanned(mesh))
     body = body.with_free_densities([""])
-    values = SOFT | {
-        "core.mu_pa": 1e5,
-        "core.lambda_pa": 2e5,
-        "density_kg_m3": 1000.0,
-    }
+    values = SOFT | {"core.mu_pa": 1e5, "core.lambda_pa": 2e5, "density_kg_m3": 1000.0}
     theta = body.theta_from_values(values)
     places = body.inverse_equilibrium.places
     assert len(places) == 5
-    rng, by_input = (
-        np.random.default_rng(1),
-        body.inverse_equilibrium.solve(theta).by_input,
-    )
+    rng, by_input = (np.random.default_rng(1), body.inverse_equilibrium.solve(theta).by_input)
     x = body.nodes_m + 1e-4 * rng.standard_normal(body.nodes_m.shape)
     v = 0.1 * rng.standard_normal(x.shape)
 
@@ -178,38 +137,22 @@ def test_the_shape_follows_the_constants_of_every_region_and_a_free_density():
         return body.inverse_equilibrium.solve(other).positions_m
 
     own = theta[places]
-    assert_derivative(
-        moved, lambda d: np.tensordot(d, by_input, 1), own, rng, 1e-6, own
-    )
+    assert_derivative(moved, lambda d: np.tensordot(d, by_input, 1), own, rng, 1e-6, own)
     by_theta = body.linearise(x, v, theta).by_theta[0].copy()
     assert_derivative(
-        lambda at: body.force(x, v, at)[0],
-        lambda d: by_theta @ d,
-        theta,
-        rng,
-        1e-6,
-        theta,
+        lambda at: body.force(x, v, at)[0], lambda d: by_theta @ d, theta, rng, 1e-6, theta
     )
 
 
 def test_a_stiff_body_is_as_scanned():
     body = scanned_body()
     rigid = body.theta_from_values(TRUTH | {"young_pa": 1e12})
-    sag_m = np.abs(
-        body.inverse_equilibrium.solve(rigid).positions_m - body.nodes_m
-    ).max()
+    sag_m = np.abs(body.inverse_equilibrium.solve(rigid).positions_m - body.nodes_m).max()
     assert sag_m < 1e-8
     other = scanned_body(rest_shape="stress_free")
-    x = body.nodes_m + 1e-4 * np.random.default_rng(0).standard_normal(
-        body.nodes_m.shape
-    )
+    x = body.nodes_m + 1e-4 * np.random.default_rng(0).standard_normal(body.nodes_m.shape)
     still = np.zeros_like(x)
-    assert (
-        relative_error(
-            body.force(x, still, rigid), other.force(x, still, rigid)
-        )
-        < 1e-4
-    )
+    assert relative_error(body.force(x, still, rigid), other.force(x, still, rigid)) < 1e-4
 
 
 def test_element_fields_refer_to_the_stress_free_shape():
@@ -220,10 +163,7 @@ def test_element_fields_refer_to_the_stress_free_shape():
     at_rest = fields.evaluate_at(stress_free[None])
     np.testing.assert_allclose(at_rest["det_f"], 1.0, atol=1e-9)
     assert at_rest["von_mises_pa"].max() < 1e-5 * SOFT["young_pa"]
-    assert (
-        fields.evaluate_at(body.nodes_m[None])["von_mises_pa"].max()
-        > 1e-2 * SOFT["young_pa"]
-    )
+    assert fields.evaluate_at(body.nodes_m[None])["von_mises_pa"].max() > 1e-2 * SOFT["young_pa"]
 
 
 # Fits --------------------------------------------------------------------------------------------
@@ -253,9 +193,7 @@ def test_slopes_of_a_fit_are_those_of_brute_force_differences(described):
     slope = linearise_fit(collocation, z).blocks[0].jacobian[..., 0]
     step = 1e-4
     ends = [tracks(values["young_pa"] * np.exp(way)) for way in (step, -step)]
-    expected = (
-        (ends[0] - ends[1]) / (2 * step) / described.markers.sigma_m[:, None]
-    )
+    expected = (ends[0] - ends[1]) / (2 * step) / described.markers.sigma_m[:, None]
     # Residuals are measured less fitted, or the other way round, all alike.
     sign = np.sign(np.sum(slope * expected))
     assert relative_error(sign * slope, expected) < 1e-5
@@ -286,11 +224,7 @@ def combined(estimate) -> tuple[float, float]:
 
 def significant(run) -> set[str]:
     """Return the sources of E that have a share of its variance."""
-    return {
-        name
-        for name, share in run.budget["young_pa"].shares.items()
-        if share > 1e-9
-    }
+    return {name for name, share in run.budget["young_pa"].shares.items() if share > 1e-9}
 
 
 @pytest.mark.long
@@ -301,27 +235,19 @@ def test_interior_point_and_reduced_space_find_the_same_optimum(static):
     problem = problem_of(experiment, **({} if static else ONE_STEP))
     collocation = Collocation(problem.experiments, problem.parameters)
     answers = [cs.ReducedSpace()(collocation), InteriorPoint()(collocation)]
-    values = [
-        collocation.parameter_values(answer.z)["young_pa"] for answer in answers
-    ]
+    values = [collocation.parameter_values(answer.z)["young_pa"] for answer in answers]
     assert values[1] == pytest.approx(values[0], rel=1e-5)
     assert values[0] == pytest.approx(TRUTH["young_pa"], rel=0.01)
 
 
-def test_forgetting_how_the_shape_depends_on_the_stiffness_leads_elsewhere(
-    described,
-):
+def test_forgetting_how_the_shape_depends_on_the_stiffness_leads_elsewhere(described):
     """The stress-free shape of the guess, kept, gives another E: its derivative matters."""
     body = described.body
-    frozen = body.stress_free_mesh(
-        body.theta_from_values(TRUTH | {"young_pa": 4e5})
-    )
+    frozen = body.stress_free_mesh(body.theta_from_values(TRUTH | {"young_pa": 4e5}))
     kept = cs.Body(frozen, mass_kg=body.mass_kg, rest_shape="stress_free")
     other = measured_on(kept)
     problem = problem_of(other, **ONE_STEP)
-    answer = cs.ReducedSpace()(
-        Collocation(problem.experiments, problem.parameters)
-    )
+    answer = cs.ReducedSpace()(Collocation(problem.experiments, problem.parameters))
     young_pa = answer.collocation.parameter_values(answer.z)["young_pa"]
     assert abs(young_pa / TRUTH["young_pa"] - 1) > 0.03
 
@@ -336,28 +262,20 @@ def measured_on(body: cs.Body) -> cs.Experiment:
 # The budget --------------------------------------------------------------------------------------
 
 
-def changes_of(
-    experiment: cs.Experiment, **deviations
-) -> dict[str, np.ndarray]:
+def changes_of(experiment: cs.Experiment, **deviations) -> dict[str, np.ndarray]:
     """Changes of markers (T, M, 3) by each assumption at the truth, in deviations of the noise."""
     problem = problem_of(experiment, **ONE_STEP)
-    parameters = problem.parameters.with_guess(
-        {n: TRUTH[n] for n in ("young_pa", "gamma_r_s")}
-    )
+    parameters = problem.parameters.with_guess({n: TRUTH[n] for n in ("young_pa", "gamma_r_s")})
     collocation = Collocation([experiment], parameters)
     x = simulate(experiment, TRUTH, "midpoint", substeps=1).positions_m
     z = collocation.pack(parameters.guess_q, [x.reshape(len(x), -1)])
-    found = changes_of_assumptions(
-        collocation, z, Assumptions(**deviations).collect_deviations()
-    )
+    found = changes_of_assumptions(collocation, z, Assumptions(**deviations).collect_deviations())
     return {name: found.blocks[0][..., k] for k, name in enumerate(found.names)}
 
 
 def simulated_on(mesh: TetMesh, mass_kg: float) -> np.ndarray:
     body = cs.Body(mesh, mass_kg=mass_kg, rest_shape="stress_free")
-    return simulate(
-        recorded(body, np.pi / 2), TRUTH, "midpoint", substeps=1
-    ).markers_m
+    return simulate(recorded(body, np.pi / 2), TRUTH, "midpoint", substeps=1).markers_m
 
 
 def test_the_row_of_the_rest_shape_is_the_deflection_in_each_pose():
@@ -370,14 +288,10 @@ def test_the_row_of_the_rest_shape_is_the_deflection_in_each_pose():
     found = changes_of(experiment, rest_shape=1.0)
     # A mesh of which X is the stress-free shape where gravity is 1/50 of that of the earth.
     small = 0.02
-    scan = cs.UnderGravity(
-        Indices(clamped_nodes(copy)), np.multiply(SCAN_GRAVITY_M_S2, small)
-    )
+    scan = cs.UnderGravity(Indices(clamped_nodes(copy)), np.multiply(SCAN_GRAVITY_M_S2, small))
     described = cs.Body(copy, mass_kg=bar.mass_kg, rest_shape=scan)
     ends = [
-        simulate(
-            recorded(body, np.pi / 2), TRUTH, "midpoint", substeps=1
-        ).markers_m
+        simulate(recorded(body, np.pi / 2), TRUTH, "midpoint", substeps=1).markers_m
         for body in (described, unstated)
     ]
     expected = (ends[0] - ends[1]) / small / experiment.markers.sigma_m[:, None]
@@ -397,10 +311,7 @@ def test_a_generated_mesh_and_one_that_is_said_to_be_free_of_stress_have_no_such
 
 
 def test_a_smooth_error_of_the_surface_is_a_body_of_another_shape():
-    from collocation_sysid.statistics.budget.shape_error import (
-        surface_modes,
-        thickness_m,
-    )
+    from collocation_sysid.statistics.budget.shape_error import surface_modes, thickness_m
 
     bar, share = straight_bar(), 1e-3
     experiment = recorded(bar, np.pi / 2)
@@ -408,9 +319,7 @@ def test_a_smooth_error_of_the_surface_is_a_body_of_another_shape():
     none = np.zeros(0, dtype=np.int64)
     moved = share * thickness_m(bar) * surface_modes(bar, none)
     ends = [
-        simulated_on(
-            TetMesh(bar.mesh.points_m + off, bar.mesh.tetrahedra), bar.mass_kg
-        )
+        simulated_on(TetMesh(bar.mesh.points_m + off, bar.mesh.tetrahedra), bar.mass_kg)
         for off in (moved[0], 0.0)
     ]
     # Where a marker is on the undeformed body changes too: on the mesh it is a node.
@@ -426,9 +335,7 @@ def test_modes_of_the_surface_have_the_deviation_and_the_length_that_are_stated(
     on_surface = np.unique(bar.mesh.surface)
 
     def share(correlation: float) -> float:
-        lengths = np.linalg.norm(surface_modes(bar, none, correlation), axis=2)[
-            :, on_surface
-        ]
+        lengths = np.linalg.norm(surface_modes(bar, none, correlation), axis=2)[:, on_surface]
         return float(np.mean(np.sum(lengths**2, axis=0)))
 
     assert 0.9 < share(0.5) <= 1.02
@@ -440,16 +347,12 @@ def test_modes_of_the_surface_have_the_deviation_and_the_length_that_are_stated(
 
 def test_what_has_no_stress_free_shape_is_refused_once():
     soft = measured(as_scanned(hung_mesh()))
-    with pytest.raises(
-        InputError, match=r"no stress-free shape.*expected.*stiffer guesses"
-    ):
+    with pytest.raises(InputError, match=r"no stress-free shape.*expected.*stiffer guesses"):
         replace_guess(soft, 30.0)
 
 
 def replace_guess(experiment: cs.Experiment, young_pa: float) -> cs.Problem:
-    fixed = {
-        name: TRUTH[name] for name in ("poisson", "gamma_r_s", "gamma_m_1_s")
-    }
+    fixed = {name: TRUTH[name] for name in ("poisson", "gamma_r_s", "gamma_m_1_s")}
     return cs.Problem([experiment], {"young_pa": Unknown(young_pa), **fixed})
 
 
@@ -478,19 +381,13 @@ def test_a_scan_goes_from_the_file_to_the_body(tmp_path):
     table += 'scan = { nodes = "top", gravity_m_s2 = [0.0, 0.0, -1.0] }\n'
     file.write_text(text.replace("[object]\n", table))
     body = cs.Problem.read(file).bodies[0]
-    np.testing.assert_array_equal(
-        body.scan_conditions.gravity_m_s2, (0.0, 0.0, -1.0)
-    )
-    file.write_text(
-        text.replace("[object]\n", '[object]\nrest_shape = "under_gravity"\n')
-    )
+    np.testing.assert_array_equal(body.scan_conditions.gravity_m_s2, (0.0, 0.0, -1.0))
+    file.write_text(text.replace("[object]\n", '[object]\nrest_shape = "under_gravity"\n'))
     with pytest.raises(InputError, match="belong together"):
         cs.Problem.read(file)
     result = run_command("check", file)
     assert result.code == 2
-    file.write_text(
-        text.replace("[object]\n", '[object]\nrest_shape = "stress_free"\n')
-    )
+    file.write_text(text.replace("[object]\n", '[object]\nrest_shape = "stress_free"\n'))
     assert cs.Problem.read(file).bodies[0].rest_shape == "stress_free"
 
 
@@ -502,7 +399,4 @@ def test_a_finer_mesh_keeps_what_is_stated():
     held = finer.scan_conditions.grasped_nodes(finer.nodes)
     assert np.abs(finer.nodes.points_m[held, 0]).max() < 1e-9
     assert len(held) == 25
-    assert (
-        UncertaintyOptions().assumptions.collect_deviations()["rest_shape"]
-        == 0.58
-    )
+    assert UncertaintyOptions().assumptions.collect_deviations()["rest_shape"] == 0.58

@@ -21,9 +21,7 @@ def box() -> TetMesh:
 
 def test_a_box_selects_its_nodes_and_those_on_its_faces(box):
     chosen = box.select(Box([-1, -1, -1], [0.02, 1, 1]))
-    np.testing.assert_array_equal(
-        chosen, np.flatnonzero(box.points_m[:, 0] < 0.021)
-    )
+    np.testing.assert_array_equal(chosen, np.flatnonzero(box.points_m[:, 0] < 0.021))
     assert chosen.dtype == np.int64
     everything = box.select(Box([-np.inf] * 3, [np.inf] * 3))
     assert len(everything) == len(box.points_m)
@@ -42,9 +40,7 @@ def test_indices_are_those_of_the_file():
     np.testing.assert_array_equal(mesh.select(Indices([4, 1, 4])), [0, 3])
     with pytest.raises(InputError, match="node 0 was dropped"):
         mesh.select(Indices([0, 1]))
-    with pytest.raises(
-        InputError, match="node 5 does not exist; the mesh has 5 nodes"
-    ):
+    with pytest.raises(InputError, match="node 5 does not exist; the mesh has 5 nodes"):
         mesh.select(Indices([5]))
     with pytest.raises(InputError, match="node -1 does not exist"):
         mesh.select(Indices([-1]))
@@ -59,12 +55,8 @@ def test_a_named_array_selects_where_it_is_true(values):
 
 
 def test_an_unknown_name_lists_the_names_there_are(box):
-    mesh = TetMesh(
-        CORNERS, [[0, 1, 2, 3]], {"grip": [1, 0, 0, 0], "tip": [0, 0, 0, 1]}
-    )
-    with pytest.raises(
-        InputError, match='no point array or group "grp"; it has "grip", "tip"'
-    ):
+    mesh = TetMesh(CORNERS, [[0, 1, 2, 3]], {"grip": [1, 0, 0, 0], "tip": [0, 0, 0, 1]})
+    with pytest.raises(InputError, match='no point array or group "grp"; it has "grip", "tip"'):
         mesh.select(Named("grp"))
     with pytest.raises(InputError, match="it has none"):
         box.select(Named("grip"))
@@ -79,13 +71,9 @@ def test_a_named_array_must_be_a_mask():
         mesh.select(Named("velocity"))
 
 
-@pytest.mark.parametrize(
-    "selection", [Box([5, 5, 5], [6, 6, 6]), Ball([5, 5, 5], 1), Indices([])]
-)
+@pytest.mark.parametrize("selection", [Box([5, 5, 5], [6, 6, 6]), Ball([5, 5, 5], 1), Indices([])])
 def test_an_empty_selection_tells_where_the_body_is(box, selection):
-    with pytest.raises(
-        InputError, match=r"selects none of the 54 nodes.*x from 0 to 0\.1 m"
-    ):
+    with pytest.raises(InputError, match=r"selects none of the 54 nodes.*x from 0 to 0\.1 m"):
         box.select(selection)
 
 
@@ -115,11 +103,7 @@ def quadratic(mesh: TetMesh) -> Body:
 
 @pytest.mark.parametrize(
     "selection",
-    [
-        Box([-1, -1, -1], [0.011, 1, 1]),
-        Ball([0, 0, 0], 0.012),
-        Ball([0.01, 0, 0], 1e-6),
-    ],
+    [Box([-1, -1, -1], [0.011, 1, 1]), Ball([0, 0, 0], 0.012), Ball([0.01, 0, 0], 1e-6)],
 )
 def test_boxes_and_balls_act_on_nodes_on_edges_too(box, selection):
     body = quadratic(box)
@@ -142,8 +126,7 @@ def test_a_node_on_an_edge_is_selected_with_both_ends_of_the_edge(selection):
     chosen = body.select(selection)
     np.testing.assert_array_equal(chosen[:3], [0, 2, 3])
     np.testing.assert_allclose(
-        sorted(body.nodes_m[chosen[3:]].tolist()),
-        [[0, 0, 0.5], [0, 0.5, 0], [0, 0.5, 0.5]],
+        sorted(body.nodes_m[chosen[3:]].tolist()), [[0, 0, 0.5], [0, 0.5, 0], [0, 0.5, 0.5]]
     )
 
 
@@ -157,8 +140,7 @@ def test_a_mid_node_of_the_file_cannot_be_given():
     points = np.vstack([CORNERS, [[0.5, 0, 0]]])
     body = quadratic(TetMesh(points, [[0, 1, 2, 3]]))
     with pytest.raises(
-        InputError,
-        match=r"node 4 was dropped.*not the corner of an element; leave it out",
+        InputError, match=r"node 4 was dropped.*not the corner of an element; leave it out"
     ):
         body.select(Indices([0, 1, 4]))
 

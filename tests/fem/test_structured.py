@@ -29,9 +29,7 @@ def face_areas(mesh: TetMesh) -> np.ndarray:
 
 def is_conforming(mesh: TetMesh) -> bool:
     """Every edge of the boundary is shared by exactly two of its triangles."""
-    edges = np.sort(
-        mesh.surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
-    )
+    edges = np.sort(mesh.surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
 
 
@@ -39,9 +37,7 @@ def test_box_has_exact_volume_bounds_and_node_count(box):
     assert len(box.points_m) == 6 * 3 * 3
     assert len(box.tetrahedra) == 6 * 5 * 2 * 2
     assert box.volume_m3 == pytest.approx(0.1 * 0.04 * 0.03, rel=1e-12)
-    np.testing.assert_allclose(
-        box.compute_bounds_m(), [[0, 0, 0], [0.1, 0.04, 0.03]]
-    )
+    np.testing.assert_allclose(box.compute_bounds_m(), [[0, 0, 0], [0.1, 0.04, 0.03]])
     assert (box.volumes_m3 > 0).all()
     assert box.notes == ()
 
@@ -49,14 +45,10 @@ def test_box_has_exact_volume_bounds_and_node_count(box):
 def test_box_surface_is_closed_outward_and_has_the_exact_area(box):
     normals = face_areas(box)
     area = 2 * (0.1 * 0.04 + 0.1 * 0.03 + 0.04 * 0.03)
-    assert np.linalg.norm(normals, axis=1).sum() == pytest.approx(
-        area, rel=1e-12
-    )
+    assert np.linalg.norm(normals, axis=1).sum() == pytest.approx(area, rel=1e-12)
     # The divergence theorem gives the volume only if every triangle faces outward.
     centers = box.points_m[box.surface].mean(axis=1)
-    assert (centers * normals).sum() / 3 == pytest.approx(
-        box.volume_m3, rel=1e-12
-    )
+    assert (centers * normals).sum() / 3 == pytest.approx(box.volume_m3, rel=1e-12)
     outward = centers - box.compute_bounds_m().mean(axis=0)
     assert ((outward * normals).sum(axis=1) > 0).all()
     assert is_conforming(box)

@@ -13,10 +13,7 @@ from collocation_sysid.fem.meshes import surface
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.mesh_files import read_triangles
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.fem.meshes.surface import (
-    merge_coincident,
-    tetrahedralize_surface,
-)
+from collocation_sysid.fem.meshes.surface import merge_coincident, tetrahedralize_surface
 
 
 def cube_surface(size_m=(0.1, 0.04, 0.04)) -> tuple[np.ndarray, np.ndarray]:
@@ -32,12 +29,8 @@ def test_an_open_surface_is_refused_with_its_open_edges():
 
 def test_a_doubled_triangle_is_not_closed_either():
     points, triangles = cube_surface()
-    with pytest.raises(
-        InputError, match=r"0 open edges .* and 3 to more than two"
-    ):
-        tetrahedralize_surface(
-            points, np.vstack([triangles, triangles[:1]]), 0.02
-        )
+    with pytest.raises(InputError, match=r"0 open edges .* and 3 to more than two"):
+        tetrahedralize_surface(points, np.vstack([triangles, triangles[:1]]), 0.02)
 
 
 @pytest.mark.parametrize(
@@ -48,9 +41,7 @@ def test_a_doubled_triangle_is_not_closed_either():
         (-1, "positive number"),
     ],
 )
-def test_an_edge_length_that_does_not_suit_the_surface_is_refused(
-    edge_length_m, message
-):
+def test_an_edge_length_that_does_not_suit_the_surface_is_refused(edge_length_m, message):
     with pytest.raises(InputError, match=message):
         tetrahedralize_surface(*cube_surface(), edge_length_m)
 
@@ -60,9 +51,7 @@ def test_a_missing_mesher_is_named_with_the_remedy(monkeypatch):
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr(surface, "version", absent)
-    with pytest.raises(
-        InputError, match=r"pip install 'collocation-sysid\[surface\]'"
-    ):
+    with pytest.raises(InputError, match=r"pip install 'collocation-sysid\[surface\]'"):
         tetrahedralize_surface(*cube_surface(), 0.02)
 
 
@@ -71,60 +60,41 @@ def test_surface_files_are_read_with_their_vertices_merged(tmp_path, ending):
     points, triangles = cube_surface()
     # Every triangle with vertices of its own, as an STL file stores them.
     soup = meshio.Mesh(
-        points[triangles].reshape(-1, 3),
-        [("triangle", np.arange(36).reshape(12, 3))],
+        points[triangles].reshape(-1, 3), [("triangle", np.arange(36).reshape(12, 3))]
     )
     path = tmp_path / f"cube.{ending}"
     meshio.write(path, soup)
     merged, faces = merge_coincident(*read_triangles(path))
     assert merged.shape == (8, 3)
     assert faces.shape == (12, 3)
-    assert abs(np.linalg.det(merged[faces]).sum() / 6) == pytest.approx(
-        1.6e-4, rel=1e-5
-    )
+    assert abs(np.linalg.det(merged[faces]).sum() / 6) == pytest.approx(1.6e-4, rel=1e-5)
 
 
 def test_quadrilaterals_are_split(tmp_path):
-    (tmp_path / "square.obj").write_text(
-        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
-    )
+    (tmp_path / "square.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
     _, triangles = read_triangles(tmp_path / "square.obj")
     np.testing.assert_array_equal(triangles, [[0, 1, 2], [0, 2, 3]])
 
 
 def test_an_open_surface_file_is_named(tmp_path):
-    (tmp_path / "square.obj").write_text(
-        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
-    )
-    with pytest.raises(
-        InputError,
-        match=r"square\.obj: the surface is not closed: 4 open edges",
-    ):
+    (tmp_path / "square.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    with pytest.raises(InputError, match=r"square\.obj: the surface is not closed: 4 open edges"):
         TetMesh.from_surface(tmp_path / "square.obj", 0.1)
 
 
-def test_pytetwild_fills_a_surface_and_the_cache_repeats_it(
-    tmp_path, monkeypatch
-):
+def test_pytetwild_fills_a_surface_and_the_cache_repeats_it(tmp_path, monkeypatch):
     pytest.importorskip("pytetwild")
     monkeypatch.chdir(tmp_path)
     points, triangles = cube_surface((100.0, 40.0, 40.0))
     meshio.write("cube.stl", meshio.Mesh(points, [("triangle", triangles)]))
-    mesh = TetMesh.from_surface(
-        "cube.stl", 0.02, length_unit="mm", cache="cache"
-    )
+    mesh = TetMesh.from_surface("cube.stl", 0.02, length_unit="mm", cache="cache")
     assert mesh.volume_m3 == pytest.approx(1.6e-4, rel=0.02)
     assert (mesh.volumes_m3 > 0).all()
     assert 0.01 < mesh.quality().edge_mean_m < 0.04
 
-    again = TetMesh.from_surface(
-        "cube.stl", 0.02, length_unit="mm", cache="cache"
-    )
+    again = TetMesh.from_surface("cube.stl", 0.02, length_unit="mm", cache="cache")
     assert again.sha256 == mesh.sha256
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == [
-        "cache",
-        "cube.stl",
-    ]
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["cache", "cube.stl"]
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
@@ -132,16 +102,11 @@ def test_a_cache_folder_that_cannot_be_made_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(surface, "version", lambda name: "0")
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written: Not a directory"):
-        tetrahedralize_surface(
-            *cube_surface(), 0.02, cache_dir=tmp_path / "file" / "cache"
-        )
+        tetrahedralize_surface(*cube_surface(), 0.02, cache_dir=tmp_path / "file" / "cache")
 
 
 def test_a_mesh_that_is_refused_is_not_kept(tmp_path, monkeypatch):
-    flat = (
-        np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]),
-        np.array([[0, 1, 2, 3]]),
-    )
+    flat = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), np.array([[0, 1, 2, 3]]))
     monkeypatch.setattr(surface, "run_ftetwild", lambda *_, **__: flat)
     monkeypatch.setattr(surface, "version", lambda name: "0")
     with pytest.raises(InputError, match="degenerate"):
@@ -151,16 +116,12 @@ def test_a_mesh_that_is_refused_is_not_kept(tmp_path, monkeypatch):
 
 def test_a_surface_of_arrays_is_scaled_by_its_unit():
     points, triangles = cube_surface((100.0, 40.0, 40.0))
-    with pytest.raises(
-        InputError, match=r"measures 0\.1 × 0\.04 × 0\.04 m: check"
-    ):
+    with pytest.raises(InputError, match=r"measures 0\.1 × 0\.04 × 0\.04 m: check"):
         TetMesh.from_surface((points, triangles), 20.0, length_unit="mm")
 
 
 def test_a_mesher_that_fails_is_reported_with_its_last_words(monkeypatch):
     monkeypatch.setattr(surface, "WORKER", "raise RuntimeError('no inside')")
     monkeypatch.setattr(surface, "version", lambda name: "0")
-    with pytest.raises(
-        InputError, match=r"could not fill the surface .*no inside"
-    ):
+    with pytest.raises(InputError, match=r"could not fill the surface .*no inside"):
         tetrahedralize_surface(*cube_surface(), 0.02)

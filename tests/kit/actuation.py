@@ -23,23 +23,15 @@ def box_with_cavity() -> TetMesh:
     return TetMesh(whole.points_m, kept, {"wall": wall})
 
 
-def hollow_octant(
-    inner_m: float, outer_m: float, divisions: int, layers: int
-) -> TetMesh:
+def hollow_octant(inner_m: float, outer_m: float, divisions: int, layers: int) -> TetMesh:
     """x, y, z >= 0 of a hollow sphere: prisms on a divided triangle, each of three tetrahedra."""
     n = divisions
-    corners = [
-        (i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)
-    ]
+    corners = [(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]
     number = {corner: k for k, corner in enumerate(corners)}
     flat = np.array(corners, dtype=float)
     directions = flat / np.linalg.norm(flat, axis=1, keepdims=True)
     up = [
-        (
-            number[i, j, n - i - j],
-            number[i + 1, j, n - i - j - 1],
-            number[i, j + 1, n - i - j - 1],
-        )
+        (number[i, j, n - i - j], number[i + 1, j, n - i - j - 1], number[i, j + 1, n - i - j - 1])
         for i in range(n)
         for j in range(n - i)
     ]
@@ -49,9 +41,7 @@ def hollow_octant(
         for j in range(n - i)
         if (k := n - i - j - 1) > 0
     ]
-    triangles = np.sort(
-        np.array(up + down), axis=1
-    )  # the same diagonal on both sides of a wall
+    triangles = np.sort(np.array(up + down), axis=1)  # the same diagonal on both sides of a wall
     radii = inner_m * (outer_m / inner_m) ** np.linspace(0, 1, layers + 1)
     points = (radii[:, None, None] * directions).reshape(-1, 3)
     a, b, c = triangles.T
@@ -64,19 +54,11 @@ def hollow_octant(
             np.stack([a + low, a + high, b + high, c + high], axis=1),
         ]
     wall = np.isclose(np.linalg.norm(points, axis=1), inner_m)
-    return TetMesh(
-        points,
-        orient_elements(points, np.concatenate(cells))[0],
-        {"wall": wall},
-    )
+    return TetMesh(points, orient_elements(points, np.concatenate(cells))[0], {"wall": wall})
 
 
 def inflated(
-    body: Body,
-    volume: EnclosedVolume,
-    pressure_pa: float,
-    constants: dict[str, float],
-    steps: int,
+    body: Body, volume: EnclosedVolume, pressure_pa: float, constants: dict[str, float], steps: int
 ) -> np.ndarray:
     """(n, 3) equilibrium of an octant under a pressure, its nodes in their planes of symmetry."""
     free = np.flatnonzero(np.abs(body.nodes_m).ravel() > 1e-9)
@@ -85,14 +67,9 @@ def inflated(
         p = share * pressure_pa
         for _ in range(20):
             state = x.reshape(-1, 3)
-            force = (
-                body.elastic_force(state, **constants).ravel()
-                + p * volume.gradient(x[None])[0]
-            )
+            force = body.elastic_force(state, **constants).ravel() + p * volume.gradient(x[None])[0]
             bent = volume.couplings.matrix(volume.hessian(x[None])[0])
-            matrix = sp.csc_matrix(
-                body.stiffness(state, **constants) - p * bent
-            )
+            matrix = sp.csc_matrix(body.stiffness(state, **constants) - p * bent)
             step: np.ndarray = spsolve(
                 matrix[free][:, free], force[free], permc_spec="MMD_AT_PLUS_A"
             )

@@ -7,9 +7,4 @@ from collocation_sysid.testing.finite_differences import (
     relative_error,
 )
 
-__all__ = [
-    "assert_derivative",
-    "directional_derivative",
-    "observed_order",
-    "relative_error",
-]
+__all__ = ["assert_derivative", "directional_derivative", "observed_order", "relative_error"]

@@ -15,9 +15,7 @@ from kit.problems import GUESS, hung_cube
 DAMPING = GUESS.items[2:]
 
 
-WITH_PRIOR = Parameters(
-    (replace(GUESS.items[0], prior=(300.0, 0.2)), *GUESS.items[1:])
-)
+WITH_PRIOR = Parameters((replace(GUESS.items[0], prior=(300.0, 0.2)), *GUESS.items[1:]))
 
 
 ENGINEERING = Parameters(
@@ -39,9 +37,7 @@ POISSON_FIXED = Parameters(
 )
 
 
-ALL_FIXED = Parameters(
-    tuple(Parameter(i.name, i.guess, is_fixed=True) for i in GUESS.items)
-)
+ALL_FIXED = Parameters(tuple(Parameter(i.name, i.guess, is_fixed=True) for i in GUESS.items))
 
 
 def swung(start: str = "equilibrium", steps: int = 5, **changes) -> Experiment:
@@ -50,14 +46,10 @@ def swung(start: str = "equilibrium", steps: int = 5, **changes) -> Experiment:
     if start == "given":
         rng = np.random.default_rng(8)
         shape = experiment.body.nodes_m.shape
-        changes["start_positions_m"] = (
-            experiment.body.nodes_m + 1e-3 * rng.normal(size=shape)
-        )
+        changes["start_positions_m"] = experiment.body.nodes_m + 1e-3 * rng.normal(size=shape)
         changes["start_velocities_m_s"] = 0.1 * rng.normal(size=shape)
     rng = np.random.default_rng(7)
-    tracks = experiment.markers.predict_positions(
-        experiment.rigid_positions(experiment.t_s)
-    )
+    tracks = experiment.markers.predict_positions(experiment.rigid_positions(experiment.t_s))
     tracks += 5e-3 * rng.normal(size=tracks.shape)
     tracks[rng.random(tracks.shape[:2]) < 0.3] = np.nan
     return replace(with_markers(experiment, tracks), start=start, **changes)
@@ -75,7 +67,5 @@ LAYOUTS = [
         ),
         strict=True,
     )
-    for start, (explicit, substeps) in zip(
-        ("equilibrium", "undeformed", "given"), row, strict=True
-    )
+    for start, (explicit, substeps) in zip(("equilibrium", "undeformed", "given"), row, strict=True)
 ]

@@ -17,9 +17,7 @@ def sensor(t_s) -> Wrench:
 def moved(t_s, way_m, **changes) -> PoseSequence:
     """Along a way (T, 3), not turned."""
     turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
-    return PoseSequence(
-        t_s, np.asarray(way_m, dtype=float), turns, "linear", **changes
-    )
+    return PoseSequence(t_s, np.asarray(way_m, dtype=float), turns, "linear", **changes)
 
 
 def quarter(body: Body) -> list[Grasp]:

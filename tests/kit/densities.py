@@ -8,13 +8,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.model.parameters import Parameters, Unknown
 from collocation_sysid.recording import Experiment, PointMass
-from kit.problems import (
-    bar_let_go,
-    bar_loaded,
-    cube_with_nuisance,
-    hung_cube,
-    quadratic_bar,
-)
+from kit.problems import bar_let_go, bar_loaded, cube_with_nuisance, hung_cube, quadratic_bar
 
 # In the ratio that is stated: then known masses are damped alike.
 DENSITY_KG_M3 = {"density_kg_m3": 36.0, "core.density_kg_m3": 60.0}
@@ -30,26 +24,15 @@ TRUTH = {
 }
 
 
-GUESS = {
-    "mu_pa": 400.0,
-    "gamma_m_1_s": 0.5,
-    "density_kg_m3": 45.0,
-    "core.density_kg_m3": 35.0,
-}
+GUESS = {"mu_pa": 400.0, "gamma_m_1_s": 0.5, "density_kg_m3": 45.0, "core.density_kg_m3": 35.0}
 
 
 def with_core(experiment: Experiment, **changes) -> Experiment:
     """The experiment with a body of two parts, whose densities are free."""
     old = experiment.body
-    core = Region(
-        "core", old.mesh.volumes_m3.argsort()[::2][:6], density_kg_m3=50.0
-    )
+    core = Region("core", old.mesh.volumes_m3.argsort()[::2][:6], density_kg_m3=50.0)
     body = Body(
-        old.mesh,
-        density_kg_m3=30.0,
-        element=old.element.name,
-        regions=[core],
-        **changes,
+        old.mesh, density_kg_m3=30.0, element=old.element.name, regions=[core], **changes
     ).with_free_densities(["", "core"])
     return replace(experiment, body=body)
 
@@ -57,9 +40,7 @@ def with_core(experiment: Experiment, **changes) -> Experiment:
 def weighted(experiment: Experiment) -> Experiment:
     """The experiment with a known mass on two of its nodes."""
     here = experiment.free_dofs[[-4, -1]] // 3
-    return replace(
-        experiment, masses=(*experiment.masses, PointMass(here, 0.01))
-    )
+    return replace(experiment, masses=(*experiment.masses, PointMass(here, 0.01)))
 
 
 def parameters(truth=TRUTH, guess=GUESS) -> Parameters:

@@ -11,12 +11,7 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 
-TRUTH = {
-    "young_pa": 1.5e5,
-    "poisson": 0.45,
-    "gamma_r_s": 1e-3,
-    "gamma_m_1_s": 0.1,
-}
+TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 
 
 MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
@@ -41,30 +36,18 @@ POSE = looking(np.array([0.06, -0.3, 0.15]))
 @cache
 def bar() -> cs.Body:
     return cs.Body(
-        cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1)),
-        density_kg_m3=1070.0,
-        element="tet10",
+        cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1)), density_kg_m3=1070.0, element="tet10"
     )
 
 
 def hanging(depths: tuple[cs.Depth, ...], **changes) -> cs.Experiment:
     """The bar held at one end, sagging."""
-    held = cs.Grasp(
-        np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
-    )
+    held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
     kept = cs.Nuisance.none(
-        depth_turn_rad=0.09,
-        depth_shift_m=0.02,
-        depth_bias_m=0.005,
-        depth_scale=0.005,
+        depth_turn_rad=0.09, depth_shift_m=0.02, depth_bias_m=0.005, depth_scale=0.005
     )
     return cs.Experiment(
-        bar(),
-        [0.0],
-        [held],
-        kind="static",
-        depths=depths,
-        **{"nuisance": kept} | changes,
+        bar(), [0.0], [held], kind="static", depths=depths, **{"nuisance": kept} | changes
     )
 
 
@@ -81,10 +64,7 @@ def hanging_m() -> np.ndarray:
 @cache
 def image_m() -> np.ndarray:
     """What a camera at POSE sees of the bar, without noise."""
-    skin, camera = (
-        VisibleSurface.from_body(bar(), NOTHING),
-        cs.DepthCamera(MATRIX, pose=POSE),
-    )
+    skin, camera = (VisibleSurface.from_body(bar(), NOTHING), cs.DepthCamera(MATRIX, pose=POSE))
     seen = (skin.subdivided_triangles(hanging_m()) - POSE[:3, 3]) @ POSE[:3, :3]
     return cs.depth_image(camera, SHAPE, seen)
 
@@ -103,17 +83,11 @@ def moved(turn_rad: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
     return off @ POSE
 
 
-def fitted(
-    image: np.ndarray, pose: np.ndarray, guess: float = 2e5, **options
-) -> cs.Solution:
+def fitted(image: np.ndarray, pose: np.ndarray, guess: float = 2e5, **options) -> cs.Solution:
     camera = cs.DepthCamera(MATRIX, pose=pose)
-    depth = cs.Depth.of_images(
-        "front", image, camera, NOISE_M, spacing_m=0.004, **options
-    )
+    depth = cs.Depth.of_images("front", image, camera, NOISE_M, spacing_m=0.004, **options)
     unknown = {**TRUTH, "young_pa": cs.Unknown(guess)}
-    return cs.solve(
-        cs.Problem([hanging((depth,))], cs.Parameters.from_mapping(unknown))
-    )
+    return cs.solve(cs.Problem([hanging((depth,))], cs.Parameters.from_mapping(unknown)))
 
 
 PROBLEM = """

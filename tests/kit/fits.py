@@ -28,9 +28,7 @@ class Problem:
     prior_slope: np.ndarray
     present: tuple[np.ndarray, ...]
 
-    def fit(
-        self, errors: list[np.ndarray], truth: np.ndarray
-    ) -> tuple[LinearisedFit, np.ndarray]:
+    def fit(self, errors: list[np.ndarray], truth: np.ndarray) -> tuple[LinearisedFit, np.ndarray]:
         """The fit to errors (T, M, 3) of each experiment, and the parameters less the truth (p,).
 
         The priors are at zero, so `truth` is how far the priors are wrong.
@@ -44,12 +42,8 @@ class Problem:
             for error, seen in zip(errors, self.present, strict=True)
         ]
         width = len(self.names)
-        matrix = np.concatenate(
-            [*(r.reshape(-1, width) for r in rows), np.diag(self.prior_slope)]
-        )
-        right = np.concatenate(
-            [*(e.ravel() for e in errors), -self.prior_slope * truth]
-        )
+        matrix = np.concatenate([*(r.reshape(-1, width) for r in rows), np.diag(self.prior_slope)])
+        right = np.concatenate([*(e.ravel() for e in errors), -self.prior_slope * truth])
         wrong = np.linalg.lstsq(matrix, right)[0]
         blocks = tuple(
             ResidualBlock(
@@ -61,9 +55,7 @@ class Problem:
                 jacobian=row,
                 sigma_m=np.full(row.shape[1], 1e-3),
             )
-            for k, (row, seen, error) in enumerate(
-                zip(rows, self.present, errors, strict=True)
-            )
+            for k, (row, seen, error) in enumerate(zip(rows, self.present, errors, strict=True))
         )
         fit = LinearisedFit(
             blocks=blocks,
@@ -77,10 +69,7 @@ class Problem:
 
 
 def problem(
-    samples: tuple[int, ...],
-    markers: int,
-    offsets: bool = True,
-    missing: float = 0.0,
+    samples: tuple[int, ...], markers: int, offsets: bool = True, missing: float = 0.0
 ) -> Problem:
     """Two damped modes, seen by markers that they move differently.
 
@@ -96,9 +85,7 @@ def problem(
     locals_of = 1 + (3 * markers if offsets else 0)
     width = 4 + len(samples) * locals_of
     for k, count in enumerate(samples):
-        shapes = np.array([1.5, 0.0, 0.0])[:, None] + rng.normal(
-            size=(3, 3 * markers)
-        ) * [
+        shapes = np.array([1.5, 0.0, 0.0])[:, None] + rng.normal(size=(3, 3 * markers)) * [
             [1.0],
             [0.4],
             [0.3],
@@ -114,30 +101,20 @@ def problem(
         if offsets:
             for c in range(3 * markers):
                 slope[:, c, 5 + k * locals_of + c] = 1.0
-                names.append(
-                    f"swing {k}: offset of m{c // 3}, {'xyz'[c % 3]} [m]"
-                )
+                names.append(f"swing {k}: offset of m{c // 3}, {'xyz'[c % 3]} [m]")
                 priors.append(1 / 3)
         slopes.append(slope.reshape(count, markers, 3, width))
         present.append(rng.random((count, markers)) >= missing)
-    return Problem(
-        tuple(slopes), tuple(names), np.array(priors), tuple(present)
-    )
+    return Problem(tuple(slopes), tuple(names), np.array(priors), tuple(present))
 
 
-def _motion(
-    step: np.ndarray, t_s: np.ndarray, shapes: np.ndarray
-) -> np.ndarray:
+def _motion(step: np.ndarray, t_s: np.ndarray, shapes: np.ndarray) -> np.ndarray:
     """(T, 3M) in units of σ after a step of two stiffnesses, two dampings, and 10 ms of time."""
     first, second, stiff, mass = np.exp(step[:4])
     t_s = t_s + 0.01 * step[4]
-    stiffness = np.array(
-        [0.3 * first + 0.7 * second, 0.8 * first + 0.2 * second]
-    )
+    stiffness = np.array([0.3 * first + 0.7 * second, 0.8 * first + 0.2 * second])
     found = -9.0 * shapes[2] / stiffness[0] + np.zeros((len(t_s), 1))
-    for shape, at, frequency_hz in zip(
-        shapes[:2], stiffness, (3.0, 9.0), strict=True
-    ):
+    for shape, at, frequency_hz in zip(shapes[:2], stiffness, (3.0, 9.0), strict=True):
         angular = 2 * np.pi * frequency_hz * np.sqrt(at)
         decay = (0.004 * stiff * angular**2 + mass) / 2
         swing = np.exp(-decay * t_s) * np.cos(angular * t_s) - 1
@@ -146,11 +123,7 @@ def _motion(
 
 
 def autoregressive(
-    rng: np.random.Generator,
-    samples: int,
-    markers: int,
-    phi: float,
-    shared: float = 0.0,
+    rng: np.random.Generator, samples: int, markers: int, phi: float, shared: float = 0.0
 ) -> np.ndarray:
     """(T, M, 3) errors of unit variance, correlated in time and (`shared`) among channels."""
     start = 300

@@ -10,16 +10,11 @@ def foundation(x, v, at, bed_n_m3, whirl_n_m3):
     moved = x - at.rest_m
     beside = ca.vertcat(-moved[1], moved[0], 0)
     spring = bed_n_m3 * at.area_m2 * (1 + ca.sumsqr(moved) / 1e-4)
-    return (
-        -spring * (moved + 0.1 * v)
-        + whirl_n_m3 * at.t_s * at.volume_m3 * beside
-    )
+    return -spring * (moved + 0.1 * v) + whirl_n_m3 * at.t_s * at.volume_m3 * beside
 
 
 def breath(x, v, at, breath_pa, brake_pa_s_m):
     """A pressure that grows in time and with the place, and what brakes along the normal."""
-    pressure_pa = (
-        breath_pa * (1 + 10 * at.t_s) * (1 + ca.sumsqr(x - at.rest_m) / 1e-6)
-    )
+    pressure_pa = breath_pa * (1 + 10 * at.t_s) * (1 + ca.sumsqr(x - at.rest_m) / 1e-6)
     along = ca.dot(v, at.normal)
     return -at.area_m2 * (pressure_pa + brake_pa_s_m * along) * at.normal

@@ -23,18 +23,11 @@ NO_TIME = LiveOptions(budget_s=1e-9)
 
 @cache
 def swing(
-    steps: int = 36,
-    nuisance: Nuisance = IDEAL,
-    seed: int = 1,
-    air_density_kg_m3: float = 0.0,
+    steps: int = 36, nuisance: Nuisance = IDEAL, seed: int = 1, air_density_kg_m3: float = 0.0
 ) -> cs.Problem:
     """A cube swung by its top, seen with noise, described rightly."""
-    hung = hung_cube(
-        steps, nuisance=nuisance, air_density_kg_m3=air_density_kg_m3
-    )
-    tracks = cs.simulate(
-        hung, TRUTH, integrator="midpoint", substeps=1
-    ).markers_m
+    hung = hung_cube(steps, nuisance=nuisance, air_density_kg_m3=air_density_kg_m3)
+    tracks = cs.simulate(hung, TRUTH, integrator="midpoint", substeps=1).markers_m
     noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=tracks.shape)
     seen = cs.with_markers(hung, tracks + noise)
     seen = replace(seen, markers=replace(seen.markers, sigma_m=NOISE_M))
@@ -61,8 +54,6 @@ def assert_same_information(
     ours: SquareRootInformation, theirs: SquareRootInformation, atol: float
 ) -> None:
     """The normal equations, each entry by the sizes on the diagonal."""
-    found, expected = (
-        normal_equations(each.triangle) for each in (ours, theirs)
-    )
+    found, expected = (normal_equations(each.triangle) for each in (ours, theirs))
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(found / scale, expected / scale, atol=atol)

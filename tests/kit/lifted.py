@@ -38,9 +38,7 @@ def of_regions() -> Body:
     return Body(mesh, density_kg_m3=30.0, prony=["prony_1"], regions=[CORE])
 
 
-def swung(
-    body: Body, values: dict[str, float], steps: int, **changes
-) -> Experiment:
+def swung(body: Body, values: dict[str, float], steps: int, **changes) -> Experiment:
     """The hung cube with this body, and the tracks that these parameters give it."""
     experiment = replace(hung_cube(steps, (1, 1, 2)), body=body, **changes)
     return measured_with(experiment, values)

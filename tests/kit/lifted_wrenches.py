@@ -26,9 +26,7 @@ ALL_UNKNOWN = Nuisance.none(
 
 
 def free_density() -> Parameters:
-    return Parameters.from_mapping(
-        {name: Unknown(1.1 * value) for name, value in DENSE.items()}
-    )
+    return Parameters.from_mapping({name: Unknown(1.1 * value) for name, value in DENSE.items()})
 
 
 def weighed(experiment: Experiment) -> Experiment:
@@ -36,9 +34,7 @@ def weighed(experiment: Experiment) -> Experiment:
     return replace(experiment, body=experiment.body.with_free_densities([""]))
 
 
-def felt_memory(
-    name: str, steps: int = 5, branches: int = 2, **changes
-) -> Experiment:
+def felt_memory(name: str, steps: int = 5, branches: int = 2, **changes) -> Experiment:
     return sensing(recorded(name, steps, branches, **changes))
 
 

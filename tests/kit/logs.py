@@ -20,10 +20,7 @@ from collocation_sysid.recording import MarkerTable, PoseSequence
 
 HZ = 30.0  # of a dataset
 START_S = 1_700_000_000.0
-ROS2, ROS1 = (
-    get_typestore(Stores.ROS2_HUMBLE),
-    get_typestore(Stores.ROS1_NOETIC),
-)
+ROS2, ROS1 = (get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC))
 MOCAP = {
     "Marker": "int8 id_type\nint32 marker_index\nstring marker_name\n"
     "geometry_msgs/Point translation\n",
@@ -31,12 +28,8 @@ MOCAP = {
 }
 for store in (ROS1, ROS2):
     for name, definition in MOCAP.items():
-        store.register(
-            get_types_from_msg(definition, f"mocap4r2_msgs/msg/{name}")
-        )
-TREE = get_types_from_msg(
-    "geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"
-)
+        store.register(get_types_from_msg(definition, f"mocap4r2_msgs/msg/{name}"))
+TREE = get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage")
 ROS1.register(TREE)
 KINDS = ("sqlite3", "mcap", "mcap file", "ros1")
 
@@ -61,12 +54,8 @@ def bag(path: Path, messages: Iterable[Message], kind: str = "sqlite3") -> Path:
         known: dict[str, Any] = {}
         for t, topic, name, message in messages:
             if topic not in known:
-                known[topic] = writer.add_connection(
-                    topic, name, typestore=ROS2
-                )
-            writer.write(
-                known[topic], _ns(t), ROS2.serialize_cdr(message, name)
-            )
+                known[topic] = writer.add_connection(topic, name, typestore=ROS2)
+            writer.write(known[topic], _ns(t), ROS2.serialize_cdr(message, name))
     return next(path.glob("*.mcap")) if kind == "mcap file" else path
 
 
@@ -75,12 +64,8 @@ def _bag1(path: Path, messages: Iterable[Message]) -> Path:
         known: dict[str, Any] = {}
         for t, topic, name, message in messages:
             if topic not in known:
-                known[topic] = writer.add_connection(
-                    topic, name, typestore=ROS1
-                )
-            writer.write(
-                known[topic], _ns(t), ROS1.serialize_ros1(message, name)
-            )
+                known[topic] = writer.add_connection(topic, name, typestore=ROS1)
+            writer.write(known[topic], _ns(t), ROS1.serialize_ros1(message, name))
     return path
 
 
@@ -99,9 +84,7 @@ class Messages:
         return self._types[name](*values)
 
     def header(self, t_s: float, frame: str) -> Any:
-        stamp = self.made(
-            "builtin_interfaces/msg/Time", *divmod(_ns(t_s), 10**9)
-        )
+        stamp = self.made("builtin_interfaces/msg/Time", *divmod(_ns(t_s), 10**9))
         sequence = (0,) if self.one else ()
         return self.made("std_msgs/msg/Header", *sequence, stamp, frame)
 
@@ -111,12 +94,8 @@ class Messages:
     def turned(self, xyzw: Iterable[float]) -> Any:
         return self.made("geometry_msgs/msg/Quaternion", *map(float, xyzw))
 
-    def transform(
-        self, t_s: float, parent: str, child: str, at: Any, xyzw: Any
-    ) -> Any:
-        moved = self.made(
-            "geometry_msgs/msg/Transform", self.vector(at), self.turned(xyzw)
-        )
+    def transform(self, t_s: float, parent: str, child: str, at: Any, xyzw: Any) -> Any:
+        moved = self.made("geometry_msgs/msg/Transform", self.vector(at), self.turned(xyzw))
         name = "geometry_msgs/msg/TransformStamped"
         return self.made(name, self.header(t_s, parent), child, moved)
 
@@ -126,83 +105,42 @@ class Messages:
 
     def pose(self, t_s: float, at: Any, xyzw: Any) -> Message:
         name = "geometry_msgs/msg/PoseStamped"
-        pose = self.made(
-            "geometry_msgs/msg/Pose",
-            self.vector(at, "Point"),
-            self.turned(xyzw),
-        )
-        return (
-            t_s,
-            "/gripper",
-            name,
-            self.made(name, self.header(t_s, "world"), pose),
-        )
+        pose = self.made("geometry_msgs/msg/Pose", self.vector(at, "Point"), self.turned(xyzw))
+        return (t_s, "/gripper", name, self.made(name, self.header(t_s, "world"), pose))
 
     def wrench(self, t_s: float, values: Any) -> Message:
         name = "geometry_msgs/msg/WrenchStamped"
         both = self.made(
-            "geometry_msgs/msg/Wrench",
-            self.vector(values[:3]),
-            self.vector(values[3:]),
+            "geometry_msgs/msg/Wrench", self.vector(values[:3]), self.vector(values[3:])
         )
-        return (
-            t_s,
-            "/wrench",
-            name,
-            self.made(name, self.header(t_s, "tool"), both),
-        )
+        return (t_s, "/wrench", name, self.made(name, self.header(t_s, "tool"), both))
 
     def joints(self, t_s: float, positions: dict[str, float]) -> Message:
         name = "sensor_msgs/msg/JointState"
         values = np.array([*positions.values()], dtype=float)
         none = np.zeros(0)
-        state = self.made(
-            name, self.header(t_s, ""), [*positions], values, none, none
-        )
+        state = self.made(name, self.header(t_s, ""), [*positions], values, none, none)
         return t_s, "/joint_states", name, state
 
     def markers(self, t_s: float, places: dict[str, Any]) -> Message:
         name = "mocap4r2_msgs/msg/Markers"
         items = [
-            self.made(
-                "mocap4r2_msgs/msg/Marker",
-                0,
-                k,
-                label,
-                self.vector(place, "Point"),
-            )
+            self.made("mocap4r2_msgs/msg/Marker", 0, k, label, self.vector(place, "Point"))
             for k, (label, place) in enumerate(places.items())
         ]
-        return (
-            t_s,
-            "/markers",
-            name,
-            self.made(name, self.header(t_s, "world"), 0, items),
-        )
+        return (t_s, "/markers", name, self.made(name, self.header(t_s, "world"), 0, items))
 
-    def image(
-        self, t_s: float, encoding: str, pixels: np.ndarray, topic: str
-    ) -> Message:
+    def image(self, t_s: float, encoding: str, pixels: np.ndarray, topic: str) -> Message:
         name, fill = "sensor_msgs/msg/Image", 4  # bytes at the end of each row
         rows = pixels.view("u1").reshape(len(pixels), -1)
         data = np.pad(rows, ((0, 0), (0, fill))).ravel()
         sizes = *pixels.shape, encoding, 0, rows.shape[1] + fill
-        return (
-            t_s,
-            topic,
-            name,
-            self.made(name, self.header(t_s, "camera"), *sizes, data),
-        )
+        return (t_s, topic, name, self.made(name, self.header(t_s, "camera"), *sizes, data))
 
     def packed(self, t_s: float, form: str, data: bytes, topic: str) -> Message:
         name = "sensor_msgs/msg/CompressedImage"
         content = np.frombuffer(data, "u1")
-        return (
-            t_s,
-            topic,
-            name,
-            self.made(name, self.header(t_s, "camera"), form, content),
-        )
+        return (t_s, topic, name, self.made(name, self.header(t_s, "camera"), form, content))
 
     def camera(
         self,
@@ -215,33 +153,15 @@ class Messages:
         corner: int = 0,
     ) -> Message:
         name = "sensor_msgs/msg/CameraInfo"
-        numbers = (
-            np.asarray(each, dtype=float).ravel()
-            for each in (distortion, matrix)
-        )
+        numbers = (np.asarray(each, dtype=float).ravel() for each in (distortion, matrix))
         whole = np.asarray(projection, dtype=float).ravel()
-        area = self.made(
-            "sensor_msgs/msg/RegionOfInterest", corner, corner, 0, 0, False
-        )
-        told = (
-            "plumb_bob",
-            *numbers,
-            np.eye(3).ravel(),
-            whole,
-            binned,
-            binned,
-            area,
-        )
+        area = self.made("sensor_msgs/msg/RegionOfInterest", corner, corner, 0, 0, False)
+        told = ("plumb_bob", *numbers, np.eye(3).ravel(), whole, binned, binned, area)
         info = self.made(name, self.header(t_s, "camera"), *shape, *told)
         return t_s, "/camera/camera_info", name, info
 
-    def cloud(
-        self, t_s: float, columns: Mapping[str, Any], topic: str
-    ) -> Message:
-        name, count = (
-            "sensor_msgs/msg/PointCloud2",
-            len(next(iter(columns.values()))),
-        )
+    def cloud(self, t_s: float, columns: Mapping[str, Any], topic: str) -> Message:
+        name, count = ("sensor_msgs/msg/PointCloud2", len(next(iter(columns.values()))))
         form = np.dtype([(each, "<f4") for each in (*columns, "rgb")])
         rows = np.zeros(count, form)
         for each, values in columns.items():
@@ -252,26 +172,14 @@ class Messages:
         ]
         data, size = np.frombuffer(rows.tobytes(), "u1"), form.itemsize
         told = 1, count, fields, False, size, size * count, data, True
-        return (
-            t_s,
-            topic,
-            name,
-            self.made(name, self.header(t_s, "camera"), *told),
-        )
+        return (t_s, topic, name, self.made(name, self.header(t_s, "camera"), *told))
 
     def pressure(self, t_s: float, value_pa: float) -> Message:
         name = "sensor_msgs/msg/FluidPressure"
-        return (
-            t_s,
-            "/chamber",
-            name,
-            self.made(name, self.header(t_s, ""), value_pa, 0.0),
-        )
+        return (t_s, "/chamber", name, self.made(name, self.header(t_s, ""), value_pa, 0.0))
 
 
-def recorded(
-    poses: PoseSequence, table: MarkerTable, kind: str
-) -> Iterator[Message]:
+def recorded(poses: PoseSequence, table: MarkerTable, kind: str) -> Iterator[Message]:
     """Messages of a gripper's poses and of tracks, those of missing samples left out."""
     of = Messages(kind)
     for k, t in enumerate(poses.t_s):
@@ -279,17 +187,13 @@ def recorded(
     for k, t in enumerate(table.t_s):
         seen = {
             name: place
-            for name, place in zip(
-                table.names, table.positions_m[k], strict=True
-            )
+            for name, place in zip(table.names, table.positions_m[k], strict=True)
             if np.isfinite(place).all()
         }
         yield of.markers(t, seen)
 
 
-def json_mcap(
-    path: Path, topics: dict[str, tuple[str, list[tuple[float, dict]]]]
-) -> Path:
+def json_mcap(path: Path, topics: dict[str, tuple[str, list[tuple[float, dict]]]]) -> Path:
     """An MCAP file of JSON messages: schema, and messages by time, by topic."""
     with path.open("wb") as file:
         writer = McapWriter(file)
@@ -304,20 +208,14 @@ def json_mcap(
     return path
 
 
-def dataset(
-    folder: Path, joints: dict[str, list[float]], episodes: int = 2
-) -> Path:
+def dataset(folder: Path, joints: dict[str, list[float]], episodes: int = 2) -> Path:
     """A LeRobot dataset; the joints of a later episode are moved by 0.01 times its number."""
     names, count = [*joints], len(next(iter(joints.values())))
     (folder / "meta").mkdir(parents=True)
     state = {"dtype": "float32", "shape": [len(names)], "names": names}
     features = {
         "observation.state": state,
-        "observation.images.top": {
-            "dtype": "video",
-            "shape": [2, 2, 3],
-            "names": None,
-        },
+        "observation.images.top": {"dtype": "video", "shape": [2, 2, 3], "names": None},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
         "episode_index": {"dtype": "int64", "shape": [1], "names": None},
     }
@@ -326,9 +224,7 @@ def dataset(
     (folder / "meta" / "info.json").write_text(json.dumps(info))
     values = np.array([*joints.values()]).T
     columns = {
-        "observation.state": [
-            row.tolist() for k in range(episodes) for row in values + 0.01 * k
-        ],
+        "observation.state": [row.tolist() for k in range(episodes) for row in values + 0.01 * k],
         "timestamp": np.tile(np.arange(count) / HZ, episodes),
         "episode_index": np.repeat(np.arange(episodes), count),
     }

@@ -20,14 +20,10 @@ TWO = ONE | {"prony_2.share": 0.25, "prony_2.tau_s": 0.15}
 @cache
 def _remembering(body: Body, branches: int) -> Body:
     names = [f"prony_{k + 1}" for k in range(branches)]
-    return Body(
-        body.mesh, density_kg_m3=30.0, element=body.element.name, prony=names
-    )
+    return Body(body.mesh, density_kg_m3=30.0, element=body.element.name, prony=names)
 
 
-def remembering(
-    name: str, steps: int, branches: int = 1, **changes
-) -> Experiment:
+def remembering(name: str, steps: int, branches: int = 1, **changes) -> Experiment:
     """A small experiment whose body has so many branches, not measured yet."""
     plain = SMALL_EXPERIMENTS[name](steps)
     return replace(plain, body=_remembering(plain.body, branches), **changes)
@@ -45,17 +41,9 @@ def guesses(values: Mapping[str, float], factor: float = 1.5) -> Parameters:
     )
 
 
-def recorded(
-    name: str,
-    steps: int,
-    branches: int = 1,
-    scheme: str = "midpoint",
-    **changes,
-):
+def recorded(name: str, steps: int, branches: int = 1, scheme: str = "midpoint", **changes):
     """The experiment with the tracks that the truth gives it."""
-    return measured_with(
-        remembering(name, steps, branches, **changes), truth(branches), scheme
-    )
+    return measured_with(remembering(name, steps, branches, **changes), truth(branches), scheme)
 
 
 def theta(values: Mapping[str, float], body: Body) -> np.ndarray:

@@ -18,11 +18,9 @@ def readings(experiment: Experiment, phi: np.ndarray) -> np.ndarray:
     """What the markers read at the truth with φ; the scheme's own trajectory."""
     collocation = alone(experiment)
     followed, p = collocation.follow_estimates(np.append(GUESS.guess_q, phi))
-    (segment,) = followed.transcriptions
-    motion = simulate(
-        segment.corrected_experiment(phi), TRUTH, "midpoint", substeps=1
-    )
-    return segment.markers.predict_samples(motion.positions_m, p[followed.nq :])
+    (transcription,) = followed.transcriptions
+    motion = simulate(transcription.corrected_experiment(phi), TRUTH, "midpoint", substeps=1)
+    return transcription.markers.predict_samples(motion.positions_m, p[followed.nq :])
 
 
 def seen_with(experiment: Experiment, phi: np.ndarray) -> Experiment:

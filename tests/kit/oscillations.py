@@ -16,9 +16,7 @@ from kit.problems import EDGE_M, hung_cube, nodes_where, vertex_markers
 AMPLITUDE_M = 1e-6 * EDGE_M
 
 
-def released_in_a_mode(
-    theta: np.ndarray, mode: int, timestep_s: float = 0.01, steps: int = 30
-):
+def released_in_a_mode(theta: np.ndarray, mode: int, timestep_s: float = 0.01, steps: int = 30):
     """A weightless cube held at its top, displaced in one of its modes and let go.
 
     Returns
@@ -29,9 +27,7 @@ def released_in_a_mode(
     cube = hung_cube()
     body, t_s = cube.body, timestep_s * np.arange(steps + 1)
     held = nodes_where(body, 2, EDGE_M)
-    modes = natural_modes(
-        Forces.of_body_alone(body, theta), body.nodes_m, cube.free_dofs
-    )
+    modes = natural_modes(Forces.of_body_alone(body, theta), body.nodes_m, cube.free_dofs)
     shape = modes.shapes[mode] / np.abs(modes.shapes[mode]).max()
     released = replace(
         cube,
@@ -46,12 +42,7 @@ def released_in_a_mode(
 
 
 def oscillation(
-    experiment: Experiment,
-    modes: Modes,
-    mode: int,
-    theta: np.ndarray,
-    integrator: str,
-    **options,
+    experiment: Experiment, modes: Modes, mode: int, theta: np.ndarray, integrator: str, **options
 ) -> tuple[float, float]:
     """Undamped angular frequency and damping ratio of a mode's amplitude in a simulation.
 
@@ -59,10 +50,7 @@ def oscillation(
     """
     body = experiment.body
     steps = {} if "timestep_s" in options else {"substeps": 1}
-    motion = (
-        simulate(experiment, theta, integrator, **steps, **options).positions_m
-        - body.nodes_m
-    )
+    motion = simulate(experiment, theta, integrator, **steps, **options).positions_m - body.nodes_m
     weights = body.node_mass[:, None] * modes.shapes[mode]
     a = np.tensordot(motion, weights, axes=2)[
         12:

@@ -7,16 +7,11 @@ import casadi as ca
 import collocation_sysid as cs
 
 SCALE = cs.NuisanceRow(
-    "camera_scale",
-    "1",
-    0.02,
-    reading=lambda y, scale, t_s, data: (1 + scale) * y,
+    "camera_scale", "1", 0.02, reading=lambda y, scale, t_s, data: (1 + scale) * y
 )
 
 
-DRIFT = cs.NuisanceRow(
-    "clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s
-)
+DRIFT = cs.NuisanceRow("clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s)
 
 
 # Cameras that sag while they warm up, each marker's lens by a vector of its own.
@@ -26,9 +21,7 @@ SAG = cs.NuisanceRow(
     0.003,
     of="marker",
     axes="x y z",
-    reading=lambda y, sag, t_s, data: (
-        y + sag * (1 - ca.exp(-t_s / data.duration_s))
-    ),
+    reading=lambda y, sag, t_s, data: y + sag * (1 - ca.exp(-t_s / data.duration_s)),
 )
 
 

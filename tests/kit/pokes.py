@@ -16,10 +16,7 @@ TRUTH = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 DEPTHS_M = np.linspace(-0.0005, 0.006, 14)
 
 
-SMALL, FLAT = (
-    cs.Sphere(0.004, (0.03, 0.03, 0.034)),
-    cs.Plane((0, 0, -1), (0, 0, 0.03)),
-)
+SMALL, FLAT = (cs.Sphere(0.004, (0.03, 0.03, 0.034)), cs.Plane((0, 0, -1), (0, 0, 0.03)))
 
 
 SIGMA_N = 0.002
@@ -27,9 +24,7 @@ SIGMA_N = 0.002
 
 @cache
 def block() -> cs.Body:
-    return cs.Body(
-        cs.box_mesh((0.06, 0.06, 0.03), (4, 4, 2)), density_kg_m3=50.0
-    )
+    return cs.Body(cs.box_mesh((0.06, 0.06, 0.03), (4, 4, 2)), density_kg_m3=50.0)
 
 
 def poked(
@@ -52,6 +47,4 @@ def poked(
     held = cs.Grasp(below, cs.PoseSequence.fixed())
     known = {"kind": "static", "gravity_m_s2": (0.0, 0.0, 0.0), "name": "poke"}
     known["nuisance"] = cs.Nuisance.none(obstacle_offset_m=place_sigma_m)
-    return Experiment(
-        block(), t_s, [held, replace(ball, **changes)], None, **known
-    )
+    return Experiment(block(), t_s, [held, replace(ball, **changes)], None, **known)

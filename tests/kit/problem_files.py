@@ -22,12 +22,7 @@ from collocation_sysid.result.synthesis import Recipe, write_data
 from kit.problems import smooth_poses, times
 
 SIZE_M, DIVISIONS = (0.06, 0.06, 0.09), (2, 2, 3)
-TRUTH = {
-    "lambda_pa": 200.0,
-    "mu_pa": 300.0,
-    "gamma_r_s": 0.009,
-    "gamma_m_1_s": 1.0,
-}
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 AT_TRUTH = [f"parameters.{name}.guess={value}" for name, value in TRUTH.items()]
 
 PROBLEM = """\
@@ -63,40 +58,26 @@ reference_m = {REFERENCES}
 """
 
 Edit = Callable[[Path], object]
-write_pictures = (
-    run_record.write_pictures
-)  # before the session's fixture leaves them out
+write_pictures = run_record.write_pictures  # before the session's fixture leaves them out
 
 
 # Writing ------------------------------------------------------------------------------------------
 
 
-def write_problem(
-    folder: Path, steps: dict[str, int], validation: str = ""
-) -> Path:
+def write_problem(folder: Path, steps: dict[str, int], validation: str = "") -> Path:
     """A problem with exact data of the midpoint scheme: a motion of its own per experiment."""
     mesh = box_mesh(SIZE_M, DIVISIONS)
     top = mesh.points_m[:, 2] > SIZE_M[2] - 1e-6
-    TetMesh(mesh.points_m, mesh.tetrahedra, {"top": top}).write(
-        folder / "body.vtu"
-    )
+    TetMesh(mesh.points_m, mesh.tetrahedra, {"top": top}).write(folder / "body.vtu")
     text = PROBLEM
     for k, (name, count) in enumerate(steps.items()):
-        poses = smooth_poses(
-            times(count), turn_rad=np.roll((0.2, -0.15, 0.3), k)
-        )
+        poses = smooth_poses(times(count), turn_rad=np.roll((0.2, -0.15, 0.3), k))
         write_poses_csv(folder / f"{name}_motion.csv", poses)
         added = EXPERIMENT.replace("swing", name)
-        text += (
-            added.replace("grasp", "validation = true\ngrasp")
-            if name == validation
-            else added
-        )
+        text += added.replace("grasp", "validation = true\ngrasp") if name == validation else added
     file = folder / "problem.toml"
     file.write_text(text)
-    exact = Problem.read(
-        file, [*AT_TRUTH, "transcription.substeps=1"], simulation=True
-    )
+    exact = Problem.read(file, [*AT_TRUTH, "transcription.substeps=1"], simulation=True)
     write_data(exact, folder, Recipe("midpoint"))
     return file
 
@@ -203,8 +184,6 @@ def pictures_drawn() -> Iterator[None]:
 def contents(folder: Path) -> dict[str, bytes | None]:
     """Every file below a folder, and what is in it."""
     return {
-        str(path.relative_to(folder)): path.read_bytes()
-        if path.is_file()
-        else None
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))
     }

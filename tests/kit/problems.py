@@ -34,18 +34,10 @@ from collocation_sysid.recording import (
     Sphere,
     Tendon,
 )
-from collocation_sysid.testing.small_problems import (
-    shaken_variables,
-    smooth_poses,
-)
+from collocation_sysid.testing.small_problems import shaken_variables, smooth_poses
 from collocation_sysid.testing.small_problems import uneven_box as uneven_box
 
-TRUTH = {
-    "lambda_pa": 200.0,
-    "mu_pa": 300.0,
-    "gamma_r_s": 0.009,
-    "gamma_m_1_s": 1.0,
-}
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 GUESS = Parameters(
     (
         Parameter("lambda_pa", 400.0, 10.0, 1e5),
@@ -58,9 +50,7 @@ GUESS = Parameters(
 
 def as_theta(given: Parameters | Mapping[str, float]) -> np.ndarray:
     """Constants of a body of one region in λ and μ, in its order."""
-    return np.array(
-        [*(given.guesses if isinstance(given, Parameters) else given).values()]
-    )
+    return np.array([*(given.guesses if isinstance(given, Parameters) else given).values()])
 
 
 GRAVITY_M_S2 = (0.0, 0.0, -9.81)
@@ -75,20 +65,13 @@ def box(
     element: str = "tet4",
 ) -> Body:
     """A foam box with a corner at the origin; bodies are shared, their kernels compile once."""
-    return Body(
-        box_mesh(size_m, divisions), density_kg_m3=30.0, element=element
-    )
+    return Body(box_mesh(size_m, divisions), density_kg_m3=30.0, element=element)
 
 
 def with_papers_damping(experiment: Experiment) -> Experiment:
     """The experiment with Rayleigh's law."""
     body = experiment.body
-    rayleigh = Body(
-        body.mesh,
-        density_kg_m3=30.0,
-        element=body.element.name,
-        damping="rayleigh",
-    )
+    rayleigh = Body(body.mesh, density_kg_m3=30.0, element=body.element.name, damping="rayleigh")
     return replace(experiment, body=rayleigh)
 
 
@@ -114,9 +97,7 @@ def times(steps: int, timestep_s: float = 0.01) -> np.ndarray:
     return timestep_s * np.arange(steps + 1)
 
 
-def hung_cube(
-    steps: int = 10, divisions: tuple[int, ...] = (2, 2, 2), **changes
-) -> Experiment:
+def hung_cube(steps: int = 10, divisions: tuple[int, ...] = (2, 2, 2), **changes) -> Experiment:
     """A cube hung from its top face, swayed and turned from rest."""
     body, t_s = box(divisions=divisions), times(steps)
     grasp = Grasp(nodes_where(body, 2, EDGE_M), smooth_poses(t_s))
@@ -131,13 +112,7 @@ def released_cube(steps: int = 10) -> Experiment:
     grasp = Grasp(nodes_where(body, 2, EDGE_M), PoseSequence.fixed())
     markers = vertex_markers(body, nodes_where(body, 2, 0.0), t_s)
     return Experiment(
-        body,
-        t_s,
-        [grasp],
-        markers,
-        name="released cube",
-        start="undeformed",
-        nuisance=IDEAL,
+        body, t_s, [grasp], markers, name="released cube", start="undeformed", nuisance=IDEAL
     )
 
 
@@ -146,18 +121,9 @@ def bar_in_two_hands(steps: int = 10) -> Experiment:
     body, t_s = box((0.15, 0.05, 0.05), (4, 1, 1)), times(steps)
     still = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
     moving = Grasp(nodes_where(body, 0, 0.15), smooth_poses(t_s))
-    inside = np.flatnonzero(
-        (body.nodes_m[:, 0] > 0.01) & (body.nodes_m[:, 0] < 0.14)
-    )
+    inside = np.flatnonzero((body.nodes_m[:, 0] > 0.01) & (body.nodes_m[:, 0] < 0.14))
     markers = vertex_markers(body, inside, t_s)
-    return Experiment(
-        body,
-        t_s,
-        [still, moving],
-        markers,
-        name="bar in two hands",
-        nuisance=IDEAL,
-    )
+    return Experiment(body, t_s, [still, moving], markers, name="bar in two hands", nuisance=IDEAL)
 
 
 def cube_with_gaps(steps: int = 12) -> Experiment:
@@ -170,12 +136,7 @@ def cube_with_gaps(steps: int = 12) -> Experiment:
     tracks[rng.random(tracks.shape[:2]) < 0.25] = np.nan
     unmeasured = replace(markers, positions_m=tracks)
     return Experiment(
-        hung.body,
-        hung.t_s,
-        hung.grasps,
-        unmeasured,
-        name="cube with gaps",
-        nuisance=IDEAL,
+        hung.body, hung.t_s, hung.grasps, unmeasured, name="cube with gaps", nuisance=IDEAL
     )
 
 
@@ -183,13 +144,9 @@ def quadratic_bar(steps: int = 10) -> Experiment:
     """A bar of quadratic elements held at one end, seen at nodes on edges and inside elements."""
     body, t_s = box((0.15, 0.05, 0.05), (2, 1, 1), "tet10"), times(steps)
     grasp = Grasp(nodes_where(body, 0, 0.0), smooth_poses(t_s))
-    points = np.vstack(
-        [body.nodes_m[-4:], [[0.13, 0.01, 0.02], [0.14, 0.03, 0.04]]]
-    )
+    points = np.vstack([body.nodes_m[-4:], [[0.13, 0.01, 0.02], [0.14, 0.03, 0.04]]])
     markers = point_markers(body, points, t_s)
-    return Experiment(
-        body, t_s, [grasp], markers, name="quadratic bar", nuisance=IDEAL
-    )
+    return Experiment(body, t_s, [grasp], markers, name="quadratic bar", nuisance=IDEAL)
 
 
 def bar_let_go(steps: int = 10) -> Experiment:
@@ -201,13 +158,8 @@ def bar_let_go(steps: int = 10) -> Experiment:
         bar,
         name="bar let go",
         grasps=(still, replace(moving, until_s=2 * dt)),
-        masses=(
-            PointMass(end, 0.004),
-            PointMass(end[:2], 0.003, from_s=3 * dt),
-        ),
-        forces=(
-            Force(end[-1:], [[0, 0, 0], [0, 0.02, 0.01]], [0.0, steps * dt]),
-        ),
+        masses=(PointMass(end, 0.004), PointMass(end[:2], 0.003, from_s=3 * dt)),
+        forces=(Force(end[-1:], [[0, 0, 0], [0, 0.02, 0.01]], [0.0, steps * dt]),),
     )
 
 
@@ -216,17 +168,12 @@ def bar_loaded(steps: int = 10) -> Experiment:
     bar = bar_in_two_hands(steps)
     still, moving = bar.grasps
     end, dt = moving.nodes, bar.timestep_s
-    pulling = Force(
-        end[1:], [[0.01, 0.02, 0.01]], from_s=1.3 * dt, until_s=3.9 * dt
-    )
+    pulling = Force(end[1:], [[0.01, 0.02, 0.01]], from_s=1.3 * dt, until_s=3.9 * dt)
     return replace(
         bar,
         name="bar loaded",
         grasps=(still,),
-        masses=(
-            PointMass(end[:2], 0.003, 1.6 * dt, until_s=4.2 * dt),
-            PointMass(end, 0.001),
-        ),
+        masses=(PointMass(end[:2], 0.003, 1.6 * dt, until_s=4.2 * dt), PointMass(end, 0.001)),
         forces=(pulling,),
         nuisance=Nuisance.none(gravity_rad=0.03, joining_s=0.004),
     )
@@ -244,47 +191,28 @@ def cube_with_nuisance(steps: int = 10) -> Experiment:
         hand_eye_m=0.002,
         hand_eye_rad=0.02,
     )
-    return replace(
-        hung_cube(steps), name="cube with nuisance", nuisance=nuisance
-    )
+    return replace(hung_cube(steps), name="cube with nuisance", nuisance=nuisance)
 
 
 def bar_with_nuisance(steps: int = 8) -> Experiment:
     """The bar that one hand lets go of, of quadratic elements, off in its grasps and its places."""
     body, t_s = box((0.15, 0.05, 0.05), (2, 1, 1), "tet10"), times(steps)
     still = Grasp(nodes_where(body, 0, 0.0), smooth_poses(t_s))
-    moving = Grasp(
-        nodes_where(body, 0, 0.15), smooth_poses(t_s), until_s=3 * t_s[1]
-    )
-    points = np.array(
-        [[0.13, 0.01, 0.02], [0.09, 0.05, 0.04], [0.12, 0.03, 0.0]]
-    )
+    moving = Grasp(nodes_where(body, 0, 0.15), smooth_poses(t_s), until_s=3 * t_s[1])
+    points = np.array([[0.13, 0.01, 0.02], [0.09, 0.05, 0.04], [0.12, 0.03, 0.0]])
     markers = point_markers(body, points, t_s)
-    exact_first = replace(
-        markers, places_sigma_m=np.array([0.0, np.nan, 0.004]), on_surface=True
-    )
-    nuisance = Nuisance.none(
-        marker_offset_m=0.003, hand_eye_m=0.002, hand_eye_rad=0.02
-    )
+    exact_first = replace(markers, places_sigma_m=np.array([0.0, np.nan, 0.004]), on_surface=True)
+    nuisance = Nuisance.none(marker_offset_m=0.003, hand_eye_m=0.002, hand_eye_rad=0.02)
     return Experiment(
-        body,
-        t_s,
-        [still, moving],
-        exact_first,
-        name="bar with nuisance",
-        nuisance=nuisance,
+        body, t_s, [still, moving], exact_first, name="bar with nuisance", nuisance=nuisance
     )
 
 
 def driven_bar(steps: int = 8) -> Experiment:
     """A bar with a cavity, held at one end, that a tendon bends and a pressure fills."""
     whole, t_s = box_mesh((0.12, 0.06, 0.06), (3, 3, 3)), times(steps)
-    inside = (
-        np.abs(whole.centres_m - [0.06, 0.03, 0.03]) < [0.03, 0.01, 0.01]
-    ).all(axis=1)
-    body = Body(
-        TetMesh(whole.points_m, whole.tetrahedra[~inside]), density_kg_m3=30.0
-    )
+    inside = (np.abs(whole.centres_m - [0.06, 0.03, 0.03]) < [0.03, 0.01, 0.01]).all(axis=1)
+    body = Body(TetMesh(whole.points_m, whole.tetrahedra[~inside]), density_kg_m3=30.0)
     points = [(x, 0.05, 0.03 + 0.1 * x) for x in (0.0, 0.05, 0.08, 0.118)]
     tip = nodes_where(body, 0, 0.12)
     cavity = Box((0.02, 0.015, 0.015), (0.1, 0.045, 0.045))
@@ -323,26 +251,18 @@ SMALL_EXPERIMENTS = {
 # an experiment has besides is none of the scheme's.
 EXPERIMENTS_AND_SCHEMES = list(
     dict.fromkeys(
-        [
-            *zip(SMALL_EXPERIMENTS, cycle(SCHEMES)),
-            *product(("hung-cube", "bar-let-go"), SCHEMES),
-        ]
+        [*zip(SMALL_EXPERIMENTS, cycle(SCHEMES)), *product(("hung-cube", "bar-let-go"), SCHEMES)]
     )
 )
 
 
-def measured(
-    experiment: Experiment, scheme: str = "midpoint", substeps: int = 1
-) -> Experiment:
+def measured(experiment: Experiment, scheme: str = "midpoint", substeps: int = 1) -> Experiment:
     """The experiment with the tracks that `TRUTH` gives it; missing samples stay missing."""
     return measured_with(experiment, TRUTH, scheme, substeps)
 
 
 def measured_with(
-    experiment: Experiment,
-    truth: Mapping[str, float],
-    scheme: str = "midpoint",
-    substeps: int = 1,
+    experiment: Experiment, truth: Mapping[str, float], scheme: str = "midpoint", substeps: int = 1
 ) -> Experiment:
     """The same with the tracks of any parameters."""
     tracks = simulate(experiment, truth, scheme, substeps=substeps).markers_m
@@ -351,10 +271,7 @@ def measured_with(
 
 
 def noisy(
-    experiment: Experiment,
-    noise_m: float = 1e-3,
-    scheme: str = "midpoint",
-    seed: int = 7,
+    experiment: Experiment, noise_m: float = 1e-3, scheme: str = "midpoint", seed: int = 7
 ) -> Experiment:
     """The experiment with the tracks that `TRUTH` gives it, and white noise."""
     made = measured(experiment, scheme)
@@ -365,29 +282,21 @@ def noisy(
 
 def relative_errors(solution: Solution) -> np.ndarray:
     """Errors of the four parameters over `TRUTH`."""
-    return np.array(
-        [solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH]
-    )
+    return np.array([solution.parameters[name] / TRUTH[name] - 1 for name in TRUTH])
 
 
-def some_point(
-    made: Collocation, rng: np.random.Generator | None = None
-) -> np.ndarray:
+def some_point(made: Collocation, rng: np.random.Generator | None = None) -> np.ndarray:
     """Variables that satisfy nothing, what is carried neither: rigid, then shaken."""
     return shaken_variables(made, rng or np.random.default_rng(1))
 
 
-def pressed_cube(
-    steps: int = 5, friction: float | str = 0.0, **changes
-) -> Experiment:
+def pressed_cube(steps: int = 5, friction: float | str = 0.0, **changes) -> Experiment:
     """A cube held below, with a ball that comes down upon it and a plate that moves against it."""
     cube = hung_cube(steps, (1, 1, 2))
     body, t_s = cube.body, cube.t_s
     down = np.outer(0.012 * (1 - np.cos(20 * t_s)), [0.3, 0.2, -1.0])
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
-    turning = Rotation.from_rotvec(
-        np.outer(np.sin(20 * t_s), [0.0, 0.05, 0.1])
-    ).as_quat()
+    turning = Rotation.from_rotvec(np.outer(np.sin(20 * t_s), [0.0, 0.05, 0.1])).as_quat()
     soft = {"stiffness_pa_m": 4e4, "width_m": 0.006, "slip": 0.02}
     ball = Obstacle(
         poses=PoseSequence(t_s, down, still),
@@ -404,9 +313,5 @@ def pressed_cube(
     )
     held = Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed())
     markers = vertex_markers(body, nodes_where(body, 2, EDGE_M), t_s)
-    made = {
-        "grasps": [held, ball, plate],
-        "markers": markers,
-        "name": "pressed cube",
-    }
+    made = {"grasps": [held, ball, plate], "markers": markers, "name": "pressed cube"}
     return replace(cube, **(made | changes))

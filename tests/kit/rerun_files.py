@@ -22,9 +22,7 @@ def read_back(file: Path) -> dict[str, dict[str, list]]:
         known = entities.setdefault(chunk.entity_path.strip("/"), {})
         for name, values in columns.items():
             key = name.rpartition(":")[2]
-            known.setdefault(
-                f"static {key}" if chunk.is_static else key, []
-            ).extend(values)
+            known.setdefault(f"static {key}" if chunk.is_static else key, []).extend(values)
     return entities
 
 

@@ -16,13 +16,7 @@ from collocation_sysid.fem.rest_shape import UnderGravity
 from collocation_sysid.problem.problem import Problem
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import (
-    Experiment,
-    Grasp,
-    Markers,
-    Nuisance,
-    PoseSequence,
-)
+from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 
 SIZE_M = (0.12, 0.03, 0.03)
 TRUTH = {"young_pa": 3e5, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
@@ -35,27 +29,17 @@ RestShape = UnderGravity | Literal["stress_free"] | None
 
 def clamped_nodes(mesh: TetMesh) -> np.ndarray:
     """Nodes at the clamped end, which is at x = 0 in the scan too."""
-    return np.flatnonzero(
-        mesh.points_m[:, 0] < mesh.points_m[:, 0].min() + 1e-3
-    )
+    return np.flatnonzero(mesh.points_m[:, 0] < mesh.points_m[:, 0].min() + 1e-3)
 
 
 def as_scanned(mesh: TetMesh) -> UnderGravity:
     """How the bar was held during the scan."""
-    return UnderGravity(
-        Indices(clamped_nodes(mesh).tolist()), SCAN_GRAVITY_M_S2
-    )
+    return UnderGravity(Indices(clamped_nodes(mesh).tolist()), SCAN_GRAVITY_M_S2)
 
 
-def straight_bar(
-    element: str = "tet4", divisions: tuple[int, int, int] = (6, 2, 2)
-) -> Body:
+def straight_bar(element: str = "tet4", divisions: tuple[int, int, int] = (6, 2, 2)) -> Body:
     """The bar free of stress."""
-    return Body(
-        box_mesh(SIZE_M, divisions),
-        density_kg_m3=DENSITY_KG_M3,
-        element=element,
-    )
+    return Body(box_mesh(SIZE_M, divisions), density_kg_m3=DENSITY_KG_M3, element=element)
 
 
 def recorded(
@@ -77,9 +61,7 @@ def recorded(
     seen = np.arange(len(mesh.points_m))[-9:]
     nowhere = np.zeros((len(t_s), len(seen), 3))
     names = [f"m{k}" for k in range(len(seen))]
-    markers = Markers(
-        t_s, nowhere, NOISE_M, names, mesh.points_m[seen]
-    ).on_body(body)
+    markers = Markers(t_s, nowhere, NOISE_M, names, mesh.points_m[seen]).on_body(body)
     grasp = Grasp(Indices(clamped_nodes(mesh).tolist()), poses)
     return Experiment(
         body,
@@ -94,9 +76,7 @@ def recorded(
 
 
 @cache
-def hung_mesh(
-    young_pa: float = TRUTH["young_pa"], element: str = "tet4"
-) -> TetMesh:
+def hung_mesh(young_pa: float = TRUTH["young_pa"], element: str = "tet4") -> TetMesh:
     """The mesh that a scan of the hanging bar gives: the deformed one."""
     body = straight_bar(element)
     theta = body.theta_from_values(TRUTH | {"young_pa": young_pa})
@@ -115,9 +95,7 @@ def measured(
     truth = recorded(straight_bar(), turn_rad, static, steps)
     tracks = simulate(truth, TRUTH, "midpoint").markers_m
     if seed is not None:
-        tracks = tracks + NOISE_M * np.random.default_rng(seed).normal(
-            size=tracks.shape
-        )
+        tracks = tracks + NOISE_M * np.random.default_rng(seed).normal(size=tracks.shape)
     mesh = hung_mesh()
     # Mass is that of the bar, whatever the volume of the mesh.
     mass_kg = straight_bar().mass_kg

@@ -27,14 +27,8 @@ FIT = FitResult(1e-3, 1e-3, {})
 ROLLOUT = ForwardResult(0.8e-3, 2e-3, {})
 
 
-def value(
-    number: float = 100.0, std_error: float | None = 1.0
-) -> ReportedEstimate:
-    interval = (
-        None
-        if std_error is None
-        else (number - 2 * std_error, number + 2 * std_error)
-    )
+def value(number: float = 100.0, std_error: float | None = 1.0) -> ReportedEstimate:
+    interval = None if std_error is None else (number - 2 * std_error, number + 2 * std_error)
     return ReportedEstimate(
         number,
         std_error,
@@ -46,9 +40,7 @@ def value(
     )
 
 
-def uncertainty(
-    names: Sequence[str], covariance: np.ndarray
-) -> UncertaintyResult:
+def uncertainty(names: Sequence[str], covariance: np.ndarray) -> UncertaintyResult:
     scale = np.sqrt(np.diag(covariance))
     quantiles = np.full(len(names), 1.96)
     correlation = covariance / np.outer(scale, scale)
@@ -68,9 +60,7 @@ def uncertainty(
     )
 
 
-def a_result(
-    parameters: Mapping[str, ReportedEstimate] | None = None, **changes: Any
-) -> Result:
+def a_result(parameters: Mapping[str, ReportedEstimate] | None = None, **changes: Any) -> Result:
     """A converged run of these parameters, with other entries as they are given."""
     whole = Result(
         schema=SCHEMA,

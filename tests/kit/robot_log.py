@@ -39,9 +39,7 @@ def robot_problem(
     file = write_problem(folder, {"swing": 12})
     bag(
         folder / "trial",
-        _messages(
-            folder, markers_frame, base=base, wrenches=wrenches, sensor=sensor
-        ),
+        _messages(folder, markers_frame, base=base, wrenches=wrenches, sensor=sensor),
     )
     text = file.read_text()
     text = text.replace("swing_motion.csv", POSES)
@@ -50,11 +48,7 @@ def robot_problem(
 
 
 def _messages(
-    folder: Path,
-    markers_frame: str,
-    base: str,
-    wrenches: np.ndarray | None,
-    sensor: str,
+    folder: Path, markers_frame: str, base: str, wrenches: np.ndarray | None, sensor: str
 ) -> Iterator[Message]:
     of = Messages()
     yield of.tree(
@@ -70,9 +64,7 @@ def _messages(
         rotation = CAMERAS * Rotation.from_quat(poses.quaternions_xyzw[k])
         position = CAMERAS_M + CAMERAS.apply(poses.positions_m[k].copy())
         position = position - rotation.apply(GRIPPER_M)
-        yield of.tree(
-            t, of.transform(t, base, "tool0", position, rotation.as_quat())
-        )
+        yield of.tree(t, of.transform(t, base, "tool0", position, rotation.as_quat()))
     for k, t in enumerate(table.t_s):
         places = dict(zip(table.names, table.positions_m[k], strict=True))
         at, topic, kind, message = of.markers(t, places)

@@ -21,17 +21,11 @@ class Library:
         edge_dofs = np.asarray(self.basis.edge_dofs)
         if edge_dofs.size:
             # Both number edges by their sorted ends, but in orders of their own.
-            theirs = np.sort(
-                np.asarray(self.basis.mesh.edges).T, axis=1
-            ).tolist()
+            theirs = np.sort(np.asarray(self.basis.mesh.edges).T, axis=1).tolist()
             column = {tuple(edge): k for k, edge in enumerate(theirs)}
             columns = [column[tuple(edge)] for edge in mesh.edges.tolist()]
-            self.dofs = np.concatenate(
-                [self.dofs, edge_dofs[:, columns].T.ravel()]
-            )
-            self.points_m = np.vstack(
-                [mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)]
-            )
+            self.dofs = np.concatenate([self.dofs, edge_dofs[:, columns].T.ravel()])
+            self.points_m = np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)])
 
     def displacement(self, positions):
         nodal = np.zeros(self.basis.N)
@@ -39,17 +33,11 @@ class Library:
         return self.basis.interpolate(nodal)
 
     def scalar(self, form, positions) -> float:
-        return skfem.Functional(form).assemble(
-            self.basis, u=self.displacement(positions)
-        )
+        return skfem.Functional(form).assemble(self.basis, u=self.displacement(positions))
 
     def vector(self, form, positions) -> np.ndarray:
         u = self.displacement(positions)
-        return (
-            skfem.LinearForm(form)
-            .assemble(self.basis, u=u)[self.dofs]
-            .reshape(-1, 3)
-        )
+        return skfem.LinearForm(form).assemble(self.basis, u=u)[self.dofs].reshape(-1, 3)
 
     def matrix(self, form, positions) -> np.ndarray:
         u = self.displacement(positions)

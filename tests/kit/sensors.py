@@ -31,20 +31,12 @@ CLAMPED = {"expression": lambda at: at.force_n, "unknowns": {}}
 
 
 def accelerometer(t_s: np.ndarray, **changes) -> Gauge:
-    given = {
-        "sigma": 0.05,
-        "points_m": LOW_M,
-        "unknowns": {"bias_m_s2": 0.5},
-    } | changes
-    return Gauge(
-        "accelerometer", specific_force, t_s, np.zeros((len(t_s), 3)), **given
-    )
+    given = {"sigma": 0.05, "points_m": LOW_M, "unknowns": {"bias_m_s2": 0.5}} | changes
+    return Gauge("accelerometer", specific_force, t_s, np.zeros((len(t_s), 3)), **given)
 
 
 def strain_gauge(t_s: np.ndarray) -> Gauge:
-    return Gauge(
-        "foil", strain, t_s, np.zeros(len(t_s)), 1e-4, ENDS_M, {"scale": 0.05}
-    )
+    return Gauge("foil", strain, t_s, np.zeros(len(t_s)), 1e-4, ENDS_M, {"scale": 0.05})
 
 
 def instrumented(experiment: Experiment, *gauges: Gauge) -> Experiment:
@@ -55,9 +47,7 @@ def noisy(experiment: Experiment) -> Experiment:
     rng = np.random.default_rng(0)
     read = [
         np.where(
-            rng.random(g.measured_values.shape) < 0.1,
-            np.nan,
-            3 * g.sigma * rng.normal(size=(1,)),
+            rng.random(g.measured_values.shape) < 0.1, np.nan, 3 * g.sigma * rng.normal(size=(1,))
         )
         + g.measured_values
         for g in experiment.readings

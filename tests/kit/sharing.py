@@ -8,13 +8,9 @@ from collocation_sysid.recording import Experiment
 from kit.problems import smooth_poses
 
 
-def sharing(
-    experiment: Experiment, *names: str, word: str = "shared"
-) -> Experiment:
+def sharing(experiment: Experiment, *names: str, word: str = "shared") -> Experiment:
     scope = dict.fromkeys(names, word)
-    return replace(
-        experiment, nuisance=replace(experiment.nuisance, scope=scope)
-    )
+    return replace(experiment, nuisance=replace(experiment.nuisance, scope=scope))
 
 
 def swung_again(experiment: Experiment, name: str) -> Experiment:

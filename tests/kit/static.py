@@ -8,15 +8,7 @@ import numpy as np
 
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from kit.problems import (
-    EDGE_M,
-    GUESS,
-    IDEAL,
-    TRUTH,
-    box,
-    nodes_where,
-    vertex_markers,
-)
+from kit.problems import EDGE_M, GUESS, IDEAL, TRUTH, box, nodes_where, vertex_markers
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])
@@ -28,9 +20,7 @@ PRESSED_M = np.array([0.0, -0.01, -0.02, -0.04])
 def pressed(t_s=TIMES, z_m=PRESSED_M) -> PoseSequence:
     """Straight down by these heights."""
     positions = np.outer(z_m, [0.0, 0.0, 1.0])
-    return PoseSequence(
-        t_s, positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)), "linear"
-    )
+    return PoseSequence(t_s, positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)), "linear")
 
 
 def block(platen: str = "z", t_s=TIMES, z_m=PRESSED_M, **changes) -> Experiment:
@@ -49,22 +39,12 @@ def block(platen: str = "z", t_s=TIMES, z_m=PRESSED_M, **changes) -> Experiment:
         Grasp(sides[1], fixed, axes="y"),
     ]
     markers = vertex_markers(body, nodes_where(body, 0, EDGE_M), t_s)
-    settings = {
-        "gravity_m_s2": (0.0, 0.0, 0.0),
-        "nuisance": IDEAL,
-        "kind": "static",
-    } | changes
+    settings = {"gravity_m_s2": (0.0, 0.0, 0.0), "nuisance": IDEAL, "kind": "static"} | changes
     return Experiment(body, t_s, grasps, markers, name="block", **settings)
 
 
 ELASTIC_ONLY = Parameters(
-    (
-        *GUESS.items[:2],
-        *(
-            replace(i, guess=TRUTH[i.name], is_fixed=True)
-            for i in GUESS.items[2:]
-        ),
-    )
+    (*GUESS.items[:2], *(replace(i, guess=TRUTH[i.name], is_fixed=True) for i in GUESS.items[2:]))
 )
 
 

@@ -16,10 +16,7 @@ import skfem.helpers
 from numpy.typing import NDArray
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import splu
-from skfem import (
-    BilinearForm,
-    LinearForm,
-)
+from skfem import BilinearForm, LinearForm
 
 import collocation_sysid as cs
 from kit.scikit_fem import Library
@@ -47,9 +44,7 @@ MOST_NEWTON_STEPS = 30
 
 def cylinder(rings: int, layers: int) -> cs.TetMesh:
     """Return the mesh of the cylinder, 2 cm in radius and 12 cm high."""
-    return cs.cylinder_mesh(
-        radius_m=0.02, height_m=0.12, rings=rings, layers=layers
-    )
+    return cs.cylinder_mesh(radius_m=0.02, height_m=0.12, rings=rings, layers=layers)
 
 
 def held_nodes(mesh: cs.TetMesh) -> NDArray[np.intp]:
@@ -96,9 +91,7 @@ def simulate_flex(mesh: cs.TetMesh, values: dict[str, float]) -> FlexMotion:
             time_s = sample * SAMPLE_S + step * MUJOCO_STEP_S
             data.ctrl[:] = _hand_command(time_s)
             mujoco.mj_step(model, data)
-    return FlexMotion(
-        positions_m, poses, model.body_mass[model.flex_vertbodyid].copy()
-    )
+    return FlexMotion(positions_m, poses, model.body_mass[model.flex_vertbodyid].copy())
 
 
 def _hand_command(time_s: float) -> Array:
@@ -154,23 +147,12 @@ def recording(mesh: cs.TetMesh, motion: FlexMotion, seed: int) -> cs.Experiment:
     free = np.setdiff1d(np.arange(len(mesh.points_m)), held)
     volumes_m3 = cs.Body(mesh, density_kg_m3=1.0).node_mass
     density = 0.999 * (motion.masses_kg / volumes_m3)[free].min()
-    body = cs.Body(
-        mesh,
-        "st-venant-kirchhoff",
-        density_kg_m3=density,
-        damping="material",
-    )
-    added = [
-        cs.PointMass([n], float(motion.masses_kg[n] - body.node_mass[n]))
-        for n in free
-    ]
+    body = cs.Body(mesh, "st-venant-kirchhoff", density_kg_m3=density, damping="material")
+    added = [cs.PointMass([n], float(motion.masses_kg[n] - body.node_mass[n])) for n in free]
     tracks_m = motion.positions_m[:, SEEN_NODES]
     noise = np.random.default_rng(seed).normal(size=tracks_m.shape)
     markers = cs.Markers(
-        t_s,
-        tracks_m + NOISE_M * noise,
-        sigma_m=NOISE_M,
-        places_m=mesh.points_m[SEEN_NODES],
+        t_s, tracks_m + NOISE_M * noise, sigma_m=NOISE_M, places_m=mesh.points_m[SEEN_NODES]
     )
     return cs.Experiment(
         body,
@@ -207,9 +189,7 @@ class ScikitFemCylinder:
             masses[added.nodes] += added.mass_kg
         self.mass_kg = np.repeat(masses, 3)
         (grasp,) = experiment.grasps
-        prescribed = (
-            3 * np.asarray(grasp.nodes)[:, None] + np.arange(3)
-        ).ravel()
+        prescribed = (3 * np.asarray(grasp.nodes)[:, None] + np.arange(3)).ravel()
         self.prescribed = prescribed
         self.free = np.setdiff1d(np.arange(self.rest_m.size), prescribed)
         step_s = SAMPLE_S / STEPS_PER_SAMPLE
@@ -246,19 +226,12 @@ class ScikitFemCylinder:
                 residual = (force - share * weight)[self.free]
                 if np.abs(residual).max() < NEWTON_TOLERANCE_N:
                     break
-                stiffness = self._tangent(
-                    x, 0 * x, lame, damping_s=0.0, position=1.0, velocity=0.0
-                )
+                stiffness = self._tangent(x, 0 * x, lame, damping_s=0.0, position=1.0, velocity=0.0)
                 x[self.free] -= self._solve(stiffness, residual)
         return x
 
     def _midpoint_velocity(
-        self,
-        x: Array,
-        v: Array,
-        end_m: Array,
-        lame: tuple[float, float],
-        damping_s: float,
+        self, x: Array, v: Array, end_m: Array, lame: tuple[float, float], damping_s: float
     ) -> Array:
         """Return the velocity (3 n,) at the middle of a step that ends at prescribed positions."""
         u = v.copy()
@@ -272,12 +245,7 @@ class ScikitFemCylinder:
             if np.abs(residual).max() < NEWTON_TOLERANCE_N:
                 return u
             tangent = self._tangent(
-                middle,
-                u,
-                lame,
-                damping_s,
-                position=0.5 * self.step_s,
-                velocity=1.0,
+                middle, u, lame, damping_s, position=0.5 * self.step_s, velocity=1.0
             ) + diags_array(2 * self.mass_kg / self.step_s)
             u[self.free] -= self._solve(tangent, residual)
         raise RuntimeError("Newton's method did not converge")
@@ -287,18 +255,10 @@ class ScikitFemCylinder:
         free = self.free
         return splu(matrix.tocsc()[free][:, free]).solve(residual)
 
-    def _force(
-        self,
-        x: Array,
-        v: Array,
-        lame: tuple[float, float],
-        damping_s: float,
-    ) -> Array:
+    def _force(self, x: Array, v: Array, lame: tuple[float, float], damping_s: float) -> Array:
         """Return the internal forces (3 n,) [N]."""
         fields = self._fields(x, v)
-        vector = _internal_force().assemble(
-            self.basis, **fields, lame=lame, damping_s=damping_s
-        )
+        vector = _internal_force().assemble(self.basis, **fields, lame=lame, damping_s=damping_s)
         return vector[self.order]
 
     def _tangent(
@@ -356,9 +316,7 @@ def _symmetric(tensor: Array) -> Array:
 
 def _state(w: Any) -> tuple[Array, Array]:
     """Return F and the second Piola–Kirchhoff stress of elasticity and damping."""
-    F = tensors.grad(w["displacement"]) + tensors.identity(
-        tensors.grad(w["displacement"])
-    )
+    F = tensors.grad(w["displacement"]) + tensors.identity(tensors.grad(w["displacement"]))
     rate = tensors.grad(w["speed"])
     strain = 0.5 * (tensors.mul(tensors.transpose(F), F) - tensors.identity(F))
     strain_rate = _symmetric(tensors.mul(tensors.transpose(F), rate))
@@ -392,11 +350,7 @@ def _internal_tangent() -> BilinearForm:
             tensors.mul(tensors.transpose(dF), tensors.grad(w["speed"]))
             + tensors.mul(tensors.transpose(F), d_rate)
         )
-        d_stress = _isotropic(
-            d_strain + w["damping_s"] * d_strain_rate, w["lame"]
-        )
-        return tensors.ddot(
-            tensors.mul(dF, stress) + tensors.mul(F, d_stress), tensors.grad(v)
-        )
+        d_stress = _isotropic(d_strain + w["damping_s"] * d_strain_rate, w["lame"])
+        return tensors.ddot(tensors.mul(dF, stress) + tensors.mul(F, d_stress), tensors.grad(v))
 
     return work

@@ -27,9 +27,7 @@ def waved_bar(steps: int = 12, **body) -> Experiment:
     return replace(bar, name="waved bar", body=other, grasps=bar.grasps[1:])
 
 
-def stiffening(
-    F: ca.SX, shear_pa: ca.SX, bulk_pa: ca.SX, stiffening: ca.SX
-) -> ca.SX:
+def stiffening(F: ca.SX, shear_pa: ca.SX, bulk_pa: ca.SX, stiffening: ca.SX) -> ca.SX:
     """A user's own material of three constants, nearly linear at first."""
     log_j = ca.log(ca.det(F))
     strain = ca.sumsqr(F) * ca.exp(-2 / 3 * log_j) - 3
@@ -45,11 +43,7 @@ MODELS = {
         {"mu_pa": 450.0, "stiff.mu_pa": 600.0, "gamma_r_s": 0.006},
     ),
     "two materials": (
-        {
-            "regions": [
-                Region("stiff", LEFT_HALF, material="st-venant-kirchhoff")
-            ]
-        },
+        {"regions": [Region("stiff", LEFT_HALF, material="st-venant-kirchhoff")]},
         {
             "young_pa": 720.0,
             "poisson": 0.2,
@@ -61,19 +55,8 @@ MODELS = {
     ),
     "three constants": (
         {"material": "yeoh"},
-        {
-            "c10_pa": 150.0,
-            "c20_pa": 60.0,
-            "c30_pa": 0.0,
-            "kappa_pa": 400.0,
-            **DAMPING,
-        },
-        {
-            "c10_pa": 220.0,
-            "c20_pa": 20.0,
-            "kappa_pa": 600.0,
-            "gamma_r_s": 0.006,
-        },
+        {"c10_pa": 150.0, "c20_pa": 60.0, "c30_pa": 0.0, "kappa_pa": 400.0, **DAMPING},
+        {"c10_pa": 220.0, "c20_pa": 20.0, "kappa_pa": 600.0, "gamma_r_s": 0.006},
     ),
     "an exponent": (
         {"material": "ogden-1"},
@@ -93,12 +76,9 @@ MODELS = {
 }
 
 
-def parameters(
-    truth: Mapping[str, float], guesses: Mapping[str, float]
-) -> Parameters:
+def parameters(truth: Mapping[str, float], guesses: Mapping[str, float]) -> Parameters:
     """Estimated where there is a guess, fixed at the truth elsewhere."""
     stated = {
-        name: Unknown(guesses[name]) if name in guesses else value
-        for name, value in truth.items()
+        name: Unknown(guesses[name]) if name in guesses else value for name, value in truth.items()
     }
     return Parameters.from_mapping(stated)

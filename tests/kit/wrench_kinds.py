@@ -16,14 +16,8 @@ def pressed(**changes) -> Experiment:
     body, t_s = hung_cube().body, np.array([0.0, 1.0, 1.5, 4.0])
     below = Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed())
     way = np.outer([0.0, 1.0, 2.0, 5.0], [0.0, 0.0, -2e-3])
-    poses = PoseSequence(
-        t_s, way, np.tile([0.0, 0.0, 0.0, 1.0], (4, 1)), "linear"
-    )
+    poses = PoseSequence(t_s, way, np.tile([0.0, 0.0, 0.0, 1.0], (4, 1)), "linear")
     above = Grasp(nodes_where(body, 2, EDGE_M), poses, axes="z")
     markers = vertex_markers(body, nodes_where(body, 0, 0.0), t_s)
-    experiment = Experiment(
-        body, t_s, [below, above], markers, kind="static", nuisance=IDEAL
-    )
-    return sensing(
-        replace(experiment, **changes), np.array([0.0, 0.5, 1.5, 3.0, 4.0])
-    )
+    experiment = Experiment(body, t_s, [below, above], markers, kind="static", nuisance=IDEAL)
+    return sensing(replace(experiment, **changes), np.array([0.0, 0.5, 1.5, 3.0, 4.0]))

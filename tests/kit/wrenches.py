@@ -27,9 +27,7 @@ EVERYTHING = Nuisance(
 )
 
 
-def sensing(
-    experiment: Experiment, t_s: np.ndarray | None = None, **changes
-) -> Experiment:
+def sensing(experiment: Experiment, t_s: np.ndarray | None = None, **changes) -> Experiment:
     """The experiment with a sensor of all components at every grasp, not measured yet."""
     times = experiment.t_s if t_s is None else t_s
     given = {"sigma_nm": SIGMA_NM, "point_m": POINT_M} | changes
@@ -39,18 +37,13 @@ def sensing(
 
 
 def fitted(
-    experiment: Experiment,
-    parameters: Parameters,
-    scheme: str = "midpoint",
-    **options,
+    experiment: Experiment, parameters: Parameters, scheme: str = "midpoint", **options
 ) -> Collocation:
     """The problem of one experiment."""
     return Collocation([experiment], parameters, scheme, **options)
 
 
-def with_wrenches(
-    experiment: Experiment, values: list[np.ndarray]
-) -> Experiment:
+def with_wrenches(experiment: Experiment, values: list[np.ndarray]) -> Experiment:
     """The experiment with other wrenches at the grasps that have a sensor."""
     found = iter(values)
     return replace(
@@ -58,9 +51,7 @@ def with_wrenches(
         grasps=[
             grasp
             if grasp.wrench is None
-            else replace(
-                grasp, wrench=replace(grasp.wrench, values=next(found))
-            )
+            else replace(grasp, wrench=replace(grasp.wrench, values=next(found)))
             for grasp in experiment.grasps
         ],
     )
@@ -70,11 +61,7 @@ def felt(experiment: Experiment) -> Experiment:
     """The experiment with wrenches that nobody would measure, a tenth of them missing."""
     rng = np.random.default_rng(3)
     values = [
-        np.where(
-            rng.random(w.values.shape) < 0.1,
-            np.nan,
-            0.01 * rng.normal(size=w.values.shape),
-        )
+        np.where(rng.random(w.values.shape) < 0.1, np.nan, 0.01 * rng.normal(size=w.values.shape))
         for w in (grasp.wrench for grasp in experiment.grasps)
         if w is not None
     ]
@@ -82,33 +69,23 @@ def felt(experiment: Experiment) -> Experiment:
 
 
 def sensed(
-    experiment: Experiment,
-    truth: Mapping[str, float] = TRUTH,
-    scheme: str = "midpoint",
+    experiment: Experiment, truth: Mapping[str, float] = TRUTH, scheme: str = "midpoint"
 ) -> Experiment:
     """The experiment with the tracks, and the wrenches, that parameters give it in a scheme."""
     made = measured_with(experiment, truth, scheme)
     collocation = fitted(made, Parameters.from_mapping(dict(truth)), scheme)
-    (segment,) = collocation.transcriptions
-    x = simulate_scheme(
-        experiment, segment.dynamics.with_theta(as_theta(truth))
-    )
+    (transcription,) = collocation.transcriptions
+    x = simulate_scheme(experiment, transcription.dynamics.with_theta(as_theta(truth)))
     (part,) = collocation.iterates_at(np.zeros(collocation.nphi), [x])
     return with_wrenches(made, predicted_wrenches(part))
 
 
 def predicted_wrenches(part: ExperimentIterate) -> list[np.ndarray]:
     """What each sensor of an experiment reads by the model."""
-    return predict_wrenches(part.segment.sensors, part.reactions, part.phi)
+    return predict_wrenches(part.transcription.sensors, part.reactions, part.phi)
 
 
-def wristed_cube(
-    steps: int = 12, nuisance: Nuisance | None = None, **changes
-) -> Experiment:
+def wristed_cube(steps: int = 12, nuisance: Nuisance | None = None, **changes) -> Experiment:
     """The hung cube in a hand with a sensor."""
-    cube = (
-        hung_cube(steps)
-        if nuisance is None
-        else hung_cube(steps, nuisance=nuisance)
-    )
+    cube = hung_cube(steps) if nuisance is None else hung_cube(steps, nuisance=nuisance)
     return sensing(cube, **changes)

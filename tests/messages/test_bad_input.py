@@ -37,12 +37,7 @@ MU = "mu_pa       = { guess = 200.0, lower = 10.0, upper = 1e5 }"
 BODY = box_mesh(SIZE_M, DIVISIONS)
 
 
-def bad(
-    id: str,
-    *words: str,
-    edit: Edit = lambda folder: None,
-    options: list[str] | None = None,
-):
+def bad(id: str, *words: str, edit: Edit = lambda folder: None, options: list[str] | None = None):
     """A slip, and the words its message must have."""
     return pytest.param(edit, options or [], words, id=id)
 
@@ -58,10 +53,7 @@ def write_mesh(points, cells: dict, file: str = "body.vtu") -> Edit:
 
 def from_surface(triangles: np.ndarray, edge_length_m: float) -> Edit:
     return both(
-        replace_text(
-            'mesh = "body.vtu"',
-            f'surface = "a.stl"\nedge_length_m = {edge_length_m}',
-        ),
+        replace_text('mesh = "body.vtu"', f'surface = "a.stl"\nedge_length_m = {edge_length_m}'),
         write_mesh(BODY.points_m, {"triangle": triangles}, "a.stl"),
     )
 
@@ -637,15 +629,7 @@ ALL = [
 ]  # fmt: skip
 
 
-JARGON = (
-    "Traceback",
-    "Input should",
-    "pydantic",
-    "errno",
-    "tuple",
-    "dict",
-    "None",
-)
+JARGON = ("Traceback", "Input should", "pydantic", "errno", "tuple", "dict", "None")
 
 
 def assert_refused(tiny: Path, words: tuple[str, ...], *command: str) -> None:
@@ -676,28 +660,10 @@ def test_a_slip_is_explained_and_nothing_is_written(tiny, edit, options, words):
             ("check nowhere.toml", "nowhere.toml", "no such file"),
             ("check .", "is a folder"),
             ("check problem.toml --set object.mass_kg=1", "exactly one"),
-            (
-                "simulate problem.toml --out swing_motion.csv",
-                "swing_motion.csv",
-                "is a file",
-            ),
-            (
-                "simulate problem.toml --out .",
-                "swing_markers.csv",
-                "reads this file",
-            ),
-            (
-                "simulate problem.toml --out s --integrator rk4",
-                "--integrator",
-                "'rk4'",
-                "newmark",
-            ),
-            (
-                "simulate problem.toml --out s --timestep-s 0",
-                "--timestep-s",
-                "found 0",
-                "above 0",
-            ),
+            ("simulate problem.toml --out swing_motion.csv", "swing_motion.csv", "is a file"),
+            ("simulate problem.toml --out .", "swing_markers.csv", "reads this file"),
+            ("simulate problem.toml --out s --integrator rk4", "--integrator", "'rk4'", "newmark"),
+            ("simulate problem.toml --out s --timestep-s 0", "--timestep-s", "found 0", "above 0"),
             (
                 "simulate problem.toml --out s --timestep-s 1e-60",
                 "found a time step of",
@@ -709,12 +675,7 @@ def test_a_slip_is_explained_and_nothing_is_written(tiny, edit, options, words):
                 "found -1",
                 "of at least 0",
             ),
-            (
-                "simulate problem.toml --out s --seed=-1",
-                "--seed",
-                "found -1",
-                "of at least 0",
-            ),
+            ("simulate problem.toml --out s --seed=-1", "--seed", "found -1", "of at least 0"),
             ("plot nowhere", "nowhere", "not a run folder", "result.json"),
             ("plot .", "not a run folder", "result.json"),
             ("new .", "problem.toml", "exists already"),
@@ -730,24 +691,18 @@ def test_simulation_without_a_marker_file_needs_places(tiny):
     both(remove(MARKERS), replace_text("mid = [0.03, 0.02, 0.03], ", ""))(tiny)
     names = settings('experiment.swing.markers.names=["low", "mid"]')
     words = (MARKERS, "no position of mid", "markers.reference_m")
-    assert_refused(
-        tiny, words, "simulate", "problem.toml", "--out", "s", *names
-    )
+    assert_refused(tiny, words, "simulate", "problem.toml", "--out", "s", *names)
 
 
 def test_a_damaged_run_cannot_be_drawn(tiny):
     (tiny / "result.json").write_text('{"history": [')
     np.savez(tiny / "trajectory.npz", t_s=np.zeros(3))
-    assert_refused(
-        tiny, ("damaged", "run the command that wrote it again"), "plot", "."
-    )
+    assert_refused(tiny, ("damaged", "run the command that wrote it again"), "plot", ".")
     (tiny / "result.json").write_text('{"schema": 4}')
     assert_refused(tiny, ("damaged", "solve the problem again"), "plot", ".")
 
 
-@pytest.mark.parametrize(
-    "command", ["solve", "solve problem.toml --colour red", "identify", ""]
-)
+@pytest.mark.parametrize("command", ["solve", "solve problem.toml --colour red", "identify", ""])
 def test_a_command_that_is_none_shows_how_to_ask(tiny, command):
     before = contents(tiny)
     outcome = run_command(*command.split())
@@ -758,11 +713,7 @@ def test_a_command_that_is_none_shows_how_to_ask(tiny, command):
 
 @pytest.mark.parametrize(
     ("word", "hint"),
-    [
-        ("slove", "; did you mean 'solve'?"),
-        ("repot", "; did you mean 'report'?"),
-        ("xyzzy", "."),
-    ],
+    [("slove", "; did you mean 'solve'?"), ("repot", "; did you mean 'report'?"), ("xyzzy", ".")],
 )
 def test_an_unknown_command_is_refused_with_the_likely_one(word, hint):
     outcome = run_command(word, "problem.toml")
@@ -770,17 +721,11 @@ def test_an_unknown_command_is_refused_with_the_likely_one(word, hint):
     assert f"No such command {word!r}{hint}\n" in outcome.err
 
 
-@pytest.mark.parametrize(
-    "command", ["report", "plot", "export", "animate", "view", "refine"]
-)
-def test_the_result_in_place_of_its_run_folder_leads_to_the_folder(
-    tiny, command
-):
+@pytest.mark.parametrize("command", ["report", "plot", "export", "animate", "view", "refine"])
+def test_the_result_in_place_of_its_run_folder_leads_to_the_folder(tiny, command):
     (tiny / "run").mkdir()
     (tiny / "run" / "result.json").write_text("{}")
-    words = (
-        "run/result.json: this is a file; expected a run folder, likely run",
-    )
+    words = ("run/result.json: this is a file; expected a run folder, likely run",)
     options = ("--to", "febio") if command == "export" else ()
     assert_refused(tiny, words, command, "run/result.json", *options)
 
@@ -792,23 +737,17 @@ def test_another_file_in_place_of_a_run_folder_is_refused(tiny):
 
 def test_a_missing_file_leads_to_the_instructions_beside_it(tiny):
     both(remove(MARKERS), write("README.md", "Ask the laboratory."))(tiny)
-    assert_refused(
-        tiny, ("README.md", "how to get it"), "check", "problem.toml"
-    )
+    assert_refused(tiny, ("README.md", "how to get it"), "check", "problem.toml")
 
 
 def keys_in(content: object, above: str = "") -> list[str]:
     items = content.items() if isinstance(content, dict) else ()
     items = enumerate(content) if isinstance(content, list) else items
     inside = [(f"{above}.{key}".lstrip("."), value) for key, value in items]
-    return [
-        key for name, value in inside for key in (name, *keys_in(value, name))
-    ]
+    return [key for name, value in inside for key in (name, *keys_in(value, name))]
 
 
-@pytest.mark.parametrize(
-    "value", ["1979-05-27", "true", "{ a = 1 }", '[["x"]]']
-)
+@pytest.mark.parametrize("value", ["1979-05-27", "true", "{ a = 1 }", '[["x"]]'])
 def test_every_key_refuses_what_it_cannot_be(tiny_problem, value):
     file = tiny_problem / "problem.toml"
     keys = keys_in(tomllib.loads(file.read_text()))
@@ -817,6 +756,4 @@ def test_every_key_refuses_what_it_cannot_be(tiny_problem, value):
         with pytest.raises(InputError) as caught:
             Problem.read(file, [f"{key}={value}"])
         assert str(caught.value).startswith(f"{file}: ")
-        assert not [word for word in JARGON if word in str(caught.value)], (
-            caught.value
-        )
+        assert not [word for word in JARGON if word in str(caught.value)], caught.value

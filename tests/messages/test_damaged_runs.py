@@ -28,12 +28,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_problem(folder, {"swing": 6})
     method = settings("solver.method=reduced-space")
     done = run_command(
-        "solve",
-        folder / "problem.toml",
-        *method,
-        "--out",
-        folder / "run",
-        "--quiet",
+        "solve", folder / "problem.toml", *method, "--out", folder / "run", "--quiet"
     )
     assert done.code == 0, done.err
     return folder / "run"
@@ -106,9 +101,7 @@ ENTRIES = [
     of_result("no parameters", entry(None, "parameters")),
     of_result("fit of another kind", entry([1], "fit")),
     of_result("text for a number", entry("x", "parameters", "mu_pa", "value")),
-    of_result(
-        "table for a number", entry({}, "rollout", "experiments", "swing")
-    ),
+    of_result("table for a number", entry({}, "rollout", "experiments", "swing")),
 ]
 ARRAYS = [
     of_result("gone", gone("trajectory.npz")),
@@ -127,9 +120,7 @@ ARRAYS = [
 
 
 @pytest.mark.parametrize("damage", RESULTS)
-def test_every_reader_refuses_a_damaged_result(
-    run: Path, tmp_path: Path, damage: Damage
-):
+def test_every_reader_refuses_a_damaged_result(run: Path, tmp_path: Path, damage: Damage):
     damage(run)
     refused("report", run)
     refused("plot", run)
@@ -147,9 +138,7 @@ def test_the_page_refuses_entries_of_another_kind(run: Path, damage: Damage):
 
 
 @pytest.mark.parametrize("damage", ARRAYS)
-def test_every_reader_of_arrays_refuses_damaged_ones(
-    run: Path, tmp_path: Path, damage: Damage
-):
+def test_every_reader_of_arrays_refuses_damaged_ones(run: Path, tmp_path: Path, damage: Damage):
     damage(run)
     refused("plot", run)
     refused("view", run, "--html", tmp_path / "page.html")
@@ -157,12 +146,7 @@ def test_every_reader_of_arrays_refuses_damaged_ones(
 
 
 @pytest.mark.parametrize(
-    "damage",
-    [
-        whole("{"),
-        entry(None, "derived"),
-        entry(1e400, "parameters", "mu_pa", "value"),
-    ],
+    "damage", [whole("{"), entry(None, "derived"), entry(1e400, "parameters", "mu_pa", "value")]
 )
 def test_a_damaged_run_is_no_start(run: Path, damage: Damage):
     damage(run)
@@ -172,21 +156,15 @@ def test_a_damaged_run_is_no_start(run: Path, damage: Damage):
 
 
 @pytest.mark.parametrize("name", ["lambda_pa", "gamma_r_s"])
-def test_a_run_without_one_of_its_parameters_is_not_exported(
-    run: Path, tmp_path: Path, name: str
-):
+def test_a_run_without_one_of_its_parameters_is_not_exported(run: Path, tmp_path: Path, name: str):
     result = json.loads((run / "result.json").read_text())
     del result["parameters"][name]
     whole(json.dumps(result))(run)
-    assert "damaged" in refused(
-        "export", run, "--to", "json", "--out", tmp_path / "out"
-    )
+    assert "damaged" in refused("export", run, "--to", "json", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_film_lies_in_the_run_folder_whatever_the_experiment_is_called(
-    run: Path,
-):
+def test_a_film_lies_in_the_run_folder_whatever_the_experiment_is_called(run: Path):
     text = (run / "result.json").read_text()
     whole(text.replace('"swing"', '"../swing"'))(run)
     outcome = run_command("animate", run, "--fps", "2", "-q")
@@ -210,14 +188,10 @@ def test_a_pipe_in_a_run_folder_is_not_waited_for(run: Path):
     assert "is a pipe; expected a regular file" in refused("report", run)
 
 
-@pytest.mark.parametrize(
-    "content", ["<", "<a/>", '<a><DataSet timestep="x" file="b"/></a>']
-)
+@pytest.mark.parametrize("content", ["<", "<a/>", '<a><DataSet timestep="x" file="b"/></a>'])
 def test_damaged_frames_are_refused(run: Path, content: str):
     (run / "trajectory.pvd").write_text(content)
-    with pytest.raises(
-        InputError, match=r"trajectory.pvd or one of its frames is damaged"
-    ):
+    with pytest.raises(InputError, match=r"trajectory.pvd or one of its frames is damaged"):
         frame_files(run, "swing")
 
 
@@ -238,9 +212,8 @@ def test_a_damaged_study_is_refused(tmp_path: Path, content: str):
 @pytest.mark.parametrize("command", ["report", "plot", "animate", "refine"])
 def test_a_run_of_another_version_is_refused(run: Path, command: str):
     entry(1, "schema")(run)
-    assert (
-        "result.json has schema 1; expected 4, which this version writes"
-        in refused(command, run)
+    assert "result.json has schema 1; expected 4, which this version writes" in refused(
+        command, run
     )
 
 
@@ -257,9 +230,7 @@ def elsewhere(tmp_path: Path) -> Path:
 
 @links
 @pytest.mark.parametrize("name", ["x.png", "problem.toml"])
-def test_a_page_shows_nothing_that_links_lead_to_elsewhere(
-    run: Path, elsewhere: Path, name: str
-):
+def test_a_page_shows_nothing_that_links_lead_to_elsewhere(run: Path, elsewhere: Path, name: str):
     (run / name).unlink(missing_ok=True)
     (run / name).symlink_to(elsewhere)
     assert run_command("report", run).code == 0
@@ -300,10 +271,7 @@ def test_links_within_the_folder_are_followed(run: Path):
     (run / "own.png").write_bytes(SECRET.encode())
     (run / "x.png").symlink_to("own.png")
     assert run_command("report", run).code == 0
-    assert (
-        base64.b64encode(SECRET.encode()).decode()
-        in (run / "report.html").read_text()
-    )
+    assert base64.b64encode(SECRET.encode()).decode() in (run / "report.html").read_text()
 
 
 @links
@@ -317,8 +285,6 @@ def test_a_page_is_not_written_through_a_link(run: Path, elsewhere: Path):
 @links
 def test_frames_outside_the_folder_are_refused(run: Path, elsewhere: Path):
     frames = (run / "trajectory.pvd").read_text()
-    (run / "trajectory.pvd").write_text(
-        frames.replace("frames/frame_0000.vtu", "../secret")
-    )
+    (run / "trajectory.pvd").write_text(frames.replace("frames/frame_0000.vtu", "../secret"))
     with pytest.raises(InputError, match="outside the run folder"):
         frame_files(run, "swing")

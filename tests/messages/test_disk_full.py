@@ -12,13 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from kit.problem_files import (
-    Outcome,
-    contents,
-    run_command,
-    settings,
-    write_problem,
-)
+from kit.problem_files import Outcome, contents, run_command, settings, write_problem
 
 from collocation_sysid.common.files import replaced_file, write_text_file
 from collocation_sysid.result.run_writers import replaced_folder
@@ -47,10 +41,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
     file = write_problem(folder, {"swing": 6})
     method = settings("solver.method=reduced-space")
-    assert (
-        run_command("solve", file, *method, "--out", folder / "run", "-q").code
-        == 0
-    )
+    assert run_command("solve", file, *method, "--out", folder / "run", "-q").code == 0
     return folder / "run"
 
 
@@ -73,42 +64,18 @@ def refused(folder: Path, names: str, *words: object) -> None:
 def test_a_page_is_there_whole_or_as_before(run: Path, tmp_path: Path):
     refused(tmp_path, "report.html", "report", run)
     (tmp_path / "page.html").write_text("an earlier page")
-    refused(
-        tmp_path, "page.html", "report", run, "--to", tmp_path / "page.html"
-    )
-    refused(
-        tmp_path, "view.html", "view", run, "--html", tmp_path / "view.html"
-    )
+    refused(tmp_path, "page.html", "report", run, "--to", tmp_path / "page.html")
+    refused(tmp_path, "view.html", "view", run, "--html", tmp_path / "view.html")
 
 
 @pytest.mark.long
-def test_pictures_and_films_are_there_whole_or_not_at_all(
-    run: Path, tmp_path: Path
-):
+def test_pictures_and_films_are_there_whole_or_not_at_all(run: Path, tmp_path: Path):
     refused(tmp_path, ".png", "plot", run)
-    refused(
-        tmp_path,
-        "film.gif",
-        "animate",
-        run,
-        "--to",
-        tmp_path / "film.gif",
-        "--fps",
-        "2",
-    )
+    refused(tmp_path, "film.gif", "animate", run, "--to", tmp_path / "film.gif", "--fps", "2")
 
 
 def test_an_export_is_there_whole_or_not_at_all(run: Path, tmp_path: Path):
-    refused(
-        tmp_path,
-        "out",
-        "export",
-        run,
-        "--to",
-        "sofa",
-        "--out",
-        tmp_path / "out",
-    )
+    refused(tmp_path, "out", "export", run, "--to", "sofa", "--out", tmp_path / "out")
 
 
 def test_a_problem_is_begun_whole_or_not_at_all(tmp_path: Path):
@@ -148,9 +115,7 @@ def test_a_file_keeps_its_ending_while_it_is_written(tmp_path: Path):
     with replaced_file(tmp_path / "deep" / "a.tar.png") as draft:
         assert draft.suffix == ".png"
         draft.write_text("x")
-    assert [file.name for file in (tmp_path / "deep").iterdir()] == [
-        "a.tar.png"
-    ]
+    assert [file.name for file in (tmp_path / "deep").iterdir()] == ["a.tar.png"]
 
 
 def test_into_a_pipe_is_written_directly(tmp_path: Path):
@@ -169,9 +134,7 @@ def test_into_a_pipe_is_written_directly(tmp_path: Path):
 def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
     with (
         room_for(10),
-        pytest.raises(
-            ValueError, match="run: this cannot be written"
-        ) as caught,
+        pytest.raises(ValueError, match="run: this cannot be written") as caught,
         replaced_folder(tmp_path / "run") as place,
     ):
         write_text_file(place / "table.csv", 100 * "x")
@@ -180,22 +143,11 @@ def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
 
 
 @pytest.mark.long
-@pytest.mark.skipif(
-    not Path("/dev/full").exists(), reason="no such device here"
-)
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
 def test_an_output_that_is_full_is_told():
-    program = [
-        sys.executable,
-        "-c",
-        "from collocation_sysid.cli import main; main()",
-        "schema",
-    ]
+    program = [sys.executable, "-c", "from collocation_sysid.cli import main; main()", "schema"]
     with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            program, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120
-        )
+        done = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)
     assert done.returncode == 2
-    assert done.stderr.startswith(
-        "error: standard output, or a temporary file: No space left"
-    )
+    assert done.stderr.startswith("error: standard output, or a temporary file: No space left")
     assert done.stderr.count("\n") == 1

@@ -22,11 +22,7 @@ TRACEBACK = "Traceback (most recent call last):\n  ...\nKeyError: 3\n"
     [
         (CommandEnd(2, "", "error: a.csv: no number\n"), True, "refused"),
         (CommandEnd(2, "", "error: a.csv: no number\n"), False, "unclear"),
-        (
-            CommandEnd(2, "", "a library's line\nerror: a.csv: no number\n"),
-            True,
-            "unclear",
-        ),
+        (CommandEnd(2, "", "a library's line\nerror: a.csv: no number\n"), True, "unclear"),
         (CommandEnd(2, "", "error: \x1b[31m\n"), True, "unclear"),
         (CommandEnd(0, "valid\n", ""), True, "accepted"),
         (CommandEnd(1, "found 2\n", ""), True, "accepted"),
@@ -37,9 +33,7 @@ TRACEBACK = "Traceback (most recent call last):\n  ...\nKeyError: 3\n"
         (CommandEnd(None, "", ""), True, "hang"),
     ],
 )
-def test_an_end_has_the_outcome_that_a_user_sees(
-    ended: CommandEnd, is_clean: bool, outcome: str
-):
+def test_an_end_has_the_outcome_that_a_user_sees(ended: CommandEnd, is_clean: bool, outcome: str):
     assert ended.outcome(is_clean) == outcome
 
 
@@ -60,39 +54,25 @@ def test_commands_end_in_a_fork_as_in_a_shell(tmp_path: Path):
     refused = hostile.run(["check", "none.toml"], tmp_path, 30)
     assert refused.err.startswith("error: none.toml")
     ends = [version, refused]
-    ends += [
-        hostile.run(["--version"], tmp_path, 1, before)
-        for before in (fail, crash, spin)
-    ]
+    ends += [hostile.run(["--version"], tmp_path, 1, before) for before in (fail, crash, spin)]
     expected = ["accepted", "refused", "traceback", "crash", "hang"]
     assert [each.outcome() for each in ends] == expected
 
 
 def test_damage_is_drawn_from_the_seed():
     content = bytes(range(256))
-    found = [
-        hostile.damaged(np.random.default_rng(3), content, (b"word",))
-        for _ in range(2)
-    ]
+    found = [hostile.damaged(np.random.default_rng(3), content, (b"word",)) for _ in range(2)]
     assert found[0] == found[1]
-    others = {
-        hostile.damaged(np.random.default_rng(k), content, (b"word",))
-        for k in range(50)
-    }
+    others = {hostile.damaged(np.random.default_rng(k), content, (b"word",)) for k in range(50)}
     assert len(others) > 40
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", list(hostile.KINDS))
 def test_no_case_ends_without_a_message(kind: str, tmp_path: Path):
-    table = hostile.table(
-        2, seed=0, only=[kind], limit_s=60.0, failure_folder=tmp_path
-    )
-    cells = [
-        cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")
-    ]
+    table = hostile.table(2, seed=0, only=[kind], limit_s=60.0, failure_folder=tmp_path)
+    cells = [cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")]
     failures = dict(zip(hostile.OUTCOMES, cells[2:], strict=False))
-    assert {
-        name: failures[name]
-        for name in ("traceback", "unclear", "hang", "crash")
-    } == {name: "0" for name in ("traceback", "unclear", "hang", "crash")}
+    assert {name: failures[name] for name in ("traceback", "unclear", "hang", "crash")} == {
+        name: "0" for name in ("traceback", "unclear", "hang", "crash")
+    }

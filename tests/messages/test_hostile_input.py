@@ -16,20 +16,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kit.problem_files import (
-    REFERENCES,
-    replace_cell,
-    replace_text,
-    run_command,
-    settings,
-)
+from kit.problem_files import REFERENCES, replace_cell, replace_text, run_command, settings
 
 from collocation_sysid.common import machine
-from collocation_sysid.common.isolated_process import (
-    Failed,
-    ProcessLimits,
-    run_isolated,
-)
+from collocation_sysid.common.isolated_process import Failed, ProcessLimits, run_isolated
 from collocation_sysid.common.signal_handling import INTERRUPTS, heed_interrupts
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
@@ -40,20 +30,14 @@ from collocation_sysid.fem.meshes.structured import (
     cylinder_of_edge,
 )
 from collocation_sysid.problem import Problem, loading, problem_size
-from collocation_sysid.recording import (
-    read_markers,
-    read_poses,
-    write_markers_csv,
-)
+from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.result import run_writers
 from collocation_sysid.runs.check import cost as memory
 
 COMMAND_LINE = "from collocation_sysid import cli; cli.main()"
 
-pipes = pytest.mark.skipif(
-    not hasattr(os, "mkfifo"), reason="no pipes by name here"
-)
+pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
 
 
 def refused(*words: object) -> str:
@@ -69,23 +53,16 @@ def refused(*words: object) -> str:
 
 @pipes
 @pytest.mark.parametrize(
-    "file",
-    ["problem.toml", "swing_markers.csv", "swing_motion.csv", "body.vtu"],
+    "file", ["problem.toml", "swing_markers.csv", "swing_motion.csv", "body.vtu"]
 )
 def test_a_pipe_is_refused_rather_than_waited_for(tiny: Path, file: str):
     (tiny / file).unlink()
     os.mkfifo(tiny / file)
-    assert "is a pipe; expected a regular file" in refused(
-        "check", "problem.toml"
-    )
-    assert "is a pipe" in refused(
-        "sweep", "problem.toml", "--over", "transcription.substeps=1,2"
-    )
+    assert "is a pipe; expected a regular file" in refused("check", "problem.toml")
+    assert "is a pipe" in refused("sweep", "problem.toml", "--over", "transcription.substeps=1,2")
 
 
-@pytest.mark.skipif(
-    not Path("/dev/zero").exists(), reason="no such device here"
-)
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no such device here")
 def test_a_device_is_refused_rather_than_read_to_its_end(tiny: Path):
     assert "expected a regular file" in refused("check", "/dev/zero")
     assert "expected a regular file" in refused(
@@ -136,15 +113,11 @@ def test_readers_that_do_not_find_the_end_of_a_mesh_are_stopped(tmp_path: Path):
     assert len(lines) == len(ENDLESS)
     for line, name in zip(lines, ENDLESS, strict=True):
         assert line.startswith(f"{name}: the file cannot be read as a mesh (")
-    assert (
-        "the process was not finished after 3 s of processor time" in lines[0]
-    )
+    assert "the process was not finished after 3 s of processor time" in lines[0]
     assert done.stderr == ""
 
 
-@pytest.mark.skipif(
-    not Path("/proc/self/statm").exists(), reason="limits of Linux"
-)
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits of Linux")
 def test_readers_have_a_limit_of_memory():
     take = "found = {'a': numpy.ones(int(sys.argv[1]))}"
     limits = ProcessLimits(time_s=60, memory_mb=300)
@@ -153,25 +126,19 @@ def test_readers_have_a_limit_of_memory():
         run_isolated(take, "100000000", limits=limits)
 
 
-@pytest.mark.parametrize(
-    "content", ["ply\nformat ascii 1.0\nelement vertex 3\n", "ply\n", "x"]
-)
+@pytest.mark.parametrize("content", ["ply\nformat ascii 1.0\nelement vertex 3\n", "ply\n", "x"])
 def test_a_damaged_cloud_is_refused_in_one_line(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], content: str
 ):
     (tmp_path / "a.ply").write_text(content)
-    with pytest.raises(
-        InputError, match=r"a\.ply: .*expected a (complete|valid) \.ply"
-    ) as refusal:
+    with pytest.raises(InputError, match=r"a\.ply: .*expected a (complete|valid) \.ply") as refusal:
         read_depth(tmp_path / "a.ply", None, 1.0)
     assert "SystemExit" not in str(refusal.value)
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("name", ["cloud.xyz", "cloud.npz", "image.npz"])
-def test_a_depth_file_with_a_length_beyond_all_measures_is_refused(
-    tmp_path: Path, name: str
-):
+def test_a_depth_file_with_a_length_beyond_all_measures_is_refused(tmp_path: Path, name: str):
     points_m = np.full((4, 3), 0.5)
     points_m[2, 1] = 1e30
     if name == "cloud.xyz":
@@ -180,18 +147,13 @@ def test_a_depth_file_with_a_length_beyond_all_measures_is_refused(
         key = "points_m" if name == "cloud.npz" else "depth_m"
         np.savez(tmp_path / name, **{key: points_m})
     with pytest.raises(
-        InputError,
-        match=rf"{name}: the largest length in the file is 1e\+30 m; expected at",
+        InputError, match=rf"{name}: the largest length in the file is 1e\+30 m; expected at"
     ):
         read_depth(tmp_path / name, None, 1.0)
 
 
-def test_lengths_in_a_depth_file_that_are_not_finite_are_missing_values(
-    tmp_path: Path,
-):
-    np.savez(
-        tmp_path / "image.npz", depth_m=np.array([[0.5, np.nan], [np.inf, 0.6]])
-    )
+def test_lengths_in_a_depth_file_that_are_not_finite_are_missing_values(tmp_path: Path):
+    np.savez(tmp_path / "image.npz", depth_m=np.array([[0.5, np.nan], [np.inf, 0.6]]))
     (image,) = read_depth(tmp_path / "image.npz", None, 1.0).images_m
     assert np.isfinite(image).sum() == 2
 
@@ -209,9 +171,7 @@ def test_an_array_that_its_header_states_too_large_is_refused(tmp_path: Path):
         archive.writestr("points_m.npy", head.getvalue() + bytes(1000))
     tracemalloc.start()
     for name in ("zeros.npz", "cut.npy", "cut.npz"):
-        with pytest.raises(
-            InputError, match=rf"{name}: the array .* takes .* GB"
-        ):
+        with pytest.raises(InputError, match=rf"{name}: the array .* takes .* GB"):
             read_depth(tmp_path / name, None, 1.0)
     with pytest.raises(InputError, match=r"poses\.npz: the array matrices"):
         read_poses(tmp_path / "poses.npz")
@@ -221,9 +181,7 @@ def test_an_array_that_its_header_states_too_large_is_refused(tmp_path: Path):
 
 @pytest.mark.long
 @pipes
-@pytest.mark.parametrize(
-    "name", ["log.bag", "log.db3", "log.mcap", "bag/part.db3"]
-)
+@pytest.mark.parametrize("name", ["log.bag", "log.db3", "log.mcap", "bag/part.db3"])
 def test_a_log_that_is_a_pipe_is_refused(tiny: Path, name: str):
     (tiny / name).parent.mkdir(exist_ok=True)
     (tiny / "bag").mkdir(exist_ok=True)
@@ -231,10 +189,7 @@ def test_a_log_that_is_a_pipe_is_refused(tiny: Path, name: str):
     os.mkfifo(tiny / name)
     words = ["log", name.partition("/")[0]]
     done = subprocess.run(
-        [sys.executable, "-c", COMMAND_LINE, *words],
-        capture_output=True,
-        text=True,
-        timeout=300,
+        [sys.executable, "-c", COMMAND_LINE, *words], capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 2, done
     assert "is a pipe; expected a regular file" in done.stderr
@@ -248,9 +203,7 @@ def test_a_closed_standard_input_is_refused(tiny: Path):
         capture_output=True, text=True, timeout=300, preexec_fn=partial(os.close, 0),
     )  # fmt: skip
     assert done.returncode == 2, done
-    assert done.stderr.startswith(
-        "error: standard input: is closed; expected frames"
-    )
+    assert done.stderr.startswith("error: standard input: is closed; expected frames")
     assert done.stderr.count("\n") == 1
 
 
@@ -259,27 +212,16 @@ def test_a_closed_standard_input_is_refused(tiny: Path):
 
 @pytest.mark.parametrize("number", ["1e308", "-1e300", "9" * 5000])
 @pytest.mark.parametrize("file", ["swing_markers.csv", "swing_motion.csv"])
-def test_a_cell_beyond_all_measures_is_refused(
-    tiny: Path, file: str, number: str
-):
+def test_a_cell_beyond_all_measures_is_refused(tiny: Path, file: str, number: str):
     replace_cell(file, 3, 1, number)(tiny)
     assert "expected a number" in refused("check", "problem.toml")
 
 
+@pytest.mark.parametrize("number", ["1e308", "5e-324", "9" * 5000, "1" + 400 * "0"])
 @pytest.mark.parametrize(
-    "number", ["1e308", "5e-324", "9" * 5000, "1" + 400 * "0"]
+    "key", ["parameters.mu_pa.guess", "object.density_kg_m3", "experiment.swing.markers.sigma_m"]
 )
-@pytest.mark.parametrize(
-    "key",
-    [
-        "parameters.mu_pa.guess",
-        "object.density_kg_m3",
-        "experiment.swing.markers.sigma_m",
-    ],
-)
-def test_a_number_beyond_all_measures_ends_in_a_message(
-    tiny: Path, key: str, number: str
-):
+def test_a_number_beyond_all_measures_ends_in_a_message(tiny: Path, key: str, number: str):
     outcome = run_command("check", "problem.toml", *settings(f"{key}={number}"))
     assert outcome.code in (0, 1, 2)
     assert len(outcome.err.strip().splitlines()) <= 1
@@ -291,9 +233,7 @@ def test_a_number_beyond_all_measures_ends_in_a_message(
      "[" + "a." * 3000 + "b]", "a = " + "9" * 5000],
     ids=["lists", "tables", "keys", "digits"],
 )  # fmt: skip
-def test_a_file_of_depths_or_digits_without_end_is_refused(
-    tiny: Path, text: str
-):
+def test_a_file_of_depths_or_digits_without_end_is_refused(tiny: Path, text: str):
     with (tiny / "problem.toml").open("a") as file:
         file.write(f"\n{text}\n")
     refused("check", "problem.toml")
@@ -317,14 +257,8 @@ def test_so_is_such_an_override(tiny: Path, value: str):
             "found 1,000,000 starts",
         ),
         (("compare-models", "--prony", "0,1000000"), "whole numbers up to 20"),
-        (
-            ("sweep", "--over", "solver.huber=1:2:1000000"),
-            "found 1,000,000 values",
-        ),
-        (
-            ("sweep", "--over", f"solver.huber=1:2:1{'0' * 30}"),
-            "found more than 10",
-        ),
+        (("sweep", "--over", "solver.huber=1:2:1000000"), "found 1,000,000 values"),
+        (("sweep", "--over", f"solver.huber=1:2:1{'0' * 30}"), "found more than 10"),
         (
             (
                 "sweep",
@@ -335,15 +269,10 @@ def test_so_is_such_an_override(tiny: Path, value: str):
             ),
             "found 810,000 runs",
         ),
-        (
-            ("sweep", "--over", "solver.huber=1:1e999:3"),
-            "expected first:last:count",
-        ),
+        (("sweep", "--over", "solver.huber=1:1e999:3"), "expected first:last:count"),
     ],
 )
-def test_a_study_without_end_is_refused_with_a_number(
-    tiny: Path, words: tuple, found: str
-):
+def test_a_study_without_end_is_refused_with_a_number(tiny: Path, words: tuple, found: str):
     command, *options = words
     assert found in refused(command, "problem.toml", *options)
 
@@ -351,9 +280,7 @@ def test_a_study_without_end_is_refused_with_a_number(
 # Memory -------------------------------------------------------------------------------------------
 
 
-def test_a_solve_that_memory_cannot_hold_is_refused(
-    tiny: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_solve_that_memory_cannot_hold_is_refused(tiny: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(memory, "SMALL_PROGRAM_VARIABLES", 0)
     monkeypatch.setattr(memory, "machine_memory_mb", lambda: 0.2)
     said = refused("solve", "problem.toml", "--method", "interior-point")
@@ -367,18 +294,9 @@ def test_a_solve_that_memory_cannot_hold_is_refused(
 @pytest.mark.parametrize(
     ("setting", "found"),
     [
-        (
-            "experiment.swing.resample_hz=1e8",
-            "samples of a body of 36 nodes take about",
-        ),
-        (
-            "experiment.swing.resample_hz=1e12",
-            "samples of a body of 36 nodes take about",
-        ),
-        (
-            "transcription.substeps=10000",
-            "9 samples of 10,000 substeps of a body of 36",
-        ),
+        ("experiment.swing.resample_hz=1e8", "samples of a body of 36 nodes take about"),
+        ("experiment.swing.resample_hz=1e12", "samples of a body of 36 nodes take about"),
+        ("transcription.substeps=10000", "9 samples of 10,000 substeps of a body of 36"),
     ],
 )
 def test_a_problem_that_memory_cannot_hold_is_refused_when_it_is_read(
@@ -387,9 +305,7 @@ def test_a_problem_that_memory_cannot_hold_is_refused_when_it_is_read(
     monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 1e3)
     began = time.process_time()
     for command in (("check",), ("solve", "--out", "run")):
-        assert found in refused(
-            command[0], "problem.toml", *command[1:], *settings(setting)
-        )
+        assert found in refused(command[0], "problem.toml", *command[1:], *settings(setting))
     assert time.process_time() - began < 10
     assert not (tiny / "run").exists()
 
@@ -402,56 +318,35 @@ def test_unknown_positions_of_more_markers_than_memory_can_hold_are_refused(
     monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 0.7)
     message = refused("check", "problem.toml")
     assert "markers of unknown position take about" in message
-    assert (
-        "expected fewer markers (markers.names), their positions (reference_m)"
-        in message
-    )
+    assert "expected fewer markers (markers.names), their positions (reference_m)" in message
 
 
 def test_a_generated_mesh_that_memory_cannot_hold_is_refused_before_it_is_made(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 2e3)
-    monkeypatch.setattr(
-        loading,
-        "box_of_edge",
-        lambda *_, **__: pytest.fail("the mesh was made"),
-    )
+    monkeypatch.setattr(loading, "box_of_edge", lambda *_, **__: pytest.fail("the mesh was made"))
     box = "box_m = [0.06, 0.06, 0.09]\nedge_length_m = 0.0015"
     replace_text('mesh = "body.vtu"', box)(tiny)
-    assert "a body of 102,541 nodes take about" in refused(
-        "check", "problem.toml"
-    )
+    assert "a body of 102,541 nodes take about" in refused("check", "problem.toml")
 
 
 @pytest.mark.parametrize(
     ("made", "counts"),
     [
-        (
-            box_of_edge((0.06, 0.05, 0.09), 0.01),
-            count_box_elements((0.06, 0.05, 0.09), 0.01),
-        ),
-        (
-            cylinder_of_edge(0.06, 0.09, 0.01),
-            count_cylinder_elements(0.06, 0.09, 0.01),
-        ),
+        (box_of_edge((0.06, 0.05, 0.09), 0.01), count_box_elements((0.06, 0.05, 0.09), 0.01)),
+        (cylinder_of_edge(0.06, 0.09, 0.01), count_cylinder_elements(0.06, 0.09, 0.01)),
     ],
 )
-def test_generated_meshes_have_the_counts_that_were_expected(
-    made: TetMesh, counts: tuple
-):
+def test_generated_meshes_have_the_counts_that_were_expected(made: TetMesh, counts: tuple):
     assert (len(made.points_m), len(made.tetrahedra)) == counts
 
 
-def test_long_work_is_announced_before_it_begins(
-    tiny: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_long_work_is_announced_before_it_begins(tiny: Path, monkeypatch: pytest.MonkeyPatch):
     announced: list[str] = []
     Problem.read("problem.toml", say=announced.append)
     assert announced == []
-    Problem.read(
-        "problem.toml", ["transcription.substeps=1000"], say=announced.append
-    )
+    Problem.read("problem.toml", ["transcription.substeps=1000"], say=announced.append)
     assert len(announced) == 1
     assert "9 samples of 1,000 substeps" in announced[0]
     assert "a solve takes about" in announced[0]
@@ -460,14 +355,10 @@ def test_long_work_is_announced_before_it_begins(
     assert "MB of recordings, most of them in swing_markers.csv" in announced[1]
 
 
-def test_so_it_is_on_the_command_line(
-    tiny: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_so_it_is_on_the_command_line(tiny: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(problem_size, "ANNOUNCED_SOLVE_S", 0.0)
     assert "a solve takes about" in run_command("check", "problem.toml").err
-    assert (
-        "takes about" not in run_command("check", "problem.toml", "--quiet").err
-    )
+    assert "takes about" not in run_command("check", "problem.toml", "--quiet").err
 
 
 @pytest.mark.long
@@ -481,18 +372,14 @@ def test_ten_thousand_markers_are_read_in_time(tiny: Path):
     assert table.names == tuple(names[::-1])
 
 
-def test_where_the_memory_is_not_known_nothing_is_refused(
-    tiny: Path, monkeypatch
-):
+def test_where_the_memory_is_not_known_nothing_is_refused(tiny: Path, monkeypatch):
     monkeypatch.setattr(memory, "SMALL_PROGRAM_VARIABLES", 0)
     monkeypatch.setattr(memory, "machine_memory_mb", lambda: None)
     problem = Problem.read("problem.toml")
     memory.require_memory(problem, problem.collocation(), problem.method)
 
 
-def test_limits_of_containers_count_as_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_limits_of_containers_count_as_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     limit = tmp_path / "memory.max"
     monkeypatch.setattr(machine, "CGROUP_LIMITS", (limit,))
     whole_mb = machine.machine_memory_mb()
@@ -565,10 +452,7 @@ cli.main()
 
 def ended(program: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        timeout=120,
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
     )
 
 
@@ -608,21 +492,14 @@ def test_two_signals_end_it_at_once(tiny: Path):
 @pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_signal_within_an_import_is_no_error_of_the_library(tiny: Path):
-    done = ended(
-        CONVERTING.format(
-            times=1, raised="raise RuntimeError('no fonts') from error"
-        )
-    )
+    done = ended(CONVERTING.format(times=1, raised="raise RuntimeError('no fonts') from error"))
     assert done.returncode == 130, done.stderr
     assert "Verdict" in done.stdout
     assert done.stderr == (
         "interrupted: the result is kept in run, but some pictures are missing; draw them with: "
         "collocation-sysid plot run\n"
     )
-    assert (
-        json.loads((tiny / "run" / "result.json").read_text())["status"]
-        == "converged"
-    )
+    assert json.loads((tiny / "run" / "result.json").read_text())["status"] == "converged"
 
 
 @pytest.mark.long
@@ -630,10 +507,7 @@ def test_a_signal_within_an_import_is_no_error_of_the_library(tiny: Path):
 def test_a_second_signal_ends_an_import(tiny: Path):
     done = ended(CONVERTING.format(times=2, raised="os._exit(77)"))
     assert done.returncode == 77
-    assert (
-        json.loads((tiny / "run" / "result.json").read_text())["status"]
-        == "converged"
-    )
+    assert json.loads((tiny / "run" / "result.json").read_text())["status"] == "converged"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
@@ -669,20 +543,14 @@ def test_an_interrupt_and_sigterm_leave_the_best_result(
             time.sleep(0.5)  # until it is heard, on the main thread
 
     monkeypatch.setattr(Recorder, "add", interrupted)
-    before = {
-        each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)
-    }
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
     try:
-        outcome = run_command(
-            "solve", "problem.toml", "--method", method, "--out", "run", "-q"
-        )
+        outcome = run_command("solve", "problem.toml", "--method", method, "--out", "run", "-q")
     finally:
         for each, handler in before.items():
             signal.signal(each, handler)
     assert outcome.code == 130
-    assert (
-        '"status": "interrupted"' in (tiny / "run" / "result.json").read_text()
-    )
+    assert '"status": "interrupted"' in (tiny / "run" / "result.json").read_text()
     assert "Traceback" not in outcome.err
     assert not list(tiny.glob(".*.partial"))
 

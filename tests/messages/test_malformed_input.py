@@ -41,9 +41,7 @@ def refused(*words: object) -> str:
 
 def assert_harmless(outcome: Outcome) -> None:
     said = outcome.out + outcome.err
-    assert not [
-        mark for mark in said if not (mark.isprintable() or mark == "\n")
-    ]
+    assert not [mark for mark in said if not (mark.isprintable() or mark == "\n")]
 
 
 @contextmanager
@@ -67,17 +65,11 @@ def bounded(seconds: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("table", ["", "[object]\n", "[transcription]\n"])
 @pytest.mark.parametrize("key", ["<b>", "<table>", ""])
-def test_a_key_in_angle_brackets_is_as_unknown_as_any_other(
-    tiny: Path, table: str, key: str
-):
+def test_a_key_in_angle_brackets_is_as_unknown_as_any_other(tiny: Path, table: str, key: str):
     with (tiny / "problem.toml").open() as file:
         text = file.read()
     added = f'"{key}" = 1\n'
-    text = (
-        text.replace(table, table + added, 1)
-        if table in text
-        else text + table + added
-    )
+    text = text.replace(table, table + added, 1) if table in text else text + table + added
     (tiny / "problem.toml").write_text(text)
     assert f"{key}: unknown key" in refused("check", "problem.toml")
 
@@ -86,15 +78,8 @@ def test_a_key_without_end_is_refused_before_it_is_parsed(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ):
     key = 50_000 * "a." + "b = 1\n"
-    monkeypatch.setattr(
-        tomllib, "loads", lambda _: pytest.fail("this takes minutes")
-    )
-    for part in (
-        key,
-        key.replace("a.", "'a' . "),
-        key.replace("a.", '"a".'),
-        f"[{key[:-5]}]\n",
-    ):
+    monkeypatch.setattr(tomllib, "loads", lambda _: pytest.fail("this takes minutes"))
+    for part in (key, key.replace("a.", "'a' . "), key.replace("a.", '"a".'), f"[{key[:-5]}]\n"):
         (tiny / "problem.toml").write_text(f"title = 'x'\n{part}")
         assert "too deeply" in refused("check", "problem.toml")
 
@@ -108,9 +93,7 @@ def test_long_words_and_lists_are_no_endless_keys(tiny: Path):
 
 @pytest.mark.skipif(os.name != "posix", reason="alarms of POSIX")
 @pytest.mark.parametrize("value", ["1.0", "{}", "{ tied_to = 'mu_pa' }"])
-def test_of_endless_unknown_parameters_the_first_is_named(
-    tiny: Path, value: str
-):
+def test_of_endless_unknown_parameters_the_first_is_named(tiny: Path, value: str):
     many = "".join(f"mu_pb{k} = {value}\n" for k in range(20_000))
     replace_text("[parameters]\n", f"[parameters]\n{many}")(tiny)
     with bounded(60):
@@ -129,20 +112,14 @@ def test_only_digits_of_ascii_are_digits(tiny: Path, file: str, number: str):
 
 def test_nor_are_others_places_in_a_list_or_counts(tiny: Path):
     words = settings("experiment.٠.start=undeformed")
-    assert "expected its number, from 0" in refused(
-        "check", "problem.toml", *words
-    )
-    assert "whole numbers" in refused(
-        "compare-models", "problem.toml", "--prony", "0,١"
-    )
+    assert "expected its number, from 0" in refused("check", "problem.toml", *words)
+    assert "whole numbers" in refused("compare-models", "problem.toml", "--prony", "0,١")
 
 
 @pytest.mark.parametrize("value", ["nan", "{ a = nan }", "{ guess = nan }"])
 def test_a_number_that_is_none_is_quoted(tiny: Path, value: str):
     words = settings(f"parameters.mu_pa={value}")
-    assert "found nan; expected a finite number" in refused(
-        "check", "problem.toml", *words
-    )
+    assert "found nan; expected a finite number" in refused("check", "problem.toml", *words)
 
 
 # What is quoted -----------------------------------------------------------------------------------
@@ -158,9 +135,7 @@ NULS = 10_000 * "\0"
         replace_text('"A tiny foam bar"', f'"{NULS}"'),
         replace_line(MARKERS, 3, lambda _: NULS),
         replace_cell(MARKERS, 3, 1, 10_000 * "x"),
-        replace_line(
-            MARKERS, 1, lambda head: head.replace("low_x", 10_000 * "x" + "_x")
-        ),
+        replace_line(MARKERS, 1, lambda head: head.replace("low_x", 10_000 * "x" + "_x")),
     ],
     ids=["key", "text", "row", "cell", "name"],
 )
@@ -170,14 +145,7 @@ def test_a_message_quotes_no_more_than_helps(tiny: Path, edit):
 
 
 @pytest.mark.parametrize(
-    "override",
-    [
-        NULS,
-        f"title.a={NULS}",
-        f"experiment.{NULS}.x=1",
-        f"{NULS}=[",
-        f"mu_pa=[{NULS}",
-    ],
+    "override", [NULS, f"title.a={NULS}", f"experiment.{NULS}.x=1", f"{NULS}=[", f"mu_pa=[{NULS}"]
 )
 def test_nor_does_it_of_an_override(tiny: Path, override: str):
     refused("check", "problem.toml", *settings(override))
@@ -202,27 +170,17 @@ def test_escapes_of_a_terminal_are_shown_and_not_sent(tiny: Path, edit):
 
 def test_a_message_is_one_line_whatever_it_quotes(tiny: Path):
     replace_text("[object]", '[object]\n"a\\nerror: forged" = 1')(tiny)
-    assert "object.a␊error: forged: unknown key" in refused(
-        "check", "problem.toml"
-    )
+    assert "object.a␊error: forged: unknown key" in refused("check", "problem.toml")
 
 
 def test_names_that_are_shown_in_tables_are_shown_as_they_are(tiny: Path):
     for file in ("problem.toml", MARKERS):
         text = (tiny / file).read_text()
-        name = (
-            r'"\u001b[2J[/b]:smile:"'
-            if file == "problem.toml"
-            else "\x1b[2J[/b]:smile:"
-        )
-        text = text.replace("side = [", f"{name} = [").replace(
-            "side_", f"{name}_"
-        )
+        name = r'"\u001b[2J[/b]:smile:"' if file == "problem.toml" else "\x1b[2J[/b]:smile:"
+        text = text.replace("side = [", f"{name} = [").replace("side_", f"{name}_")
         (tiny / file).write_text(text)
     method = settings("solver.method=reduced-space")
-    outcome = run_command(
-        "solve", "problem.toml", "-v", *method, "--out", "run"
-    )
+    outcome = run_command("solve", "problem.toml", "-v", *method, "--out", "run")
     assert outcome.code == 0, outcome
     assert_harmless(outcome)
     assert "␛[2J[/b]:smile:" in outcome.out
@@ -260,33 +218,21 @@ OBJ = "".join(f"v {row}\n" for row in VERTICES.splitlines())
 )
 def test_a_damaged_surface_is_refused(tmp_path: Path, name: str, content: str):
     (tmp_path / name).write_text(content)
-    with pytest.raises(
-        InputError, match=f"{name}: the file cannot be read as a mesh"
-    ):
+    with pytest.raises(InputError, match=f"{name}: the file cannot be read as a mesh"):
         TetMesh.from_surface(tmp_path / name, 0.02)
 
 
-def test_a_c3d_that_crashes_its_reader_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_c3d_that_crashes_its_reader_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     file = whole_c3d(tmp_path)
     content = bytearray(file.read_bytes())
     for at, value in ((756, 42), (868, 111), (1002, 229)):
         content[at] = value
     file.write_bytes(content)
-    with suppress(
-        InputError
-    ):  # a later ezc3d may read it; this process must go on
+    with suppress(InputError):  # a later ezc3d may read it; this process must go on
         read_markers(file)
     whole_c3d(tmp_path)
-    monkeypatch.setattr(
-        c3d,
-        "WORKER",
-        "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
-    )
-    with pytest.raises(
-        InputError, match=r"C3D file is damaged.*killed by SIGSEGV"
-    ):
+    monkeypatch.setattr(c3d, "WORKER", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    with pytest.raises(InputError, match=r"C3D file is damaged.*killed by SIGSEGV"):
         read_markers(file)
 
 
@@ -296,8 +242,6 @@ def whole_c3d(folder: Path) -> Path:
     recording["parameters"]["POINT"]["RATE"]["value"] = [100]
     recording["parameters"]["POINT"]["LABELS"]["value"] = ("a", "b")
     recording["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
-    recording["data"]["points"] = np.random.default_rng(0).normal(
-        size=(4, 2, 6)
-    )
+    recording["data"]["points"] = np.random.default_rng(0).normal(size=(4, 2, 6))
     recording.write(str(folder / "take.c3d"))
     return folder / "take.c3d"

@@ -8,35 +8,21 @@ from kit.collocations import collocation_of
 from kit.problems import GUESS, SMALL_EXPERIMENTS, TRUTH, hung_cube, noisy
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.comparison.penalty import (
-    AugmentedLagrangian,
-    Penalty,
-)
+from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Penalty
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.program.collocation import Collocation
 
 # Their bands are wide; a penalty of the same steps finds the truth of these every time.
-DEAR = (
-    "quadratic-bar",
-    "cube-with-nuisance",
-    "bar-with-nuisance",
-    "driven-bar",
-)
+DEAR = ("quadratic-bar", "cube-with-nuisance", "bar-with-nuisance", "driven-bar")
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=pytest.mark.slow) if n in DEAR else n
-        for n in SMALL_EXPERIMENTS
-    ],
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in DEAR else n for n in SMALL_EXPERIMENTS]
 )
 def test_the_true_parameters_are_recovered(name: str):
     # A cube that is let go tells little of γ_m: the last digits of the loss tell it.
-    solution = AugmentedLagrangian(tolerance=1e-7)(
-        collocation_of(name, steps=6)
-    )
+    solution = AugmentedLagrangian(tolerance=1e-7)(collocation_of(name, steps=6))
     assert solution.status is Status.CONVERGED
     found = [solution.parameters[key] for key in TRUTH]
     np.testing.assert_allclose(found, list(TRUTH.values()), rtol=2e-3)
@@ -46,15 +32,10 @@ def test_the_true_parameters_are_recovered(name: str):
 @pytest.mark.parametrize("name", ["hung-cube", "bar-let-go"])
 def test_with_noise_it_is_the_optimum_of_the_reduced_space(name: str):
     collocation = collocation_of(name, noise_m=1e-3, steps=12)
-    solution, reference = (
-        AugmentedLagrangian()(collocation),
-        ReducedSpace()(collocation),
-    )
+    solution, reference = (AugmentedLagrangian()(collocation), ReducedSpace()(collocation))
     assert solution.status is Status.CONVERGED
     np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-4)
-    np.testing.assert_allclose(
-        solution.multipliers, reference.multipliers, atol=1e-2
-    )
+    np.testing.assert_allclose(solution.multipliers, reference.multipliers, atol=1e-2)
     assert solution.kkt_residual < 2e-6
     assert solution.max_violation_relative < 1e-7
 
@@ -71,9 +52,7 @@ def test_explicit_grasps_have_multipliers_too():
 @pytest.mark.long
 def test_it_leaves_far_less_slack_than_a_penalty_of_the_same_weight():
     collocation = collocation_of("hung-cube", noise_m=1e-3, steps=6)
-    paid = Penalty(
-        "levenberg-marquardt", schedule="constant", rho=1e6, violation=1.0
-    )(collocation)
+    paid = Penalty("levenberg-marquardt", schedule="constant", rho=1e6, violation=1.0)(collocation)
     multiplied = AugmentedLagrangian(rho_max=1e6)(collocation)
     assert multiplied.max_violation_n < 1e-3 * paid.max_violation_n
 
@@ -101,9 +80,7 @@ def test_an_interruption_keeps_the_last_iterate():
         if line.number >= 2:
             raise KeyboardInterrupt
 
-    solution = AugmentedLagrangian()(
-        collocation_of("hung-cube"), watch=interrupt
-    )
+    solution = AugmentedLagrangian()(collocation_of("hung-cube"), watch=interrupt)
     assert solution.status is Status.INTERRUPTED
     assert solution.rms_m < solution.history[0].rms_m
 
@@ -113,10 +90,7 @@ def test_an_interruption_keeps_the_last_iterate():
     [
         ({"inner": "simplex"}, "inner: found 'simplex'; expected 'cg-descent'"),
         ({"rho": -1.0}, "rho: found -1.0; expected a number above 0"),
-        (
-            {"rho_factor": 0.5},
-            "rho_factor: found 0.5; expected a number above 1",
-        ),
+        ({"rho_factor": 0.5}, "rho_factor: found 0.5; expected a number above 1"),
         (
             {"rho_max": 1.0},
             r"rho_max: found 1, which is less than rho = 100000; expected rho or more",

@@ -23,12 +23,7 @@ from collocation_sysid.methods.comparison.casadi_nlp import (
     refusal_reason,
 )
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.solution import (
-    Iteration,
-    Solution,
-    Status,
-    Watch,
-)
+from collocation_sysid.methods.solution import Iteration, Solution, Status, Watch
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 
@@ -45,9 +40,7 @@ def solved(plugin: str) -> Solution:
     return answer(plugin, cube())
 
 
-def answer(
-    plugin: str, collocation: Collocation, watch: Watch | None = None
-) -> Solution:
+def answer(plugin: str, collocation: Collocation, watch: Watch | None = None) -> Solution:
     """Runs of sleqp differ: now and then one fails within it where the next does not."""
     found = PLUGINS[plugin]()(collocation, watch)
     failed = plugin == "sleqp" and found.status is Status.NUMERICAL_FAILURE
@@ -64,12 +57,8 @@ def functions() -> NlpFunctions:
 def point() -> tuple[np.ndarray, np.ndarray]:
     """Some variables and multipliers."""
     rng = np.random.default_rng(1)
-    z = cube().pack(
-        GUESS.guess_q, [ReducedSpace()(cube()).positions_m[0].reshape(5, -1)]
-    )
-    return z + 1e-3 * rng.normal(size=len(z)), rng.normal(
-        size=cube().constraint_count
-    )
+    z = cube().pack(GUESS.guess_q, [ReducedSpace()(cube()).positions_m[0].reshape(5, -1)])
+    return z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=cube().constraint_count)
 
 
 # The answer
@@ -82,9 +71,7 @@ def test_the_true_parameters_are_recovered(plugin: str):
     assert solution.status.converged
     assert solution.method == f"casadi:{plugin}"
     # The damping by mass hardly shows in four steps.
-    np.testing.assert_allclose(
-        solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4
-    )
+    np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
     assert solution.theta[3] == pytest.approx(1.0, rel=1e-2)
     assert solution.max_violation_relative < 1e-5
     assert solution.kkt_residual < 1e-6
@@ -98,16 +85,10 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(plugin: str):
     # Some runs of sleqp stall a little short of the tolerance.
     stalls = plugin == "sleqp" and solution.status is Status.STALLED
     assert solution.status.converged or stalls
-    np.testing.assert_allclose(
-        solution.q[:3], reference.q[:3], atol=1e-3 if stalls else 1e-4
-    )
-    np.testing.assert_allclose(
-        solution.positions_m[0], reference.positions_m[0], atol=1e-5
-    )
+    np.testing.assert_allclose(solution.q[:3], reference.q[:3], atol=1e-3 if stalls else 1e-4)
+    np.testing.assert_allclose(solution.positions_m[0], reference.positions_m[0], atol=1e-5)
     if not stalls:
-        np.testing.assert_allclose(
-            solution.multipliers, reference.multipliers, atol=1e-3
-        )
+        np.testing.assert_allclose(solution.multipliers, reference.multipliers, atol=1e-3)
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
@@ -117,17 +98,13 @@ def test_explicit_grasps_lead_to_the_same_answer(plugin: str):
     )
     solution = PLUGINS[plugin]()(collocation)
     assert solution.status.converged
-    np.testing.assert_allclose(
-        solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4
-    )
+    np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
 
 
 def test_the_exact_hessian_leads_sqp_to_the_same_answer_without_noise():
     solution = SqpMethod("exact")(cube())
     assert solution.status is Status.CONVERGED
-    np.testing.assert_allclose(
-        solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4
-    )
+    np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
 
 
 def test_options_of_the_plugin_win():
@@ -141,9 +118,7 @@ def test_options_of_the_plugin_win():
 
 def test_both_triangles_of_the_hessian_are_those_of_the_upper_one():
     z, multipliers = point()
-    found = functions().function("h", "hess")(
-        z, np.zeros((0, 1)), 0.7, multipliers
-    )
+    found = functions().function("h", "hess")(z, np.zeros((0, 1)), 0.7, multipliers)
     expected = cube().hessian(z, 0.7, multipliers)
     np.testing.assert_allclose(found.full(), expected.toarray(), rtol=1e-12)
 
@@ -158,17 +133,9 @@ def test_the_lagrangians_gradient_has_its_forward_derivative(rng):
     slope = collocation.gradient(z)
     jacobian = collocation.jacobian(z)
     value = gradient(z, none, 0.7, multipliers)
-    np.testing.assert_allclose(
-        value.full().ravel(), 0.7 * slope + jacobian.T @ multipliers
-    )
-    found = gradient.forward(1)(
-        z, none, 0.7, multipliers, value, by_z, none, 0.3, by_y
-    )
-    expected = (
-        collocation.hessian(z, 0.7, multipliers) @ by_z
-        + 0.3 * slope
-        + jacobian.T @ by_y
-    )
+    np.testing.assert_allclose(value.full().ravel(), 0.7 * slope + jacobian.T @ multipliers)
+    found = gradient.forward(1)(z, none, 0.7, multipliers, value, by_z, none, 0.3, by_y)
+    expected = collocation.hessian(z, 0.7, multipliers) @ by_z + 0.3 * slope + jacobian.T @ by_y
     np.testing.assert_allclose(found.full().ravel(), expected, atol=1e-10)
 
 
@@ -227,9 +194,7 @@ def test_the_history_is_what_was_watched(plugin: str):
     solution = answer(plugin, cube(), seen.append)
     assert list(solution.history) == seen[-len(solution.history) :]
     assert len(solution.history) > 3
-    np.testing.assert_allclose(
-        [*seen[-1].parameters.values()], solution.theta, rtol=1e-2
-    )
+    np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta, rtol=1e-2)
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
@@ -247,14 +212,7 @@ def test_every_plugin_of_casadi_is_offered_or_refused_with_a_reason():
         if not ca.has_nlpsol(plugin):
             missing.append(plugin)
     # Those that need a library fail to load, but are there.
-    assert set(missing) <= {
-        "ccopt",
-        "conopt",
-        "knitro",
-        "madnlp",
-        "snopt",
-        "worhp",
-    }
+    assert set(missing) <= {"ccopt", "conopt", "knitro", "madnlp", "snopt", "worhp"}
 
 
 @pytest.mark.parametrize(
@@ -266,14 +224,8 @@ def test_every_plugin_of_casadi_is_offered_or_refused_with_a_reason():
         ),
         ("casadi:uno", "aborts the process"),
         ("casadi:ipopt", 'IPOPT is available as the method "interior-point"'),
-        (
-            "casadi:sqpmetod",
-            "did you mean 'casadi:sqpmethod'? expected one of casadi:sqpmethod, ",
-        ),
-        (
-            "casadi:what",
-            "which CasADi does not have; expected one of casadi:sqpmethod, casadi:sl",
-        ),
+        ("casadi:sqpmetod", "did you mean 'casadi:sqpmethod'? expected one of casadi:sqpmethod, "),
+        ("casadi:what", "which CasADi does not have; expected one of casadi:sqpmethod, casadi:sl"),
     ],
 )
 def test_other_names_are_refused_with_a_reason(name: str, message: str):
@@ -286,17 +238,14 @@ def test_offered_names_are_not_refused():
 
 def test_an_unknown_hessian_is_refused():
     with pytest.raises(
-        InputError,
-        match="hessian: found 'bfgs'; expected 'gauss-newton' or 'exact'",
+        InputError, match="hessian: found 'bfgs'; expected 'gauss-newton' or 'exact'"
     ):
         SqpMethod("bfgs")  # pyright: ignore
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_an_unknown_option_is_refused_in_the_solvers_words(plugin: str):
-    with pytest.raises(
-        InputError, match=f"{plugin} cannot be set up: .*max_itre"
-    ):
+    with pytest.raises(InputError, match=f"{plugin} cannot be set up: .*max_itre"):
         PLUGINS[plugin](casadi={"max_itre": 3})(cube())
 
 
@@ -306,33 +255,20 @@ def test_an_unknown_option_is_refused_in_the_solvers_words(plugin: str):
 @pytest.mark.long
 def test_a_solver_is_chosen_in_a_problem_file(tmp_path):
     file = write_problem(tmp_path, {"swing": 4})
-    chosen = [
-        "solver.method=casadi:sqpmethod",
-        "solver.casadi:sqpmethod.casadi.min_iter=1",
-    ]
+    chosen = ["solver.method=casadi:sqpmethod", "solver.casadi:sqpmethod.casadi.min_iter=1"]
     solution = solve_problem(Problem.read(file, chosen))
     assert solution.status.converged
-    assert solution.parameters["mu_pa"] == pytest.approx(
-        TRUTH["mu_pa"], rel=1e-4
-    )
+    assert solution.parameters["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-4)
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (
-            "casadi:knitro",
-            "solver.method: found 'casadi:knitro', which is not offered: it needs a",
-        ),
-        (
-            "casadi:sleq",
-            "solver.method: found 'casadi:sleq', which CasADi does not have; did you",
-        ),
+        ("casadi:knitro", "solver.method: found 'casadi:knitro', which is not offered: it needs a"),
+        ("casadi:sleq", "solver.method: found 'casadi:sleq', which CasADi does not have; did you"),
     ],
 )
-def test_a_problem_file_is_told_why_a_solver_is_not_offered(
-    tmp_path, name: str, message: str
-):
+def test_a_problem_file_is_told_why_a_solver_is_not_offered(tmp_path, name: str, message: str):
     file = write_problem(tmp_path, {"swing": 4})
     with pytest.raises(InputError, match=message):
         Problem.read(file, [f"solver.method={name}"])

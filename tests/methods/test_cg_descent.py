@@ -26,14 +26,7 @@ def rosenbrock(x):
 
 def powell_singular(x):
     a, b, c, d = x
-    r = np.array(
-        [
-            a + 10 * b,
-            np.sqrt(5) * (c - d),
-            (b - 2 * c) ** 2,
-            np.sqrt(10) * (a - d) ** 2,
-        ]
-    )
+    r = np.array([a + 10 * b, np.sqrt(5) * (c - d), (b - 2 * c) ** 2, np.sqrt(10) * (a - d) ** 2])
     bend, pull = 2 * (b - 2 * c), 2 * np.sqrt(10) * (a - d)
     jacobian = np.array(
         [
@@ -71,12 +64,7 @@ def dixon_price(x):
 
 def wood(x):
     a, b, c, d = x
-    value = (
-        100 * (b - a**2) ** 2
-        + (1 - a) ** 2
-        + 90 * (d - c**2) ** 2
-        + (1 - c) ** 2
-    )
+    value = 100 * (b - a**2) ** 2 + (1 - a) ** 2 + 90 * (d - c**2) ** 2 + (1 - c) ** 2
     value += 10 * (b + d - 2) ** 2 + 0.1 * (b - d) ** 2
     both, apart = 20 * (b + d - 2), 0.2 * (b - d)
     slope = [
@@ -99,9 +87,7 @@ FUNCTIONS = {
 }
 
 
-def followed(
-    name: str, options: CgDescentOptions = OPTIONS
-) -> tuple[CgResult, list[CgState]]:
+def followed(name: str, options: CgDescentOptions = OPTIONS) -> tuple[CgResult, list[CgState]]:
     function, start = FUNCTIONS[name]
     states: list[CgState] = []
     return minimise_cg_descent(function, start, options, states.append), states
@@ -112,10 +98,7 @@ def test_gradients_of_the_functions_are_right(name: str, rng):
     function, start = FUNCTIONS[name]
     point = start + 0.1 * rng.standard_normal(len(start))
     scale = np.linalg.norm(function(point)[1])
-    assert (
-        check_grad(lambda x: function(x)[0], lambda x: function(x)[1], point)
-        < 1e-5 * scale
-    )
+    assert check_grad(lambda x: function(x)[0], lambda x: function(x)[1], point) < 1e-5 * scale
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -123,9 +106,7 @@ def test_it_finds_the_minimum_that_scipy_finds(name: str):
     function, start = FUNCTIONS[name]
     result, _ = followed(name)
     settings = {"gtol": 1e-6, "maxiter": 20_000}
-    reference = scipy_minimise(
-        function, start, jac=True, method="CG", options=settings
-    )
+    reference = scipy_minimise(function, start, jac=True, method="CG", options=settings)
     assert result.ending == "converged"
     assert np.abs(result.gradient).max() <= 1e-6
     assert result.value == pytest.approx(reference.fun, abs=1e-6)
@@ -148,10 +129,7 @@ def test_every_step_satisfies_a_form_of_the_wolfe_conditions(name: str):
         slope = after.gradient @ after.direction
         assert slope >= 0.9 * after.slope * (1 + 1e-9)
         largest = max(abs(state.value) for state in states)
-        flat = (
-            slope <= (2 * 0.1 - 1) * after.slope
-            and after.value <= before.value + 1e-6 * largest
-        )
+        flat = slope <= (2 * 0.1 - 1) * after.slope and after.value <= before.value + 1e-6 * largest
         fallen = after.value - before.value <= 0.1 * after.step * after.slope
         assert flat or fallen
 
@@ -163,9 +141,7 @@ def test_a_point_out_of_the_domain_is_stepped_back_from():
         return value, 1 / (1 - x) - 5 if inside else np.full_like(x, np.nan)
 
     states: list[CgState] = []
-    result = minimise_cg_descent(
-        barrier, np.array([-50.0, 0.5]), OPTIONS, states.append
-    )
+    result = minimise_cg_descent(barrier, np.array([-50.0, 0.5]), OPTIONS, states.append)
     assert result.ending == "converged"
     np.testing.assert_allclose(result.x, 0.8, atol=1e-6)
     assert all((state.x < 1).all() for state in states)
@@ -181,31 +157,16 @@ def test_the_value_alone_is_asked_where_that_is_enough():
     _, start = FUNCTIONS["rosenbrock in 2"]
     alone = minimise_cg_descent(rosenbrock, start, OPTIONS, value=value)
     assert asked
-    assert (
-        alone.evaluations
-        < minimise_cg_descent(rosenbrock, start, OPTIONS).evaluations
-    )
+    assert alone.evaluations < minimise_cg_descent(rosenbrock, start, OPTIONS).evaluations
 
 
 def test_it_says_why_it_ended():
     _, start = FUNCTIONS["rosenbrock in 2"]
     few = replace(OPTIONS, max_iterations=3)
-    assert (
-        minimise_cg_descent(rosenbrock, start, few).ending == "iteration-limit"
-    )
-    assert (
-        minimise_cg_descent(
-            rosenbrock, start, OPTIONS, lambda state: True
-        ).ending
-        == "stopped"
-    )
-    assert (
-        minimise_cg_descent(rosenbrock, np.ones(2), OPTIONS).ending
-        == "converged"
-    )
+    assert minimise_cg_descent(rosenbrock, start, few).ending == "iteration-limit"
+    assert minimise_cg_descent(rosenbrock, start, OPTIONS, lambda state: True).ending == "stopped"
+    assert minimise_cg_descent(rosenbrock, np.ones(2), OPTIONS).ending == "converged"
     nowhere = minimise_cg_descent(lambda x: (np.inf, x), np.ones(2), OPTIONS)
     assert nowhere.ending == "not-finite"
-    wrong = minimise_cg_descent(
-        lambda x: (float(x @ x), -2 * x), np.ones(2), OPTIONS
-    )
+    wrong = minimise_cg_descent(lambda x: (float(x @ x), -2 * x), np.ones(2), OPTIONS)
     assert wrong.ending == "line-search"

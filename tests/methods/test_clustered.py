@@ -30,10 +30,7 @@ import collocation_sysid as cs
 from collocation_sysid.common import cluster
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import experiment_executors
-from collocation_sysid.methods.experiment_executors import (
-    DaskExecutor,
-    connect_executor,
-)
+from collocation_sysid.methods.experiment_executors import DaskExecutor, connect_executor
 from collocation_sysid.methods.initial_trajectories import simulate_trajectories
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
@@ -47,40 +44,22 @@ dask = pytest.importorskip("dask")
 def there() -> Iterator[Any]:
     """Two workers with one thread each, in this process."""
     with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=False,
-        protocol="tcp",
-        dashboard_address=":0",
+        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=":0"
     ) as found:
         yield found
 
 
 def lose(there: Any, number: int) -> None:
     """Let a worker vanish without a word."""
-    there.sync(
-        there.workers[number].close,
-        reason="lost",
-        executor_wait=False,
-        nanny=False,
-    )
+    there.sync(there.workers[number].close, reason="lost", executor_wait=False, nanny=False)
 
 
 def several(steps: int = 8) -> list[cs.Experiment]:
     """Recordings of two bodies, of one of them three."""
     cube = replace(noisy(hung_cube(steps), 1e-4), name="first")
-    again = replace(
-        noisy(hung_cube(steps + 3), 1e-4, seed=1), name="again", body=cube.body
-    )
-    nuisance = replace(
-        noisy(cube_with_nuisance(steps), 1e-4), name="with nuisance"
-    )
-    return [
-        cube,
-        again,
-        replace(measured(cube_with_gaps(steps + 4)), name="gaps"),
-        nuisance,
-    ]
+    again = replace(noisy(hung_cube(steps + 3), 1e-4, seed=1), name="again", body=cube.body)
+    nuisance = replace(noisy(cube_with_nuisance(steps), 1e-4), name="with nuisance")
+    return [cube, again, replace(measured(cube_with_gaps(steps + 4)), name="gaps"), nuisance]
 
 
 def assert_alike(clustered: cs.Solution, threads: cs.Solution) -> None:
@@ -108,24 +87,16 @@ def test_a_run_on_workers_is_that_on_threads(there):
     }
     assert errors.keys() >= {"lambda_pa", "mu_pa", "gamma_r_s"}
     for name, error in errors.items():
-        assert found.estimates[name].statistical_std_error == pytest.approx(
-            error, rel=1e-9
-        )
+        assert found.estimates[name].statistical_std_error == pytest.approx(error, rel=1e-9)
 
 
 @pytest.mark.long
 def test_markers_without_places_are_read_in_the_same_elements(there):
     experiment = noisy(bar_with_nuisance())
-    markers = replace(
-        experiment.markers,
-        located=np.zeros(len(experiment.markers.names), bool),
-    )
+    markers = replace(experiment.markers, located=np.zeros(len(experiment.markers.names), bool))
     collocation = Collocation([replace(experiment, markers=markers)], GUESS)
     with connect_executor(there.scheduler_address) as found:
-        assert_alike(
-            ReducedSpace()(collocation, workers=found),
-            ReducedSpace()(collocation),
-        )
+        assert_alike(ReducedSpace()(collocation, workers=found), ReducedSpace()(collocation))
 
 
 @pytest.mark.long
@@ -167,9 +138,7 @@ def test_what_a_lost_worker_had_is_done_again(there):
         "1 of 2 workers were lost during the solve: their recordings were computed "
         "again by other workers"
     )
-    assert_alike(
-        replace(solution, notes=tuple(notes)), ReducedSpace()(collocation)
-    )
+    assert_alike(replace(solution, notes=tuple(notes)), ReducedSpace()(collocation))
 
 
 def assert_best_is_kept(solution: cs.Solution, why: str) -> None:
@@ -178,9 +147,7 @@ def assert_best_is_kept(solution: cs.Solution, why: str) -> None:
     assert solution.message == f"{Status.CLUSTER_DISCONNECTED.sentence} {why}"
     assert solution.parameters == solution.history[-1].parameters
     collocation, z = solution.collocation, solution.z
-    alike, failure = simulate_trajectories(
-        collocation, collocation.unpack(z)[0]
-    )
+    alike, failure = simulate_trajectories(collocation, collocation.unpack(z)[0])
     assert failure is None
     for part, x in zip(collocation.iterates(z), alike, strict=True):
         np.testing.assert_allclose(part.x, x, atol=1e-9)
@@ -196,9 +163,7 @@ def test_without_workers_left_the_best_is_kept(there, monkeypatch):
                 lose(there, number)
 
     with connect_executor(there.scheduler_address) as found:
-        solution = ReducedSpace()(
-            Collocation(several(), GUESS), watch, workers=found
-        )
+        solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
     assert_best_is_kept(solution, "No worker is left.")
 
 
@@ -211,9 +176,7 @@ def test_without_a_scheduler_left_the_best_is_kept(there, monkeypatch):
             there.sync(there.scheduler.close)
 
     with connect_executor(there.scheduler_address) as found:
-        solution = ReducedSpace()(
-            Collocation(several(), GUESS), watch, workers=found
-        )
+        solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
     with dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}):
         there.close()  # which looks for the scheduler
     assert_best_is_kept(solution, "The scheduler no longer responds.")
@@ -240,15 +203,11 @@ thread.join()
 
 
 @pytest.mark.long
-@pytest.mark.skipif(
-    platform.libc_ver()[0] != "glibc", reason="another C library"
-)
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
 def test_workers_keep_the_memory_of_arrays_that_come_and_go():
     """A nanny's processes give it back: each array of 1 MB then is 256 pages to be had anew."""
     environment = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536"}
-    said = subprocess.check_output(
-        [sys.executable, "-c", FAULTS], env=environment, text=True
-    )
+    said = subprocess.check_output([sys.executable, "-c", FAULTS], env=environment, text=True)
     before, after = map(int, said.split())
     assert before > 100 * 250
     assert after < 100
@@ -264,9 +223,7 @@ def test_an_interrupted_solve_keeps_its_best(there):
             raise KeyboardInterrupt
 
     with connect_executor(there.scheduler_address) as found:
-        solution = ReducedSpace()(
-            Collocation(several(), GUESS), watch, workers=found
-        )
+        solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
     assert solution.status is Status.INTERRUPTED
     assert solution.parameters == lines[-1].parameters
     assert np.isfinite(solution.z).all()
@@ -282,13 +239,9 @@ def apart(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
         [*command, "distributed.cli.dask_scheduler", "--port", "0", *options],
         *[[*command, "distributed.cli.dask_worker", *one, *options]] * 2,
     ]
-    processes = [
-        subprocess.Popen(each, stderr=subprocess.DEVNULL) for each in commands
-    ]
+    processes = [subprocess.Popen(each, stderr=subprocess.DEVNULL) for each in commands]
     try:
-        with distributed.Client(
-            scheduler_file=str(file), set_as_default=False
-        ) as client:
+        with distributed.Client(scheduler_file=str(file), set_as_default=False) as client:
             client.wait_for_workers(2, timeout=60)
             address = client.scheduler.address
         yield address, processes
@@ -302,23 +255,13 @@ def apart(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
 @pytest.mark.parametrize(
     ("ended", "status", "said"),
     [
-        (
-            slice(1, 2),
-            Status.CONVERGED,
-            "1 of 2 workers were lost during the solve",
-        ),
+        (slice(1, 2), Status.CONVERGED, "1 of 2 workers were lost during the solve"),
         (slice(1, 3), Status.CLUSTER_DISCONNECTED, "No worker is left."),
-        (
-            slice(0, 1),
-            Status.CLUSTER_DISCONNECTED,
-            "The scheduler no longer responds.",
-        ),
+        (slice(0, 1), Status.CLUSTER_DISCONNECTED, "The scheduler no longer responds."),
     ],
     ids=["a worker", "all workers", "the scheduler"],
 )
-def test_killed_processes_cost_no_answer(
-    apart, monkeypatch, ended, status, said
-):
+def test_killed_processes_cost_no_answer(apart, monkeypatch, ended, status, said):
     monkeypatch.setattr(experiment_executors, "LOOK_EVERY_S", 0.5)
     monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 2.0)
     address, processes = apart
@@ -339,14 +282,10 @@ def test_killed_processes_cost_no_answer(
 
 
 def test_workers_of_another_version_are_refused():
-    answers = {
-        "tcp://a:1": experiment_executors.version("collocation-sysid"),
-        "tcp://b:1": "0.0.1",
-    }
+    answers = {"tcp://a:1": experiment_executors.version("collocation-sysid"), "tcp://b:1": "0.0.1"}
     client = SimpleNamespace(run=lambda *_, **__: answers)
     with pytest.raises(
-        InputError,
-        match=r"found collocation-sysid 0\.0\.1 on the worker tcp://b:1; expected",
+        InputError, match=r"found collocation-sysid 0\.0\.1 on the worker tcp://b:1; expected"
     ):
         DaskExecutor(client)
     answers.clear()
@@ -355,18 +294,14 @@ def test_workers_of_another_version_are_refused():
 
 
 @pytest.mark.parametrize("error", [OSError, distributed.client.CancelledError])
-def test_a_scheduler_lost_while_versions_are_asked_for_is_reported(
-    monkeypatch, error
-):
+def test_a_scheduler_lost_while_versions_are_asked_for_is_reported(monkeypatch, error):
     def lost(*_: object, **__: object) -> None:
         raise error("gone")
 
     client = SimpleNamespace(run=lost, close=lost)
     monkeypatch.setattr(distributed, "Client", lambda *_, **__: client)
     with (
-        pytest.raises(
-            InputError, match="--scheduler: the scheduler stopped answering"
-        ),
+        pytest.raises(InputError, match="--scheduler: the scheduler stopped answering"),
         connect_executor("tcp://a:1"),
     ):
         pytest.fail("the work was started")
@@ -374,15 +309,8 @@ def test_a_scheduler_lost_while_versions_are_asked_for_is_reported(
 
 def test_costly_experiments_are_shared_out_first():
     threads = {"a": 1, "b": 1}
-    assert experiment_executors._assign_workers([1, 5, 2, 3], threads) == [
-        "a",
-        "a",
-        "b",
-        "b",
-    ]
-    assert experiment_executors._assign_workers(
-        [1, 1, 1], {"a": 2, "b": 1}
-    ) == ["a", "b", "a"]
+    assert experiment_executors._assign_workers([1, 5, 2, 3], threads) == ["a", "a", "b", "b"]
+    assert experiment_executors._assign_workers([1, 1, 1], {"a": 2, "b": 1}) == ["a", "b", "a"]
 
 
 # The command line
@@ -392,25 +320,13 @@ def test_costly_experiments_are_shared_out_first():
     ("method", "said"),
     [
         ("interior-point", "interior-point cannot distribute its experiments"),
-        (
-            "reduced-space",
-            "found 'tcp://127.0.0.1:1', where no scheduler answers",
-        ),
+        ("reduced-space", "found 'tcp://127.0.0.1:1', where no scheduler answers"),
     ],
 )
-def test_a_scheduler_that_is_of_no_use_ends_the_command(
-    tmp_path, monkeypatch, method, said
-):
+def test_a_scheduler_that_is_of_no_use_ends_the_command(tmp_path, monkeypatch, method, said):
     monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 0.5)
     file = write_problem(tmp_path, {"swing": 8})
-    options = (
-        "--method",
-        method,
-        "--scheduler",
-        "tcp://127.0.0.1:1",
-        "--out",
-        tmp_path / "run",
-    )
+    options = ("--method", method, "--scheduler", "tcp://127.0.0.1:1", "--out", tmp_path / "run")
     outcome = run_command("solve", file, *options)
     assert outcome.code == 2
     assert said in " ".join(outcome.err.split())

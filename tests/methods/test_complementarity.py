@@ -16,10 +16,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.model.contact.contact_force import contact_terms
 from collocation_sysid.recording import Experiment
-from collocation_sysid.runs.forward_simulation import (
-    ForwardSimulation,
-    simulate_experiment,
-)
+from collocation_sysid.runs.forward_simulation import ForwardSimulation, simulate_experiment
 
 TRUTH = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.3}
 STIFFER = np.array([1.0, 10.0])
@@ -28,16 +25,12 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def along_z(t_s: np.ndarray, way_m: np.ndarray) -> cs.PoseSequence:
-    return cs.PoseSequence(
-        t_s, np.outer(way_m, [0.0, 0.0, 1.0]), np.tile(UPRIGHT, (len(t_s), 1))
-    )
+    return cs.PoseSequence(t_s, np.outer(way_m, [0.0, 0.0, 1.0]), np.tile(UPRIGHT, (len(t_s), 1)))
 
 
 def pressed(shape: cs.Plane | cs.Sphere, **changes) -> Experiment:
     """A block that something comes down on, and whose force is measured."""
-    body = cs.Body(
-        cs.box_mesh((0.06, 0.06, 0.03), (2, 2, 1)), density_kg_m3=50.0
-    )
+    body = cs.Body(cs.box_mesh((0.06, 0.06, 0.03), (2, 2, 1)), density_kg_m3=50.0)
     t_s = np.arange(3.0)
     held = cs.Grasp(nodes_where(body, 2, 0.0), cs.PoseSequence.fixed())
     comes = cs.Obstacle(
@@ -46,51 +39,29 @@ def pressed(shape: cs.Plane | cs.Sphere, **changes) -> Experiment:
         name="plate",
         wrench=cs.Wrench(t_s, np.zeros((3, 3)), 1e-3),
     )
-    still = {
-        "kind": "static",
-        "gravity_m_s2": (0.0, 0.0, 0.0),
-        "nuisance": cs.Nuisance.none(),
-    }
-    return Experiment(
-        body,
-        t_s,
-        [held, replace(comes, **changes)],
-        None,
-        name="press",
-        **still,
-    )
+    still = {"kind": "static", "gravity_m_s2": (0.0, 0.0, 0.0), "nuisance": cs.Nuisance.none()}
+    return Experiment(body, t_s, [held, replace(comes, **changes)], None, name="press", **still)
 
 
 def let_down() -> Experiment:
     """A block that a gripper sets on a table."""
-    body = cs.Body(
-        cs.box_mesh((0.05, 0.05, 0.05), (1, 1, 2)), density_kg_m3=100.0
-    )
+    body = cs.Body(cs.box_mesh((0.05, 0.05, 0.05), (1, 1, 2)), density_kg_m3=100.0)
     t_s = np.linspace(0.0, 0.3, 13)
     held = cs.Grasp(
-        nodes_where(body, 2, 0.05),
-        along_z(t_s, -0.002 * (1 - np.cos(np.pi * t_s / 0.3))),
+        nodes_where(body, 2, 0.05), along_z(t_s, -0.002 * (1 - np.cos(np.pi * t_s / 0.3)))
     )
     table = cs.Obstacle(shape=cs.Plane(UP, -0.002 * UP), name="table")
-    seen = cs.Markers(
-        t_s, np.zeros((13, 1, 3)), 1e-3, places_m=[[0.05, 0.05, 0.025]]
-    )
+    seen = cs.Markers(t_s, np.zeros((13, 1, 3)), 1e-3, places_m=[[0.05, 0.05, 0.025]])
     still = {"start": "undeformed", "nuisance": cs.Nuisance.none()}
     return Experiment(body, t_s, [held, table], seen, name="set down", **still)
 
 
-MADE = {
-    "plane": lambda: pressed(cs.Plane(-UP, 0.03 * UP)),
-    "let down": let_down,
-}
+MADE = {"plane": lambda: pressed(cs.Plane(-UP, 0.03 * UP)), "let down": let_down}
 
 
 def stiffer(experiment: Experiment, factor: float) -> Experiment:
     """With κ so much larger, and δ smaller: at the same pressure the gap is zero."""
-    edges = [
-        each.contact_surface(experiment.body).edge_m
-        for each in experiment.obstacles
-    ]
+    edges = [each.contact_surface(experiment.body).edge_m for each in experiment.obstacles]
     return experiment.with_obstacles(
         [
             replace(
@@ -113,9 +84,7 @@ def seen(experiment: Experiment) -> Experiment:
     return experiment.with_obstacles([replace(ours, wrench=felt)])
 
 
-def solved(
-    experiment: Experiment, parameters: cs.Parameters | None = None
-) -> Solution:
+def solved(experiment: Experiment, parameters: cs.Parameters | None = None) -> Solution:
     known = parameters or cs.Parameters.from_mapping(TRUTH)
     problem = cs.Problem([seen(experiment)], known, scheme="bdf2")
     return InteriorPoint(contact="complementarity")(problem.collocation())
@@ -136,9 +105,7 @@ def test_it_is_what_an_ever_stiffer_energy_tends_to(name: str):
     own = slice(len(experiment.body.mesh.points_m))
     apart_m = []
     for factor in STIFFER:
-        motion = cs.simulate(
-            stiffer(experiment, factor), TRUTH, "bdf2", substeps=1
-        )
+        motion = cs.simulate(stiffer(experiment, factor), TRUTH, "bdf2", substeps=1)
         apart_m.append(np.abs(motion.positions_m - hard)[:, own].max())
     assert apart_m[-1] < 1e-5
     assert observed_order(1 / STIFFER, apart_m) == pytest.approx(1.0, abs=0.1)
@@ -157,13 +124,8 @@ def test_nothing_is_entered_and_pressure_times_gap_is_small(name: str):
     )
     (term,) = contact_terms(relaxed)
     product_m2 = term.scaled_pressures(hard)[0] * gaps
-    assert (
-        product_m2.max()
-        <= 1.000001 * RELAXED[-1] * term.law_of_contact.largest_width_m**2
-    )
-    assert np.any(
-        term.scaled_pressures(hard) > 0.01 * term.law_of_contact.largest_width_m
-    )
+    assert product_m2.max() <= 1.000001 * RELAXED[-1] * term.law_of_contact.largest_width_m**2
+    assert np.any(term.scaled_pressures(hard) > 0.01 * term.law_of_contact.largest_width_m)
 
 
 @pytest.mark.long
@@ -172,16 +134,13 @@ def test_a_stiffness_is_that_of_an_ever_stiffer_energy():
     poked = stiffer(pressed(cs.Sphere(0.03, (0.03, 0.03, 0.06))), 10.0)
     answer = solved(poked, unknown)
     assert answer.status.converged
-    assert answer.parameters["young_pa"] == pytest.approx(
-        TRUTH["young_pa"], rel=5e-3
-    )
+    assert answer.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=5e-3)
 
 
 def test_friction_is_refused():
     rough = pressed(cs.Plane(-UP, 0.03 * UP), friction=0.3)
     with pytest.raises(
-        cs.InputError,
-        match='plate has friction, which contact = "complementarity"',
+        cs.InputError, match='plate has friction, which contact = "complementarity"'
     ):
         solved(rough)
 
@@ -191,9 +150,7 @@ def test_friction_of_a_recording_for_validation_is_simulated_by_the_contacts_ene
     rough = seen(pressed(cs.Plane(-UP, 0.03 * UP), friction=0.3))
     predicted = replace(rough, name="rubbed", validation=True)
     hard = InteriorPoint(contact="complementarity")
-    problem = cs.Problem(
-        [seen(smooth), predicted], TRUTH, scheme="bdf2", method=hard
-    )
+    problem = cs.Problem([seen(smooth), predicted], TRUTH, scheme="bdf2", method=hard)
     simulated = simulate_experiment(problem, answer, predicted)
     assert isinstance(simulated, ForwardSimulation), simulated
     assert simulated.rms_m < 1e-4

@@ -15,25 +15,18 @@ from kit.static import HANGING, block
 from kit.wrenches import sensing, wristed_cube
 from scipy.interpolate import CubicSpline
 
-from collocation_sysid.methods.condensed_program import (
-    CondensedCollocation,
-    condense,
-)
+from collocation_sysid.methods.condensed_program import CondensedCollocation, condense
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.lifted.lifted_collocation import (
-    with_lifted_variables,
-)
+from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
 from collocation_sysid.recording import Experiment, Nuisance
 
 DEFAULT, ON_TIME = Nuisance(), Nuisance(time_shift_s=None)
 
 
-def late_cube(
-    nuisance: Nuisance, samples: float = 0.0, steps: int = 16
-) -> Experiment:
+def late_cube(nuisance: Nuisance, samples: float = 0.0, steps: int = 16) -> Experiment:
     """The hung cube, seen so many samples late by markers with noise."""
     cube = noisy(hung_cube(steps, (1, 1, 2)), 1e-4)
     seen = cube.markers
@@ -52,10 +45,7 @@ def several() -> list[Experiment]:
 
 CASES: dict[str, Callable[[Nuisance], tuple[list[Experiment], Parameters]]] = {
     "cube": lambda nuisance: ([late_cube(nuisance)], GUESS),
-    "let go": lambda nuisance: (
-        [replace(bar_let_go(6), nuisance=nuisance)],
-        GUESS,
-    ),
+    "let go": lambda nuisance: ([replace(bar_let_go(6), nuisance=nuisance)], GUESS),
     "wrench": lambda nuisance: ([wristed_cube(5, nuisance)], GUESS),
     "memory": lambda nuisance: (
         [sensing(recorded("hung-cube", 4, 2, nuisance=nuisance))],
@@ -69,9 +59,7 @@ CASES: dict[str, Callable[[Nuisance], tuple[list[Experiment], Parameters]]] = {
 }
 
 
-def made(
-    name: str, nuisance: Nuisance
-) -> tuple[Collocation, Collocation, CondensedCollocation]:
+def made(name: str, nuisance: Nuisance) -> tuple[Collocation, Collocation, CondensedCollocation]:
     """A collocation, all that follows as variables, and without held dofs."""
     collocation = Collocation(*CASES[name](nuisance))
     whole = with_lifted_variables(collocation)
@@ -80,14 +68,12 @@ def made(
     return collocation, whole, program
 
 
-def some_point(
-    collocation: Collocation, program: Collocation, rng: np.random.Generator
-):
+def some_point(collocation: Collocation, program: Collocation, rng: np.random.Generator):
     positions = []
-    for segment in collocation.transcriptions:
-        rigid = segment.experiment.rigid_positions(
-            segment.dynamics.t_s
-        ).reshape(-1, segment.dof_count)
+    for transcription in collocation.transcriptions:
+        rigid = transcription.experiment.rigid_positions(transcription.dynamics.t_s).reshape(
+            -1, transcription.dof_count
+        )
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
     p = collocation.guess_p
     p += 0.1 * rng.normal(size=len(p))
@@ -98,19 +84,14 @@ def some_point(
 def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
     collocation, whole, program = made(name, ON_TIME)
     rows = sum(
-        s.is_grasp_constraint.sum()
-        for s in whole.transcriptions
-        if s.nuisance.affects_grasps
+        s.is_grasp_constraint.sum() for s in whole.transcriptions if s.nuisance.affects_grasps
     )
     assert (
         whole.variable_count - program.variable_count
         == whole.constraint_count - program.constraint_count
         == rows
     )
-    z, y = (
-        some_point(collocation, program, rng),
-        rng.normal(size=program.constraint_count),
-    )
+    z, y = (some_point(collocation, program, rng), rng.normal(size=program.constraint_count))
 
     def slope(at: np.ndarray) -> np.ndarray:
         return 1.3 * program.gradient(at) + program.jacobian(at).T @ y
@@ -124,21 +105,17 @@ def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
     of_phi[program.phi_columns] = 0.1
     for scale in (0.1, of_phi):
         options = {"scale": scale, "directions": 1}
-        assert_derivative(
-            program.objective, lambda d: gradient @ d, z, rng, **options
-        )
-        assert_derivative(
-            program.constraint_values, lambda d: jacobian @ d, z, rng, **options
-        )
+        assert_derivative(program.objective, lambda d: gradient @ d, z, rng, **options)
+        assert_derivative(program.constraint_values, lambda d: jacobian @ d, z, rng, **options)
         assert_derivative(slope, lambda d: hessian @ d, z, rng, **options)
 
 
 def times_of_positions(program: Collocation) -> np.ndarray:
     """Grid time of each variable, by experiment; −1 for all that are no positions."""
     times = np.full(program.variable_count, -1)
-    for number, segment in enumerate(program.transcriptions):
-        own = np.arange(segment.variable_count) // segment.dof_count
-        times[segment.columns] = own + 1_000_000 * number
+    for number, transcription in enumerate(program.transcriptions):
+        own = np.arange(transcription.variable_count) // transcription.dof_count
+        times[transcription.columns] = own + 1_000_000 * number
     return times
 
 
@@ -182,72 +159,51 @@ def ones(structure: tuple[np.ndarray, np.ndarray], height: int) -> np.ndarray:
     """The dense matrix with a one at each entry of compressed columns."""
     indptr, rows = structure
     dense = np.zeros((height, len(indptr) - 1))
-    np.add.at(
-        dense, (rows, np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))), 1
-    )
+    np.add.at(dense, (rows, np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))), 1)
     assert dense.max() <= 1
     return dense
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_held_dofs_are_where_the_grasps_are_and_multipliers_balance_them(
-    name: str, rng
-):
+def test_held_dofs_are_where_the_grasps_are_and_multipliers_balance_them(name: str, rng):
     collocation, whole, program = made(name, ON_TIME)
-    z, y = (
-        some_point(collocation, program, rng),
-        rng.normal(size=program.constraint_count),
-    )
-    at, of_rows = (
-        program.complete_variables(z),
-        program.complete_multipliers(z, 1.0, y),
-    )
+    z, y = (some_point(collocation, program, rng), rng.normal(size=program.constraint_count))
+    at, of_rows = (program.complete_variables(z), program.complete_multipliers(z, 1.0, y))
     rows = np.concatenate([each.rows for each in program.eliminated])
     held = np.concatenate([each.variables for each in program.eliminated])
-    np.testing.assert_allclose(
-        whole.constraint_values(at)[rows], 0.0, atol=1e-12
-    )
+    np.testing.assert_allclose(whole.constraint_values(at)[rows], 0.0, atol=1e-12)
     np.testing.assert_array_equal(np.delete(at, held), z)
     slope = whole.gradient(at) + whole.jacobian(at).T @ of_rows
     own = program.gradient(z) + program.jacobian(z).T @ y
     np.testing.assert_allclose(slope[held], 0.0, atol=1e-9 * np.abs(own).max())
-    np.testing.assert_allclose(
-        np.delete(slope, held), own, atol=1e-9 * np.abs(own).max()
-    )
+    np.testing.assert_allclose(np.delete(slope, held), own, atol=1e-9 * np.abs(own).max())
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
-def test_a_clock_adds_no_entry_between_timesteps_that_motion_does_not_join(
-    substeps: int,
-):
+def test_a_clock_adds_no_entry_between_timesteps_that_motion_does_not_join(substeps: int):
     whole = Collocation([late_cube(DEFAULT)], GUESS, substeps=substeps)
     program = condense(whole)
-    (segment,) = whole.transcriptions
+    (transcription,) = whole.transcriptions
     apart = []
-    for each, dofs in (
-        (whole, segment.dof_count),
-        (program, len(segment.free_dofs)),
-    ):
+    for each, dofs in ((whole, transcription.dof_count), (program, len(transcription.free_dofs))):
         indptr, rows = each.hessian_structure
         columns = np.repeat(np.arange(each.variable_count), np.diff(indptr))
         of_x = (rows >= each.nq) & (columns < each.phi_columns.start)
-        first, second = (
-            (index[of_x] - each.nq) // dofs for index in (rows, columns)
-        )
+        first, second = ((index[of_x] - each.nq) // dofs for index in (rows, columns))
         apart.append((second - first).max())
     assert apart[0] == 4 * substeps
-    assert apart[1] <= segment.dynamics.largest_lag
+    assert apart[1] <= transcription.dynamics.largest_lag
 
 
 def test_steps_take_slopes_as_they_are_at_the_nearest_sample(rng):
     whole = Collocation([late_cube(DEFAULT)], GUESS)
     program = condense(whole)
-    (segment,) = whole.transcriptions
+    (transcription,) = whole.transcriptions
     z = some_point(whole, program, rng)
-    (clock,) = program.phi_columns.start + segment.nuisance.clock_indices
+    (clock,) = program.phi_columns.start + transcription.nuisance.clock_indices
     sample = (
-        segment.experiment.timestep_s
-        / segment.nuisance.scales[segment.nuisance.clock_indices[0]]
+        transcription.experiment.timestep_s
+        / transcription.nuisance.scales[transcription.nuisance.clock_indices[0]]
     )
     found = []
     for samples in (0.4, 0.0, 0.6, 1.0):

@@ -22,11 +22,7 @@ from kit.problems import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.continuation import (
-    Continuation,
-    first_samples,
-    first_share,
-)
+from collocation_sysid.methods.continuation import Continuation, first_samples, first_share
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
@@ -40,9 +36,7 @@ from collocation_sysid.recording import Experiment
 SHARES = (0.5, 1.0)
 
 
-def continued(
-    collocation: Collocation, watch=None, shares=SHARES, **stage
-) -> Solution:
+def continued(collocation: Collocation, watch=None, shares=SHARES, **stage) -> Solution:
     return Continuation(shares, stage)(collocation, watch)
 
 
@@ -65,18 +59,8 @@ def test_the_first_samples_keep_everything_but_later_measurements():
     cut = first_samples(whole, 6)
     np.testing.assert_array_equal(cut.t_s, whole.t_s[:6])
     np.testing.assert_array_equal(cut.markers.t_s, whole.t_s[:6])
-    np.testing.assert_array_equal(
-        cut.markers.positions_m, whole.markers.positions_m[:6]
-    )
-    for name in (
-        "name",
-        "body",
-        "grasps",
-        "masses",
-        "forces",
-        "nuisance",
-        "start",
-    ):
+    np.testing.assert_array_equal(cut.markers.positions_m, whole.markers.positions_m[:6])
+    for name in ("name", "body", "grasps", "masses", "forces", "nuisance", "start"):
         assert getattr(cut, name) == getattr(whole, name)
     assert len(first_samples(whole, 99).t_s) == len(whole.t_s)
 
@@ -95,17 +79,16 @@ def test_a_part_has_the_layout_of_the_whole():
         huber=3.0,
     )
     part = first_share(whole, 0.5)
-    assert [segment.grid_times for segment in part.transcriptions] == [19, 31]
+    assert [transcription.grid_times for transcription in part.transcriptions] == [19, 31]
     assert (part.scheme, part.substeps, part.huber) == ("bdf2", 2, 3.0)
-    assert all(segment.has_grasp_constraints for segment in part.transcriptions)
+    assert all(transcription.has_grasp_constraints for transcription in part.transcriptions)
 
 
 # The answer
 
 
 @pytest.mark.parametrize(
-    ("experiment", "method"),
-    [*zip(SMALL_EXPERIMENTS, cycle(["reduced-space", "shooting"]))],
+    ("experiment", "method"), [*zip(SMALL_EXPERIMENTS, cycle(["reduced-space", "shooting"]))]
 )
 def test_the_true_parameters_are_recovered(experiment: str, method: str):
     made = measured(SMALL_EXPERIMENTS[experiment](14))
@@ -127,18 +110,13 @@ def test_interior_point_goes_on_from_the_positions_of_the_stage_before():
     assert np.abs(relative_errors(solution)).max() < 1e-4
     assert solution.max_violation_relative < 1e-6
     cold = InteriorPoint(**alone)(collocation)
-    assert solution.notes[-1].startswith(
-        "100 % of the samples by interior-point: converged"
-    )
+    assert solution.notes[-1].startswith("100 % of the samples by interior-point: converged")
     last_stage = int(solution.notes[-1].split("after ")[1].split()[0])
     assert last_stage < cold.iterations
 
 
 def test_a_parameter_at_its_bound_stays_there_from_stage_to_stage():
-    items = [
-        replace(item, upper=250.0) if item.name == "mu_pa" else item
-        for item in GUESS.items
-    ]
+    items = [replace(item, upper=250.0) if item.name == "mu_pa" else item for item in GUESS.items]
     bounded = Collocation([measured(hung_cube(19))], Parameters(tuple(items)))
     solution = continued(bounded, method="reduced-space")
     assert solution.status.converged
@@ -147,9 +125,7 @@ def test_a_parameter_at_its_bound_stays_there_from_stage_to_stage():
 
 def test_the_history_goes_on_over_the_stages_and_the_notes_tell_of_them():
     seen: list[Iteration] = []
-    solution = continued(
-        cube(), seen.append, (0.4, 0.7, 1.0), method="reduced-space"
-    )
+    solution = continued(cube(), seen.append, (0.4, 0.7, 1.0), method="reduced-space")
     assert list(solution.history) == seen
     numbers = [line.number for line in seen]
     assert numbers == sorted(numbers)
@@ -161,18 +137,13 @@ def test_the_history_goes_on_over_the_stages_and_the_notes_tell_of_them():
     ]
     assert "mu_pa = 300" in solution.notes[2]
     timing = solution.timing
-    assert (
-        timing.evaluations + timing.linear_algebra + timing.build
-        <= timing.total
-    )
+    assert timing.evaluations + timing.linear_algebra + timing.build <= timing.total
 
 
 def test_it_starts_from_given_variables():
     collocation = cube()
     answer = ReducedSpace()(collocation)
-    solution = Continuation(SHARES, {"method": "shooting"})(
-        collocation, start=answer.z
-    )
+    solution = Continuation(SHARES, {"method": "shooting"})(collocation, start=answer.z)
     assert solution.iterations < 4
 
 
@@ -201,23 +172,11 @@ def test_what_a_stage_does_not_reach_the_last_one_reports():
 @pytest.mark.parametrize(
     ("shares", "stage", "message"),
     [
-        (
-            (0.5, 0.25, 1.0),
-            {},
-            r"shares: found \[0.5, 0.25, 1.0\]; expected numbers above 0 that",
-        ),
+        ((0.5, 0.25, 1.0), {}, r"shares: found \[0.5, 0.25, 1.0\]; expected numbers above 0 that"),
         ((0.5,), {}, "ascend to 1"),
         ((), {}, "ascend to 1"),
-        (
-            SHARES,
-            {"method": "shoting"},
-            "stage.method: found 'shoting'; expected one of",
-        ),
-        (
-            SHARES,
-            {"method": "continuation"},
-            "found 'continuation'; expected one of",
-        ),
+        (SHARES, {"method": "shoting"}, "stage.method: found 'shoting'; expected one of"),
+        (SHARES, {"method": "continuation"}, "found 'continuation'; expected one of"),
         (
             SHARES,
             {"hessia": "exact"},
@@ -249,31 +208,19 @@ def test_stages_are_chosen_in_a_problem_file(tmp_path):
     assert [note.split(":")[0] for note in solution.notes[:2]] == [
         f"{share} % of the samples by shooting" for share in (50, 100)
     ]
-    assert solution.parameters["mu_pa"] == pytest.approx(
-        TRUTH["mu_pa"], rel=1e-4
-    )
+    assert solution.parameters["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-4)
 
 
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
         ("stage.metod=shooting", "'interior-point' has no option 'metod'"),
-        (
-            "stage.method=shoting",
-            "stage.method: found 'shoting'; expected one of",
-        ),
+        ("stage.method=shoting", "stage.method: found 'shoting'; expected one of"),
         ("stage.gradient=forward", "'interior-point' has no option 'gradient'"),
         ("shares=[1.0, 0.5]", "expected numbers above 0 that ascend to 1"),
     ],
 )
-def test_wrong_stages_of_a_problem_file_are_refused(
-    tmp_path, chosen: str, message: str
-):
+def test_wrong_stages_of_a_problem_file_are_refused(tmp_path, chosen: str, message: str):
     file = write_problem(tmp_path, {"swing": 8})
     with pytest.raises(InputError, match=re.escape(message)):
-        solve(
-            Problem.read(
-                file,
-                ["solver.method=continuation", f"solver.continuation.{chosen}"],
-            )
-        )
+        solve(Problem.read(file, ["solver.method=continuation", f"solver.continuation.{chosen}"]))

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from kit.checks import directional_derivative
 from kit.memories import guesses, recorded, truth
-from kit.problems import (
-    GUESS,
-    TRUTH,
-    bar_let_go,
-    cube_with_nuisance,
-    hung_cube,
-    noisy,
-)
+from kit.problems import GUESS, TRUTH, bar_let_go, cube_with_nuisance, hung_cube, noisy
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.horizon import Horizon, Iterate
@@ -22,47 +15,33 @@ from collocation_sysid.methods.loss_curvature import exact_curvature
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
-from collocation_sysid.program.measurement_residual import (
-    huber_as_least_squares,
-)
+from collocation_sysid.program.measurement_residual import huber_as_least_squares
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment
 
 
-def with_noise(
-    noise_m: float, experiment: Experiment | None = None, **changes
-) -> Collocation:
-    return Collocation(
-        [noisy(experiment or hung_cube(), noise_m, seed=2)], GUESS, **changes
-    )
+def with_noise(noise_m: float, experiment: Experiment | None = None, **changes) -> Collocation:
+    return Collocation([noisy(experiment or hung_cube(), noise_m, seed=2)], GUESS, **changes)
 
 
 def point_at(collocation: Collocation, p: np.ndarray) -> Iterate:
-    (segment,) = collocation.transcriptions
+    (transcription,) = collocation.transcriptions
     q, phi = np.split(p, [collocation.nq])
-    setting = segment.equations_at(q, phi)
-    x = simulate_scheme(segment.experiment, setting.dynamics)
-    return Horizon(collocation, [segment.grid_times]).evaluate(p, [x])
+    setting = transcription.equations_at(q, phi)
+    x = simulate_scheme(transcription.experiment, setting.dynamics)
+    return Horizon(collocation, [transcription.grid_times]).evaluate(p, [x])
 
 
 @pytest.mark.parametrize("huber", [None, 4.0])
-@pytest.mark.parametrize(
-    "experiment", [hung_cube(), bar_let_go(), cube_with_nuisance()]
-)
-def test_exact_curvature_completes_the_hessian_of_the_loss(
-    experiment, huber, rng
-):
+@pytest.mark.parametrize("experiment", [hung_cube(), bar_let_go(), cube_with_nuisance()])
+def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rng):
     collocation = with_noise(5e-3, experiment, huber=huber)
     count = 4 + collocation.nphi
-    p = np.concatenate(
-        [np.log(list(TRUTH.values())), np.zeros(collocation.nphi)]
-    )
+    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.nphi)])
     p += 0.05 * rng.normal(size=count)
     direction = rng.normal(size=count)
     point = point_at(collocation, p)
-    hessian = point.fit.compute_information() + exact_curvature(
-        collocation, point
-    )
+    hessian = point.fit.compute_information() + exact_curvature(collocation, point)
 
     def half_gradient(at: np.ndarray) -> np.ndarray:
         there = point_at(collocation, at)
@@ -73,19 +52,14 @@ def test_exact_curvature_completes_the_hessian_of_the_loss(
         hessian @ direction, differences, atol=1e-6 * np.abs(differences).max()
     )
     gauss_newton = point.fit.compute_information() @ direction
-    assert (
-        np.abs(gauss_newton - differences).max()
-        > 1e-3 * np.abs(differences).max()
-    )
+    assert np.abs(gauss_newton - differences).max() > 1e-3 * np.abs(differences).max()
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("experiment", "huber"), [(bar_let_go(), 2.0), (cube_with_nuisance(), None)]
 )
-def test_both_methods_find_the_same_optimum_of_all_parameters(
-    experiment, huber
-):
+def test_both_methods_find_the_same_optimum_of_all_parameters(experiment, huber):
     collocation = with_noise(1e-3, experiment, huber=huber)
     reduced = ReducedSpace(tolerance=1e-9)(collocation)
     alone = InteriorPoint(initial="simulation", tolerance=1e-10)
@@ -93,9 +67,7 @@ def test_both_methods_find_the_same_optimum_of_all_parameters(
     assert reduced.status.converged
     assert interior.status.converged
     assert reduced.kkt_residual < 1e-7
-    found, expected = (
-        collocation.parameters_from(s.z) for s in (reduced, interior)
-    )
+    found, expected = (collocation.parameters_from(s.z) for s in (reduced, interior))
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
@@ -119,9 +91,7 @@ def test_huberised_residuals_square_to_hubers_loss_with_its_gradient(rng):
     shrunk, weighted = huber_as_least_squares(residual, slope, 2.0)
     assert np.sum(shrunk**2) == pytest.approx(loss(np.zeros(2))[0])
     expected = directional_derivative(loss, np.zeros(2), direction, 1e-4)[0]
-    assert 2 * np.sum(shrunk * (weighted @ direction)) == pytest.approx(
-        expected, rel=1e-6
-    )
+    assert 2 * np.sum(shrunk * (weighted @ direction)) == pytest.approx(expected, rel=1e-6)
 
 
 def test_hubers_loss_is_not_led_astray_by_swapped_markers():
@@ -132,9 +102,7 @@ def test_hubers_loss_is_not_led_astray_by_swapped_markers():
     mistaken = with_markers(experiment, tracks)
     truth = np.log(list(TRUTH.values()))
     best = np.abs(ReducedSpace()(collocation).q - truth).max()
-    squared = np.abs(
-        ReducedSpace()(Collocation([mistaken], GUESS)).q - truth
-    ).max()
+    squared = np.abs(ReducedSpace()(Collocation([mistaken], GUESS)).q - truth).max()
     huber = ReducedSpace()(Collocation([mistaken], GUESS, huber=2.0))
     assert huber.status.converged
     assert np.abs(huber.q - truth).max() < 0.5 * squared
@@ -153,7 +121,5 @@ def test_an_exact_hessian_is_refused_where_there_is_none_before_anything_is_solv
         raise AssertionError("a sweep was made")
 
     remembers = Collocation([recorded("hung-cube", 4)], guesses(truth(1)))
-    with pytest.raises(
-        InputError, match=r"materials with memory .*expected 'gauss-newton'"
-    ):
+    with pytest.raises(InputError, match=r"materials with memory .*expected 'gauss-newton'"):
         ReducedSpace(hessian="exact")(remembers, watch)

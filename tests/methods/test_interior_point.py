@@ -34,10 +34,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods import initial_point
 from collocation_sysid.methods.condensed_program import condense
-from collocation_sysid.methods.initial_point import (
-    LARGEST_CORRECTION,
-    adjoint_multipliers,
-)
+from collocation_sysid.methods.initial_point import LARGEST_CORRECTION, adjoint_multipliers
 from collocation_sysid.methods.initial_trajectories import (
     associated_at_guess,
     initial_variables,
@@ -50,9 +47,7 @@ from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation, convert_variables
-from collocation_sysid.program.lifted.lifted_collocation import (
-    with_lifted_variables,
-)
+from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Markers, Nuisance
 from collocation_sysid.runs.warm_start import WarmStart
@@ -100,12 +95,7 @@ def test_substeps_are_fitted_too():
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {"hessian": "gauss-newton"},
-        {"hessian": "limited-memory"},
-        {"warm_up": 0.0},
-    ],
+    "options", [{"hessian": "gauss-newton"}, {"hessian": "limited-memory"}, {"warm_up": 0.0}]
 )
 def test_every_hessian_leads_to_the_same_answer(options: dict):
     solution = InteriorPoint(**options, tolerance=1e-10)(cube())
@@ -121,19 +111,12 @@ def test_explicit_grasps_lead_to_the_same_answer(make):
         for explicit in (False, True)
     ]
     np.testing.assert_allclose(answers[0].theta, answers[1].theta, rtol=1e-5)
-    np.testing.assert_allclose(
-        answers[0].positions_m[0], answers[1].positions_m[0], atol=1e-9
-    )
+    np.testing.assert_allclose(answers[0].positions_m[0], answers[1].positions_m[0], atol=1e-9)
 
 
 def test_fixed_parameters_stay_and_the_others_are_found():
-    fixed = [
-        Parameter(name, TRUTH[name], is_fixed=True)
-        for name in ("gamma_r_s", "gamma_m_1_s")
-    ]
-    collocation = Collocation(
-        [measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed))
-    )
+    fixed = [Parameter(name, TRUTH[name], is_fixed=True) for name in ("gamma_r_s", "gamma_m_1_s")]
+    collocation = Collocation([measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed)))
     solution = PRECISE(collocation)
     assert np.abs(relative_errors(solution)).max() < 1e-5
     assert solution.parameters["gamma_r_s"] == TRUTH["gamma_r_s"]
@@ -148,22 +131,18 @@ def test_young_and_poisson_are_found_as_well():
         )
     )
     solution = PRECISE(Collocation([measured(hung_cube())], parameters))
-    young_pa, poisson = engineering_constants(
-        TRUTH["lambda_pa"], TRUTH["mu_pa"]
-    )
+    young_pa, poisson = engineering_constants(TRUTH["lambda_pa"], TRUTH["mu_pa"])
     assert solution.parameters["young_pa"] == pytest.approx(young_pa, rel=1e-5)
     assert solution.parameters["poisson"] == pytest.approx(poisson, rel=1e-5)
 
 
 def test_the_positions_satisfy_grasp_and_motion():
     solution = solved_cube()
-    segment = cube().transcriptions[0]
+    transcription = cube().transcriptions[0]
     positions = solution.positions_m[0]
     np.testing.assert_allclose(
-        positions.reshape(len(positions), -1)[
-            :, segment.experiment.prescribed_dofs
-        ],
-        segment.experiment.prescribed_positions(segment.dynamics.t_s),
+        positions.reshape(len(positions), -1)[:, transcription.experiment.prescribed_dofs],
+        transcription.experiment.prescribed_positions(transcription.dynamics.t_s),
         atol=1e-9,
     )
     assert solution.multipliers.shape == (cube().constraint_count,)
@@ -174,10 +153,7 @@ def test_the_positions_satisfy_grasp_and_motion():
 
 def soft_guess() -> Parameters:
     """So soft that no rest state is found."""
-    soft = [
-        replace(item, guess=item.guess / 100, lower=1e-3)
-        for item in GUESS.items[:2]
-    ]
+    soft = [replace(item, guess=item.guess / 100, lower=1e-3) for item in GUESS.items[:2]]
     return Parameters((*soft, *GUESS.items[2:]))
 
 
@@ -185,15 +161,11 @@ def soft_guess() -> Parameters:
 def test_a_guess_that_cannot_be_simulated_starts_from_the_rigid_shape():
     collocation = Collocation([measured(hung_cube())], soft_guess())
     start, notes = initial_variables(collocation)
-    segment = collocation.transcriptions[0]
-    expected = rigid_trajectory(segment, as_theta(soft_guess()))
-    np.testing.assert_allclose(
-        collocation.unpack(start)[1][0], expected, atol=1e-15
-    )
+    transcription = collocation.transcriptions[0]
+    expected = rigid_trajectory(transcription, as_theta(soft_guess()))
+    np.testing.assert_allclose(collocation.unpack(start)[1][0], expected, atol=1e-15)
     assert len(notes) == 1
-    assert notes[0].startswith(
-        "experiment 'hung cube': the simulation at the guess failed ("
-    )
+    assert notes[0].startswith("experiment 'hung cube': the simulation at the guess failed (")
     assert notes[0].endswith(
         "the initial trajectory is the rest shape moving rigidly with the grasp"
     )
@@ -210,19 +182,15 @@ def test_a_guess_that_can_be_simulated_starts_on_the_constraints():
 
 
 def test_the_start_shape_is_carried_with_the_grasp():
-    segment = cube().transcriptions[0]
-    x = rigid_trajectory(segment, as_theta(TRUTH)).reshape(
-        segment.grid_times, -1, 3
-    )
+    transcription = cube().transcriptions[0]
+    x = rigid_trajectory(transcription, as_theta(TRUTH)).reshape(transcription.grid_times, -1, 3)
     np.testing.assert_allclose(
-        x.reshape(len(x), -1)[:, segment.experiment.prescribed_dofs],
-        segment.experiment.prescribed_positions(segment.dynamics.t_s),
+        x.reshape(len(x), -1)[:, transcription.experiment.prescribed_dofs],
+        transcription.experiment.prescribed_positions(transcription.dynamics.t_s),
         atol=1e-12,
     )
     lengths = np.linalg.norm(x - x[:, :1], axis=2)
-    np.testing.assert_allclose(
-        lengths, np.broadcast_to(lengths[0], lengths.shape), atol=1e-12
-    )
+    np.testing.assert_allclose(lengths, np.broadcast_to(lengths[0], lengths.shape), atol=1e-12)
 
 
 def test_a_given_start_is_used():
@@ -237,9 +205,7 @@ def test_a_given_start_is_used():
 
 def note_of(solution: Solution) -> str:
     """The note on the initial point."""
-    (note,) = (
-        each for each in solution.notes if each.startswith("initial point: ")
-    )
+    (note,) = (each for each in solution.notes if each.startswith("initial point: "))
     return note
 
 
@@ -322,9 +288,7 @@ def test_a_parameter_at_its_bound_needs_no_iteration_from_the_answer():
     """The multiplier of an active bound is part of the initial multipliers."""
     low_pa = 1.5 * TRUTH["mu_pa"]
     stiff = Parameter("mu_pa", 2 * TRUTH["mu_pa"], low_pa, 1e5)
-    bounded = Parameters(
-        tuple(stiff if item.name == "mu_pa" else item for item in GUESS.scalars)
-    )
+    bounded = Parameters(tuple(stiff if item.name == "mu_pa" else item for item in GUESS.scalars))
     collocation = Collocation([measured(hung_cube())], bounded)
     answer = ReducedSpace()(collocation)
     found = InteriorPoint()(collocation, start=answer.z)
@@ -342,9 +306,7 @@ def test_an_answer_that_meets_the_conditions_is_not_factorised():
     assert found.kkt_residual < 1e-8
 
 
-def test_a_refinement_that_fails_keeps_the_coarse_point(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_a_refinement_that_fails_keeps_the_coarse_point(monkeypatch: pytest.MonkeyPatch):
     """Without sweeps for the refinement, IPOPT begins at the coarse solution."""
     monkeypatch.setattr(initial_point, "REFINING_SWEEPS", 0)
     solution = PRECISE(cube())
@@ -354,9 +316,7 @@ def test_a_refinement_that_fails_keeps_the_coarse_point(
 
 
 @cache
-def soft_bar(
-    divisions: tuple[int, int, int] = (4, 1, 1), samples: int = 31
-) -> Problem:
+def soft_bar(divisions: tuple[int, int, int] = (4, 1, 1), samples: int = 31) -> Problem:
     """A soft bar whose markers have unknown places; its guesses are wrong by factors of three."""
     return bar(divisions, samples, ideal=False)
 
@@ -395,9 +355,7 @@ def test_a_finer_soft_bar_converges_from_distant_guesses_too():
 def test_rows_of_the_equations_do_not_slow_the_steps_of_ipopt_alone():
     soft = soft_bar()
     wrong = {"mu_pa": 3 * SOFT["mu_pa"]}
-    found = alone_from_the_guess(
-        replace(soft, parameters=soft.parameters.with_guess(wrong))
-    )
+    found = alone_from_the_guess(replace(soft, parameters=soft.parameters.with_guess(wrong)))
     assert found.status is Status.CONVERGED
     assert found.iterations <= 14
 
@@ -408,34 +366,23 @@ def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
     answer = run(problem, ReducedSpace(), seek_causes=False)
     substeps = answer.solution.collocation.substeps
     folder = answer.save(tmp_path / "answer")
-    found = run(
-        problem, InteriorPoint(), start=folder, seek_causes=False
-    ).solution
+    found = run(problem, InteriorPoint(), start=folder, seek_causes=False).solution
     assert found.status is Status.CONVERGED
     assert found.iterations <= 5
     assert found.collocation.substeps == substeps
-    assert found.history[0].rms_m == pytest.approx(
-        answer.solution.rms_m, rel=1e-2
-    )
+    assert found.history[0].rms_m == pytest.approx(answer.solution.rms_m, rel=1e-2)
     again = solve(problem, InteriorPoint(), start=folder)
-    found_by = (
-        r"initial point: (the given initial values|1 sweep|[2-9] sweeps)\b"
-    )
+    found_by = r"initial point: (the given initial values|1 sweep|[2-9] sweeps)\b"
     assert re.match(found_by, note_of(again))
 
 
 @pytest.mark.long
 def test_a_start_with_finer_steps_is_continued_with_these():
     problem = soft_bar()
-    answer = WarmStart.of(
-        ReducedSpace()(replace(problem, substeps=2).collocation())
-    )
+    answer = WarmStart.of(ReducedSpace()(replace(problem, substeps=2).collocation()))
     assert answer.substeps == 2
     assert solve(problem, start=answer).collocation.substeps == 2
-    assert (
-        solve(replace(problem, substeps=1), start=answer).collocation.substeps
-        == 1
-    )
+    assert solve(replace(problem, substeps=1), start=answer).collocation.substeps == 1
 
 
 # What is unknown by default
@@ -446,10 +393,7 @@ def unplaced() -> Experiment:
     bar = bar_in_two_hands(16)
     held = replace(bar, grasps=bar.grasps[1:])
     seen = noisy(held).markers
-    return replace(
-        held,
-        markers=Markers(seen.t_s, seen.positions_m, seen.sigma_m, seen.names),
-    )
+    return replace(held, markers=Markers(seen.t_s, seen.positions_m, seen.sigma_m, seen.names))
 
 
 def remembering() -> Experiment:
@@ -462,11 +406,7 @@ def remembering() -> Experiment:
 
 UNKNOWN = {
     "places": (unplaced, TRUTH, "gamma_m_1_s"),
-    "wrench": (
-        lambda: noisy(sensed(wristed_cube(12)), 1e-4),
-        TRUTH,
-        "gamma_m_1_s",
-    ),
+    "wrench": (lambda: noisy(sensed(wristed_cube(12)), 1e-4), TRUTH, "gamma_m_1_s"),
     "memory": (remembering, ONE, "prony_1.tau_s"),
 }
 # IPOPT's line of an iteration, with lg(rg): by how much it shifted the Hessian's diagonal.
@@ -475,18 +415,11 @@ ITERATION = r"^ +\d+r?(?: +\S+){5} +(-|-?\d\S+) +\S+ +\S+ +\d+"
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", UNKNOWN)
-def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(
-    name: str, capfd
-):
+def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(name: str, capfd):
     make, truth, known = UNKNOWN[name]
     factors = dict(zip(truth, (2.0, 0.5, 2.0, 0.5, 1.5, 1.5), strict=False))
-    given = {
-        k: v if k == known else Unknown(factors[k] * v)
-        for k, v in truth.items()
-    }
-    problem = Problem(
-        [replace(make(), nuisance=Nuisance())], given, scheme="midpoint"
-    )
+    given = {k: v if k == known else Unknown(factors[k] * v) for k, v in truth.items()}
+    problem = Problem([replace(make(), nuisance=Nuisance())], given, scheme="midpoint")
     expected = solve(problem, ReducedSpace(tolerance=1e-10))
     precise = replace(ALONE, tolerance=1e-10, ipopt={"print_level": 5})
     found = precise(expected.collocation)  # where its markers are read
@@ -520,31 +453,17 @@ def test_a_linear_solver_that_is_not_installed_is_a_refusal_with_a_remedy():
     solution = InteriorPoint(linear_solver="ma27")(cube())
     assert solution.status is Status.REFUSED
     assert solution.iterations == 0
-    assert (
-        "linear_solver = 'ma27' probably needs a library" in solution.notes[-1]
-    )
+    assert "linear_solver = 'ma27' probably needs a library" in solution.notes[-1]
     assert "'mumps'" in solution.notes[-1]
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"linear_solver": "lapack"},
-            '"lapack" is not a valid setting for Option: linear_solver',
-        ),
-        (
-            {"ipopt": {"toll": 1e-3}},
-            "solver: IPOPT cannot be set up: No such IPOPT option: toll",
-        ),
-        (
-            {"ipopt": {"mu_init": -1.0}},
-            '"-1" is not a valid setting for Option: mu_init',
-        ),
-        (
-            {"hessian": "bfgs"},
-            "hessian: found 'bfgs'; expected 'exact', 'gauss-newton' or",
-        ),
+        ({"linear_solver": "lapack"}, '"lapack" is not a valid setting for Option: linear_solver'),
+        ({"ipopt": {"toll": 1e-3}}, "solver: IPOPT cannot be set up: No such IPOPT option: toll"),
+        ({"ipopt": {"mu_init": -1.0}}, '"-1" is not a valid setting for Option: mu_init'),
+        ({"hessian": "bfgs"}, "hessian: found 'bfgs'; expected 'exact', 'gauss-newton' or"),
     ],
 )
 def test_unknown_options_are_refused(options: dict, message: str, capfd):
@@ -590,17 +509,9 @@ def test_an_error_in_the_callers_function_reaches_the_caller(capfd):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "objective",
-        "gradient",
-        "constraint_values",
-        "constraints_and_jacobian",
-        "hessian_values",
-    ],
+    ["objective", "gradient", "constraint_values", "constraints_and_jacobian", "hessian_values"],
 )
-def test_an_error_in_an_evaluation_reaches_the_caller(
-    name: str, monkeypatch, capfd
-):
+def test_an_error_in_an_evaluation_reaches_the_caller(name: str, monkeypatch, capfd):
     def broken(*_: object, **__: object) -> None:
         raise KeyboardInterrupt(name)
 
@@ -614,11 +525,7 @@ def test_an_error_in_an_evaluation_reaches_the_caller(
 
 
 def test_every_ipopt_status_has_a_meaning():
-    converged = {
-        "Solve_Succeeded",
-        "Solved_To_Acceptable_Level",
-        "Feasible_Point_Found",
-    }
+    converged = {"Solve_Succeeded", "Solved_To_Acceptable_Level", "Feasible_Point_Found"}
     assert set(IPOPT_STATUS) == converged | {
         "Infeasible_Problem_Detected",
         "Search_Direction_Becomes_Too_Small",
@@ -639,9 +546,7 @@ def test_every_ipopt_status_has_a_meaning():
         "Internal_Error",
     }
     assert all(isinstance(status, Status) for status in IPOPT_STATUS.values())
-    assert {
-        name for name, status in IPOPT_STATUS.items() if status.converged
-    } == converged
+    assert {name for name, status in IPOPT_STATUS.items() if status.converged} == converged
 
 
 @pytest.mark.parametrize("status", Status)
@@ -662,9 +567,7 @@ def test_the_history_counts_iterations_and_ends_at_the_answer():
     seen: list[Iteration] = []
     solution = ALONE(cube(), watch=seen.append)
     assert list(solution.history) == seen
-    assert [iteration.number for iteration in seen] == list(
-        range(solution.iterations + 1)
-    )
+    assert [iteration.number for iteration in seen] == list(range(solution.iterations + 1))
     assert (np.diff([iteration.time_s for iteration in seen]) >= 0).all()
     np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
     np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta)

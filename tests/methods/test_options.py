@@ -31,16 +31,12 @@ def test_every_option_is_documented(name: str):
 def test_every_method_is_known_by_its_name_and_has_a_schema(name: str):
     kind = METHODS[name]
     assert kind().name == name
-    assert set(TypeAdapter(kind).json_schema()["properties"]) == set(
-        documented(kind)
-    )
+    assert set(TypeAdapter(kind).json_schema()["properties"]) == set(documented(kind))
     assert TypeAdapter(kind).validate_python({}) == kind()
 
 
 def test_a_method_is_built_from_a_table():
-    method = method_from_options(
-        ReducedSpace, {"ladder": [0.5, 1], "max_iterations": 3}, "solver"
-    )
+    method = method_from_options(ReducedSpace, {"ladder": [0.5, 1], "max_iterations": 3}, "solver")
     assert method == ReducedSpace(ladder=(0.5, 1.0), max_iterations=3)
 
 
@@ -53,59 +49,27 @@ def test_a_method_is_built_from_a_table():
             "solver: the method 'penalty' has no option 'rh'; .*did you mean 'rho'?",
         ),
         ("penalty", {"rho": "1"}, "solver.rho: found '1'; expected a number$"),
-        (
-            "penalty",
-            {"rho": True},
-            "solver.rho: found True; expected a number$",
-        ),
-        (
-            "penalty",
-            {"max_iterations": 1.5},
-            "solver.max_iterations: .* expected a whole number",
-        ),
-        (
-            "reduced-space",
-            {"hessian": "exat"},
-            "'gauss-newton' or 'exact'; did you mean 'exact'",
-        ),
-        (
-            "reduced-space",
-            {"ladder": [0.5]},
-            "solver.ladder: found .0.5.; expected numbers above",
-        ),
-        (
-            "reduced-space",
-            {"ladder": 1.0},
-            "solver.ladder: found 1.0; expected a list",
-        ),
-        (
-            "interior-point",
-            {"ipopt": {"sb": True}},
-            "solver.ipopt.sb: found true; expected text",
-        ),
+        ("penalty", {"rho": True}, "solver.rho: found True; expected a number$"),
+        ("penalty", {"max_iterations": 1.5}, "solver.max_iterations: .* expected a whole number"),
+        ("reduced-space", {"hessian": "exat"}, "'gauss-newton' or 'exact'; did you mean 'exact'"),
+        ("reduced-space", {"ladder": [0.5]}, "solver.ladder: found .0.5.; expected numbers above"),
+        ("reduced-space", {"ladder": 1.0}, "solver.ladder: found 1.0; expected a list"),
+        ("interior-point", {"ipopt": {"sb": True}}, "solver.ipopt.sb: found true; expected text"),
         (
             "continuation",
             {"stage": {"rho": 1}},
             "solver.stage: the method 'interior-point' has no option",
         ),
-        (
-            "continuation",
-            {"stage": {"tolerance": 0}},
-            "solver.stage.tolerance: found 0; expected",
-        ),
+        ("continuation", {"stage": {"tolerance": 0}}, "solver.stage.tolerance: found 0; expected"),
     ],
 )
-def test_what_an_option_cannot_be_is_refused_by_its_key(
-    kind: str, options: dict, message: str
-):
+def test_what_an_option_cannot_be_is_refused_by_its_key(kind: str, options: dict, message: str):
     with pytest.raises(InputError, match=message):
         method_from_options(METHODS[kind], options, "solver")
 
 
 def test_a_changed_method_is_checked_again():
-    with pytest.raises(
-        InputError, match="tolerance: found 0; expected a number above 0"
-    ):
+    with pytest.raises(InputError, match="tolerance: found 0; expected a number above 0"):
         replace(Penalty(), tolerance=0)
 
 
@@ -115,13 +79,9 @@ def test_whatever_solves_is_a_method():
         patience: int
 
         def __call__(self, collocation, watch=None, start=None):
-            return ReducedSpace(max_iterations=self.patience)(
-                collocation, watch, start
-            )
+            return ReducedSpace(max_iterations=self.patience)(collocation, watch, start)
 
     collocation = Collocation([measured(hung_cube(19))], GUESS)
     solution = Continuation((0.5, 1.0), Patient(50))(collocation)
     assert solution.status.converged
-    assert solution.notes[0].startswith(
-        "50 % of the samples by reduced-space: converged"
-    )
+    assert solution.notes[0].startswith("50 % of the samples by reduced-space: converged")

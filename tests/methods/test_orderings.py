@@ -23,9 +23,7 @@ def output(order: int) -> str:
     """What MUMPS prints with an ordering."""
     program = DENSE.format(size=SIZE, order=order)
     command = [sys.executable, "-c", program]
-    return subprocess.run(
-        command, capture_output=True, text=True, check=True
-    ).stdout
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def test_statistics_are_those_of_a_dense_matrix() -> None:
@@ -71,7 +69,4 @@ def test_a_setting_is_measured_in_a_process_of_its_own() -> None:
 
 @pytest.mark.long
 def test_a_failed_process_gives_none() -> None:
-    assert run_in_own_process("no_such_problem", "amd", iterations=1) == (
-        None,
-        None,
-    )
+    assert run_in_own_process("no_such_problem", "amd", iterations=1) == (None, None)

@@ -20,14 +20,8 @@ from kit.problems import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.comparison.inner import (
-    FIRST_ORDER,
-    minimise_merit,
-)
-from collocation_sysid.methods.comparison.merit import (
-    MeritFunction,
-    PenaltyProblem,
-)
+from collocation_sysid.methods.comparison.inner import FIRST_ORDER, minimise_merit
+from collocation_sysid.methods.comparison.merit import MeritFunction, PenaltyProblem
 from collocation_sysid.methods.comparison.penalty import Penalty
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.methods.solution import Iteration, Status
@@ -38,9 +32,7 @@ NEWTON = Penalty(inner="levenberg-marquardt")
 
 def disturbed(problem: PenaltyProblem, rng: np.random.Generator) -> np.ndarray:
     z, _ = initial_variables(problem.original)
-    return z + np.where(
-        problem.is_free, 0.01 * rng.standard_normal(len(z)), 0.0
-    )
+    return z + np.where(problem.is_free, 0.01 * rng.standard_normal(len(z)), 0.0)
 
 
 # The merit function
@@ -49,16 +41,12 @@ def disturbed(problem: PenaltyProblem, rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
 def test_the_gradient_of_the_merit_is_that_of_differences(name: str, rng):
     problem = PenaltyProblem(collocation_of(name))
-    merit = MeritFunction(
-        problem, 30.0, rng.standard_normal(problem.nlp.constraint_count)
-    )
+    merit = MeritFunction(problem, 30.0, rng.standard_normal(problem.nlp.constraint_count))
     z = disturbed(problem, rng)
     _, gradient = merit.value_and_gradient(z)
     assert not gradient[~problem.is_free].any()
     scale = 0.1 * problem.is_free
-    assert_derivative(
-        merit.value, lambda d: gradient @ d, z, rng, tolerance=1e-6, scale=scale
-    )
+    assert_derivative(merit.value, lambda d: gradient @ d, z, rng, tolerance=1e-6, scale=scale)
 
 
 def test_grasps_are_paid_for_and_given_starts_are_not():
@@ -89,11 +77,11 @@ def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
     rows = problem.nlp.constraint_values(answer).reshape(
         -1, problem.nlp.transcriptions[0].dof_count
     )
-    (segment,) = problem.nlp.transcriptions
-    assert segment.dynamics.is_temporarily_prescribed.any()
-    np.testing.assert_allclose(rows[:, segment.prescribed_dofs], 0, atol=1e-12)
+    (transcription,) = problem.nlp.transcriptions
+    assert transcription.dynamics.is_temporarily_prescribed.any()
+    np.testing.assert_allclose(rows[:, transcription.prescribed_dofs], 0, atol=1e-12)
     np.testing.assert_allclose(
-        rows[segment.dynamics.is_temporarily_prescribed], 0, atol=1e-12
+        rows[transcription.dynamics.is_temporarily_prescribed], 0, atol=1e-12
     )
 
 
@@ -103,9 +91,7 @@ def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
 @pytest.mark.long
 @pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
 def test_newton_steps_at_large_rho_find_the_truth(name: str):
-    solution = replace(NEWTON, rho=1e5, violation=1e-6)(
-        collocation_of(name, steps=6)
-    )
+    solution = replace(NEWTON, rho=1e5, violation=1e-6)(collocation_of(name, steps=6))
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-3
     assert solution.max_violation_relative < 1e-6
@@ -141,9 +127,7 @@ def test_methods_of_first_order_lower_the_merit_and_stay_upright(inner):
     start, _ = initial_variables(collocation)
     assert merit.value(solution.z) < 1e-3 * merit.value(start)
     assert problem.has_valid_elements(solution.z)
-    assert [line.number for line in lines] == sorted(
-        {line.number for line in lines}
-    )
+    assert [line.number for line in lines] == sorted({line.number for line in lines})
     lower, upper = problem.lower, problem.upper
     assert ((solution.z >= lower) & (solution.z <= upper)).all()
 
@@ -155,18 +139,11 @@ def test_conjugate_gradients_lower_the_merit_in_every_step():
     start, _ = initial_variables(collocation)
     values = []
     minimise_merit(
-        "cg-descent",
-        merit,
-        start,
-        1e-12,
-        150,
-        lambda z, value, slope: values.append(value),
+        "cg-descent", merit, start, 1e-12, 150, lambda z, value, slope: values.append(value)
     )
     changes = np.diff(values)
     assert len(changes) > 50
-    assert (
-        changes <= 1e-6 * np.abs(values[:-1])
-    ).all()  # what the approximate conditions allow
+    assert (changes <= 1e-6 * np.abs(values[:-1])).all()  # what the approximate conditions allow
 
 
 @pytest.mark.slow
@@ -195,9 +172,7 @@ def test_rising_schedules_end_within_the_violation(schedule):
     solution = replace(NEWTON, schedule=schedule, rho=1e4)(collocation)
     assert solution.status is Status.CONVERGED
     assert solution.max_violation_relative <= 1e-3
-    assert solution.history[-1].violation_n == pytest.approx(
-        solution.max_violation_n
-    )
+    assert solution.history[-1].violation_n == pytest.approx(solution.max_violation_n)
 
 
 def test_budgets_end_it():
@@ -230,10 +205,7 @@ def test_an_interruption_keeps_the_last_and_best_iterate():
 @pytest.mark.long
 def test_both_layouts_of_grasps_give_the_same_answer():
     made = noisy(hung_cube(), 1e-4)
-    bounds, rows = (
-        Collocation([made], GUESS, has_grasp_constraints=e)
-        for e in (False, True)
-    )
+    bounds, rows = (Collocation([made], GUESS, has_grasp_constraints=e) for e in (False, True))
     options = replace(NEWTON, rho=1e6)
     solution, explicit = options(bounds), options(rows)
     np.testing.assert_allclose(solution.z, explicit.z, atol=1e-6)
@@ -245,9 +217,7 @@ def test_both_layouts_of_grasps_give_the_same_answer():
 
 def test_nuisance_parameters_may_be_estimated_by_gradients_alone():
     collocation = Collocation([measured(cube_with_nuisance(5))], GUESS)
-    options = Penalty(
-        "l-bfgs-b", schedule="constant", rho=1e3, max_iterations=60
-    )
+    options = Penalty("l-bfgs-b", schedule="constant", rho=1e3, max_iterations=60)
     solution = options(collocation)
     assert solution.rms_m < 0.1 * solution.history[0].rms_m
 
@@ -255,27 +225,15 @@ def test_nuisance_parameters_may_be_estimated_by_gradients_alone():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (
-            {"inner": "simplex"},
-            "inner: found 'simplex'; expected 'cg-descent', 'scipy-cg', ",
-        ),
-        (
-            {"schedule": "slow"},
-            "schedule: found 'slow'; expected 'geometric', 'progress' or",
-        ),
+        ({"inner": "simplex"}, "inner: found 'simplex'; expected 'cg-descent', 'scipy-cg', "),
+        ({"schedule": "slow"}, "schedule: found 'slow'; expected 'geometric', 'progress' or"),
         ({"rho": 0.0}, "rho: found 0.0; expected a number above 0"),
-        (
-            {"rho_factor": 1.0},
-            "rho_factor: found 1.0; expected a number above 1",
-        ),
+        ({"rho_factor": 1.0}, "rho_factor: found 1.0; expected a number above 1"),
         (
             {"rho": 1e9},
             r"rho_max: found 1e\+08, which is less than rho = 1e\+09; expected rho or more",
         ),
-        (
-            {"violation": -1.0},
-            "violation: found -1.0; expected a number above 0",
-        ),
+        ({"violation": -1.0}, "violation: found -1.0; expected a number above 0"),
     ],
 )
 def test_bad_options_are_refused(options: dict, said: str):
@@ -291,7 +249,5 @@ def test_a_start_with_inverted_elements_is_refused():
     collocation = collocation_of("hung-cube")
     z, _ = initial_variables(collocation)
     q, (x,) = collocation.unpack(z)
-    with pytest.raises(
-        InputError, match="elements are inverted at the initial point"
-    ):
+    with pytest.raises(InputError, match="elements are inverted at the initial point"):
         NEWTON(collocation, start=collocation.pack(q, [-x]))

@@ -33,10 +33,7 @@ from collocation_sysid.methods.initial_trajectories import (
     simulate_trajectories,
 )
 from collocation_sysid.methods.interior_point import InteriorPoint
-from collocation_sysid.methods.loss_curvature import (
-    secant_update,
-    with_curvature,
-)
+from collocation_sysid.methods.loss_curvature import secant_update, with_curvature
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.model.parameters import Parameter, Parameters
@@ -49,10 +46,7 @@ KKT = 1e-8
 
 def with_parameter(name: str, **changes) -> Parameters:
     return Parameters(
-        tuple(
-            replace(item, **changes) if item.name == name else item
-            for item in GUESS.items
-        )
+        tuple(replace(item, **changes) if item.name == name else item for item in GUESS.items)
     )
 
 
@@ -87,31 +81,21 @@ def test_with_noise_it_is_the_optimum_of_interior_point(make):
     assert solution.status.converged
     assert reference.status.converged
     np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-6)
-    np.testing.assert_allclose(
-        solution.positions_m[0], reference.positions_m[0], atol=1e-8
-    )
-    np.testing.assert_allclose(
-        solution.multipliers, reference.multipliers, atol=1e-6
-    )
+    np.testing.assert_allclose(solution.positions_m[0], reference.positions_m[0], atol=1e-8)
+    np.testing.assert_allclose(solution.multipliers, reference.multipliers, atol=1e-6)
     assert solution.kkt_residual < KKT
 
 
 def test_experiments_of_different_lengths_and_grasps_are_fitted_together():
     held_out = replace(measured(hung_cube(5)), name="held out", validation=True)
-    made = [
-        measured(hung_cube(9)),
-        measured(bar_in_two_hands(14)),
-        measured(released_cube(8)),
-    ]
+    made = [measured(hung_cube(9)), measured(bar_in_two_hands(14)), measured(released_cube(8))]
     solution = ReducedSpace()(Collocation([*made, held_out], GUESS))
     assert np.abs(relative_errors(solution)).max() < 1e-6
     assert [len(x) for x in solution.positions_m] == [10, 15, 9]
     assert solution.kkt_residual < KKT
 
 
-@pytest.mark.parametrize(
-    "options", [{"substeps": 3}, {"has_grasp_constraints": True}]
-)
+@pytest.mark.parametrize("options", [{"substeps": 3}, {"has_grasp_constraints": True}])
 def test_every_layout_is_fitted(options: dict):
     made = measured(hung_cube(8), substeps=options.get("substeps", 1))
     solution = ReducedSpace()(Collocation([made], GUESS, **options))
@@ -120,22 +104,15 @@ def test_every_layout_is_fitted(options: dict):
 
 
 def test_fixed_parameters_stay_and_the_others_are_found():
-    fixed = [
-        Parameter(name, TRUTH[name], is_fixed=True)
-        for name in ("gamma_r_s", "gamma_m_1_s")
-    ]
-    collocation = Collocation(
-        [measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed))
-    )
+    fixed = [Parameter(name, TRUTH[name], is_fixed=True) for name in ("gamma_r_s", "gamma_m_1_s")]
+    collocation = Collocation([measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed)))
     solution = ReducedSpace()(collocation)
     assert np.abs(relative_errors(solution)).max() < 1e-6
     assert solution.parameters["gamma_r_s"] == TRUTH["gamma_r_s"]
 
 
 def test_with_all_parameters_fixed_it_simulates():
-    fixed = Parameters(
-        tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH)
-    )
+    fixed = Parameters(tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH))
     solution = ReducedSpace()(Collocation([measured(hung_cube())], fixed))
     assert solution.status is Status.CONVERGED
     assert solution.rms_m < 1e-9
@@ -143,31 +120,22 @@ def test_with_all_parameters_fixed_it_simulates():
 
 
 def test_young_and_poisson_are_found_as_well():
-    elastic = (
-        Parameter("young_pa", 300.0, 10.0, 1e5),
-        Parameter("poisson", 0.4, 0.01, 0.49),
-    )
+    elastic = (Parameter("young_pa", 300.0, 10.0, 1e5), Parameter("poisson", 0.4, 0.01, 0.49))
     parameters = Parameters((*elastic, *GUESS.items[2:]))
     solution = ReducedSpace()(Collocation([measured(hung_cube())], parameters))
-    young_pa, poisson = engineering_constants(
-        TRUTH["lambda_pa"], TRUTH["mu_pa"]
-    )
+    young_pa, poisson = engineering_constants(TRUTH["lambda_pa"], TRUTH["mu_pa"])
     assert solution.parameters["young_pa"] == pytest.approx(young_pa, rel=1e-6)
     assert solution.parameters["poisson"] == pytest.approx(poisson, rel=1e-6)
 
 
 @pytest.mark.parametrize("bound", [{"lower": 350.0}, {"upper": 250.0}])
 def test_a_bound_that_excludes_the_truth_is_active_at_the_answer(bound: dict):
-    parameters = with_parameter(
-        "mu_pa", guess=next(iter(bound.values())), **bound
-    )
+    parameters = with_parameter("mu_pa", guess=next(iter(bound.values())), **bound)
     collocation = Collocation([measured(hung_cube())], parameters)
     solution = ReducedSpace()(collocation)
     reference = InteriorPoint(tolerance=1e-11)(collocation)
     assert solution.status is Status.CONVERGED
-    assert solution.parameters["mu_pa"] == pytest.approx(
-        next(iter(bound.values())), rel=1e-12
-    )
+    assert solution.parameters["mu_pa"] == pytest.approx(next(iter(bound.values())), rel=1e-12)
     np.testing.assert_allclose(solution.theta, reference.theta, rtol=1e-4)
     assert solution.kkt_residual < KKT
 
@@ -189,9 +157,7 @@ def test_every_factorisation_leads_to_the_same_answer(factorisation):
 
 
 def test_memory_grows_no_faster_than_the_number_of_timesteps():
-    short, long = (
-        Collocation([hung_cube(steps)], GUESS) for steps in (49, 199)
-    )
+    short, long = (Collocation([hung_cube(steps)], GUESS) for steps in (49, 199))
     assert memory_mb(short) < memory_mb(long) <= 4 * memory_mb(short)
 
 
@@ -204,16 +170,10 @@ def test_a_guess_that_cannot_be_simulated_is_a_status_that_tells_what_to_change(
         replace(item, guess=guess, lower=1e-4, upper=guess * 1.001)
         for item, guess in zip(GUESS.items[:2], (0.4, 0.15), strict=True)
     ]
-    collocation = Collocation(
-        [measured(hung_cube())], Parameters((*soft, *GUESS.items[2:]))
-    )
+    collocation = Collocation([measured(hung_cube())], Parameters((*soft, *GUESS.items[2:])))
     solution = ReducedSpace()(collocation)
     assert solution.status is Status.NOT_SIMULABLE
-    for part in (
-        "stiffer or less damped parameters",
-        "loses its stability",
-        "t = 0 s, element ",
-    ):
+    for part in ("stiffer or less damped parameters", "loses its stability", "t = 0 s, element "):
         assert part in solution.message
     assert np.isfinite(solution.z).all()
     assert solution.rms_m > 0
@@ -245,12 +205,8 @@ def test_a_start_near_the_optimum_is_solved_to_the_tolerance(distance: float):
 
 @pytest.mark.parametrize("make", [hung_cube, released_cube, bar_let_go])
 @pytest.mark.parametrize("explicit", [False, True])
-def test_positions_to_start_from_need_satisfy_neither_dynamics_nor_grasps(
-    make, explicit, rng
-):
-    collocation = Collocation(
-        [measured(make())], GUESS, has_grasp_constraints=explicit
-    )
+def test_positions_to_start_from_need_satisfy_neither_dynamics_nor_grasps(make, explicit, rng):
+    collocation = Collocation([measured(make())], GUESS, has_grasp_constraints=explicit)
     q, (x,) = collocation.unpack(initial_variables(collocation)[0])
     start = collocation.pack(q + 0.2, [x + 1e-4 * rng.normal(size=x.shape)])
     solution = ReducedSpace()(collocation, start=start)
@@ -263,9 +219,7 @@ def test_a_start_whose_positions_lead_nowhere_is_simulated_at_its_parameters():
     start = cube().pack(solved_cube().q, [np.zeros((11, 81))])
     solution = ReducedSpace()(cube(), seen.append, start)
     assert solution.status is Status.CONVERGED
-    assert seen[0].parameters == pytest.approx(
-        solved_cube().parameters, rel=1e-7
-    )
+    assert seen[0].parameters == pytest.approx(solved_cube().parameters, rel=1e-7)
     np.testing.assert_allclose(solution.theta, solved_cube().theta, rtol=1e-6)
 
 
@@ -273,9 +227,7 @@ def test_a_start_whose_positions_lead_nowhere_is_simulated_at_its_parameters():
 def test_few_starts_far_away_all_succeed():
     from study_starts import SwungBody, guesses, hanging_cylinder, study
 
-    case = SwungBody(
-        hanging_cylinder(layers=4, steps=24, scheme="midpoint"), TRUTH
-    )
+    case = SwungBody(hanging_cylinder(layers=4, steps=24, scheme="midpoint"), TRUTH)
     outcomes = study(case, guesses(8, 10.0, seed=0))
     assert [outcome.number for outcome in outcomes if not outcome.success] == []
     assert np.median([outcome.sweeps for outcome in outcomes]) < 14
@@ -298,9 +250,7 @@ def test_no_progress_is_a_status(monkeypatch: pytest.MonkeyPatch):
     assert solution.max_violation_relative < 1e-3
 
 
-def test_rows_that_can_be_simulated_are_solved_first(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_rows_that_can_be_simulated_are_solved_first(monkeypatch: pytest.MonkeyPatch):
     """As long as the parameters are those of the guess, the last rows cannot be reached."""
 
     def short_at_the_guess(self: Horizon, q, x=None):
@@ -317,9 +267,7 @@ def test_rows_that_can_be_simulated_are_solved_first(
     assert np.abs(relative_errors(solution)).max() < 1e-6
 
 
-def test_rows_that_stay_out_of_reach_are_a_status(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_rows_that_stay_out_of_reach_are_a_status(monkeypatch: pytest.MonkeyPatch):
     def short(self: Horizon, q, x=None):
         (found,), _ = extend(self, q, x)
         return [found.x[:12]], SimulationError("it fails", 0.12, 7)
@@ -355,14 +303,9 @@ def test_rows_not_reached_are_carried_by_the_grasp():
     def interrupt(_: Iteration) -> None:
         raise KeyboardInterrupt
 
-    solution = ReducedSpace()(
-        Collocation([measured(hung_cube(40))], GUESS), watch=interrupt
-    )
-    (segment,) = solution.collocation.transcriptions
-    (found,), expected = (
-        solution.positions_m,
-        rigid_trajectory(segment, as_theta(GUESS)),
-    )
+    solution = ReducedSpace()(Collocation([measured(hung_cube(40))], GUESS), watch=interrupt)
+    (transcription,) = solution.collocation.transcriptions
+    (found,), expected = (solution.positions_m, rigid_trajectory(transcription, as_theta(GUESS)))
     away_m = np.abs(found - expected.reshape(found.shape)).max(axis=(1, 2))
     reached = 10  # a quarter of 41 rows
     assert (away_m[1:reached] > 1e-5).all()
@@ -379,9 +322,7 @@ def test_an_error_in_the_callers_function_reaches_the_caller():
 
 def test_a_misfit_far_above_the_noise_is_noted():
     made = measured(hung_cube())
-    shifted = with_markers(
-        made, made.markers.positions_m + np.array([0.01, 0.0, 0.0])
-    )
+    shifted = with_markers(made, made.markers.positions_m + np.array([0.01, 0.0, 0.0]))
     solution = ReducedSpace()(Collocation([shifted], GUESS))
     assert "times their standard deviations" in solution.notes[-1]
     assert not solved_cube().notes
@@ -399,17 +340,9 @@ def residuals(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def point_of(q: np.ndarray, before: Iterate | None = None) -> Iterate:
     """A point that has these."""
     residual, slope = residuals(q)
-    crossed = (
-        np.zeros(len(q))
-        if before is None
-        else residuals(before.p)[1].T @ residual
-    )
+    crossed = np.zeros(len(q)) if before is None else residuals(before.p)[1].T @ residual
     return Iterate(
-        q,
-        [],
-        [],
-        SquareRootInformation.empty(len(q)).with_rows(residual, slope),
-        crossed,
+        q, [], [], SquareRootInformation.empty(len(q)).with_rows(residual, slope), crossed
     )
 
 
@@ -424,20 +357,13 @@ def test_the_learned_curvature_explains_the_last_step():
 
 
 def test_curvature_joins_the_triangle_unless_that_is_indefinite(rng):
-    triangle, right = (
-        np.triu(rng.normal(size=(4, 4))) + 3 * np.eye(4),
-        rng.normal(size=4),
-    )
+    triangle, right = (np.triu(rng.normal(size=(4, 4))) + 3 * np.eye(4), rng.normal(size=4))
     b = rng.normal(size=(4, 4))
     b += b.T
     fit = SquareRootInformation(np.column_stack([triangle, right]))
     joined = with_curvature(fit, b)
-    np.testing.assert_allclose(
-        joined.compute_information(), triangle.T @ triangle + b, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        joined.compute_score(), triangle.T @ right, atol=1e-12
-    )
+    np.testing.assert_allclose(joined.compute_information(), triangle.T @ triangle + b, atol=1e-12)
+    np.testing.assert_allclose(joined.compute_score(), triangle.T @ right, atol=1e-12)
     assert with_curvature(fit, -100 * np.eye(4)) is fit
 
 

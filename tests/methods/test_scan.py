@@ -7,14 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from kit.problems import (
-    GUESS,
-    TRUTH,
-    hung_cube,
-    measured,
-    point_markers,
-    relative_errors,
-)
+from kit.problems import GUESS, TRUTH, hung_cube, measured, point_markers, relative_errors
 from kit.static import block
 from kit.wrenches import sensed, sensing, with_wrenches, wristed_cube
 
@@ -92,9 +85,7 @@ def test_the_scan_starts_from_usual_values():
     young_pa = scanned().young_pa[scanned().best]
     assert values["mu_pa"] == pytest.approx(young_pa / 2.6)
     assert values["lambda_pa"] == pytest.approx(1.5 * values["mu_pa"])
-    assert (values["gamma_r_s"], values["gamma_m_1_s"]) == pytest.approx(
-        (0.003, 0.3)
-    )
+    assert (values["gamma_r_s"], values["gamma_m_1_s"]) == pytest.approx((0.003, 0.3))
 
 
 def test_a_guess_that_is_given_is_used():
@@ -102,37 +93,21 @@ def test_a_guess_that_is_given_is_used():
     found = scan_stiffness(cube(given).collocation()).parameters
     assert found.guesses["lambda_pa"] == 333.0
     assert found.guesses["gamma_r_s"] == 0.009
-    assert [item.name for item in found.free] == [
-        "lambda_pa",
-        "mu_pa",
-        "gamma_m_1_s",
-    ]
+    assert [item.name for item in found.free] == ["lambda_pa", "mu_pa", "gamma_m_1_s"]
 
 
 def test_bounds_clip_the_scan_and_are_tried_once():
-    given = {
-        name: Unknown(lower=200.0, upper=2e3) for name in ("lambda_pa", "mu_pa")
-    }
+    given = {name: Unknown(lower=200.0, upper=2e3) for name in ("lambda_pa", "mu_pa")}
     found = scan_stiffness(cube({**NOTHING, **given}).collocation())
-    for value in (
-        found.parameters.guesses["lambda_pa"],
-        found.parameters.guesses["mu_pa"],
-    ):
+    for value in (found.parameters.guesses["lambda_pa"], found.parameters.guesses["mu_pa"]):
         assert 200.0 <= value <= 2e3
-    assert (
-        len(found.young_pa) < 8
-    )  # of 15, for what lies beyond both bounds is the same
+    assert len(found.young_pa) < 8  # of 15, for what lies beyond both bounds is the same
     assert found.young_pa[-1] < 2e4
 
 
 def test_a_prior_tells_where_to_start():
     given = {**NOTHING, "gamma_r_s": Unknown(prior=(0.02, 0.5))}
-    assert (
-        typical_parameters(Parameters.from_mapping(given), 1e3).guesses[
-            "gamma_r_s"
-        ]
-        == 0.02
-    )
+    assert typical_parameters(Parameters.from_mapping(given), 1e3).guesses["gamma_r_s"] == 0.02
 
 
 def test_several_regions_are_scaled_together():
@@ -142,21 +117,12 @@ def test_several_regions_are_scaled_together():
         density_kg_m3=30.0,
         regions=[Region("core", Box((0, 0, 0), (0.1, 0.1, 0.05)), "yeoh")],
     )
-    names = (
-        "c10_pa",
-        "c01_pa",
-        "kappa_pa",
-        "core.c10_pa",
-        "core.c20_pa",
-        "core.c30_pa",
-    )
+    names = ("c10_pa", "c01_pa", "kappa_pa", "core.c10_pa", "core.c20_pa", "core.c30_pa")
     parameters = Parameters.from_mapping(
         {name: Unknown() for name in (*names, "core.poisson", "gamma_r_s")}
         | {"gamma_m_1_s": 1.0, "core.gamma_r_s": Tied("gamma_r_s", 2.0)}
     )
-    soft, stiff = (
-        typical_parameters(parameters, young) for young in (1e3, 1e5)
-    )
+    soft, stiff = (typical_parameters(parameters, young) for young in (1e3, 1e5))
     for name in ("c10_pa", "c01_pa", "kappa_pa", "core.c10_pa"):
         assert stiff.guesses[name] == pytest.approx(100 * soft.guesses[name])
     assert stiff.guesses["core.c20_pa"] == 0.0
@@ -172,19 +138,17 @@ def test_several_regions_are_scaled_together():
 
 def test_a_constant_of_which_nothing_is_known_needs_a_guess():
     with pytest.raises(
-        InputError,
-        match="stiffening: this parameter has no guess, and no usual value",
+        InputError, match="stiffening: this parameter has no guess, and no usual value"
     ):
         Parameters.from_mapping({"stiffening": Unknown()})
-    assert Parameters.from_mapping(
-        {"bulk_pa": Unknown()}
-    ).list_names_without_guess() == ("bulk_pa",)
+    assert Parameters.from_mapping({"bulk_pa": Unknown()}).list_names_without_guess() == (
+        "bulk_pa",
+    )
 
 
 def test_without_a_guess_values_are_refused_by_name():
     with pytest.raises(
-        InputError,
-        match="lambda_pa: this parameter has no guess; expected guess = ",
+        InputError, match="lambda_pa: this parameter has no guess; expected guess = "
     ):
         _ = Parameters.from_mapping(NOTHING).guesses
 
@@ -220,9 +184,7 @@ def test_the_scan_ends_after_two_that_cannot_be_simulated():
 
 
 def test_the_scan_does_not_end_at_a_resonance():
-    tried = walked(
-        lambda young: {5: 9.0, 3: 0.1}.get(round(np.log10(young)), 1.0)
-    )
+    tried = walked(lambda young: {5: 9.0, 3: 0.1}.get(round(np.log10(young)), 1.0))
     assert min(tried.misfits) == pytest.approx(1e2)
 
 
@@ -231,8 +193,7 @@ def test_the_scan_goes_on_beyond_an_end_that_is_best(truth, softest):
     tried = walked(lambda young: 1.0 + abs(np.log10(young / truth)))
     assert tried.is_best_at_end(softest)
     tried.extend_range(
-        min(tried.misfits) if softest else max(tried.misfits),
-        0.1 if softest else 10.0,
+        min(tried.misfits) if softest else max(tried.misfits), 0.1 if softest else 10.0
     )
     best = min(tried.misfits, key=lambda young: tried.misfits[young])
     assert 0.1 < best / truth < 10
@@ -249,11 +210,7 @@ def unseen(experiment, **changes):
 
 
 def felt_offsets(experiment, offset_n):
-    readings = [
-        g.wrench.values + offset_n
-        for g in experiment.grasps
-        if g.wrench is not None
-    ]
+    readings = [g.wrench.values + offset_n for g in experiment.grasps if g.wrench is not None]
     return with_wrenches(experiment, readings)
 
 
@@ -277,8 +234,7 @@ def test_markers_and_forces_count_alike():
     both = sensed(wristed_cube(30))
     seen = replace(both, grasps=[replace(g, wrench=None) for g in both.grasps])
     trials = [
-        TrialSimulation(Problem([each], GUESS).collocation())
-        for each in (both, seen, unseen(both))
+        TrialSimulation(Problem([each], GUESS).collocation()) for each in (both, seen, unseen(both))
     ]
     together, of_markers, of_forces = (
         trial.evaluate_guess(is_complete=False)[0] for trial in trials
@@ -289,18 +245,14 @@ def test_markers_and_forces_count_alike():
 
 
 def test_an_unknown_tare_hides_no_stiffness():
-    zeroed = felt_offsets(
-        unseen(block("z"), nuisance=Nuisance(tare=100.0)), 0.05
-    )
+    zeroed = felt_offsets(unseen(block("z"), nuisance=Nuisance(tare=100.0)), 0.05)
     young_pa, _ = misfits(zeroed)
     assert YOUNG_PA / 2 < young_pa < 2 * YOUNG_PA
 
 
 @pytest.mark.long
 def test_a_force_that_is_felt_late_is_waited_for():
-    bench = unseen(
-        block("z", t_s=np.arange(40.0), z_m=-0.001 * np.arange(40.0))
-    )
+    bench = unseen(block("z", t_s=np.arange(40.0), z_m=-0.001 * np.arange(40.0)))
     later = np.where(bench.t_s[:, None] < 30, np.nan, 0.0)
     young_pa, _ = misfits(felt_offsets(bench, later))
     assert YOUNG_PA / 2 < young_pa < 2 * YOUNG_PA
@@ -308,13 +260,10 @@ def test_a_force_that_is_felt_late_is_waited_for():
 
 def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
     bench = unseen(block("z"))
-    collocation, found = start_problem(
-        Problem([bench], guessed(mu_pa=9e3)).collocation()
-    )
+    collocation, found = start_problem(Problem([bench], guessed(mu_pa=9e3)).collocation())
     assert found is not None
     assert (
-        "the simulation is farther from the measurements than a body that moves"
-        in found.sentence
+        "the simulation is farther from the measurements than a body that moves" in found.sentence
     )
     assert collocation.parameters.guesses["mu_pa"] < 2 * TRUTH["mu_pa"]
 
@@ -323,19 +272,14 @@ def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "method", ["reduced-space", "shooting", "interior-point"]
-)
+@pytest.mark.parametrize("method", ["reduced-space", "shooting", "interior-point"])
 def test_it_is_solved_without_a_guess(method):
     solution = solve(cube(), method)
     assert solution.status.converged
     assert np.abs(relative_errors(solution)).max() < 1e-5
     assert solution.scan is not None
     assert solution.notes[0].startswith("no guess: started from E = ")
-    assert (
-        f"after a scan of {len(solution.scan.young_pa)} stiffnesses in"
-        in solution.notes[0]
-    )
+    assert f"after a scan of {len(solution.scan.young_pa)} stiffnesses in" in solution.notes[0]
 
 
 def test_a_guess_that_can_be_simulated_is_kept():
@@ -344,13 +288,8 @@ def test_a_guess_that_can_be_simulated_is_kept():
 
 
 def test_damping_alone_needs_no_scan():
-    given = {
-        **{name: TRUTH[name] for name in ("lambda_pa", "mu_pa")},
-        "gamma_m_1_s": 1.0,
-    }
-    collocation, found = start_problem(
-        cube({**given, "gamma_r_s": Unknown()}).collocation()
-    )
+    given = {**{name: TRUTH[name] for name in ("lambda_pa", "mu_pa")}, "gamma_m_1_s": 1.0}
+    collocation, found = start_problem(cube({**given, "gamma_r_s": Unknown()}).collocation())
     assert found is None
     assert collocation.parameters.guesses["gamma_r_s"] == pytest.approx(0.003)
 
@@ -359,16 +298,13 @@ def test_a_guess_that_cannot_be_simulated_is_rescued_with_a_note():
     solution = solve(cube(guessed(lambda_pa=4.0, mu_pa=1.5)))
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-6
-    assert solution.notes[0].startswith(
-        "the body cannot be simulated at the guess ("
-    )
+    assert solution.notes[0].startswith("the body cannot be simulated at the guess (")
     assert "started from E = " in solution.notes[0]
 
 
 def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit",
-        1e-3,
+        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit", 1e-3
     )
     collocation, found = start_problem(cube(guessed(mu_pa=1e4)).collocation())
     assert found is not None
@@ -384,8 +320,7 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
 
 def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit",
-        0.0,
+        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit", 0.0
     )
     collocation = cube(guessed(**{**TRUTH, "mu_pa": 301.0})).collocation()
     assert start_problem(collocation)[0] is collocation
@@ -394,8 +329,7 @@ def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
 def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
     """As where a tare, which is not estimated in a scan, makes most of the misfit."""
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit",
-        0.0,
+        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit", 0.0
     )
     problem = cube(guessed(mu_pa=600.0))
     (experiment,) = problem.experiments
@@ -403,13 +337,9 @@ def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
     moved = replace(
         markers,
         positions_m=markers.positions_m
-        + np.random.default_rng(1).normal(
-            scale=0.3, size=markers.positions_m.shape
-        ),
+        + np.random.default_rng(1).normal(scale=0.3, size=markers.positions_m.shape),
     )
-    blurred = replace(
-        problem, experiments=[replace(experiment, markers=moved)]
-    ).collocation()
+    blurred = replace(problem, experiments=[replace(experiment, markers=moved)]).collocation()
     trial = TrialSimulation(blurred)
     misfit, failure = trial.evaluate_guess(False)
     result = scan_stiffness(without_guesses(blurred))
@@ -420,10 +350,7 @@ def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
 
 
 def too_soft() -> dict[str, Unknown | float]:
-    return {
-        **NOTHING,
-        **{n: Unknown(lower=1e-4, upper=2e-4) for n in ("lambda_pa", "mu_pa")},
-    }
+    return {**NOTHING, **{n: Unknown(lower=1e-4, upper=2e-4) for n in ("lambda_pa", "mu_pa")}}
 
 
 def test_a_body_that_can_never_be_simulated_is_refused():
@@ -439,69 +366,48 @@ def test_a_body_that_can_never_be_simulated_is_refused():
 
 @pytest.mark.long
 def test_with_a_guess_it_is_left_to_the_method():
-    given = too_soft() | {
-        n: Unknown(1.5e-4, 1e-4, 2e-4) for n in ("lambda_pa", "mu_pa")
-    }
+    given = too_soft() | {n: Unknown(1.5e-4, 1e-4, 2e-4) for n in ("lambda_pa", "mu_pa")}
     solution = solve(cube(given | {"gamma_r_s": 1e-3, "gamma_m_1_s": 1.0}))
     assert solution.status is Status.NOT_SIMULABLE
     assert solution.scan is None
 
 
-def test_a_method_that_simulates_everything_gets_a_start_that_can_be(
-    monkeypatch,
-):
+def test_a_method_that_simulates_everything_gets_a_start_that_can_be(monkeypatch):
     best = scanned().young_pa[scanned().best]
     monkeypatch.setattr(
         "collocation_sysid.methods.stiffness_scan.TrialSimulation.is_simulable",
         lambda _, young: young > 1.5 * best,
     )
     found = scan_stiffness(cube().collocation(), is_complete=True)
-    assert found.young_pa[found.best] == pytest.approx(
-        scanned().young_pa[scanned().best + 1]
-    )
+    assert found.young_pa[found.best] == pytest.approx(scanned().young_pa[scanned().best + 1])
 
 
 def test_several_experiments_are_scanned_together():
     experiments = [swung_cube(), replace(swung_cube(), name="again")]
-    found = scan_stiffness(
-        Collocation(experiments, Parameters.from_mapping(NOTHING))
-    )
+    found = scan_stiffness(Collocation(experiments, Parameters.from_mapping(NOTHING)))
     assert found.samples == 2 * scanned().samples
     np.testing.assert_allclose(found.misfit, scanned().misfit, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("second", "scanned"), [(Status.CONVERGED, True), (Status.STALLED, False)]
-)
+@pytest.mark.parametrize(("second", "scanned"), [(Status.CONVERGED, True), (Status.STALLED, False)])
 def test_a_search_that_is_lost_begins_again_from_a_scan(second, scanned):
     ends, starts = [Status.STALLED, second], []
 
     def method(collocation, watch=None, start=None):
         starts.append(collocation.parameters.guesses["mu_pa"])
-        return replace(
-            ReducedSpace()(collocation, watch, start),
-            status=ends[len(starts) - 1],
-        )
+        return replace(ReducedSpace()(collocation, watch, start), status=ends[len(starts) - 1])
 
     solution = solve(cube(GUESS), method)
     assert starts[0] == GUESS.guesses["mu_pa"] != starts[1]
-    assert (solution.status is Status.CONVERGED, solution.scan is not None) == (
-        scanned,
-        scanned,
-    )
+    assert (solution.status is Status.CONVERGED, solution.scan is not None) == (scanned, scanned)
     said = "the search from the guess failed (stalled): started from E = "
-    assert [note for note in solution.notes if said in note][:1] == list(
-        solution.notes[:scanned]
-    )
+    assert [note for note in solution.notes if said in note][:1] == list(solution.notes[:scanned])
     assert solution.collocation.parameters.guesses["mu_pa"] == starts[scanned]
 
 
 def test_a_linear_constant_without_a_guess_gets_an_error_bar():
     bench = unseen(block("z"))
-    given = {
-        "lambda_pa": 200.0,
-        "mu_pa": Unknown(scale="linear", lower=1.0, upper=1e6),
-    }
+    given = {"lambda_pa": 200.0, "mu_pa": Unknown(scale="linear", lower=1.0, upper=1e6)}
     still = given | {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
     found = run(Problem([bench], still), seek_causes=False)
     estimate = found.estimates["mu_pa"]

@@ -10,10 +10,7 @@ from kit.problems import hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.runs import solving
-from collocation_sysid.runs.second_start import (
-    NEARLY_INCOMPRESSIBLE,
-    second_start,
-)
+from collocation_sysid.runs.second_start import NEARLY_INCOMPRESSIBLE, second_start
 from collocation_sysid.runs.solving import best_of_second_start
 
 KNOWN = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
@@ -26,9 +23,7 @@ def answer(*free: str) -> cs.Solution:
     swung = hung_cube()
     tracks_m = cs.simulate(swung, TRUTH, "midpoint", substeps=1).markers_m
     estimated = {name: cs.Unknown(TRUTH[name]) for name in free}
-    return cs.solve(
-        cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated})
-    )
+    return cs.solve(cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated}))
 
 
 def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
@@ -50,15 +45,10 @@ def test_the_better_of_two_answers_counts():
     first = answer("young_pa", "poisson", "gamma_r_s")
     same = best_of_second_start(cs.ReducedSpace(), first, None)
     assert same is first
-    worse = replace(
-        first,
-        history=(replace(first.history[-1], loss=first.history[-1].loss + 5),),
-    )
+    worse = replace(first, history=(replace(first.history[-1], loss=first.history[-1].loss + 5),))
     better = best_of_second_start(cs.ReducedSpace(), worse, None)
     assert "χ² lower by 5" in better.notes[0]
-    assert better.parameters["poisson"] == pytest.approx(
-        first.parameters["poisson"], rel=1e-3
-    )
+    assert better.parameters["poisson"] == pytest.approx(first.parameters["poisson"], rel=1e-3)
 
 
 def test_a_second_start_keeps_a_parameter_at_its_bound():
@@ -70,9 +60,7 @@ def test_a_second_start_keeps_a_parameter_at_its_bound():
         "poisson": cs.Unknown(TRUTH["poisson"]),
         "gamma_m_1_s": cs.Unknown(6.0, lower=5.0, upper=100.0),
     }
-    first = cs.solve(
-        cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated})
-    )
+    first = cs.solve(cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated}))
     assert first.parameters["gamma_m_1_s"] == pytest.approx(5.0)
     assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
     start = second_start(first)
@@ -85,21 +73,15 @@ def rubber(largest_stretch: float, **stated: cs.Unknown) -> cs.Problem:
     the stated parameters.
     """
     experiments = cs.datasets.kawabata_1981(
-        "ogden-2",
-        tests=("uniaxial", "equibiaxial", "planar"),
-        largest_stretch=largest_stretch,
+        "ogden-2", tests=("uniaxial", "equibiaxial", "planar"), largest_stretch=largest_stretch
     )
-    free = dict.fromkeys(
-        ("mu_1_pa", "alpha_1", "mu_2_pa", "alpha_2"), cs.Unknown()
-    )
+    free = dict.fromkeys(("mu_1_pa", "alpha_1", "mu_2_pa", "alpha_2"), cs.Unknown())
     fixed = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
     return cs.Problem(experiments, {**free, **stated, **fixed})
 
 
 @pytest.mark.long
-def test_two_exponents_of_one_sign_are_compared_with_opposite_ones(
-    monkeypatch,
-):
+def test_two_exponents_of_one_sign_are_compared_with_opposite_ones(monkeypatch):
     problem = rubber(2.5)
     with monkeypatch.context() as patch:
         patch.setattr(solving, "second_start", lambda _: None)
@@ -107,10 +89,7 @@ def test_two_exponents_of_one_sign_are_compared_with_opposite_ones(
     assert first.parameters["alpha_2"] > 0
     start = second_start(first)
     assert start is not None
-    before, after = (
-        each.guesses
-        for each in (first.collocation.parameters, start.parameters)
-    )
+    before, after = (each.guesses for each in (first.collocation.parameters, start.parameters))
     assert after["alpha_2"] == -2.0
     assert after["mu_2_pa"] * after["alpha_2"] == pytest.approx(
         before["mu_2_pa"] * before["alpha_2"]

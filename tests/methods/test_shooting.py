@@ -39,26 +39,19 @@ from collocation_sysid.statistics.linearised import sensitivities
 GRADIENTS = ("forward", "adjoint")
 
 
-def with_noise(
-    experiment: Experiment, noise_m: float = 1e-3, **changes
-) -> Collocation:
+def with_noise(experiment: Experiment, noise_m: float = 1e-3, **changes) -> Collocation:
     return Collocation([noisy(experiment, noise_m)], GUESS, **changes)
 
 
 def some_parameters(collocation: Collocation) -> np.ndarray:
     rng = np.random.default_rng(3)
-    p = np.concatenate(
-        [np.log(list(TRUTH.values())), np.zeros(collocation.nphi)]
-    )
+    p = np.concatenate([np.log(list(TRUTH.values())), np.zeros(collocation.nphi)])
     return p + 0.1 * rng.normal(size=len(p))
 
 
 def softened(factor: float) -> Parameters:
     """Moduli so low that no rest state is found."""
-    soft = [
-        replace(item, guess=item.guess / factor, lower=1e-4)
-        for item in GUESS.items[:2]
-    ]
+    soft = [replace(item, guess=item.guess / factor, lower=1e-4) for item in GUESS.items[:2]]
     return Parameters((*soft, *GUESS.items[2:]))
 
 
@@ -75,13 +68,9 @@ def test_the_adjoint_gradient_is_the_sensitivities_share_of_the_loss():
     z = simulate_variables(collocation, some_parameters(collocation))
     (by_p,) = sensitivities(collocation, z)
     _, (by_x,) = collocation.unpack(collocation.gradient(z))
-    by_x = (
-        by_x / collocation.transcriptions[0].length_m ** 2
-    )  # a slope, not a length
+    by_x = by_x / collocation.transcriptions[0].length_m ** 2  # a slope, not a length
     expected = np.einsum("td,tdm->m", by_x, by_p)
-    np.testing.assert_allclose(
-        adjoint_gradient(collocation, z), expected, rtol=1e-8
-    )
+    np.testing.assert_allclose(adjoint_gradient(collocation, z), expected, rtol=1e-8)
 
 
 # The answer
@@ -89,9 +78,7 @@ def test_the_adjoint_gradient_is_the_sensitivities_share_of_the_loss():
 
 @pytest.mark.parametrize("experiment", SMALL_EXPERIMENTS)
 def test_the_true_parameters_are_recovered(experiment: str):
-    solution = Shooting()(
-        Collocation([measured(SMALL_EXPERIMENTS[experiment]())], GUESS)
-    )
+    solution = Shooting()(Collocation([measured(SMALL_EXPERIMENTS[experiment]())], GUESS))
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-8
     assert solution.rms_m < 1e-9
@@ -107,38 +94,25 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(make, gradient):
     reference = ReducedSpace()(collocation)
     assert solution.status.converged
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-6)
-    np.testing.assert_allclose(
-        solution.positions_m[0], reference.positions_m[0], atol=1e-8
-    )
-    np.testing.assert_allclose(
-        solution.multipliers, reference.multipliers, atol=1e-6
-    )
+    np.testing.assert_allclose(solution.positions_m[0], reference.positions_m[0], atol=1e-8)
+    np.testing.assert_allclose(solution.multipliers, reference.multipliers, atol=1e-6)
     assert solution.kkt_residual < 1e-7
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_hubers_loss_and_nuisance_parameters_have_the_same_optimum(gradient):
     collocation = with_noise(bar_let_go(), 2e-3, huber=2.0)
-    solution, reference = (
-        Shooting(gradient)(collocation),
-        ReducedSpace()(collocation),
-    )
+    solution, reference = (Shooting(gradient)(collocation), ReducedSpace()(collocation))
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-5)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_experiments_are_fitted_together_up_to_a_bound(gradient):
-    items = [
-        replace(item, upper=250.0) if item.name == "mu_pa" else item
-        for item in GUESS.items
-    ]
+    items = [replace(item, upper=250.0) if item.name == "mu_pa" else item for item in GUESS.items]
     made = [measured(hung_cube(8)), measured(bar_in_two_hands(10))]
     collocation = Collocation(made, Parameters(tuple(items)))
-    solution, reference = (
-        Shooting(gradient)(collocation),
-        ReducedSpace()(collocation),
-    )
+    solution, reference = (Shooting(gradient)(collocation), ReducedSpace()(collocation))
     assert solution.status.converged
     assert solution.parameters["mu_pa"] == pytest.approx(250.0, rel=1e-12)
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-5)
@@ -146,9 +120,7 @@ def test_experiments_are_fitted_together_up_to_a_bound(gradient):
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_with_all_parameters_fixed_it_simulates(gradient):
-    fixed = Parameters(
-        tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH)
-    )
+    fixed = Parameters(tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH))
     solution = Shooting(gradient)(Collocation([measured(hung_cube())], fixed))
     assert solution.status is Status.CONVERGED
     assert solution.rms_m < 1e-9
@@ -160,9 +132,7 @@ def test_it_starts_from_given_parameters():
     start = cube().pack(np.log(list(TRUTH.values())), [np.zeros((11, 81))])
     solution = Shooting()(cube(), watch=seen.append, start=start)
     assert solution.iterations < 4
-    np.testing.assert_allclose(
-        [*seen[0].parameters.values()], list(TRUTH.values())
-    )
+    np.testing.assert_allclose([*seen[0].parameters.values()], list(TRUTH.values()))
 
 
 # Simulations that fail
@@ -174,11 +144,7 @@ def test_a_guess_that_cannot_be_simulated_is_a_status(gradient):
     collocation = Collocation([measured(hung_cube())], softened(1000))
     solution = Shooting(gradient)(collocation)
     assert solution.status is Status.NOT_SIMULABLE
-    for part in (
-        "cannot be simulated at the guess",
-        "interior-point",
-        "t = 0 s",
-    ):
+    for part in ("cannot be simulated at the guess", "interior-point", "t = 0 s"):
         assert part in solution.message
     assert solution.iterations == 1
     assert np.isfinite(solution.z).all()
@@ -186,9 +152,7 @@ def test_a_guess_that_cannot_be_simulated_is_a_status(gradient):
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
-def test_trials_that_cannot_be_simulated_are_stepped_back_from(
-    gradient, monkeypatch
-):
+def test_trials_that_cannot_be_simulated_are_stepped_back_from(gradient, monkeypatch):
     def short(collocation, p, stopwatch=None):
         if np.abs(p - GUESS.guess_q).max() > 0.2 and not short.failed:
             short.failed = True
@@ -201,16 +165,12 @@ def test_trials_that_cannot_be_simulated_are_stepped_back_from(
     assert solution.status is Status.CONVERGED
     *errors, of_mass_damping = np.abs(relative_errors(solution))
     assert max(errors) < 1e-6
-    assert (
-        of_mass_damping < 1e-5
-    )  # it hardly shows: the loss is down to rounding
+    assert of_mass_damping < 1e-5  # it hardly shows: the loss is down to rounding
     assert solution.notes[0].startswith("1 of ")
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
-def test_where_everything_else_fails_it_stalls_at_the_guess(
-    gradient, monkeypatch
-):
+def test_where_everything_else_fails_it_stalls_at_the_guess(gradient, monkeypatch):
     def only_the_guess(collocation, p, stopwatch=None):
         if not np.array_equal(p, GUESS.guess_q):
             raise SimulationError("it fails", 0.1)
@@ -228,10 +188,7 @@ def test_where_everything_else_fails_it_stalls_at_the_guess(
 @pytest.mark.parametrize("gradient", GRADIENTS)
 @pytest.mark.parametrize(
     ("limit", "status"),
-    [
-        ({"max_iterations": 3}, Status.ITERATION_LIMIT),
-        ({"max_time_s": 1e-9}, Status.TIME_LIMIT),
-    ],
+    [({"max_iterations": 3}, Status.ITERATION_LIMIT), ({"max_time_s": 1e-9}, Status.TIME_LIMIT)],
 )
 def test_limits_keep_the_best_simulation(gradient, limit: dict, status: Status):
     solution = Shooting(gradient, **limit)(cube())
@@ -273,14 +230,9 @@ def test_the_history_is_what_was_watched_and_its_loss_falls(gradient):
     )
     timing = solution.timing
     assert min(timing.evaluations, timing.linear_algebra) > 0
-    assert (
-        timing.evaluations + timing.linear_algebra + timing.build
-        <= timing.total
-    )
+    assert timing.evaluations + timing.linear_algebra + timing.build <= timing.total
 
 
 def test_an_unknown_gradient_is_refused():
-    with pytest.raises(
-        InputError, match="gradient: found 'finite'; expected 'forward' or"
-    ):
+    with pytest.raises(InputError, match="gradient: found 'finite'; expected 'forward' or"):
         Shooting("finite")  # pyright: ignore[reportArgumentType]

@@ -8,25 +8,17 @@ import pytest
 from kit.memories import guesses, recorded, truth
 
 from collocation_sysid import Collocation, ReducedSpace
-from collocation_sysid.fem.kernels import (
-    concurrent_count,
-    map_experiments,
-    run_in_slices,
-)
+from collocation_sysid.fem.kernels import concurrent_count, map_experiments, run_in_slices
 
 
 def test_results_are_in_the_order_of_the_items():
-    assert map_experiments(lambda k: k**2, range(7), threads=2) == [
-        k**2 for k in range(7)
-    ]
+    assert map_experiments(lambda k: k**2, range(7), threads=2) == [k**2 for k in range(7)]
 
 
 def test_items_wait_for_each_other_only_where_there_are_threads_for_them():
     both = threading.Barrier(2)
     map_experiments(lambda _: both.wait(timeout=10), range(2), threads=2)
-    alone = map_experiments(
-        lambda _: threading.current_thread(), range(2), threads=1
-    )
+    alone = map_experiments(lambda _: threading.current_thread(), range(2), threads=1)
     assert alone == [threading.current_thread()] * 2
 
 
@@ -50,10 +42,7 @@ def test_an_item_shares_nothing_of_its_own_with_other_threads():
 
 
 def test_experiments_are_fitted_alike_on_any_number_of_threads(monkeypatch):
-    recordings = [
-        recorded(name, 8)
-        for name in ("hung-cube", "cube-with-gaps", "hung-cube")
-    ]
+    recordings = [recorded(name, 8) for name in ("hung-cube", "cube-with-gaps", "hung-cube")]
     answers = []
     for threads in (1, 2):
         for recording in recordings:

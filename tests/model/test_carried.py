@@ -14,17 +14,9 @@ from kit.problems import GUESS, hung_cube
 from collocation_sysid.model.recursion import Recursion, RecursionTrajectory
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.experiment_iterate import ExperimentIterate
-from collocation_sysid.program.lifted.expression_patterns import (
-    ExpressionPattern,
-    PatternIndices,
-)
-from collocation_sysid.program.lifted.lifted_collocation import (
-    LiftedCollocation,
-)
-from collocation_sysid.program.lifted.lifted_variables import (
-    LiftedOffsets,
-    LiftedVariables,
-)
+from collocation_sysid.program.lifted.expression_patterns import ExpressionPattern, PatternIndices
+from collocation_sysid.program.lifted.lifted_collocation import LiftedCollocation
+from collocation_sysid.program.lifted.lifted_variables import LiftedOffsets, LiftedVariables
 
 CORNERS = np.array([[0, 3], [1, 5], [2, 4]])
 MODULUS_PA = 1e3
@@ -52,17 +44,15 @@ class Stretches(LiftedVariables):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        return 1, self.segment.grid_times, 3
+        return 1, self.transcription.grid_times, 3
 
     @property
     def began(self) -> np.ndarray:
-        return (np.arange(self.segment.grid_times) == 0)[None, :, None]
+        return (np.arange(self.transcription.grid_times) == 0)[None, :, None]
 
     def evolution(self, part: ExperimentIterate) -> RecursionTrajectory:
         modulus_pa = np.exp(part.q[:1])
-        return RecursionTrajectory.from_signal(
-            STRETCH, modulus_pa, self.began, self.looked(part.x)
-        )
+        return RecursionTrajectory.from_signal(STRETCH, modulus_pa, self.began, self.looked(part.x))
 
     def looked(self, x: np.ndarray) -> np.ndarray:
         """(6, N, 3, …) positions of each pair."""
@@ -75,17 +65,13 @@ class Stretches(LiftedVariables):
     @cached_property
     def patterns(self) -> tuple[ExpressionPattern, ...]:
         rows = np.arange(self.count).reshape(self.shape)
-        columns = np.arange(
-            self.segment.columns.start, self.segment.columns.stop
-        )
-        at = self.looked(columns.reshape(self.segment.grid_times, -1))
+        columns = np.arange(self.transcription.columns.start, self.transcription.columns.stop)
+        at = self.looked(columns.reshape(self.transcription.grid_times, -1))
         recursion = Recursion(
-            lambda before, now, last, q, data: slow_stretch(
-                before, now, last, ca.exp(q), data
-            ),
+            lambda before, now, last, q, data: slow_stretch(before, now, last, ca.exp(q), data),
             *(1, 6, 1, 1),
         )
-        looked = PatternIndices(at, np.full((1, 1, 1), self.segment.length_m))
+        looked = PatternIndices(at, np.full((1, 1, 1), self.transcription.length_m))
         states, of_q = (
             PatternIndices(self.offsets.variable + rows),
             PatternIndices(np.zeros((1, 1, 1), int)),
@@ -99,18 +85,14 @@ def program() -> Collocation:
     plain = Collocation([hung_cube(5)], GUESS)
     last = LiftedOffsets(plain.variable_count, plain.constraint_count)
     made = LiftedCollocation([hung_cube(5)], GUESS)
-    vars(made)["lifted"] = (
-        Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),
-    )
+    vars(made)["lifted"] = (Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),)
     return made
 
 
-def some_positions(
-    program: Collocation, rng: np.random.Generator
-) -> np.ndarray:
-    (segment,) = program.transcriptions
-    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(
-        -1, segment.dof_count
+def some_positions(program: Collocation, rng: np.random.Generator) -> np.ndarray:
+    (transcription,) = program.transcriptions
+    rigid = transcription.experiment.rigid_positions(transcription.dynamics.t_s).reshape(
+        -1, transcription.dof_count
     )
     return rigid + 1e-3 * rng.normal(size=rigid.shape)
 
@@ -119,9 +101,7 @@ def test_rows_vanish_where_it_follows_from_the_motion(program, rng):
     z = program.pack(program.guess_p, [some_positions(program, rng)])
     (carried,) = program.lifted
     assert (z[carried.columns] > 0.01).all()
-    np.testing.assert_allclose(
-        program.constraint_values(z)[carried.rows], 0.0, atol=1e-14
-    )
+    np.testing.assert_allclose(program.constraint_values(z)[carried.rows], 0.0, atol=1e-14)
 
 
 def test_a_programs_matrices_have_it(program, rng):
@@ -131,20 +111,8 @@ def test_a_programs_matrices_have_it(program, rng):
     jacobian, hessian = program.jacobian(z), program.hessian(z, 1.3, y)
     own = jacobian[carried.rows]
     values = program.constraint_values
-    assert_derivative(
-        lambda at: values(at)[carried.rows],
-        lambda d: own @ d,
-        z,
-        rng,
-        1e-7,
-        0.1,
-        1,
-    )
-    for here in (
-        slice(program.nq),
-        program.transcriptions[0].columns,
-        carried.columns,
-    ):
+    assert_derivative(lambda at: values(at)[carried.rows], lambda d: own @ d, z, rng, 1e-7, 0.1, 1)
+    for here in (slice(program.nq), program.transcriptions[0].columns, carried.columns):
         scale = np.zeros(len(z))
         scale[here] = 0.1
         assert_derivative(
@@ -158,7 +126,7 @@ def test_a_programs_matrices_have_it(program, rng):
 def test_columns_that_eliminate_it_are_those_of_its_rows(program, rng):
     """Forward −J_h⁻¹ J_p of the rows, backward their transpose."""
     x = some_positions(program, rng)
-    z, (segment,), (carried,) = (
+    z, (transcription,), (carried,) = (
         program.pack(program.guess_p, [x]),
         program.transcriptions,
         program.lifted,
@@ -173,8 +141,8 @@ def test_columns_that_eliminate_it_are_those_of_its_rows(program, rng):
     change = evolution.jacobian_vector_product(
         carried.looked(moved), np.exp(part.q[:1]) * by_q[None]
     )
-    columns = np.vstack([by_q, moved.reshape(-1, 2) / segment.length_m])
-    sides = rows[:, [0, *range(*segment.columns.indices(len(z)))]] @ columns
+    columns = np.vstack([by_q, moved.reshape(-1, 2) / transcription.length_m])
+    sides = rows[:, [0, *range(*transcription.columns.indices(len(z)))]] @ columns
     expected = -np.linalg.solve(rows[:, carried.columns], sides)
     assert relative_error(change.reshape(-1, 2), expected) < 1e-12
     weights = rng.normal(size=evolution.states.shape)
@@ -191,10 +159,6 @@ def test_coefficients_of_a_linear_one_are_those_of_all_its_instances(rng):
 
     c, data = ca.SX.sym("c", 2), ca.SX.sym("data", 1)
     found = ca.Function(
-        "found",
-        [c, data],
-        [Recursion(blend, 1, 1, 2, 1).linear_coefficients(c, data)],
+        "found", [c, data], [Recursion(blend, 1, 1, 2, 1).linear_coefficients(c, data)]
     )
-    np.testing.assert_allclose(
-        found([0.5, 3.0], 2.0).full().ravel(), [0.5, 2.0, -9.0]
-    )
+    np.testing.assert_allclose(found([0.5, 3.0], 2.0).full().ravel(), [0.5, 2.0, -9.0])

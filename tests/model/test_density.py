@@ -18,10 +18,7 @@ from kit.densities import (
     remembering_core,
     with_core,
 )
-from kit.problems import (
-    hung_cube,
-    measured_with,
-)
+from kit.problems import hung_cube, measured_with
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.constants import is_density
@@ -42,26 +39,20 @@ def test_derivatives_of_the_forces_of_a_body_by_its_densities(rng):
     def force(values):
         return body.force(x, v, values, tied)[0]
 
-    assert_derivative(
-        force, lambda d: at.by_theta[0] @ d, theta, rng, scale=0.1 * theta
-    )
+    assert_derivative(force, lambda d: at.by_theta[0] @ d, theta, rng, scale=0.1 * theta)
     found = body.second_derivatives(x, v, w, theta, tied_kg=tied)
 
     def slope(values):
         return body.linearise(x, v, values, tied_kg=tied).by_theta[0].T @ w
 
-    assert_derivative(
-        slope, lambda d: found.theta_theta[0] @ d, theta, rng, scale=0.1 * theta
-    )
+    assert_derivative(slope, lambda d: found.theta_theta[0] @ d, theta, rng, scale=0.1 * theta)
 
     def by_velocity(values):
         matrix = body.linearise(x, v, values, tied_kg=tied).by_velocity[0]
         return body.pattern.matrix(matrix) @ w
 
     along = found.velocity_theta[0]
-    assert_derivative(
-        by_velocity, lambda d: along @ d, theta, rng, scale=0.1 * theta
-    )
+    assert_derivative(by_velocity, lambda d: along @ d, theta, rng, scale=0.1 * theta)
 
 
 # The same optimum ---------------------------------------------------------------------------
@@ -72,18 +63,13 @@ def test_methods_find_densities_where_a_known_mass_sets_the_scale(name):
     experiment = measured_with(MADE[name](), TRUTH)
     collocation = Collocation([experiment], parameters())
     reduced, interior, shot = (
-        METHODS[m]()(collocation)
-        for m in ("reduced-space", "interior-point", "shooting")
+        METHODS[m]()(collocation) for m in ("reduced-space", "interior-point", "shooting")
     )
     for solution in (reduced, interior, shot):
         assert solution.status.converged, solution.message
         for each in GUESS:
-            assert solution.parameters[each] == pytest.approx(
-                TRUTH[each], rel=1e-3
-            )
-    values = [
-        [*solution.parameters.values()] for solution in (reduced, interior)
-    ]
+            assert solution.parameters[each] == pytest.approx(TRUTH[each], rel=1e-3)
+    values = [[*solution.parameters.values()] for solution in (reduced, interior)]
     np.testing.assert_allclose(*values, rtol=1e-5)
     assert reduced.kkt_residual < 1e-8
 
@@ -95,9 +81,7 @@ TOLD = {name: (make, TRUTH) for name, make in MADE.items()}
 TOLD["memory"] = remembering_core, REMEMBERED
 
 
-@pytest.mark.parametrize(
-    ("name", "integrator"), [*zip(TOLD, cycle(["newmark", "midpoint"]))]
-)
+@pytest.mark.parametrize(("name", "integrator"), [*zip(TOLD, cycle(["newmark", "midpoint"]))])
 def test_a_density_in_theta_is_one_that_is_stated(name, integrator):
     make, truth = TOLD[name]
     free = make()
@@ -109,13 +93,7 @@ def test_a_density_in_theta_is_one_that_is_stated(name, integrator):
         element=free.body.element.name,
         damping=rest.damping,
         prony=rest.prony,
-        regions=[
-            Region(
-                "core",
-                core.cells,
-                density_kg_m3=DENSITY_KG_M3["core.density_kg_m3"],
-            )
-        ],
+        regions=[Region("core", core.cells, density_kg_m3=DENSITY_KG_M3["core.density_kg_m3"])],
     )
     found = simulate(free, truth, integrator).markers_m
     expected = simulate(replace(free, body=body), stated, integrator).markers_m

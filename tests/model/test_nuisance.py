@@ -30,17 +30,9 @@ from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.association import Association
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.markers.marker_association import (
-    MarkerAssociation,
-)
+from collocation_sysid.program.markers.marker_association import MarkerAssociation
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import (
-    Experiment,
-    Grasp,
-    Markers,
-    Nuisance,
-    PoseSequence,
-)
+from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 ONE_OF_EACH = {
@@ -69,15 +61,9 @@ def test_without_nuisance_markers_read_where_they_are():
 
 def test_an_error_of_a_place_turns_with_the_body():
     cube = replace(cube_with_gaps(), nuisance=ONE_OF_EACH["place"])
-    phi = np.random.default_rng(1).uniform(
-        -2, 2, NuisanceMap.from_experiment(cube).size
-    )
-    places = cube.markers.predict_positions(
-        cube.body.nodes_m
-    ) + 0.003 * phi.reshape(-1, 3)
-    really = replace(
-        cube, markers=point_markers(cube.body, places, cube.t_s), nuisance=IDEAL
-    )
+    phi = np.random.default_rng(1).uniform(-2, 2, NuisanceMap.from_experiment(cube).size)
+    places = cube.markers.predict_positions(cube.body.nodes_m) + 0.003 * phi.reshape(-1, 3)
+    really = replace(cube, markers=point_markers(cube.body, places, cube.t_s), nuisance=IDEAL)
     expected = simulate(really, TRUTH, "midpoint", substeps=1).markers_m
     assert np.ptp(expected - readings(cube, 0 * phi), axis=0).max() > 1e-3
     np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-12)
@@ -86,43 +72,29 @@ def test_an_error_of_a_place_turns_with_the_body():
 def test_a_motion_in_the_grasp_is_a_body_held_elsewhere():
     """The reading with φ is that of a body that is really off in its grasp."""
     plain = hung_cube()
-    cube = replace(
-        plain, nuisance=Nuisance.none(hand_eye_m=0.003, hand_eye_rad=0.05)
-    )
+    cube = replace(plain, nuisance=Nuisance.none(hand_eye_m=0.003, hand_eye_rad=0.05))
     phi = np.array([1.0, -0.6, 0.8, 0.5, -1.0, 0.3])
     (grasp,) = plain.grasps
     moved = Grasp(
-        grasp.nodes,
-        grasp.poses.after(
-            NuisanceMap.from_experiment(cube).grasp_motion_matrix(phi)
-        ),
+        grasp.nodes, grasp.poses.after(NuisanceMap.from_experiment(cube).grasp_motion_matrix(phi))
     )
-    expected = simulate(
-        replace(plain, grasps=(moved,)), TRUTH, "midpoint", substeps=1
-    ).markers_m
+    expected = simulate(replace(plain, grasps=(moved,)), TRUTH, "midpoint", substeps=1).markers_m
     assert np.abs(expected - readings(cube, 0 * phi)).max() > 3e-3
     np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-9)
 
 
 def test_the_start_given_says_where_the_body_is_in_its_grasp():
-    cube = replace(
-        released_cube(),
-        nuisance=Nuisance.none(hand_eye_m=0.003, hand_eye_rad=0.05),
-    )
+    cube = replace(released_cube(), nuisance=Nuisance.none(hand_eye_m=0.003, hand_eye_rad=0.05))
     assert NuisanceMap.from_experiment(cube).size == 0
 
 
 @pytest.mark.parametrize("share", [-0.6, 0.3, 1.0])
 def test_a_time_shift_reads_the_motion_at_another_time(share: float):
     cube = replace(hung_cube(20), nuisance=Nuisance.none(time_shift_s=0.01))
-    (segment,) = alone(cube, substeps=10).transcriptions
+    (transcription,) = alone(cube, substeps=10).transcriptions
     grid = simulate(cube, TRUTH, "midpoint", substeps=10)
-    found = segment.markers.predict_samples(grid.positions_m, np.array([share]))
-    dense = replace(
-        cube,
-        t_s=np.linspace(0, 0.2, 201),
-        markers=_on(cube, np.linspace(0, 0.2, 201)),
-    )
+    found = transcription.markers.predict_samples(grid.positions_m, np.array([share]))
+    dense = replace(cube, t_s=np.linspace(0, 0.2, 201), markers=_on(cube, np.linspace(0, 0.2, 201)))
     expected = simulate(dense, TRUTH, "midpoint", substeps=1).markers_m
     moved = np.abs(expected - expected[0]).max()
     inside = np.arange(3, 18)
@@ -144,9 +116,7 @@ def test_a_corrected_pose_is_another_grasp_under_the_same_gravity():
     cube = replace(measured(plain), nuisance=nuisance)
     phi = np.array([1.0, -0.6, 0.8, 0.5, -1.0, 0.3])
     pivot = plain.rigid_positions(plain.t_s[:1])[0].mean(axis=0)
-    half = (
-        0.1 * phi[:3] / 2
-    )  # Cayley's parameters: tan(angle / 2) along the axis
+    half = 0.1 * phi[:3] / 2  # Cayley's parameters: tan(angle / 2) along the axis
     length = np.linalg.norm(half)
     turn = Rotation.from_rotvec(2 * np.arctan(length) * half / length)
     poses = plain.grasps[0].poses
@@ -162,9 +132,7 @@ def test_a_corrected_pose_is_another_grasp_under_the_same_gravity():
 
 
 def test_a_tilt_turns_gravity_and_keeps_its_size():
-    nuisance = NuisanceMap.from_experiment(
-        replace(hung_cube(), nuisance=ONE_OF_EACH["tilt"])
-    )
+    nuisance = NuisanceMap.from_experiment(replace(hung_cube(), nuisance=ONE_OF_EACH["tilt"]))
     gravity = nuisance.gravity(np.array([1.0, -2.0]))
     assert np.linalg.norm(gravity) == pytest.approx(9.81)
     angle = np.arccos(gravity @ nuisance.gravity_m_s2 / 9.81**2)
@@ -173,18 +141,13 @@ def test_a_tilt_turns_gravity_and_keeps_its_size():
 
 def test_without_gravity_there_is_no_tilt():
     floating = hung_cube(start="undeformed", gravity_m_s2=np.zeros(3))
-    nuisance = NuisanceMap.from_experiment(
-        replace(floating, nuisance=ONE_OF_EACH["tilt"])
-    )
+    nuisance = NuisanceMap.from_experiment(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
     assert nuisance.size == 0
     np.testing.assert_array_equal(nuisance.gravity(np.zeros(0)), np.zeros(3))
 
 
 def test_deviations_must_be_positive():
-    with pytest.raises(
-        InputError,
-        match=r"'time_shift_s' is 0; expected a value above 0",
-    ):
+    with pytest.raises(InputError, match=r"'time_shift_s' is 0; expected a value above 0"):
         Nuisance(time_shift_s=0.0)
 
 
@@ -194,10 +157,7 @@ def test_deviations_must_be_positive():
 # Every kind by one method; by the others one that moves the body, by one of them what is read too.
 FOUND_BY = [
     *product(ONE_OF_EACH, ("reduced-space",)),
-    *product(
-        ("tilt",),
-        ("interior-point", "shooting", "augmented-lagrangian", "continuation"),
-    ),
+    *product(("tilt",), ("interior-point", "shooting", "augmented-lagrangian", "continuation")),
     ("offset", "interior-point"),
 ]
 
@@ -206,9 +166,7 @@ FOUND_BY = [
 @pytest.mark.parametrize(("kind", "method"), FOUND_BY)
 def test_nuisance_is_found_beside_the_material(kind: str, method: str, rng):
     cube = replace(cube_with_gaps(14), nuisance=ONE_OF_EACH[kind])
-    precise = replace(
-        cube.markers, sigma_m=np.full(len(cube.markers.names), 1e-7)
-    )
+    precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 1e-7))
     cube = replace(cube, markers=precise)
     phi = rng.uniform(-1, 1, NuisanceMap.from_experiment(cube).size)
     solution = solve(Problem([seen_with(cube, phi)], GUESS), method)
@@ -233,17 +191,12 @@ def test_a_prior_keeps_what_the_data_do_not_tell():
 
 
 @pytest.mark.parametrize(
-    ("about", "low", "high"),
-    [(0, -2, 2), (5, 3, 7), (-5, -7, -3), (9, 7, 10), (-10, -10, -8)],
+    ("about", "low", "high"), [(0, -2, 2), (5, 3, 7), (-5, -7, -3), (9, 7, 10), (-10, -10, -8)]
 )
-def test_the_clock_is_limited_to_samples_read_and_a_quarter_of_the_recording(
-    about, low, high
-):
+def test_the_clock_is_limited_to_samples_read_and_a_quarter_of_the_recording(about, low, high):
     cube = replace(hung_cube(40), nuisance=Nuisance.none(time_shift_s=0.02))
     limits = np.concatenate(NuisanceMap.from_experiment(cube).bounds(about))
-    np.testing.assert_allclose(
-        limits, np.array([low, high]) * cube.timestep_s / 0.02
-    )
+    np.testing.assert_allclose(limits, np.array([low, high]) * cube.timestep_s / 0.02)
 
 
 @pytest.mark.parametrize("samples", [-5, 5])
@@ -253,7 +206,7 @@ def test_a_shift_of_several_samples_is_found(samples: int):
     solution = solve(Problem([seen_with(cube, phi)], GUESS), "reduced-space")
     assert solution.status.converged
     (part,) = solution.collocation.iterates(solution.z)
-    assert part.segment.association.clock_samples == samples
+    assert part.transcription.association.clock_samples == samples
     # The prior pulls towards no shift.
     np.testing.assert_allclose(part.phi, phi, atol=1e-2)
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=0.02)
@@ -279,14 +232,8 @@ def test_a_clock_at_its_limit_says_so():
 def foam_without_references() -> tuple[Experiment, np.ndarray]:
     """A swung block seen by markers of which nobody knows where they sit, and where they do."""
     cube = hung_cube(25)
-    places = np.random.default_rng(8).uniform(0.01, 0.09, size=(6, 3)) * [
-        1,
-        1,
-        0.6,
-    ]
-    seen = noisy(
-        replace(cube, markers=point_markers(cube.body, places, cube.t_s)), 2e-4
-    )
+    places = np.random.default_rng(8).uniform(0.01, 0.09, size=(6, 3)) * [1, 1, 0.6]
+    seen = noisy(replace(cube, markers=point_markers(cube.body, places, cube.t_s)), 2e-4)
     tracks = seen.markers.positions_m
     return replace(cube, markers=Markers(cube.t_s, tracks, 2e-4)), places
 
@@ -295,25 +242,19 @@ def test_unknown_places_are_found_from_any_guess():
     experiment, places = foam_without_references()
     found, values = [], []
     for factor in (0.3, 3.0):
-        guess = GUESS.with_guess(
-            {name: factor * value for name, value in TRUTH.items()}
-        )
+        guess = GUESS.with_guess({name: factor * value for name, value in TRUTH.items()})
         solution = solve(Problem([experiment], guess), "reduced-space")
         assert solution.status.converged
         (part,) = solution.collocation.iterates(solution.z)
-        found.append(part.segment.marker_places_m(part.phi))
+        found.append(part.transcription.marker_places_m(part.phi))
         values.append(solution.theta)
     np.testing.assert_allclose(values[0], values[1], rtol=1e-4)
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
     bars = uncertainty_at(solution.collocation, solution.z)
-    deviations_m = (
-        np.array(list(bars.nuisance.values())) * part.segment.nuisance.scales
-    )
+    deviations_m = np.array(list(bars.nuisance.values())) * part.transcription.nuisance.scales
     assert deviations_m.max() < 0.01
     assert np.abs((found[0] - places) / deviations_m.reshape(-1, 3)).max() < 3.5
-    errors = np.log(values[0] / list(TRUTH.values())) / np.sqrt(
-        np.diag(bars.covariance)
-    )
+    errors = np.log(values[0] / list(TRUTH.values())) / np.sqrt(np.diag(bars.covariance))
     assert np.abs(errors).max() < 3.0
 
 
@@ -322,33 +263,20 @@ def test_places_on_the_surface_stay_there():
     below, beside = [0.04, 0.03, 0.0], [0.0, 0.06, 0.03]
     shifts = np.array([[0.006, 0.012, 0.0], [0.0, -0.004, 0.007]])
     given = np.array([below, beside])
-    seen = noisy(
-        replace(
-            cube, markers=point_markers(cube.body, given + shifts, cube.t_s)
-        ),
-        2e-4,
-    )
+    seen = noisy(replace(cube, markers=point_markers(cube.body, given + shifts, cube.t_s)), 2e-4)
     # Seen off the surface, as balls are whose middle is not where they are glued.
-    tracks = seen.markers.positions_m + np.array(
-        [[0, 0, -0.003], [-0.003, 0, 0]]
-    )
+    tracks = seen.markers.positions_m + np.array([[0, 0, -0.003], [-0.003, 0, 0]])
     off_m = []
     for on_surface in (False, True):
         markers = Markers(
-            cube.t_s,
-            tracks,
-            2e-4,
-            None,
-            given,
-            places_sigma_m=0.01,
-            on_surface=on_surface,
+            cube.t_s, tracks, 2e-4, None, given, places_sigma_m=0.01, on_surface=on_surface
         )
         collocation = alone(replace(cube, markers=markers))
         assert collocation.nphi == (4 if on_surface else 6)
         solution = ReducedSpace()(collocation)
         assert solution.status.converged
         (part,) = solution.collocation.iterates(solution.z)
-        places = part.segment.marker_places_m(part.phi)
+        places = part.transcription.marker_places_m(part.phi)
         off_m.append(np.abs([places[0, 2], places[1, 0]]).max())
     assert off_m[0] > 1e-3
     assert off_m[1] < 1e-12
@@ -357,10 +285,7 @@ def test_places_on_the_surface_stay_there():
 def test_a_place_beyond_an_edge_of_the_surface_settles():
     """The planes of the faces of a ball that stands off a corner lead away from each other."""
     cube = hung_cube(3)
-    given, ball = (
-        np.array([[0.097, 1e-4, 0.1]]),
-        np.array([0.1247, 1e-4, 0.107]),
-    )
+    given, ball = (np.array([[0.097, 1e-4, 0.1]]), np.array([0.1247, 1e-4, 0.107]))
     markers = Markers(
         cube.t_s,
         np.zeros((len(cube.t_s), 1, 3)),
@@ -370,22 +295,17 @@ def test_a_place_beyond_an_edge_of_the_surface_settles():
         places_sigma_m=0.01,
         on_surface=True,
     )
-    chart, found = (
-        MarkerAssociation.from_experiment(replace(cube, markers=markers)),
-        [],
-    )
+    association, found = (MarkerAssociation.from_experiment(replace(cube, markers=markers)), [])
     for _ in range(8):
         nearest = (
-            chart.axes[0].T
-            @ (ball - chart.centre_places_m[0])
-            / chart.sigma_m[0]
+            association.axes[0].T @ (ball - association.centre_places_m[0]) / association.sigma_m[0]
         )
-        before, (chart, phi) = (
-            chart,
-            chart.follow_estimates(chart.centre_coordinates + nearest),
+        before, (association, phi) = (
+            association,
+            association.follow_estimates(association.centre_coordinates + nearest),
         )
-        found.append(chart.places_m(phi)[0])
-    assert chart is before
+        found.append(association.places_m(phi)[0])
+    assert association is before
     np.testing.assert_allclose(found[-1], found[-2])
     # As near as the plane of one of the three faces comes.
     distance_m = np.linalg.norm(ball - found[-1])
@@ -395,9 +315,7 @@ def test_a_place_beyond_an_edge_of_the_surface_settles():
 def test_a_problem_with_other_places_does_not_keep_the_charts_of_the_old_ones():
     cube = replace(hung_cube(4), nuisance=ONE_OF_EACH["place"])
     charted = Collocation(
-        [cube],
-        GUESS,
-        associations={cube.name: Association.from_experiment(cube)},
+        [cube], GUESS, associations={cube.name: Association.from_experiment(cube)}
     )
     exact = replace(charted, experiments=[replace(cube, nuisance=IDEAL)])
     assert len(exact.guess_p) == exact.nq
@@ -410,32 +328,19 @@ def test_a_problem_with_other_places_does_not_keep_the_charts_of_the_old_ones():
 def test_nuisance_parameters_widen_the_error_bars_of_the_material():
     plain = measured(hung_cube(20))
     known = ReducedSpace()(alone(plain))
-    unknown = ReducedSpace()(
-        alone(replace(plain, nuisance=cube_with_nuisance().nuisance))
-    )
+    unknown = ReducedSpace()(alone(replace(plain, nuisance=cube_with_nuisance().nuisance)))
     narrow, wide = (
-        np.sqrt(np.diag(uncertainty_at(s.collocation, s.z).covariance))
-        for s in (known, unknown)
+        np.sqrt(np.diag(uncertainty_at(s.collocation, s.z).covariance)) for s in (known, unknown)
     )
     assert (wide > 1.05 * narrow).all()
 
 
 def test_experiments_keep_their_nuisance_to_themselves(rng):
-    first, second = (
-        replace(hung_cube(n), nuisance=ONE_OF_EACH["time"]) for n in (12, 16)
-    )
+    first, second = (replace(hung_cube(n), nuisance=ONE_OF_EACH["time"]) for n in (12, 16))
     second = replace(second, name="second")
-    both = [
-        seen_with(first, np.array([0.7])),
-        seen_with(second, np.array([-0.4])),
-    ]
+    both = [seen_with(first, np.array([0.7])), seen_with(second, np.array([-0.4]))]
     exact = [
-        replace(
-            e,
-            markers=replace(
-                e.markers, sigma_m=np.full(len(e.markers.names), 1e-7)
-            ),
-        )
+        replace(e, markers=replace(e.markers, sigma_m=np.full(len(e.markers.names), 1e-7)))
         for e in both
     ]
     solution = ReducedSpace()(Collocation(exact, GUESS))
@@ -450,13 +355,9 @@ def test_experiments_keep_their_nuisance_to_themselves(rng):
 def _on(cube: Experiment, t_s: np.ndarray):
     markers = cube.markers
     return replace(
-        markers,
-        t_s=t_s,
-        positions_m=np.zeros((len(t_s), *markers.positions_m.shape[1:])),
+        markers, t_s=t_s, positions_m=np.zeros((len(t_s), *markers.positions_m.shape[1:]))
     )
 
 
 def _only_first(cube: Experiment):
-    return vertex_markers(
-        cube.body, cube.markers.placement.nodes[0][[0]], cube.t_s
-    )
+    return vertex_markers(cube.body, cube.markers.placement.nodes[0][[0]], cube.t_s)

@@ -15,9 +15,7 @@ from collocation_sysid.model.numerical_damping import (
 )
 from collocation_sysid.model.schemes import SCHEMES
 
-EULER, MIDPOINT, BDF2 = (
-    SCHEMES[name] for name in ("backward-euler", "midpoint", "bdf2")
-)
+EULER, MIDPOINT, BDF2 = (SCHEMES[name] for name in ("backward-euler", "midpoint", "bdf2"))
 STEP_S = 0.01
 SILICONE_RAD_S = 2 * np.pi * 7.7
 
@@ -26,13 +24,9 @@ SILICONE_RAD_S = 2 * np.pi * 7.7
 def test_roots_are_those_worked_out_by_hand(h: float):
     assert principal_root(EULER.regular, h) == pytest.approx(1 / (1 - 1j * h))
     half = 1j * h / 2
-    assert principal_root(MIDPOINT.regular, h) == pytest.approx(
-        (1 + half) / (1 - half)
-    )
+    assert principal_root(MIDPOINT.regular, h) == pytest.approx((1 + half) / (1 - half))
     # (3 − 4u + u²) / 2 = ih for u = 1/z, which is one at h = 0
-    assert principal_root(BDF2.regular, h) == pytest.approx(
-        1 / (2 - np.sqrt(1 + 2j * h))
-    )
+    assert principal_root(BDF2.regular, h) == pytest.approx(1 / (2 - np.sqrt(1 + 2j * h)))
 
 
 def test_backward_euler_damps_by_half_the_phase_of_a_step():
@@ -60,14 +54,10 @@ def test_bdf2_damps_with_the_third_power_of_the_step():
 @pytest.mark.parametrize("damping_ratio", [0.0, 0.2])
 def test_errors_vanish_with_the_schemes_order(name: str, damping_ratio: float):
     steps = np.array([0.01, 0.02, 0.04])
-    roots = [
-        principal_root(SCHEMES[name].regular, h, damping_ratio) for h in steps
-    ]
+    roots = [principal_root(SCHEMES[name].regular, h, damping_ratio) for h in steps]
     exact = -damping_ratio + 1j * np.sqrt(1 - damping_ratio**2)
     errors = np.abs(np.log(roots) / steps - exact)
-    assert observed_order(steps, errors) == pytest.approx(
-        SCHEMES[name].order, abs=0.1
-    )
+    assert observed_order(steps, errors) == pytest.approx(SCHEMES[name].order, abs=0.1)
 
 
 @pytest.mark.parametrize("name", SCHEMES)
@@ -78,19 +68,13 @@ def test_a_simulation_damps_as_much_as_predicted(name: str, gamma_m_1_s: float):
     omega, ratio = oscillation(released, modes, 0, theta, name)
     true_omega = modes.compute_angular_frequencies_rad_s()[0]
     physical = modes.damping_ratios[0]
-    mode = numerical_mode(
-        SCHEMES[name], true_omega, released.timestep_s, physical
-    )
+    mode = numerical_mode(SCHEMES[name], true_omega, released.timestep_s, physical)
     assert ratio - physical == pytest.approx(mode.damping_ratio, abs=2e-5)
-    period_ratio = (
-        true_omega * np.sqrt(1 - physical**2) / (omega * np.sqrt(1 - ratio**2))
-    )
+    period_ratio = true_omega * np.sqrt(1 - physical**2) / (omega * np.sqrt(1 - ratio**2))
     assert period_ratio - 1 == pytest.approx(mode.period_error, abs=2e-5)
 
 
-@pytest.mark.parametrize(
-    "scheme", [EULER, BDF2, MIDPOINT], ids=lambda scheme: scheme.name
-)
+@pytest.mark.parametrize("scheme", [EULER, BDF2, MIDPOINT], ids=lambda scheme: scheme.name)
 def test_the_substeps_named_are_the_fewest_that_suffice(scheme):
     limit = 0.005
     needed = substeps_needed(scheme, SILICONE_RAD_S, STEP_S, limit)

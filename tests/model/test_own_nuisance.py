@@ -31,9 +31,7 @@ def only(*rows: cs.NuisanceRow, **others) -> cs.Nuisance:
 
 def known_to(experiment: cs.Experiment, sigma_m: float) -> cs.Experiment:
     sigmas = np.full(len(experiment.markers.names), sigma_m)
-    return replace(
-        experiment, markers=replace(experiment.markers, sigma_m=sigmas)
-    )
+    return replace(experiment, markers=replace(experiment.markers, sigma_m=sigmas))
 
 
 def test_readings_are_changed_as_said():
@@ -45,9 +43,7 @@ def test_readings_are_changed_as_said():
     since = 1 - np.exp(-cube.t_s / cube.duration_s)
     np.testing.assert_allclose(scaled[:, 0], 1.01 * plain[:, 0], atol=1e-14)
     sag = 0.003 * np.outer(since, [1.0, 0.0, -2.0])
-    np.testing.assert_allclose(
-        scaled[:, 1], 1.01 * plain[:, 1] + sag, atol=1e-14
-    )
+    np.testing.assert_allclose(scaled[:, 1], 1.01 * plain[:, 1] + sag, atol=1e-14)
 
 
 # Every one by one method; by the others one of them.
@@ -59,13 +55,9 @@ FOUND_BY = [
 
 
 @pytest.mark.parametrize(("name", "method"), FOUND_BY)
-def test_what_a_user_adds_is_found_beside_the_material(
-    name: str, method: str, rng
-):
+def test_what_a_user_adds_is_found_beside_the_material(name: str, method: str, rng):
     steps, sigma_m = (14, 1e-7) if method == "reduced-space" else (9, 1e-5)
-    cube = known_to(
-        replace(cube_with_gaps(steps), nuisance=only(ROWS[name])), sigma_m
-    )
+    cube = known_to(replace(cube_with_gaps(steps), nuisance=only(ROWS[name])), sigma_m)
     phi = rng.uniform(-1, 1, NuisanceMap.from_experiment(cube).size)
     solution = solve(cs.Problem([seen_with(cube, phi)], GUESS), method)
     assert solution.status.converged
@@ -78,9 +70,7 @@ def test_a_run_tells_of_it_and_the_verdict_judges_it():
     cube = known_to(replace(hung_cube(14), nuisance=only(SCALE)), 1e-4)
     far = 5.0  # deviations of its prior
     seen = seen_with(cube, np.array([far]))
-    noise = 1e-4 * np.random.default_rng(2).normal(
-        size=seen.markers.positions_m.shape
-    )
+    noise = 1e-4 * np.random.default_rng(2).normal(size=seen.markers.positions_m.shape)
     noisy = cs.with_markers(seen, seen.markers.positions_m + noise)
     finished = run(cs.Problem([noisy], GUESS, substeps=1), seek_causes=False)
     (told,) = finished.result.nuisance["hung cube"].items()
@@ -88,9 +78,7 @@ def test_a_run_tells_of_it_and_the_verdict_judges_it():
     assert told[1].prior == 0.02
     assert abs(told[1].value - far * 0.02) < 3.5 * told[1].std_error < 0.01
     assert any("camera scale" in reason for reason in finished.trust.reasons)
-    said = " ".join(
-        plain_text(run_summary(finished.result, Path("run"))).split()
-    )
+    said = " ".join(plain_text(run_summary(finished.result, Path("run"))).split())
     assert re.search(r"camera scale (9\.\d|10) % \(prior ±2 %\)", said)
 
 
@@ -100,12 +88,7 @@ def test_without_it_the_answer_is_wrong():
     seen = seen_with(cube, np.array([-2.0]))
     blind = replace(seen, nuisance=cs.Nuisance.none())
     errors = [
-        np.abs(
-            np.log(
-                ReducedSpace()(Collocation([each], GUESS)).theta
-                / list(TRUTH.values())
-            )
-        )
+        np.abs(np.log(ReducedSpace()(Collocation([each], GUESS)).theta / list(TRUTH.values())))
         for each in (seen, blind)
     ]
     assert errors[0].max() < 0.05 < errors[1].max()
@@ -114,24 +97,12 @@ def test_without_it_the_answer_is_wrong():
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        (
-            {"reading": None},
-            "'extra' has neither a reading nor a clock; expected exactly one",
-        ),
-        (
-            {"sigma": None},
-            "'extra' has no sigma; expected the standard deviation of its prior",
-        ),
+        ({"reading": None}, "'extra' has neither a reading nor a clock; expected exactly one"),
+        ({"sigma": None}, "'extra' has no sigma; expected the standard deviation of its prior"),
         ({"sigma": 0.0}, "'extra' is 0; expected a value above 0"),
         ({"name": "tare"}, "two nuisance parameters are named 'tare'"),
-        (
-            {"of": "load"},
-            "'extra' has of = 'load'; expected 'recording' or 'marker'",
-        ),
-        (
-            {"reading": lambda y, v, t_s, data: y[:2]},
-            r"has the shape \(2, 1\); expected \(3, 1\)",
-        ),
+        ({"of": "load"}, "'extra' has of = 'load'; expected 'recording' or 'marker'"),
+        ({"reading": lambda y, v, t_s, data: y[:2]}, r"has the shape \(2, 1\); expected \(3, 1\)"),
         (
             {"reading": lambda y, v, t_s, data: y + v.nothing},
             "the reading of the nuisance parameter 'extra' failed",
@@ -147,17 +118,9 @@ def test_without_it_the_answer_is_wrong():
     ],
 )
 def test_a_row_that_cannot_be_is_refused(row, message: str):
-    given = {
-        "name": "extra",
-        "unit": "1",
-        "sigma": 0.1,
-        "reading": lambda y, v, t, d: y + v,
-    } | row
+    given = {"name": "extra", "unit": "1", "sigma": 0.1, "reading": lambda y, v, t, d: y + v} | row
     with pytest.raises(InputError, match=message):
-        cs.Problem(
-            [replace(hung_cube(4), nuisance=only(cs.NuisanceRow(**given)))],
-            GUESS,
-        )
+        cs.Problem([replace(hung_cube(4), nuisance=only(cs.NuisanceRow(**given)))], GUESS)
 
 
 # Problem files
@@ -188,10 +151,7 @@ def scaled(tiny: Path) -> Path:
     write("cameras.py", CAMERAS)(tiny)
     head, *lines = (tiny / "swing_markers.csv").read_text().splitlines()
     cells = [[float(cell) for cell in line.split(",")] for line in lines]
-    seen = [
-        ",".join(str(c if k == 0 else 1.03 * c) for k, c in enumerate(row))
-        for row in cells
-    ]
+    seen = [",".join(str(c if k == 0 else 1.03 * c) for k, c in enumerate(row)) for row in cells]
     write("swing_markers.csv", "\n".join([head, *seen]) + "\n")(tiny)
     return tiny
 
@@ -204,35 +164,19 @@ def test_a_file_gives_a_row_where_that_is_allowed(scaled: Path):
     assert abs(scale["value"] - 0.03) < 3.5 * scale["std_error"] < 0.03
     page = scaled / "page.html"
     assert run_command("report", "run", "--to", page).code == 0
-    assert re.search(
-        r"camera scale</td>\s*<td[^>]*>[23](\.\d)? %<", page.read_text()
-    )
+    assert re.search(r"camera scale</td>\s*<td[^>]*>[23](\.\d)? %<", page.read_text())
 
 
 @pytest.mark.parametrize(
     ("edit", "options", "message"),
     [
-        (
-            lambda folder: None,
-            (),
-            "nuisance.own: found the file cameras.py, which would be run",
-        ),
-        (
-            replace_text('"SCALE"', '"SCAL"'),
-            ALLOWED,
-            "no NuisanceRow 'SCAL'; expected one of",
-        ),
+        (lambda folder: None, (), "nuisance.own: found the file cameras.py, which would be run"),
+        (replace_text('"SCALE"', '"SCAL"'), ALLOWED, "no NuisanceRow 'SCAL'; expected one of"),
         (write("cameras.py", "SCALE = 3"), ALLOWED, "expected one of none"),
-        (
-            write("cameras.py", CAMERAS.replace("* y", "* y[:1]")),
-            ALLOWED,
-            "has the shape (1, 1)",
-        ),
+        (write("cameras.py", CAMERAS.replace("* y", "* y[:1]")), ALLOWED, "has the shape (1, 1)"),
     ],
 )
-def test_a_file_that_gives_no_row_is_refused(
-    scaled: Path, edit, options, message: str
-):
+def test_a_file_that_gives_no_row_is_refused(scaled: Path, edit, options, message: str):
     edit(scaled)
     done = run_command("check", "problem.toml", *options)
     assert done.code == 2

@@ -66,15 +66,8 @@ def made(tmp_path_factory) -> Path:
     (folder / "tension.csv").write_text(TENSION)
     file = folder / "problem.toml"
     file.write_text(PROBLEM)
-    at_truth = [
-        f"parameters.mu_pa.guess={TRUTH['mu_pa']}",
-        "transcription.substeps=1",
-    ]
-    write_data(
-        Problem.read(file, at_truth, simulation=True),
-        folder,
-        Recipe("midpoint"),
-    )
+    at_truth = [f"parameters.mu_pa.guess={TRUTH['mu_pa']}", "transcription.substeps=1"]
+    write_data(Problem.read(file, at_truth, simulation=True), folder, Recipe("midpoint"))
     return folder
 
 
@@ -89,26 +82,17 @@ def driven(made, tmp_path) -> Path:
 @pytest.mark.long
 def test_a_driven_box_is_read_solved_and_shown(driven):
     (experiment,) = Problem.read(driven / "problem.toml").experiments
-    assert [actuator.name for actuator in experiment.actuators] == [
-        "tendon_1",
-        "air",
-    ]
-    np.testing.assert_allclose(
-        experiment.tendons[0].energy_amplitude_at([0.025]), 0.0025
-    )
+    assert [actuator.name for actuator in experiment.actuators] == ["tendon_1", "air"]
+    np.testing.assert_allclose(experiment.tendons[0].energy_amplitude_at([0.025]), 0.0025)
     with pictures_drawn():
-        done = run_command(
-            "solve", driven / "problem.toml", "--out", driven / "run"
-        )
+        done = run_command("solve", driven / "problem.toml", "--out", driven / "run")
     assert done.code == 0, done.err
     said = " ".join(done.out.split())
     assert "tendon_1, more than stated by" in said
     assert "(prior ±10 %)" in said
     assert "air, lost" in said
     result = json.loads((driven / "run" / "result.json").read_text())
-    assert result["parameters"]["mu_pa"]["optimum"] == pytest.approx(
-        TRUTH["mu_pa"], rel=1e-3
-    )
+    assert result["parameters"]["mu_pa"]["optimum"] == pytest.approx(TRUTH["mu_pa"], rel=1e-3)
     assert "tendon_1, more than stated [1]" in result["nuisance"]["drive"]
     assert list((driven / "run").glob("**/mesh.*"))
     shown = run_command("report", driven / "run", "--to", driven / "page.html")
@@ -119,11 +103,7 @@ def test_a_driven_box_is_read_solved_and_shown(driven):
 def test_a_group_of_triangles_is_the_wall(driven):
     body = Problem.read(driven / "problem.toml").experiments[0].body
     volume = (
-        body
-        and Problem.read(driven / "problem.toml")
-        .experiments[0]
-        .pressures[0]
-        .require_measure()
+        body and Problem.read(driven / "problem.toml").experiments[0].pressures[0].require_measure()
     )
     assert isinstance(volume, EnclosedVolume)
     cells = [("tetra", body.mesh.tetrahedra), ("triangle", volume.faces)]
@@ -132,85 +112,39 @@ def test_a_group_of_triangles_is_the_wall(driven):
     mesh.write(driven / "grouped.vtu")
     read = TetMesh.read(driven / "grouped.vtu")
     assert read.face_sets["cavity"].shape == (12, 3)
-    text = PROBLEM.replace("box.vtu", "grouped.vtu").replace(
-        '"wall"', '"cavity"'
-    )
+    text = PROBLEM.replace("box.vtu", "grouped.vtu").replace('"wall"', '"cavity"')
     (driven / "problem.toml").write_text(text)
-    again = (
-        Problem.read(driven / "problem.toml")
-        .experiments[0]
-        .pressures[0]
-        .require_measure()
-    )
+    again = Problem.read(driven / "problem.toml").experiments[0].pressures[0].require_measure()
     at = body.nodes_m.reshape(1, -1)
-    assert again.evaluate(at)[0] == pytest.approx(
-        volume.evaluate(at)[0], rel=1e-12
-    )
+    assert again.evaluate(at)[0] == pytest.approx(volume.evaluate(at)[0], rel=1e-12)
 
 
-TENDON = PROBLEM[
-    PROBLEM.index("[[experiment.tendon]]") : PROBLEM.index(
-        "[[experiment.pressure]]"
-    )
-]
+TENDON = PROBLEM[PROBLEM.index("[[experiment.tendon]]") : PROBLEM.index("[[experiment.pressure]]")]
 SLIPS = {
     "no column": (
         ("tension.csv", "t_s,tension\n0,1\n1,1\n"),
         "column tension names no unit; .*call it tension_n",
     ),
-    "other unit": (
-        ("tension.csv", "t_s,tension_kg\n0,1\n1,1\n"),
-        "a unit of force, one of n, mn",
-    ),
-    "pushes": (
-        ("tension.csv", "t_s,tension_n\n0,1\n1,-2\n"),
-        "line 3.*a tendon only pulls",
-    ),
-    "raw": (
-        ("tension.csv", "t_s,tension_n\n0,1\n1,9e7\n"),
-        "too large for a soft body",
-    ),
-    "back in time": (
-        ("tension.csv", "t_s,tension_n\n1,1\n0,1\n"),
-        "line 3.*must increase",
-    ),
+    "other unit": (("tension.csv", "t_s,tension_kg\n0,1\n1,1\n"), "a unit of force, one of n, mn"),
+    "pushes": (("tension.csv", "t_s,tension_n\n0,1\n1,-2\n"), "line 3.*a tendon only pulls"),
+    "raw": (("tension.csv", "t_s,tension_n\n0,1\n1,9e7\n"), "too large for a soft body"),
+    "back in time": (("tension.csv", "t_s,tension_n\n1,1\n0,1\n"), "line 3.*must increase"),
     "blank": (("tension.csv", "t_s,tension_n\n0,1\n1,\n"), "line 3.*holds ''"),
     "empty": (("tension.csv", ""), "is empty"),
     "other clock": (
         ("tension.csv", "t_s,tension_n\n100,1\n101,1\n"),
         "tendon_1 is given from 100 s to 101 s, but the recording lasts from 0 s to 0.05 s",
     ),
-    "no file": (
-        (TENDON, TENDON.replace("tension.csv", "t.csv")),
-        "t.csv does not exist",
-    ),
+    "no file": ((TENDON, TENDON.replace("tension.csv", "t.csv")), "t.csv does not exist"),
     "both": (
-        (
-            TENDON,
-            TENDON.replace('"tension.csv"', '"tension.csv"\ntension_n = 1.0'),
-        ),
+        (TENDON, TENDON.replace('"tension.csv"', '"tension.csv"\ntension_n = 1.0')),
         "found tension_n and tension; expected exactly one",
     ),
-    "neither": (
-        (TENDON, TENDON.replace('tension = "tension.csv"', "")),
-        "expected exactly one",
-    ),
-    "one point": (
-        ("[0.003, 0.004, 0.015], [0.003, 0.004, 0.0]", ""),
-        r"tendon\.0\.points_m",
-    ),
-    "millimetres": (
-        ("[0.003, 0.004, 0.015]", "[3, 4, 15]"),
-        "point 2 at .* m outside the body",
-    ),
-    "name twice": (
-        ('name = "air"', 'name = "tendon_1"'),
-        "two tendons or pressures are called",
-    ),
-    "no wall": (
-        ('"wall" }', '"cavity" }'),
-        'no group of faces "cavity"; it has "wall"',
-    ),
+    "neither": ((TENDON, TENDON.replace('tension = "tension.csv"', "")), "expected exactly one"),
+    "one point": (("[0.003, 0.004, 0.015], [0.003, 0.004, 0.0]", ""), r"tendon\.0\.points_m"),
+    "millimetres": (("[0.003, 0.004, 0.015]", "[3, 4, 15]"), "point 2 at .* m outside the body"),
+    "name twice": (('name = "air"', 'name = "tendon_1"'), "two tendons or pressures are called"),
+    "no wall": (('"wall" }', '"cavity" }'), 'no group of faces "cavity"; it has "wall"'),
     "whole surface": (
         ('{ name = "wall" }', "{ box_m = [[-1, -1, -1], [1, 1, 1]] }"),
         "the faces are the outer surface of the body",
@@ -219,10 +153,7 @@ SLIPS = {
         ('{ name = "wall" }', "{ box_m = [[-1, -1, -1], [1, 1, 0.001]] }"),
         "the faces are not closed, and 12 of the 12 edges of their rim move",
     ),
-    "negative prior": (
-        ("prior_pa = 1.0", "prior_pa = -1.0"),
-        "pressure_lost.prior_pa",
-    ),
+    "negative prior": (("prior_pa = 1.0", "prior_pa = -1.0"), "pressure_lost.prior_pa"),
 }
 
 

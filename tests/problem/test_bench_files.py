@@ -20,11 +20,7 @@ from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.new_problem import TEMPLATES
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.recording import (
-    displaced_axes,
-    read_displacement,
-    read_wrench,
-)
+from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report, run_summary
@@ -68,9 +64,7 @@ s;mm;N
 0,1;0,25;2,5
 0,2;0,50;6,0
 """
-TABS = (
-    PLAIN.replace(",", "\t").replace(" (mm)", " / mm").replace(" (s)", " [ms]")
-)
+TABS = PLAIN.replace(",", "\t").replace(" (mm)", " / mm").replace(" (s)", " [ms]")
 TABS = TABS.replace("0.1\t", "100\t").replace("0.2\t", "200\t")
 
 
@@ -95,23 +89,13 @@ def written(tmp_path: Path):
         (GERMAN, "cp1252"),
         (TABS, "utf-16"),
     ],
-    ids=[
-        "plain",
-        "header",
-        "units below",
-        "semicolons from Windows",
-        "tabs in UTF-16",
-    ],
+    ids=["plain", "header", "units below", "semicolons from Windows", "tabs in UTF-16"],
 )
-def test_a_machines_columns_are_recognised_with_their_units(
-    written, text, encoding
-):
+def test_a_machines_columns_are_recognised_with_their_units(written, text, encoding):
     file = written(text, encoding)
     moved = read_displacement(file, sign=-1)
     np.testing.assert_allclose(moved.t_s, TIMES)
-    np.testing.assert_allclose(
-        moved.positions_m[:, 2], -1e-3 * np.array(PRESSED_MM)
-    )
+    np.testing.assert_allclose(moved.positions_m[:, 2], -1e-3 * np.array(PRESSED_MM))
     assert displaced_axes(file) == "z"
     t_s, quarter = read_wrench(file, sign=-1, symmetry=4, axis="x")
     np.testing.assert_allclose(t_s, TIMES)
@@ -133,25 +117,18 @@ def test_rows_without_times_are_equilibria_of_a_body_without_memory(tmp_path):
     untimed = re.sub("^[^,]*,", "", PLAIN, flags=re.MULTILINE)
     for name in ("first", "second"):
         (tmp_path / f"{name}.csv").write_text(untimed)
-    np.testing.assert_array_equal(
-        Problem.read(file).experiments[1].t_s, [0, 1, 2]
-    )
+    np.testing.assert_array_equal(Problem.read(file).experiments[1].t_s, [0, 1, 2])
     memory = '[[object.prony]]\nname = "prony_1"\n\n[parameters]\nprony_1.share = 0.1\n'
-    file.write_text(
-        SHARED.replace("[parameters]", memory + "prony_1.tau_s = 1.0")
-    )
+    file.write_text(SHARED.replace("[parameters]", memory + "prony_1.tau_s = 1.0"))
     with pytest.raises(
-        InputError,
-        match=r"line 1: the columns are .*; expected t_s and any of x_m",
+        InputError, match=r"line 1: the columns are .*; expected t_s and any of x_m"
     ):
         Problem.read(file)
 
 
 def test_columns_are_named_where_they_are_not_recognised(written):
     file = written("Takt [s],Kanal 1 (mm),Kanal 2,rest\n0,0,0,5\n1,2,3,5\n")
-    moved = read_displacement(
-        file, {"t": "Takt [s]", "displacement": "Kanal 1 (mm)"}
-    )
+    moved = read_displacement(file, {"t": "Takt [s]", "displacement": "Kanal 1 (mm)"})
     np.testing.assert_allclose(moved.positions_m[:, 2], [0, 2e-3])
     columns = {"t": "Takt [s]", "force": "Kanal 2 (kN)"}
     np.testing.assert_allclose(read_wrench(file, columns)[1][:, 2], [0, 3000])
@@ -159,9 +136,7 @@ def test_columns_are_named_where_they_are_not_recognised(written):
 
 def test_one_file_in_this_projects_own_form_holds_both(written):
     file = written("t_s,z_mm,fz_n\n0,0,0\n1,-2,\n2,-3,-1\n")
-    np.testing.assert_allclose(
-        read_displacement(file).positions_m[:, 2], [0, -2e-3, -3e-3]
-    )
+    np.testing.assert_allclose(read_displacement(file).positions_m[:, 2], [0, -2e-3, -3e-3])
     np.testing.assert_array_equal(read_wrench(file)[1][:, 2], [0, np.nan, -1])
 
 
@@ -173,61 +148,35 @@ def test_pressures_have_any_unit(written):
 
 
 BAD = {
-    "no unit": (
-        "Time (s),Force\n0,1\n1,2\n",
-        {},
-        "line 1: column Force names no unit",
-    ),
-    "a mass": (
-        "Time (s),Load (kg)\n0,1\n1,2\n",
-        {},
-        "a unit of force, one of n, mn",
-    ),
+    "no unit": ("Time (s),Force\n0,1\n1,2\n", {}, "line 1: column Force names no unit"),
+    "a mass": ("Time (s),Load (kg)\n0,1\n1,2\n", {}, "a unit of force, one of n, mn"),
     "two": (
         "Time (s),Load (N),Force (N)\n0,1,1\n1,2,2\n",
         {},
         "Load (N), Force (N) could all be force; expected one of them, or "
         'columns = { force = "Load (N)" } or columns = { force = "Force (N)" }',
     ),
-    "only stress": (
-        "Time (s),Stress (kPa)\n0,1\n1,2\n",
-        {},
-        "a stress needs area_m2",
-    ),
+    "only stress": ("Time (s),Stress (kPa)\n0,1\n1,2\n", {}, "a stress needs area_m2"),
     "no area": (PLAIN, {"area_m2": 1.0}, "expected t_s and any of stress_pa"),
     "true stress": (
         "Time (s),True Stress (kPa)\n0,1\n1,2\n",
         {"area_m2": 1.0, "columns": {"stress": "True Stress (kPa)"}},
         "column True Stress (kPa) refers to the deformed specimen; expected engineering stress",
     ),
-    "not there": (
-        PLAIN,
-        {"columns": {"force": "Forse (N)"}},
-        "did you mean 'Force (N)'",
-    ),
-    "no such key": (
-        PLAIN,
-        {"columns": {"load": "Force (N)"}},
-        "the key 'load'; expected one of t",
-    ),
+    "not there": (PLAIN, {"columns": {"force": "Forse (N)"}}, "did you mean 'Force (N)'"),
+    "no such key": (PLAIN, {"columns": {"load": "Force (N)"}}, "the key 'load'; expected one of t"),
     "header": (
         WITH_HEADER.replace("0.25,2.5", "0.25,wet"),
         {},
         "line 7: column Load (N) holds 'we",
     ),
     "mixed commas": (GERMAN.replace("0,25", "0.25"), {}, "holds '0,0'"),
-    "a length": (
-        "Time (s),Force (mm)\n0,1\n1,2\n",
-        {},
-        "Force (mm) has the unit mm",
-    ),
+    "a length": ("Time (s),Force (mm)\n0,1\n1,2\n", {}, "Force (mm) has the unit mm"),
 }
 
 
 @pytest.mark.parametrize(("text", "how", "words"), BAD.values(), ids=BAD)
-def test_what_cannot_be_the_force_says_why_and_what_to_write(
-    written, text, how, words
-):
+def test_what_cannot_be_the_force_says_why_and_what_to_write(written, text, how, words):
     with pytest.raises(InputError, match=re.escape(words)):
         read_wrench(written(text), **how)
 
@@ -279,19 +228,11 @@ def test_experiments_share_what_they_do_not_say_themselves(tmp_path):
     np.testing.assert_allclose(first.t_s, [0, 0.2])
     np.testing.assert_allclose(second.t_s, [0, 0.1, 0.2, 0.3])
     (sensor,) = (grasp.wrench for grasp in second.grasps if grasp.wrench)
-    np.testing.assert_allclose(
-        sensor.values[:, 2], np.array([0, -2.5, -6, -9]) / 4
-    )
+    np.testing.assert_allclose(sensor.values[:, 2], np.array([0, -2.5, -6, -9]) / 4)
     assert sensor.sigma_n == 0.01
     assert problem.origin is not None
-    assert {file.name for file in problem.origin.files} == {
-        "block.vtu",
-        "first.csv",
-        "second.csv",
-    }
-    overridden = Problem.read(
-        tmp_path / "problem.toml", ["experiment_defaults.every=3"]
-    )
+    assert {file.name for file in problem.origin.files} == {"block.vtu", "first.csv", "second.csv"}
+    overridden = Problem.read(tmp_path / "problem.toml", ["experiment_defaults.every=3"])
     np.testing.assert_allclose(overridden.experiments[0].t_s, [0, 0.3])
 
 
@@ -304,15 +245,11 @@ def test_a_half_height_takes_the_scaled_displacement(tmp_path):
     half = problem.experiments[1].grasps[1]
     assert half.displacement_scale == 0.5
     assert np.abs(complete.poses.positions_m[:, 2]).max() > 0
-    np.testing.assert_allclose(
-        half.poses.positions_m, complete.poses.positions_m / 2
-    )
+    np.testing.assert_allclose(half.poses.positions_m, complete.poses.positions_m / 2)
     # Files of a simulation have the displacement of the whole specimen again.
     write_data(Problem.read(file, simulation=True), tmp_path / "twin")
     written = read_displacement(tmp_path / "twin" / "second.csv", sign=-1)
-    np.testing.assert_allclose(
-        written.positions_m, complete.poses.positions_m, atol=1e-12
-    )
+    np.testing.assert_allclose(written.positions_m, complete.poses.positions_m, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -332,72 +269,46 @@ def test_a_scale_is_positive_and_not_of_strains(tmp_path, stated, message):
 @pytest.mark.long
 def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
     """As those of the same part whose file has its own loads, times four."""
-    part = SHARED.replace(
-        "sign = -1, symmetry = 4, sigma_n = 0.04", "sign = -1, sigma_n = 0.01"
-    )
+    part = SHARED.replace("sign = -1, symmetry = 4, sigma_n = 0.04", "sign = -1, sigma_n = 0.01")
     block_problem(tmp_path)
     (tmp_path / "part.toml").write_text(part)
     for name in ("first", "second"):
         head, *rows = (tmp_path / f"{name}.csv").read_text().splitlines()
         cells = [row.split(",") for row in rows]
-        lines = [
-            ",".join([*row[:-1], repr(float(row[-1]) / 4)]) for row in cells
-        ]
-        (tmp_path / f"{name}_part.csv").write_text(
-            "\n".join([head, *lines, ""])
-        )
-    parts = [
-        f"experiment.{name}.file={name}_part.csv"
-        for name in ("first", "second")
-    ]
+        lines = [",".join([*row[:-1], repr(float(row[-1]) / 4)]) for row in cells]
+        (tmp_path / f"{name}_part.csv").write_text("\n".join([head, *lines, ""]))
+    parts = [f"experiment.{name}.file={name}_part.csv" for name in ("first", "second")]
     found = run(Problem.read(tmp_path / "problem.toml"), seek_causes=False)
     alone = run(Problem.read(tmp_path / "part.toml", parts), seek_causes=False)
     whole_fit, part_fit = found.result.fit, alone.result.fit
     assert part_fit.wrench_rms_n is not None
     assert part_fit.wrench_rms_n > 0
-    assert whole_fit.wrench_rms_n == pytest.approx(
-        4 * part_fit.wrench_rms_n, rel=1e-6
-    )
+    assert whole_fit.wrench_rms_n == pytest.approx(4 * part_fit.wrench_rms_n, rel=1e-6)
     assert whole_fit.experiments["first"].wrench_sigma_n == pytest.approx(0.04)
     assert whole_fit.symmetry == {"first": 4, "second": 4}
     assert part_fit.symmetry is None
-    simulated = [
-        each.rollout.experiments["second"]
-        for each in (found.result, alone.result)
-    ]
-    assert simulated[0].wrench_rms_n == pytest.approx(
-        4 * simulated[1].wrench_rms_n, rel=1e-6
-    )
+    simulated = [each.rollout.experiments["second"] for each in (found.result, alone.result)]
+    assert simulated[0].wrench_rms_n == pytest.approx(4 * simulated[1].wrench_rms_n, rel=1e-6)
     arrays = []
     for name, finished in (("whole", found), ("part", alone)):
         finished.save(tmp_path / name, frames=False)
-        arrays.append(
-            np.load(tmp_path / name / "trajectory.npz")["second/wrench_1"]
-        )
-    np.testing.assert_allclose(
-        arrays[0][:, 3], [0, -2.5, -6, -9]
-    )  # as in the file
-    np.testing.assert_allclose(
-        arrays[0][:, 1:], 4 * arrays[1][:, 1:], rtol=1e-6
-    )
+        arrays.append(np.load(tmp_path / name / "trajectory.npz")["second/wrench_1"])
+    np.testing.assert_allclose(arrays[0][:, 3], [0, -2.5, -6, -9])  # as in the file
+    np.testing.assert_allclose(arrays[0][:, 1:], 4 * arrays[1][:, 1:], rtol=1e-6)
     said = plain_text(run_summary(found.result, tmp_path / "whole"))
     words = (
         "loads of 'first' and 'second' are those of the whole specimen, 4 times those of the "
         "modelled part"
     )
     assert words in said
-    assert "specimen" not in plain_text(
-        run_summary(alone.result, tmp_path / "part")
-    )
+    assert "specimen" not in plain_text(run_summary(alone.result, tmp_path / "part"))
     priors_n = [
         float(re.search(r"tare: up to \S+ N \(prior ±(\S+) N\)", said)[1])
         for each in (found.result, alone.result)
         if (said := each.fit.experiments["first"].notes[-1])
     ]
     assert priors_n[0] == pytest.approx(4 * priors_n[1])
-    assert "Forces are those of the modelled part." in as_markdown(
-        [run_report(tmp_path / "whole")]
-    )
+    assert "Forces are those of the modelled part." in as_markdown([run_report(tmp_path / "whole")])
 
 
 def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):
@@ -410,9 +321,7 @@ def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):
         ]
 
     assert said(SHARED) == []
-    assert (
-        said(SHARED.replace("sign = -1", "sign = 1")) == []
-    )  # pulled, not pressed
+    assert said(SHARED.replace("sign = -1", "sign = 1")) == []  # pulled, not pressed
     for wrong in (
         SHARED.replace("{ sign = -1 }", "{}"),
         SHARED.replace("{ sign = -1, sym", "{ sym"),
@@ -427,52 +336,24 @@ def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):
 
 def test_a_part_of_a_default_is_overridden_for_one_experiment(tmp_path):
     file = block_problem(tmp_path)
-    problem = Problem.read(
-        file, ["experiment.second.grasp.1.wrench.sigma_n=0.4"]
-    )
-    sigmas = [
-        e.grasps[1].wrench.sigma_n
-        for e in problem.experiments
-        if e.grasps[1].wrench
-    ]
+    problem = Problem.read(file, ["experiment.second.grasp.1.wrench.sigma_n=0.4"])
+    sigmas = [e.grasps[1].wrench.sigma_n for e in problem.experiments if e.grasps[1].wrench]
     assert sigmas == [0.01, 0.1]
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (
-            "every = 2",
-            "every = 0",
-            "problem.toml: experiment_defaults.every: found 0",
-        ),
-        (
-            "kind =",
-            "kynd =",
-            "experiment_defaults.kynd: unknown key; did you mean 'kind'",
-        ),
+        ("every = 2", "every = 0", "problem.toml: experiment_defaults.every: found 0"),
+        ("kind =", "kynd =", "experiment_defaults.kynd: unknown key; did you mean 'kind'"),
         ("every = 1", "every = 0", "experiment 'second': every: found 0"),
         ('"first.csv"', '"third.csv"', "experiment 'first': file: "),
-        (
-            'file = "first.csv"',
-            "",
-            "experiment 'first': grasp.1.displacement: missing; expected a",
-        ),
-        (
-            "{ sign = -1 }",
-            "{ sign = 2 }",
-            "experiment_defaults.grasp.1.displacement.sign: found 2",
-        ),
-        (
-            "[experiment_defaults]",
-            "[[experiment_defaults]]",
-            "experiment_defaults: found [",
-        ),
+        ('file = "first.csv"', "", "experiment 'first': grasp.1.displacement: missing; expected a"),
+        ("{ sign = -1 }", "{ sign = 2 }", "experiment_defaults.grasp.1.displacement.sign: found 2"),
+        ("[experiment_defaults]", "[[experiment_defaults]]", "experiment_defaults: found ["),
     ],
 )
-def test_a_slip_in_what_is_shared_is_named_where_it_stands(
-    tmp_path, old, new, words
-):
+def test_a_slip_in_what_is_shared_is_named_where_it_stands(tmp_path, old, new, words):
     assert old in SHARED
     file = block_problem(tmp_path, SHARED.replace(old, new))
     with pytest.raises(InputError) as caught:
@@ -496,9 +377,7 @@ def test_a_slip_in_what_is_shared_is_named_where_it_stands(
         ("%", "ratio", 1e-2),
     ],
 )
-def test_units_are_what_they_are_defined_as(
-    unit: str, dimension: str, si: float
-):
+def test_units_are_what_they_are_defined_as(unit: str, dimension: str, si: float):
     assert si_factor(unit, dimension) == pytest.approx(si, rel=1e-7)
 
 
@@ -515,9 +394,7 @@ def test_units_are_what_they_are_defined_as(
         ("specimen", {"pull.csv"}),
     ],
 )
-def test_a_new_problem_of_each_kind_runs_as_it_is(
-    tmp_path, monkeypatch, kind, data
-):
+def test_a_new_problem_of_each_kind_runs_as_it_is(tmp_path, monkeypatch, kind, data):
     monkeypatch.chdir(tmp_path)
     begun = run_command("new", "mine", "--kind", kind)
     assert begun.code == 0
@@ -529,10 +406,7 @@ def test_a_new_problem_of_each_kind_runs_as_it_is(
     assert "collocation-sysid check mine/problem.toml" in begun.err
     assert "collocation-sysid solve mine/problem.toml" in begun.err
     guess = {"specimen": "mu_pa", "swing": ""}.get(kind, "young_pa")
-    guessed = (
-        "--set",
-        f"parameters.{guess}.guess=3e4" if guess else "solver.huber=9.0",
-    )
+    guessed = ("--set", f"parameters.{guess}.guess=3e4" if guess else "solver.huber=9.0")
     assert run_command("check", "mine/problem.toml", *guessed).code == 0
     problem = Problem.read("mine/problem.toml", guessed[1:])
     found = run(problem, seek_causes=False)
@@ -547,27 +421,17 @@ def test_a_new_problem_of_each_kind_runs_as_it_is(
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_recordings_of_templates_are_what_a_simulation_gives(
-    tmp_path, kind
-):
+def test_the_recordings_of_templates_are_what_a_simulation_gives(tmp_path, kind):
     shutil.copytree(TEMPLATES / kind, tmp_path / kind)
     shipped = sorted((TEMPLATES / kind).glob("*.csv"))
     for file in shipped:
         (tmp_path / kind / file.name).unlink()
     KINDS[kind](tmp_path / kind)
     for file in shipped:
-        made, there = (
-            (at / file.name).read_text()
-            for at in (tmp_path / kind, file.parent)
-        )
+        made, there = ((at / file.name).read_text() for at in (tmp_path / kind, file.parent))
         assert made.splitlines()[0] == there.splitlines()[0]
-        numbers = [
-            np.genfromtxt(t.splitlines()[1:], delimiter=",")
-            for t in (made, there)
-        ]
-        np.testing.assert_allclose(
-            *numbers, rtol=1e-6, atol=1e-6 if kind == "swing" else 2e-4
-        )
+        numbers = [np.genfromtxt(t.splitlines()[1:], delimiter=",") for t in (made, there)]
+        np.testing.assert_allclose(*numbers, rtol=1e-6, atol=1e-6 if kind == "swing" else 2e-4)
 
 
 @pytest.mark.long
@@ -576,14 +440,7 @@ def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
     shutil.copytree(TEMPLATES / kind, tmp_path / "measured")
     file, twin = tmp_path / "measured" / "problem.toml", tmp_path / "twin"
     told = run_command(
-        *(
-            "simulate",
-            file,
-            "--out",
-            twin,
-            "--set",
-            "parameters.young_pa.guess=4e4",
-        ),
+        *("simulate", file, "--out", twin, "--set", "parameters.young_pa.guess=4e4"),
         *("--noise-n", "0.01"),
     )
     assert told.code == 0, told.err
@@ -591,12 +448,8 @@ def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
     rows = len((TEMPLATES / kind / "run_1.csv").read_text().splitlines())
     assert len((twin / "run_1.csv").read_text().splitlines()) == rows
     shutil.copy(file, twin)
-    again, measured = (
-        Problem.read(at / "problem.toml") for at in (twin, file.parent)
-    )
-    for ours, theirs in zip(
-        again.experiments, measured.experiments, strict=True
-    ):
+    again, measured = (Problem.read(at / "problem.toml") for at in (twin, file.parent))
+    for ours, theirs in zip(again.experiments, measured.experiments, strict=True):
         np.testing.assert_allclose(ours.t_s, theirs.t_s)
         for grasp, recorded in zip(ours.grasps, theirs.grasps, strict=True):
             np.testing.assert_allclose(
@@ -646,24 +499,13 @@ def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
             "t_s,displacement_m,force_n",
         ),
     ],
-    ids=[
-        "signs",
-        "names",
-        "strain and stress",
-        "a name for one",
-        "a time for one",
-        "half",
-    ],
+    ids=["signs", "names", "strain and stress", "a name for one", "a time for one", "half"],
 )
 def test_a_simulated_table_reads_back_as_what_was_simulated(
     tmp_path, displacement, wrench, measured, simulated
 ):
-    text = SHARED.replace(
-        "displacement = { sign = -1 }", f"displacement = {{ {displacement} }}"
-    )
-    file = block_problem(
-        tmp_path, text.replace("sign = -1, symmetry = 4", wrench)
-    )
+    text = SHARED.replace("displacement = { sign = -1 }", f"displacement = {{ {displacement} }}")
+    file = block_problem(tmp_path, text.replace("sign = -1, symmetry = 4", wrench))
     columns = measured
     rows = "0,0,0\n100,0.02,0.001\n200,0.04,0.002\n300,0.06,0.003\n"
     for name in ("first", "second"):
@@ -671,31 +513,22 @@ def test_a_simulated_table_reads_back_as_what_was_simulated(
     problem = Problem.read(file, simulation=True)
     write_data(problem, tmp_path / "twin")
     for name in ("first", "second"):
-        assert (tmp_path / "twin" / f"{name}.csv").read_text().splitlines()[
-            0
-        ] == simulated
+        assert (tmp_path / "twin" / f"{name}.csv").read_text().splitlines()[0] == simulated
     for name in ("block.vtu", "problem.toml"):
         shutil.copy(tmp_path / name, tmp_path / "twin")
     again = Problem.read(tmp_path / "twin" / "problem.toml", simulation=True)
-    for ours, theirs in zip(
-        again.experiments, problem.experiments, strict=True
-    ):
+    for ours, theirs in zip(again.experiments, problem.experiments, strict=True):
         np.testing.assert_allclose(
-            ours.grasps[1].poses.positions_m,
-            theirs.grasps[1].poses.positions_m,
-            atol=1e-12,
+            ours.grasps[1].poses.positions_m, theirs.grasps[1].poses.positions_m, atol=1e-12
         )
         (sensed,) = simulate(theirs, problem.parameters).wrenches
-        np.testing.assert_allclose(
-            ours.wrenches[0].values[:, 2], sensed[:, 2], rtol=1e-9
-        )
+        np.testing.assert_allclose(ours.wrenches[0].values[:, 2], sensed[:, 2], rtol=1e-9)
 
 
 def test_one_table_of_two_recordings_is_not_simulated(tmp_path):
     file = block_problem(tmp_path, SHARED.replace("second.csv", "first.csv"))
     with pytest.raises(
-        InputError,
-        match=r"'second': file: the file first.csv is read by 'first' too",
+        InputError, match=r"'second': file: the file first.csv is read by 'first' too"
     ):
         write_data(Problem.read(file, simulation=True), tmp_path / "twin")
     assert not (tmp_path / "twin").exists()
@@ -704,19 +537,13 @@ def test_one_table_of_two_recordings_is_not_simulated(tmp_path):
 def test_faces_are_found_without_any_length():
     mesh = box_mesh((0.02, 0.03, 0.04), (2, 2, 2), origin_m=(0.01, 0.0, -0.5))
     nodes = ElementNodes.corners(mesh)
-    faces = (
-        (Face("top"), 2, -0.46, 9),
-        (Face("bottom"), 2, -0.5, 9),
-        (Face("side_x"), 0, 0.01, 3),
-    )
+    faces = ((Face("top"), 2, -0.46, 9), (Face("bottom"), 2, -0.5, 9), (Face("side_x"), 0, 0.01, 3))
     for face, axis, place, count in faces:
         chosen = mesh.points_m[face.resolve(nodes)]
         np.testing.assert_allclose(chosen[:, axis], place)
         assert len(chosen) == count
     assert len(Face("side_x").resolve_faces(mesh)) == 8
-    with pytest.raises(
-        InputError, match="the face top selects nodes, and no cells"
-    ):
+    with pytest.raises(InputError, match="the face top selects nodes, and no cells"):
         Face("top").resolve_cells(mesh)
     with pytest.raises(InputError, match="face"):
         Face("left")  # pyright: ignore[reportArgumentType]
@@ -726,23 +553,11 @@ def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_command("new", "mine", "--kind", "compression")
     file = tmp_path / "mine" / "run_1.csv"
-    ours = (
-        Problem.read("mine/problem.toml", simulation=True)
-        .experiments[0]
-        .grasps[1]
-        .wrench
-    )
-    text = file.read_text().replace(
-        "Displacement (mm),Force (N)", "Standardweg (mm),Kraft (N)"
-    )
+    ours = Problem.read("mine/problem.toml", simulation=True).experiments[0].grasps[1].wrench
+    text = file.read_text().replace("Displacement (mm),Force (N)", "Standardweg (mm),Kraft (N)")
     text = "Probe 7\nWerkstoff,Silikon\n\n" + text
     file.write_text(text.replace(",", ";").replace(".", ","), encoding="cp1252")
-    again = (
-        Problem.read("mine/problem.toml", simulation=True)
-        .experiments[0]
-        .grasps[1]
-        .wrench
-    )
+    again = Problem.read("mine/problem.toml", simulation=True).experiments[0].grasps[1].wrench
     assert ours is not None
     assert again is not None
     np.testing.assert_array_equal(again.values, ours.values)
@@ -755,14 +570,8 @@ def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):
             "edge_length_m = 1e-5",
             "object.edge_length_m: with this length the mesh has 4.5e+11 elements; expected at most",
         ),
-        (
-            "mass_kg = 1.0",
-            "edge_length_m is missing; expected the length",
-        ),
-        (
-            'edge_length_m = 0.01\nmesh = "a.vtu"',
-            "found mesh and cylinder; expected exactly one",
-        ),
+        ("mass_kg = 1.0", "edge_length_m is missing; expected the length"),
+        ('edge_length_m = 0.01\nmesh = "a.vtu"', "found mesh and cylinder; expected exactly one"),
     ],
 )
 def test_a_shape_that_cannot_be_meshed_is_refused(tmp_path, shape, words):
@@ -780,18 +589,13 @@ def test_a_shape_that_cannot_be_meshed_is_refused(tmp_path, shape, words):
             "cylinder = { diameter_m = 0.05, height_m = 24 }",
             "object.cylinder.height_m: found 24 m; expected at most 10 m, likely 0.024",
         ),
-        (
-            "box_m = [0.02, 24, 0.02]",
-            "object.box_m: found 24 m; expected at most 10 m, likely",
-        ),
+        ("box_m = [0.02, 24, 0.02]", "object.box_m: found 24 m; expected at most 10 m, likely"),
     ],
 )
 def test_a_length_in_millimetres_is_named_and_not_the_edges_that_it_makes_too_many(
     tmp_path, shape, words
 ):
-    text = SHARED.replace(
-        'mesh = "block.vtu"', f"{shape}\nedge_length_m = 0.0005"
-    )
+    text = SHARED.replace('mesh = "block.vtu"', f"{shape}\nedge_length_m = 0.0005")
     with pytest.raises(InputError) as caught:
         Problem.read(block_problem(tmp_path, text))
     assert words in str(caught.value)
@@ -799,9 +603,7 @@ def test_a_length_in_millimetres_is_named_and_not_the_edges_that_it_makes_too_ma
 
 
 def test_a_quarter_of_a_cylinder_has_a_quarter_of_its_volume():
-    whole, quarter = (
-        cylinder_of_edge(0.05, 0.03, 0.011, part) for part in (False, True)
-    )
+    whole, quarter = (cylinder_of_edge(0.05, 0.03, 0.011, part) for part in (False, True))
     assert whole.volume_m3 == pytest.approx(np.pi * 0.025**2 * 0.03, rel=1e-9)
     assert quarter.volume_m3 == pytest.approx(whole.volume_m3 / 4, rel=1e-9)
     assert quarter.points_m[:, :2].min() == 0.0

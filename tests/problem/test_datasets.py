@@ -36,53 +36,34 @@ def test_kawabatas_tables_are_those_of_the_publication():
     uniaxial, equibiaxial, planar, biaxial = cs.datasets.kawabata_1981(
         tests=("uniaxial", "equibiaxial", "planar", "biaxial")
     )
-    counts = [
-        len(each.t_s) for each in (uniaxial, equibiaxial, planar, biaxial)
-    ]
+    counts = [len(each.t_s) for each in (uniaxial, equibiaxial, planar, biaxial)]
     assert counts == [18, 16, 18, 65]
     assert uniaxial.specimen is DEFORMATIONS["uniaxial"]
     stress_pa = uniaxial.readings[0].measured_values[:, 0]
     assert stress_pa[0] == pytest.approx(0.0434e6)
     assert np.all(np.diff(stress_pa) > 0)
-    assert [gauge.name for gauge in biaxial.readings] == [
-        "stress",
-        "second stress",
-    ]
-    (small,) = cs.datasets.kawabata_1981(
-        tests=("equibiaxial",), largest_stretch=1.3
-    )
+    assert [gauge.name for gauge in biaxial.readings] == ["stress", "second stress"]
+    (small,) = cs.datasets.kawabata_1981(tests=("equibiaxial",), largest_stretch=1.3)
     assert len(small.t_s) < 16
 
 
 def test_a_stretch_below_all_samples_is_refused_with_the_smallest_one():
-    with pytest.raises(
-        cs.InputError, match=r"largest_stretch = 1; expected at least 1\.0"
-    ):
+    with pytest.raises(cs.InputError, match=r"largest_stretch = 1; expected at least 1\.0"):
         cs.datasets.kawabata_1981(largest_stretch=1.0)
 
 
 def test_a_law_fits_kawabatas_small_stretches_well():
     tests = cs.datasets.kawabata_1981("mooney-rivlin", largest_stretch=1.3)
-    constants = {
-        "c10_pa": cs.Unknown(),
-        "c01_pa": cs.Unknown(),
-        "kappa_pa": 1e12,
-    }
-    run = cs.run(
-        cs.Problem(tests, {**constants, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
-    )
+    constants = {"c10_pa": cs.Unknown(), "c01_pa": cs.Unknown(), "kappa_pa": 1e12}
+    run = cs.run(cs.Problem(tests, {**constants, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}))
     # Rivlin's linear regression of the same stresses for an incompressible solid.
     rows, measured = [], []
     for test in tests:
         strain = test.grasps[3].poses.at(test.t_s)[1][:, 2] / 0.01
         stretch = 1 + strain
         of_test = {
-            "uniaxial": np.column_stack(
-                [stretch - stretch**-2, 1 - stretch**-3]
-            ),
-            "equibiaxial": np.column_stack(
-                [stretch - stretch**-5, stretch**3 - stretch**-3]
-            ),
+            "uniaxial": np.column_stack([stretch - stretch**-2, 1 - stretch**-3]),
+            "equibiaxial": np.column_stack([stretch - stretch**-5, stretch**3 - stretch**-3]),
             "planar": np.column_stack([stretch - stretch**-3] * 2),
         }
         rows.append(2 * of_test[test.name])
@@ -90,9 +71,7 @@ def test_a_law_fits_kawabatas_small_stretches_well():
         if test.name == "planar":
             rows.append(2 * np.column_stack([1 - stretch**-2, stretch**2 - 1]))
             measured.append(test.readings[1].measured_values[:, 0])
-    exact = np.linalg.lstsq(
-        np.vstack(rows), np.concatenate(measured), rcond=None
-    )[0]
+    exact = np.linalg.lstsq(np.vstack(rows), np.concatenate(measured), rcond=None)[0]
     found = [run.parameters["c10_pa"], run.parameters["c01_pa"]]
     assert found == pytest.approx(exact, rel=3e-3)
 
@@ -112,10 +91,7 @@ def test_a_copy_of_measured_data_has_source_licence_and_schema(tmp_path):
         assert {"LICENSE_Hyperelastics.md", "schema.json"} <= names
         text = file.read_text()
         assert text.startswith("#:schema schema.json\n")
-        assert (
-            "Hyperelastics.jl, Copyright (c) 2022 TRACER Lab at Liberty University, MIT"
-            in text
-        )
+        assert "Hyperelastics.jl, Copyright (c) 2022 TRACER Lab at Liberty University, MIT" in text
     assert not (tmp_path / "kawabata_1981" / "calendering.csv").exists()
     with pytest.raises(cs.InputError, match="this file exists already"):
         copy_dataset("diani", tmp_path / "diani")
@@ -130,9 +106,7 @@ def test_a_copy_of_a_simulated_recording_names_a_schema_beside_it(tmp_path):
 
 
 @pytest.mark.long
-def test_a_wheel_contains_the_datasets_with_their_licence(
-    tmp_path, monkeypatch
-):
+def test_a_wheel_contains_the_datasets_with_their_licence(tmp_path, monkeypatch):
     hatchling = pytest.importorskip("hatchling.build")
     monkeypatch.chdir(ROOT)  # the project that is built
     wheel = tmp_path / hatchling.build_wheel(str(tmp_path))
@@ -151,21 +125,10 @@ def test_a_wheel_contains_the_datasets_with_their_licence(
             encoding="utf-8",
         ).stdout
 
-    assert "LICENSE_Hyperelastics.md" in run(
-        "new", "rubber", "--dataset", "kawabata_1981"
-    )
-    run(
-        "solve",
-        "rubber/problem.toml",
-        "--out",
-        "run",
-        "--no-pictures",
-        "--quiet",
-    )
+    assert "LICENSE_Hyperelastics.md" in run("new", "rubber", "--dataset", "kawabata_1981")
+    run("solve", "rubber/problem.toml", "--out", "run", "--no-pictures", "--quiet")
     result = json.loads((tmp_path / "run" / "result.json").read_text())
-    assert result["derived"]["young_pa"]["value"] == pytest.approx(
-        1.2e6, rel=0.3
-    )
+    assert result["derived"]["young_pa"]["value"] == pytest.approx(1.2e6, rel=0.3)
     for name in cs.datasets.DATASETS:
         run("new", name, "--dataset", name)
         assert (tmp_path / name / cs.datasets.DATASETS[name]).is_file()

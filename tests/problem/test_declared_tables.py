@@ -30,11 +30,7 @@ def as_sentence(text: str) -> str:
 
 def described_prior(row: NuisanceRow) -> str:
     """Key of a prior, followed by its default if it has one."""
-    return (
-        row.prior_key()
-        if row.sigma is None
-        else f"{row.prior_key()}, {row.usual} by default"
-    )
+    return row.prior_key() if row.sigma is None else f"{row.prior_key()}, {row.usual} by default"
 
 
 # Nuisance parameters -------------------------------------------------------------------------
@@ -44,9 +40,7 @@ def test_nuisance_has_a_field_for_each_kind():
     names = [field.name for field in fields(Nuisance)]
     assert names == [*(row.name for row in KINDS), "scope", "own"]
     standard = Nuisance()
-    assert [standard.sigma(row) for row in KINDS] == [
-        row.sigma for row in KINDS
-    ]
+    assert [standard.sigma(row) for row in KINDS] == [row.sigma for row in KINDS]
 
 
 def test_fields_of_nuisance_are_described_as_the_kinds():
@@ -59,38 +53,27 @@ def test_the_table_has_a_key_for_each_kind():
     assert list(NuisanceSection.model_fields) == [*KEYS, "own"]
     for key, rows in KEYS.items():
         description = " ".join(
-            as_sentence(f"{row.description}: {described_prior(row)}")
-            for row in rows
+            as_sentence(f"{row.description}: {described_prior(row)}") for row in rows
         )
         assert NuisanceSection.model_fields[key].description == description
 
 
 def prior_section(key: str) -> Any:
     """Class of the table of a key of [experiment.nuisance]."""
-    return next(
-        iter(table_models(NuisanceSection.model_fields[key].annotation))
-    )
+    return next(iter(table_models(NuisanceSection.model_fields[key].annotation)))
 
 
 @pytest.mark.parametrize(("key", "rows"), KEYS.items(), ids=KEYS)
-def test_the_table_of_a_key_has_the_priors_of_its_kinds(
-    key: str, rows: list[NuisanceRow]
-):
+def test_the_table_of_a_key_has_the_priors_of_its_kinds(key: str, rows: list[NuisanceRow]):
     section = prior_section(key)
     stated = section.model_fields
     assert list(stated) == ["scope", *(row.prior_key() for row in rows)]
-    assert (
-        section.__doc__
-        == f"Prior of a nuisance parameter: {rows[0].description}."
-    )
+    assert section.__doc__ == f"Prior of a nuisance parameter: {rows[0].description}."
     assert section.has_default == any(row.sigma is not None for row in rows)
     # A prior that refers to another one needs it.
     needs_all = any(row.reference is not None for row in rows)
     for row in rows:
-        assert (
-            stated[row.prior_key()].description
-            == f"Standard deviation [{row.unit}]."
-        )
+        assert stated[row.prior_key()].description == f"Standard deviation [{row.unit}]."
         missing = PydanticUndefined if needs_all else None
         assert stated[row.prior_key()].default == (row.reference or missing)
 
@@ -113,15 +96,9 @@ def test_only_effects_of_known_sign_have_a_mean():
 
 
 def test_fields_of_assumptions_are_described_as_the_rows():
-    section = inspect.cleandoc(Assumptions.__doc__ or "").partition(
-        "Attributes\n----------\n"
-    )[2]
+    section = inspect.cleandoc(Assumptions.__doc__ or "").partition("Attributes\n----------\n")[2]
     blocks = re.findall(r"^(\w+) : .*\n((?: +.*(?:\n|$))+)", section, re.M)
     described = {name: " ".join(text.split()) for name, text in blocks}
-    expected = {
-        row.name: f"{row.description} [{row.unit or 1}]" for row in ASSUMPTIONS
-    }
+    expected = {row.name: f"{row.description} [{row.unit or 1}]" for row in ASSUMPTIONS}
     expected |= {row.name: f"{row.description} [{row.unit}]" for row in KINDS}
-    assert described == {
-        name: as_sentence(text) for name, text in expected.items()
-    }
+    assert described == {name: as_sentence(text) for name, text in expected.items()}

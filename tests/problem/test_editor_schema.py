@@ -23,11 +23,7 @@ from collocation_sysid.problem.new_problem import TEMPLATES, create_problem
 from collocation_sysid.problem.problem_reading import read_problem_file
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = [
-    each
-    for each in (ROOT / "problems").glob("*/*.toml")
-    if each.name != "limits.toml"
-]
+SHIPPED = [each for each in (ROOT / "problems").glob("*/*.toml") if each.name != "limits.toml"]
 
 
 def first_line(file: Path) -> str:
@@ -41,10 +37,7 @@ def validate(file: Path, schema: str) -> None:
 
 @pytest.mark.parametrize("kind", ["compression", "swing", "tension"])
 def test_a_template_names_the_schema_and_follows_it(kind, tmp_path):
-    assert (
-        first_line(TEMPLATES / kind / "problem.toml")
-        == f"#:schema {SCHEMA_FILE}"
-    )
+    assert first_line(TEMPLATES / kind / "problem.toml") == f"#:schema {SCHEMA_FILE}"
     file, *others = create_problem(tmp_path / "mine", kind)
     assert first_line(file) == f"#:schema {SCHEMA_FILE}"
     assert others[-1] == file.parent / SCHEMA_FILE
@@ -54,9 +47,7 @@ def test_a_template_names_the_schema_and_follows_it(kind, tmp_path):
     assert problem.title == "mine"
 
 
-@pytest.mark.parametrize(
-    "file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}"
-)
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
 def test_a_shipped_problem_names_the_schema_and_follows_it(file):
     directive, _, path = first_line(file).partition(" ")
     assert directive == "#:schema"
@@ -75,10 +66,7 @@ def test_a_misspelt_key_does_not_follow_the_schema(tmp_path):
 def tables(schema: str) -> dict[str, set[str]]:
     """The keys of each table; other details differ between versions of pydantic."""
     content = json.loads(schema)
-    known = {
-        name: set(table.get("properties", {}))
-        for name, table in content["$defs"].items()
-    }
+    known = {name: set(table.get("properties", {})) for name, table in content["$defs"].items()}
     return known | {"": set(content["properties"])}
 
 
@@ -86,10 +74,7 @@ def test_the_schema_of_the_shipped_problems_is_that_of_the_command():
     shipped = (ROOT / "problems" / SCHEMA_FILE).read_text(encoding="utf-8")
     outcome = run_command("schema")
     assert outcome.out == schema_text()
-    assert (
-        json.loads(outcome.out)["$schema"]
-        == "https://json-schema.org/draft/2020-12/schema"
-    )
+    assert json.loads(outcome.out)["$schema"] == "https://json-schema.org/draft/2020-12/schema"
     remedy = "write it again: collocation-sysid schema > problems/schema.json"
     assert tables(shipped) == tables(outcome.out), remedy
 
@@ -132,9 +117,7 @@ def test_the_documentation_publishes_the_schema(tmp_path, monkeypatch):
     from reference import PUBLISHED, write_pages
 
     write_pages(tmp_path)
-    assert (tmp_path / PUBLISHED / SCHEMA_FILE).read_text(
-        encoding="utf-8"
-    ) == schema_text()
+    assert (tmp_path / PUBLISHED / SCHEMA_FILE).read_text(encoding="utf-8") == schema_text()
     configuration = (ROOT / "docs" / "conf.py").read_text()
     assert 'html_extra_path = [f"generated/{PUBLISHED}",' in configuration
 

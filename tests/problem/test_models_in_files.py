@@ -8,14 +8,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
-from kit.problem_files import (
-    both,
-    contents,
-    replace_text,
-    run_command,
-    settings,
-    write,
-)
+from kit.problem_files import both, contents, replace_text, run_command, settings, write
 from kit.region_files import DENSITY, TWO_REGIONS
 
 TRUTH = settings(
@@ -42,9 +35,7 @@ OWN_MATERIAL = both(replace_text(DENSITY, CODE), write("mine.py", MINE))
 def refusal(tiny: Path, *arguments: object) -> str:
     """The one line on stderr of a command that must not write anything."""
     before = contents(tiny)
-    outcome = run_command(
-        "solve", "problem.toml", "--out", "run", "--quiet", *arguments
-    )
+    outcome = run_command("solve", "problem.toml", "--out", "run", "--quiet", *arguments)
     assert outcome.code == 2, outcome.err
     assert contents(tiny) == before
     assert outcome.err.count("\n") == 1
@@ -73,9 +64,7 @@ def test_a_body_of_two_regions_is_simulated_and_identified(tiny):
     ))  # fmt: skip
     assert outcome.code == 0, outcome.err
     result = json.loads((tiny / "run/result.json").read_text())
-    found = {
-        name: each["optimum"] for name, each in result["parameters"].items()
-    }
+    found = {name: each["optimum"] for name, each in result["parameters"].items()}
     assert list(found) == [
         "young_pa",
         "poisson",
@@ -105,50 +94,20 @@ def test_a_body_of_two_regions_is_simulated_and_identified(tiny):
     [
         ("young_pa =", "youngs_pa =", "did you mean 'young_pa'?"),
         ("young_pa =", "mu_pa = 300.0\nyoung_pa =", "mu_pa, young_pa, poisson"),
-        (
-            "stiff.c30_pa = 0.0\n",
-            "",
-            "c30_pa is missing: the material yeoh of region 'stiff'",
-        ),
-        (
-            "stiff.c30_pa = 0.0\n",
-            "",
-            "write stiff.c30_pa = {} to estimate it",
-        ),
+        ("stiff.c30_pa = 0.0\n", "", "c30_pa is missing: the material yeoh of region 'stiff'"),
+        ("stiff.c30_pa = 0.0\n", "", "write stiff.c30_pa = {} to estimate it"),
         ("stiff.c30_pa", "stif.c30_pa", "did you mean 'stiff.c30_pa'?"),
-        (
-            "stiff.c30_pa",
-            "stiff.c20_pa.lower = 0.0\nstiff.c30_pa",
-            "problem.toml",
-        ),
-        (
-            '"stiff.c10_pa" =',
-            'stiff.c10_pa = 3.0\n"stiff.c10_pa" =',
-            "given twice",
-        ),
-        (
-            "c30_pa = 0.0",
-            'c30_pa = { tied_to = "stiff.c1_pa" }',
-            "did you mean 'stiff.c10_pa'?",
-        ),
+        ("stiff.c30_pa", "stiff.c20_pa.lower = 0.0\nstiff.c30_pa", "problem.toml"),
+        ('"stiff.c10_pa" =', 'stiff.c10_pa = 3.0\n"stiff.c10_pa" =', "given twice"),
+        ("c30_pa = 0.0", 'c30_pa = { tied_to = "stiff.c1_pa" }', "did you mean 'stiff.c10_pa'?"),
         ("typical = 20.0", "typical = -1.0", "parameters.stiff.c20_pa.typical"),
-        (
-            "poisson = 0.25",
-            "poisson = 0.5",
-            "poisson: fixed = 0.5, expected less than 0.5",
-        ),
+        ("poisson = 0.25", "poisson = 0.5", "poisson: fixed = 0.5, expected less than 0.5"),
         ('"yeoh"', '"yeo"', "did you mean 'yeoh'?"),
         ("[[-1, -1, 0.03]", "[[-1, -1, 5.0]", "low corner"),
-        (
-            "[[-1, -1, 0.03], [1, 1, 0.09]]",
-            "[[1, 1, 1], [2, 2, 2]]",
-            "none of the",
-        ),
+        ("[[-1, -1, 0.03], [1, 1, 0.09]]", "[[1, 1, 1], [2, 2, 2]]", "none of the"),
     ],
 )
-def test_a_slip_in_the_model_is_one_message(
-    tiny, old: str, new: str, expected: str
-):
+def test_a_slip_in_the_model_is_one_message(tiny, old: str, new: str, expected: str):
     TWO_REGIONS(tiny)
     replace_text(old, new)(tiny)
     assert expected in refusal(tiny)
@@ -165,31 +124,14 @@ def test_foreign_code_is_not_run_unless_it_is_allowed(tiny):
 def test_a_material_of_the_users_own_is_identified_when_allowed(tiny):
     own, built_in = (tiny / "own", tiny / "built-in")
     reduced = settings("solver.method=reduced-space")
-    assert (
-        run_command(
-            "solve", "problem.toml", "--quiet", "--out", built_in, *reduced
-        ).code
-        == 0
-    )
+    assert run_command("solve", "problem.toml", "--quiet", "--out", built_in, *reduced).code == 0
     OWN_MATERIAL(tiny)
-    arguments = (
-        "solve",
-        "problem.toml",
-        "--quiet",
-        "--allow-code",
-        "--out",
-        own,
-        *reduced,
-    )
+    arguments = ("solve", "problem.toml", "--quiet", "--allow-code", "--out", own, *reduced)
     outcome = run_command(*arguments)
     assert outcome.code == 0, outcome.err
-    found, expected = (
-        json.loads((r / "result.json").read_text()) for r in (own, built_in)
-    )
+    found, expected = (json.loads((r / "result.json").read_text()) for r in (own, built_in))
     for name, parameter in expected["parameters"].items():
-        assert found["parameters"][name]["value"] == pytest.approx(
-            parameter["value"], rel=1e-9
-        )
+        assert found["parameters"][name]["value"] == pytest.approx(parameter["value"], rel=1e-9)
     assert run_command("check", "problem.toml", "--allow-code").code == 0
 
 
@@ -200,22 +142,12 @@ def test_a_material_of_the_users_own_is_identified_when_allowed(tiny):
         (MINE, "stressed", "undeformed"),
         ("import nothing_like_it", "energy", "ModuleNotFoundError"),
         ("def energy(F):\n    return 0", "energy", "no constants"),
-        (
-            "def energy(F, mu_pa, lambda_pa):\n    exit(7)",
-            "energy",
-            "SystemExit: 7",
-        ),
+        ("def energy(F, mu_pa, lambda_pa):\n    exit(7)", "energy", "SystemExit: 7"),
         ("exit(7)", "energy", "SystemExit: 7"),
-        (
-            "def energy(F, mu_pa, lambda_pa):\n    return mu_pa * F",
-            "energy",
-            "only defined for",
-        ),
+        ("def energy(F, mu_pa, lambda_pa):\n    return mu_pa * F", "energy", "only defined for"),
     ],
 )
-def test_a_file_that_gives_no_material_is_refused(
-    tiny, content, function, expected
-):
+def test_a_file_that_gives_no_material_is_refused(tiny, content, function, expected):
     OWN_MATERIAL(tiny)
     replace_text('function = "energy"', f'function = "{function}"')(tiny)
     write("mine.py", content)(tiny)
@@ -225,14 +157,7 @@ def test_a_file_that_gives_no_material_is_refused(
 @pytest.mark.long
 def test_a_study_runs_allowed_code_in_its_workers(tiny):
     OWN_MATERIAL(tiny)
-    command = (
-        "compare-methods",
-        "problem.toml",
-        "--methods",
-        "reduced-space",
-        "--workers",
-        "1",
-    )
+    command = ("compare-methods", "problem.toml", "--methods", "reduced-space", "--workers", "1")
     outcome = run_command(*command, "--allow-code", "--quiet", "--out", "study")
     assert outcome.code == 0, outcome.err
     summary = json.loads((tiny / "study/summary.json").read_text())

@@ -22,9 +22,7 @@ LAWS = {
 }
 
 
-def soft_bar(
-    folder: Path, material: str, stiffness: float = 1.0, **changes: str
-) -> Path:
+def soft_bar(folder: Path, material: str, stiffness: float = 1.0, **changes: str) -> Path:
     """A recording of a bar so soft that it strains much, with 0.2 mm of noise.
 
     The constants are without guess, except those in `changes`. Moduli are those of `LAWS` times
@@ -38,14 +36,10 @@ def soft_bar(
     )
     constants = {**dict.fromkeys(LAWS[material], "{}"), **changes}
     start, stop = PROBLEM.index("lambda_pa"), PROBLEM.index("\n[solver]")
-    text = PROBLEM[:start] + "".join(
-        f"{name} = {value}\n" for name, value in constants.items()
-    )
+    text = PROBLEM[:start] + "".join(f"{name} = {value}\n" for name, value in constants.items())
     text += DAMPING + PROBLEM[stop:]
     text = text.replace("interior-point", "reduced-space")
-    text = text.replace(
-        'mesh = "body.vtu"', f'mesh = "body.vtu"\nmaterial = "{material}"'
-    )
+    text = text.replace('mesh = "body.vtu"', f'mesh = "body.vtu"\nmaterial = "{material}"')
     text += EXPERIMENT.replace("0.089", "0.119")
     text += '\n[environment]\nair_density_kg_m3 = "none"\n'
     file = folder / "problem.toml"
@@ -55,24 +49,18 @@ def soft_bar(
         for name, value in LAWS[material].items()
     ]
     write_data(
-        Problem.read(file, truth, simulation=True),
-        folder,
-        Recipe("midpoint", noise_m=2e-4, seed=1),
+        Problem.read(file, truth, simulation=True), folder, Recipe("midpoint", noise_m=2e-4, seed=1)
     )
     return file
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("material", LAWS)
-def test_a_file_without_guesses_recovers_the_constants_of_a_twin(
-    material, tmp_path
-):
+def test_a_file_without_guesses_recovers_the_constants_of_a_twin(material, tmp_path):
     """mu_1 and alpha_1 are estimated together; the third constant is known."""
     third = list(LAWS[material])[2]
     file = soft_bar(tmp_path, material, **{third: str(LAWS[material][third])})
-    outcome = run_command(
-        "solve", file, "--out", tmp_path / "run", "--quiet", "--no-pictures"
-    )
+    outcome = run_command("solve", file, "--out", tmp_path / "run", "--quiet", "--no-pictures")
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert outcome.code in (0, 1), outcome.err
     for name in ("mu_1_pa", "alpha_1"):
@@ -91,14 +79,10 @@ def test_a_file_without_guesses_recovers_the_constants_of_a_twin(
 def test_the_exponent_is_not_determined_by_small_strains(tmp_path):
     """At small strains only G = ½ μ α matters, and the output says so."""
     file = soft_bar(tmp_path, "ogden-1", stiffness=1e3, kappa_pa="19e4")
-    outcome = run_command(
-        "solve", file, "--out", tmp_path / "run", "--no-pictures"
-    )
+    outcome = run_command("solve", file, "--out", tmp_path / "run", "--no-pictures")
     assert outcome.code in (0, 1), outcome.err
     assert "Verdict: good" not in outcome.out
-    found = json.loads((tmp_path / "run" / "result.json").read_text())[
-        "parameters"
-    ]["alpha_1"]
+    found = json.loads((tmp_path / "run" / "result.json").read_text())["parameters"]["alpha_1"]
     low, high = found["combined95"] or (-np.inf, np.inf)
     assert found["at_bound"] or high - low > abs(found["value"])
 
@@ -108,10 +92,7 @@ def test_the_exponent_is_not_determined_by_small_strains(tmp_path):
     ("changes", "message"),
     [
         ({"alpha_1": "40.0"}, "alpha_1: fixed = 40, expected less than 30"),
-        (
-            {"alpha_1": "-40.0"},
-            "alpha_1: fixed = -40, expected a number >= -30",
-        ),
+        ({"alpha_1": "-40.0"}, "alpha_1: fixed = -40, expected a number >= -30"),
         ({"mu_1_pa": "-5.0"}, "mu_1_pa: fixed = -5, expected a number >= 0"),
         ({"alpha_1": "{ lower = -50.0 }"}, "expected -30 <= lower < upper"),
         ({"alpha_2": "2.0"}, "alpha_2"),
@@ -123,11 +104,7 @@ def test_impossible_constants_are_refused(changes, message, tmp_path):
     for name, value in changes.items():
         line = f"{name} = {value}\n"
         old = f"{name} = {{}}\n"
-        text = (
-            text.replace(old, line)
-            if old in text
-            else text.replace(DAMPING, line + DAMPING)
-        )
+        text = text.replace(old, line) if old in text else text.replace(DAMPING, line + DAMPING)
     file.write_text(text)
     outcome = run_command("check", file)
     assert outcome.code == 2
@@ -163,11 +140,7 @@ def test_terms_beyond_four_are_refused(tmp_path):
 
 def test_unstated_constants_have_distinct_starts():
     """Equal terms would have equal derivatives, and none could be told from another."""
-    from collocation_sysid.fem.laws.constants import (
-        ALPHA_TERMS,
-        MU_TERMS,
-        usual_value,
-    )
+    from collocation_sysid.fem.laws.constants import ALPHA_TERMS, MU_TERMS, usual_value
 
     exponents = [constant.usual for constant in ALPHA_TERMS]
     assert len(set(exponents)) == len(exponents)

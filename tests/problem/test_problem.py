@@ -35,21 +35,14 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.problem.problem_reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.recording import (
-    PoseSequence,
-    read_markers,
-    read_poses,
-    write_poses_csv,
-)
+from collocation_sysid.recording import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import shortened_problem
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
 BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"
 PROBLEMS = (Path(__file__).parents[2] / "problems").glob("*/*.toml")
-SHIPPED = sorted(
-    file for file in PROBLEMS if file.name != "limits.toml"
-)  # of motions
+SHIPPED = sorted(file for file in PROBLEMS if file.name != "limits.toml")  # of motions
 
 
 def load(tiny: Path, *overrides: str, **options):
@@ -100,10 +93,7 @@ def test_the_text_as_run_has_the_overrides_in_it(tiny):
     text = text_of(load(tiny, "parameters.mu_pa.guess=250"))
     assert tomllib.loads(text)["parameters"]["mu_pa"]["guess"] == 250
     write("problem.toml", text)(tiny)
-    assert (
-        read_problem_file(tiny / "problem.toml")[0].parameters["mu_pa"].guess
-        == 250
-    )
+    assert read_problem_file(tiny / "problem.toml")[0].parameters["mu_pa"].guess == 250
 
 
 def test_a_file_from_a_windows_editor_is_read(tiny):
@@ -124,17 +114,15 @@ def test_lengths_of_a_mesh_have_a_unit(tiny):
     mesh = meshio.read(tiny / "body.vtu")
     mesh.points = 1e3 * mesh.points
     mesh.write(tiny / "body.vtu")
-    assert load(tiny, "object.length_unit=mm").bodies[
-        0
-    ].mesh.volume_m3 == pytest.approx(0.06**2 * 0.09)
+    assert load(tiny, "object.length_unit=mm").bodies[0].mesh.volume_m3 == pytest.approx(
+        0.06**2 * 0.09
+    )
 
 
 def test_elastic_parameters_may_be_young_and_poisson(tiny):
     young, poisson = 720.0, 0.2
     both(
-        replace_text(
-            "lambda_pa   = { guess = 400.0,", f"young_pa = {{ guess = {young},"
-        ),
+        replace_text("lambda_pa   = { guess = 400.0,", f"young_pa = {{ guess = {young},"),
         replace_text(
             "mu_pa       = { guess = 200.0, lower = 10.0, upper = 1e5 }",
             f"poisson = {{ fixed = {poisson} }}",
@@ -142,28 +130,17 @@ def test_elastic_parameters_may_be_young_and_poisson(tiny):
     )(tiny)
     problem = load(tiny)
     parameters = problem.parameters
-    assert problem.bodies[0].theta_from_values(parameters.guesses)[
-        :2
-    ] == pytest.approx([200.0, 300.0])
-    assert [item.name for item in parameters.free] == [
-        "young_pa",
-        "gamma_r_s",
-        "gamma_m_1_s",
-    ]
+    assert problem.bodies[0].theta_from_values(parameters.guesses)[:2] == pytest.approx(
+        [200.0, 300.0]
+    )
+    assert [item.name for item in parameters.free] == ["young_pa", "gamma_r_s", "gamma_m_1_s"]
 
 
 def test_bounds_and_priors_reach_the_parameters(tiny):
     prior = "parameters.mu_pa.prior={ mean = 250.0, relative = 0.2 }"
-    replace_text(
-        "{ guess = 0.5, lower = 1e-3, upper = 100.0 }", "{ guess = 0.5 }"
-    )(tiny)
+    replace_text("{ guess = 0.5, lower = 1e-3, upper = 100.0 }", "{ guess = 0.5 }")(tiny)
     _, mu, _, gamma_m = load(tiny, prior).parameters.items
-    assert (mu.guess, mu.lower, mu.upper, mu.prior) == (
-        200.0,
-        10.0,
-        1e5,
-        (250.0, 0.2),
-    )
+    assert (mu.guess, mu.lower, mu.upper, mu.prior) == (200.0, 10.0, 1e5, (250.0, 0.2))
     assert gamma_m.lower < 1e-3 < 100 < gamma_m.upper
 
 
@@ -176,25 +153,18 @@ def test_bounds_and_priors_reach_the_parameters(tiny):
         ("poisson", "mean = 0.25, deviation = 0.05", 0.05),
     ],
 )
-def test_the_deviation_of_a_prior_may_be_relative_or_not(
-    tiny, name, prior, expected
-):
+def test_the_deviation_of_a_prior_may_be_relative_or_not(tiny, name, prior, expected):
     replace_text("lambda_pa   = { guess = 400.0, lower = 10.0, upper = 1e5 }",
                  "poisson = { guess = 0.2, lower = 0.1, upper = 0.45 }")(tiny)  # fmt: skip
     items = {
-        p.name: p
-        for p in load(
-            tiny, f"parameters.{name}.prior={{ {prior} }}"
-        ).parameters.items
+        p.name: p for p in load(tiny, f"parameters.{name}.prior={{ {prior} }}").parameters.items
     }
     assert items[name].prior == pytest.approx((items[name].prior[0], expected))
 
 
 def test_parameters_may_be_numbers_ties_and_on_a_linear_scale(tiny):
     tie = "parameters.lambda_pa={ tied_to = 'mu_pa', ratio = 2.0 }"
-    scale = (
-        "parameters.mu_pa={ guess = 200.0, scale = 'linear', typical = 50.0 }"
-    )
+    scale = "parameters.mu_pa={ guess = 200.0, scale = 'linear', typical = 50.0 }"
     parameters = load(tiny, tie, scale, "parameters.gamma_m_1_s=0.7").parameters
     assert [item.name for item in parameters.free] == ["mu_pa", "gamma_r_s"]
     assert parameters.guess_q[0] == pytest.approx(4.0)
@@ -215,9 +185,7 @@ def test_what_was_cleaned_is_noted(tiny):
 def test_a_surface_is_filled_once_and_kept(tiny):
     pytest.importorskip("pytetwild")
     box = box_mesh(SIZE_M, (1, 1, 1))
-    meshio.Mesh(1e3 * box.points_m, [("triangle", box.surface)]).write(
-        tiny / "scan.stl"
-    )
+    meshio.Mesh(1e3 * box.points_m, [("triangle", box.surface)]).write(tiny / "scan.stl")
     surface = 'surface = "scan.stl"\nedge_length_m = 0.03\nlength_unit = "mm"'
     replace_text('mesh = "body.vtu"', surface)(tiny)
     mesh = load(tiny).bodies[0].mesh
@@ -242,9 +210,7 @@ def test_a_surface_is_filled_once_and_kept(tiny):
 )
 def test_every_kind_of_selection_finds_its_nodes(tiny, selection):
     replace_text(BOX, selection)(tiny)
-    np.testing.assert_array_equal(
-        experiment_of(tiny).prescribed_dofs, dofs_of(top_nodes())
-    )
+    np.testing.assert_array_equal(experiment_of(tiny).prescribed_dofs, dofs_of(top_nodes()))
 
 
 def test_a_grasp_is_a_table_or_a_list_of_tables(tiny):
@@ -252,9 +218,7 @@ def test_a_grasp_is_a_table_or_a_list_of_tables(tiny):
     replace_text(f"grasp = {GRASP}", f"grasp = [{GRASP}]")(tiny)
     listed = experiment_of(tiny).grasps
     assert len(one) == len(listed) == 1
-    np.testing.assert_array_equal(
-        one[0].poses.positions_m, listed[0].poses.positions_m
-    )
+    np.testing.assert_array_equal(one[0].poses.positions_m, listed[0].poses.positions_m)
 
 
 def test_a_second_hand_without_poses_stays_where_it_is(tiny):
@@ -266,9 +230,7 @@ def test_a_second_hand_without_poses_stays_where_it_is(tiny):
     still = experiment.grasps[1].poses.moved_positions(
         experiment.body.nodes_m[nodes], experiment.t_s
     )
-    np.testing.assert_allclose(
-        still - experiment.body.nodes_m[nodes], 0.0, atol=1e-15
-    )
+    np.testing.assert_allclose(still - experiment.body.nodes_m[nodes], 0.0, atol=1e-15)
 
 
 def test_poses_are_interpolated_or_held_as_asked(tiny):
@@ -280,21 +242,15 @@ def test_poses_are_interpolated_or_held_as_asked(tiny):
 # Markers ------------------------------------------------------------------------------------------
 
 
-def test_places_of_markers_without_a_reference_start_from_their_first_sample(
-    tiny,
-):
+def test_places_of_markers_without_a_reference_start_from_their_first_sample(tiny):
     replace_text(f"reference_m = {REFERENCES}", "")(tiny)
     experiment = experiment_of(tiny)
     markers, nodes_m = experiment.markers, experiment.body.nodes_m
     assert not markers.located.any()
-    np.testing.assert_allclose(
-        experiment.compute_place_sigma_m(), np.linalg.norm(SIZE_M)
-    )
+    np.testing.assert_allclose(experiment.compute_place_sigma_m(), np.linalg.norm(SIZE_M))
     # The first pose is that of the undeformed body, and this marker is inside.
     np.testing.assert_allclose(
-        markers.predict_positions(nodes_m)[1],
-        markers.positions_m[0, 1],
-        atol=1e-9,
+        markers.predict_positions(nodes_m)[1], markers.positions_m[0, 1], atol=1e-9
     )
 
 
@@ -305,15 +261,10 @@ def test_some_markers_may_have_a_reference_and_others_not(tiny):
     found = experiment.markers
     assert found.names == known.names
     assert found.located.tolist() == [True, False, True]
-    assert (experiment.compute_place_sigma_m() > 0).tolist() == [
-        False,
-        True,
-        False,
-    ]
+    assert (experiment.compute_place_sigma_m() > 0).tolist() == [False, True, False]
     shape, given = np.random.default_rng(0).normal(size=(36, 3)), [0, 2]
     np.testing.assert_allclose(
-        found.predict_positions(shape)[given],
-        known.predict_positions(shape)[given],
+        found.predict_positions(shape)[given], known.predict_positions(shape)[given]
     )
 
 
@@ -343,10 +294,7 @@ def test_markers_are_chosen_by_name_and_weighted_by_sigma(tiny):
 def test_lengths_of_a_marker_file_have_a_unit(tiny):
     expected = experiment_of(tiny).markers.positions_m
     head, *rows = (tiny / MARKERS).read_text().splitlines()
-    table = np.array([row.split(",") for row in rows], dtype=float) * [
-        1.0,
-        *[1e3] * 9,
-    ]
+    table = np.array([row.split(",") for row in rows], dtype=float) * [1.0, *[1e3] * 9]
     np.savetxt(tiny / MARKERS, table, delimiter=",", header=head, comments="")
     markers = experiment_of(tiny, "experiment.0.markers.length_unit=mm").markers
     np.testing.assert_allclose(markers.positions_m, expected, atol=1e-12)
@@ -365,9 +313,7 @@ def test_a_window_cuts_poses_and_markers(tiny):
 
 def test_resampling_puts_everything_on_the_new_rate(tiny):
     problem = load(tiny, "experiment.0.resample_hz=50")
-    np.testing.assert_allclose(
-        problem.experiments[0].t_s, [0, 0.02, 0.04, 0.06, 0.08]
-    )
+    np.testing.assert_allclose(problem.experiments[0].t_s, [0, 0.02, 0.04, 0.06, 0.08])
     assert problem.notes == ()
 
 
@@ -410,10 +356,7 @@ def test_the_window_that_a_message_gives_cuts_a_recording_to_its_poses(tiny):
 def test_poses_that_lack_one_sample_at_the_end_are_told(tiny):
     keep_lines(POSES, 9)(tiny)
     (note,) = load(tiny).notes
-    assert (
-        "the markers were cut to the time of the poses by 0.01 s at the end"
-        in note
-    )
+    assert "the markers were cut to the time of the poses by 0.01 s at the end" in note
 
 
 def test_a_grasp_that_stands_still_needs_two_poses(tiny):
@@ -425,9 +368,7 @@ def test_a_grasp_that_stands_still_needs_two_poses(tiny):
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
-def test_sparse_poses_are_taken_where_it_is_said_how_the_grasp_moves(
-    tiny, interpolation
-):
+def test_sparse_poses_are_taken_where_it_is_said_how_the_grasp_moves(tiny, interpolation):
     slower(tiny, 300.0)
     keep = (tiny / POSES).read_text().splitlines()
     (tiny / POSES).write_text("\n".join([keep[0], keep[1], keep[-1]]))
@@ -438,11 +379,7 @@ def test_sparse_poses_are_taken_where_it_is_said_how_the_grasp_moves(
 
 def test_equilibria_may_have_sparse_poses_or_one(tiny):
     slower(tiny, 300.0)
-    static = [
-        "experiment.0.kind=static",
-        "parameters.gamma_r_s=0.0",
-        "parameters.gamma_m_1_s=0.0",
-    ]
+    static = ["experiment.0.kind=static", "parameters.gamma_r_s=0.0", "parameters.gamma_m_1_s=0.0"]
     load(tiny, *static)
     keep_lines(POSES, 2)(tiny)
     load(tiny, *static)
@@ -462,21 +399,14 @@ def test_poses_of_another_rate_need_no_resampling(tiny):
     poses = read_poses(tiny / POSES)
     t_s = np.linspace(0.0, 0.08, 12)
     rotations, positions_m = poses.at(t_s)
-    slower = PoseSequence(
-        t_s, positions_m, Rotation.from_matrix(rotations).as_quat()
-    )
+    slower = PoseSequence(t_s, positions_m, Rotation.from_matrix(rotations).as_quat())
     write_poses_csv(tiny / POSES, slower)
     problem = load(tiny)
     (experiment,) = problem.experiments
     (note,) = problem.notes
-    assert (
-        "recorded at 137.5 Hz, were interpolated (smooth) at the markers' times, 100 Hz"
-        in note
-    )
+    assert "recorded at 137.5 Hz, were interpolated (smooth) at the markers' times, 100 Hz" in note
     np.testing.assert_array_equal(experiment.t_s, expected.t_s)
-    np.testing.assert_array_equal(
-        experiment.markers.positions_m, expected.markers.positions_m
-    )
+    np.testing.assert_array_equal(experiment.markers.positions_m, expected.markers.positions_m)
     held = [e.prescribed_positions(e.t_s) for e in (experiment, expected)]
     np.testing.assert_allclose(*held, atol=1e-5)
 
@@ -487,13 +417,9 @@ def test_poses_of_the_gripper_carry_the_body_that_it_holds(tiny):
     of_body[:3, :3] = Rotation.from_quat([0.5, -0.5, 0.5, 0.5]).as_matrix()
     of_body[:3, 3] = 0.02, -0.3, 0.1
     poses = read_poses(tiny / POSES)
-    write_poses_csv(
-        tiny / POSES, poses.after(np.linalg.inv(of_body))
-    )  # what the gripper did
+    write_poses_csv(tiny / POSES, poses.after(np.linalg.inv(of_body)))  # what the gripper did
     of_gripper = "{ position_m = [0.02, -0.3, 0.1], quaternion_xyzw = [0.5, -0.5, 0.5, 0.5] }"
-    found = experiment_of(
-        tiny, f"experiment.0.grasp.gripper_to_body={of_gripper}"
-    )
+    found = experiment_of(tiny, f"experiment.0.grasp.gripper_to_body={of_gripper}")
     held = [e.prescribed_positions(e.t_s) for e in (found, expected)]
     np.testing.assert_allclose(*held, atol=1e-9)
 
@@ -529,9 +455,7 @@ def test_experiments_for_validation_are_loaded_but_not_fitted(tiny):
 # Simulation ---------------------------------------------------------------------------------------
 
 
-def test_before_anything_is_measured_markers_are_sampled_at_the_poses_times(
-    tiny,
-):
+def test_before_anything_is_measured_markers_are_sampled_at_the_poses_times(tiny):
     remove(MARKERS)(tiny)
     experiment = load(tiny, simulation=True).experiments[0]
     np.testing.assert_allclose(experiment.t_s, read_poses(tiny / POSES).t_s)
@@ -550,9 +474,7 @@ def test_loading_writes_nothing(tiny):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}"
-)
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_a_shipped_problem_loads_and_its_derivatives_agree(path):
     try:
         problem = Problem.read(path, allow_code=True)
@@ -572,9 +494,7 @@ def test_a_shipped_problem_loads_and_its_derivatives_agree(path):
     assert all(body.smallest_element_quality > 0.1 for body in findings.bodies)
 
 
-@pytest.mark.parametrize(
-    "path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}"
-)
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_a_shipped_problem_follows_the_schema(path):
     content = tomllib.loads(path.read_text())
     ProblemFile.model_validate(content)
@@ -620,9 +540,7 @@ def loaded(tiny: Path) -> Path:
     """The tiny problem with loads and nuisance parameters."""
     file = tiny / "problem.toml"
     file.write_text(file.read_text().replace('nuisance = "none"\n', "") + LOADS)
-    (tiny / "push.csv").write_text(
-        "t_s,fx_n,fy_n,fz_n\n0.0,0,0,0\n0.05,0,0,0.2\n"
-    )
+    (tiny / "push.csv").write_text("t_s,fx_n,fy_n,fz_n\n0.0,0,0,0\n0.05,0,0,0.2\n")
     return tiny
 
 
@@ -630,9 +548,7 @@ def test_masses_and_forces_are_read(loaded):
     experiment = experiment_of(loaded)
     (mass,) = experiment.masses
     assert (mass.mass_kg, mass.from_s, len(mass.nodes)) == (0.002, 0.03, 9)
-    assert experiment.moving_node_mass_kg([0.0, 0.04]).sum(
-        axis=1
-    ) == pytest.approx(
+    assert experiment.moving_node_mass_kg([0.0, 0.04]).sum(axis=1) == pytest.approx(
         [experiment.body.mass_kg, experiment.body.mass_kg + 0.002]
     )
     total = experiment.declared_node_forces_n([0.025]).sum(axis=1)[0]
@@ -642,11 +558,7 @@ def test_masses_and_forces_are_read(loaded):
 def test_nuisance_is_read(loaded):
     unknown = experiment_of(loaded).nuisance
     assert (unknown.marker_offset_m, unknown.time_shift_s) == (0.003, 0.01)
-    assert (
-        unknown.pose_turn_rad,
-        unknown.pose_shift_m,
-        unknown.gravity_rad,
-    ) == (0.02, None, 0.03)
+    assert (unknown.pose_turn_rad, unknown.pose_shift_m, unknown.gravity_rad) == (0.02, None, 0.03)
     assert (unknown.hand_eye_m, unknown.hand_eye_rad) == (None, None)
     assert unknown.camera_offset_m == 0.001
 
@@ -659,51 +571,31 @@ def test_a_grasp_may_hold_for_a_while(tiny):
 
 
 def test_every_takes_only_some_samples(tiny):
-    whole, some = (
-        experiment_of(tiny),
-        experiment_of(tiny, "experiment.swing.every=3"),
-    )
+    whole, some = (experiment_of(tiny), experiment_of(tiny, "experiment.swing.every=3"))
     np.testing.assert_allclose(some.t_s, whole.t_s[::3])
-    np.testing.assert_array_equal(
-        some.markers.positions_m, whole.markers.positions_m[::3]
-    )
+    np.testing.assert_array_equal(some.markers.positions_m, whole.markers.positions_m[::3])
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            ("mass_kg = 0.002", "mass_kg = 0"),
-            r"mass.0.mass_kg: found 0; expected a number above 0",
-        ),
+        (("mass_kg = 0.002", "mass_kg = 0"), r"mass.0.mass_kg: found 0; expected a number above 0"),
         (('"top"', '"middle"'), r'force.0.nodes: .*"middle"'),
         (("[0.0, 0.1, 0.0]", "[0.0, 0.1]"), r"force.0.force_n"),
-        (
-            ('file = "push.csv"', 'file = "pull.csv"'),
-            r"force.1.file: .*pull.csv does not exist",
-        ),
+        (('file = "push.csv"', 'file = "pull.csv"'), r"force.1.file: .*pull.csv does not exist"),
         (('file = "push.csv"', ""), r"force.1: .*exactly one of force_n, file"),
-        (
-            ("{ prior_rad = 0.02 }", "{}"),
-            r"nuisance.pose: .*expected one or both",
-        ),
+        (("{ prior_rad = 0.02 }", "{}"), r"nuisance.pose: .*expected one or both"),
         (("prior_s = 0.01", "prior_ms = 10"), r"nuisance.time_shift.prior_ms"),
     ],
 )
-def test_loads_and_nuisance_that_are_wrong_name_their_key(
-    loaded, change, message: str
-):
+def test_loads_and_nuisance_that_are_wrong_name_their_key(loaded, change, message: str):
     replace_text(*change)(loaded)
     with pytest.raises(InputError, match=message):
         load(loaded)
 
 
 def test_profiles_are_of_estimated_parameters_only(tiny):
-    text = (
-        tiny / "problem.toml"
-    ).read_text() + '\n[uncertainty]\nprofile = ["young_pa"]\n'
+    text = (tiny / "problem.toml").read_text() + '\n[uncertainty]\nprofile = ["young_pa"]\n'
     (tiny / "problem.toml").write_text(text)
-    with pytest.raises(
-        InputError, match=r"profile: found 'young_pa'; expected estimated par"
-    ):
+    with pytest.raises(InputError, match=r"profile: found 'young_pa'; expected estimated par"):
         load(tiny)

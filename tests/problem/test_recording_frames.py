@@ -8,14 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.problem_files import TRUTH, run_command, write_problem
-from kit.robot_log import (
-    CAMERAS,
-    CAMERAS_M,
-    GRIPPER_M,
-    SENSOR,
-    SENSOR_M,
-    robot_problem,
-)
+from kit.robot_log import CAMERAS, CAMERAS_M, GRIPPER_M, SENSOR, SENSOR_M, robot_problem
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
@@ -40,26 +33,17 @@ def gravity_notes(problem: Problem) -> list[str]:
     return [note for note in problem.notes if "gravity" in note]
 
 
-def test_gravity_is_rotated_from_the_frame_of_the_robots_base(
-    tmp_path: Path,
-) -> None:
-    problem = Problem.read(
-        with_key(robot_problem(tmp_path), 'gravity_frame = "base_link"')
-    )
+def test_gravity_is_rotated_from_the_frame_of_the_robots_base(tmp_path: Path) -> None:
+    problem = Problem.read(with_key(robot_problem(tmp_path), 'gravity_frame = "base_link"'))
     gravity = problem.experiments[0].gravity_m_s2
-    np.testing.assert_allclose(
-        gravity, CAMERAS.inv().apply(EARTH_M_S2), atol=1e-12
-    )
-    assert np.degrees(
-        np.arccos(gravity @ EARTH_M_S2 / 9.81**2)
-    ) == pytest.approx(4.0)
+    np.testing.assert_allclose(gravity, CAMERAS.inv().apply(EARTH_M_S2), atol=1e-12)
+    assert np.degrees(np.arccos(gravity @ EARTH_M_S2 / 9.81**2)) == pytest.approx(4.0)
     assert not gravity_notes(problem)
 
 
 def test_a_stated_gravity_is_rotated_too(tmp_path: Path) -> None:
     file = with_key(
-        robot_problem(tmp_path),
-        'gravity_frame = "base_link"\ngravity_m_s2 = [1.0, 2.0, 3.0]',
+        robot_problem(tmp_path), 'gravity_frame = "base_link"\ngravity_m_s2 = [1.0, 2.0, 3.0]'
     )
     gravity = Problem.read(file).experiments[0].gravity_m_s2
     np.testing.assert_allclose(gravity, CAMERAS.inv().apply([1.0, 2.0, 3.0]))
@@ -67,9 +51,7 @@ def test_a_stated_gravity_is_rotated_too(tmp_path: Path) -> None:
 
 def test_a_tilted_frame_of_the_recording_is_noted(tmp_path: Path) -> None:
     problem = Problem.read(robot_problem(tmp_path))
-    np.testing.assert_array_equal(
-        problem.experiments[0].gravity_m_s2, EARTH_M_S2
-    )
+    np.testing.assert_array_equal(problem.experiments[0].gravity_m_s2, EARTH_M_S2)
     (note,) = gravity_notes(problem)
     expected = CAMERAS.inv().apply(EARTH_M_S2)
     for part in (
@@ -82,18 +64,14 @@ def test_a_tilted_frame_of_the_recording_is_noted(tmp_path: Path) -> None:
         assert part in note
 
 
-@pytest.mark.parametrize(
-    "line", ['gravity_frame = "mocap"', "gravity_m_s2 = [0.0, 0.0, -9.81]"]
-)
+@pytest.mark.parametrize("line", ['gravity_frame = "mocap"', "gravity_m_s2 = [0.0, 0.0, -9.81]"])
 def test_a_stated_direction_is_not_noted(tmp_path: Path, line: str) -> None:
     problem = Problem.read(with_key(robot_problem(tmp_path), line))
     np.testing.assert_allclose(problem.experiments[0].gravity_m_s2, EARTH_M_S2)
     assert not gravity_notes(problem)
 
 
-def test_frames_that_are_not_level_by_their_names_are_not_noted(
-    tmp_path: Path,
-) -> None:
+def test_frames_that_are_not_level_by_their_names_are_not_noted(tmp_path: Path) -> None:
     problem = Problem.read(robot_problem(tmp_path, base="rig"))
     assert not gravity_notes(problem)
 
@@ -105,9 +83,7 @@ def test_frames_that_are_not_level_by_their_names_are_not_noted(
         ("base_lnk", ["is not connected", "did you mean 'base_link'"]),
     ],
 )
-def test_a_frame_that_is_not_fixed_is_refused(
-    tmp_path: Path, frame: str, parts: list[str]
-) -> None:
+def test_a_frame_that_is_not_fixed_is_refused(tmp_path: Path, frame: str, parts: list[str]) -> None:
     file = with_key(robot_problem(tmp_path), f'gravity_frame = "{frame}"')
     result = run_command("check", file)
     assert result.code == 2
@@ -116,9 +92,7 @@ def test_a_frame_that_is_not_fixed_is_refused(
 
 
 def test_a_frame_without_a_log_is_refused(tmp_path: Path) -> None:
-    file = with_key(
-        write_problem(tmp_path, {"swing": 12}), 'gravity_frame = "base_link"'
-    )
+    file = with_key(write_problem(tmp_path, {"swing": 12}), 'gravity_frame = "base_link"')
     with pytest.raises(InputError, match="not topics of a log"):
         Problem.read(file)
 
@@ -126,9 +100,7 @@ def test_a_frame_without_a_log_is_refused(tmp_path: Path) -> None:
 # Markers ------------------------------------------------------------------------------------------
 
 
-def test_poses_in_another_frame_than_the_markers_are_named_first(
-    tmp_path: Path,
-) -> None:
+def test_poses_in_another_frame_than_the_markers_are_named_first(tmp_path: Path) -> None:
     file = robot_problem(tmp_path)
     file.write_text(file.read_text().replace("mocap>", "base_link>"))
     result = run_command("check", file)
@@ -215,8 +187,7 @@ def test_a_wrench_is_expressed_in_the_body_by_the_transforms_of_the_log(
     file = with_wrench(
         robot_problem(tmp_path, wrenches=WRENCHES),
         f", sign = {sign}" if sign < 0 else "",
-        ", gripper_to_body = { position_m = [0, 0, 0.01], "
-        f"quaternion_xyzw = {quaternion} }}",
+        f", gripper_to_body = {{ position_m = [0, 0, 0.01], quaternion_xyzw = {quaternion} }}",
     )
     problem = Problem.read(file)
     wrench = problem.experiments[0].grasps[0].wrench
@@ -237,37 +208,23 @@ def test_a_wrench_is_expressed_in_the_body_by_the_transforms_of_the_log(
         assert part in note
 
 
-def test_a_sensor_that_is_fixed_in_the_world_measures_in_its_axes(
-    tmp_path: Path,
-) -> None:
-    file = with_wrench(
-        robot_problem(tmp_path, wrenches=WRENCHES),
-        ', sensor_frame = "base_link"',
-    )
+def test_a_sensor_that_is_fixed_in_the_world_measures_in_its_axes(tmp_path: Path) -> None:
+    file = with_wrench(robot_problem(tmp_path, wrenches=WRENCHES), ', sensor_frame = "base_link"')
     wrench = Problem.read(file).experiments[0].grasps[0].wrench
     assert wrench is not None
     assert wrench.frame == "world"
     np.testing.assert_allclose(
-        wrench.values[:, :3],
-        CAMERAS.inv().apply(WRENCHES[: len(wrench.t_s), :3]),
+        wrench.values[:, :3], CAMERAS.inv().apply(WRENCHES[: len(wrench.t_s), :3])
     )
-    np.testing.assert_allclose(
-        wrench.point_m, -CAMERAS.inv().apply(CAMERAS_M), atol=1e-12
-    )
+    np.testing.assert_allclose(wrench.point_m, -CAMERAS.inv().apply(CAMERAS_M), atol=1e-12)
 
 
-def test_stated_axes_are_kept_and_a_contradiction_of_the_log_is_noted(
-    tmp_path: Path,
-) -> None:
-    file = with_wrench(
-        robot_problem(tmp_path, wrenches=WRENCHES), ', frame = "grasp"'
-    )
+def test_stated_axes_are_kept_and_a_contradiction_of_the_log_is_noted(tmp_path: Path) -> None:
+    file = with_wrench(robot_problem(tmp_path, wrenches=WRENCHES), ', frame = "grasp"')
     problem = Problem.read(file)
     wrench = problem.experiments[0].grasps[0].wrench
     assert wrench is not None
-    np.testing.assert_array_equal(
-        wrench.values, WRENCHES[: len(wrench.t_s)].astype(float)
-    )
+    np.testing.assert_array_equal(wrench.values, WRENCHES[: len(wrench.t_s)].astype(float))
     (note,) = wrench_notes(problem)
     assert "is rotated by 180° against these axes" in note
     assert "omit frame and point_m" in note
@@ -275,16 +232,13 @@ def test_stated_axes_are_kept_and_a_contradiction_of_the_log_is_noted(
 
 def test_axes_that_agree_with_the_log_are_not_noted(tmp_path: Path) -> None:
     file = with_wrench(
-        robot_problem(tmp_path, wrenches=WRENCHES, sensor="gripper"),
-        ', frame = "grasp"',
+        robot_problem(tmp_path, wrenches=WRENCHES, sensor="gripper"), ', frame = "grasp"'
     )
     assert not wrench_notes(Problem.read(file))
 
 
 def test_a_sensor_without_transforms_is_noted(tmp_path: Path) -> None:
-    file = with_wrench(
-        robot_problem(tmp_path, wrenches=WRENCHES, sensor="netft")
-    )
+    file = with_wrench(robot_problem(tmp_path, wrenches=WRENCHES, sensor="netft"))
     problem = Problem.read(file)
     wrench = problem.experiments[0].grasps[0].wrench
     assert wrench is not None
@@ -304,9 +258,7 @@ def test_a_sensor_without_transforms_is_noted(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_wrong_frame_of_a_sensor_is_refused(
-    tmp_path: Path, keys: str, parts: list[str]
-) -> None:
+def test_a_wrong_frame_of_a_sensor_is_refused(tmp_path: Path, keys: str, parts: list[str]) -> None:
     file = with_wrench(robot_problem(tmp_path, wrenches=WRENCHES), keys)
     result = run_command("check", file)
     assert result.code == 2

@@ -14,16 +14,8 @@ from collocation_sysid.common.field_descriptions import documented
 from collocation_sysid.common.schema_tables import Section
 from collocation_sysid.fem.spatial_field import Field
 from collocation_sysid.model.parameters import PARAMETER_KEYS, Unknown
-from collocation_sysid.problem import (
-    camera_section,
-    load_schema,
-    recording_schema,
-    schema,
-)
-from collocation_sysid.problem.problem_options import (
-    RolloutOptions,
-    UncertaintyOptions,
-)
+from collocation_sysid.problem import camera_section, load_schema, recording_schema, schema
+from collocation_sysid.problem.problem_options import RolloutOptions, UncertaintyOptions
 from collocation_sysid.recording import (
     Depth,
     DepthCamera,
@@ -55,10 +47,7 @@ SECTIONS: dict[type, type[Section]] = {
     Depth: camera_section.DepthSection,
     DepthCamera: camera_section.DepthCameraSection,
     Experiment: recording_schema.ExperimentSection,
-    **{
-        kind: getattr(load_schema, f"{kind.__name__}Section")
-        for *_, kind in load_schema.LOADS
-    },
+    **{kind: getattr(load_schema, f"{kind.__name__}Section") for *_, kind in load_schema.LOADS},
     Plane: solid_sections.PlaneSection,
     Sphere: solid_sections.SphereSection,
     Cylinder: solid_sections.SolidCylinderSection,
@@ -72,9 +61,7 @@ OTHER_FORMS = {(Experiment, "start")}
 # Texts that are about the file: what the numbers of the table mean in it.
 OTHER_TEXTS = {(Wrench, "symmetry"), (Gauge, "grasp"), (Experiment, "start")}
 
-each_class = pytest.mark.parametrize(
-    "kind", SECTIONS, ids=lambda kind: kind.__name__
-)
+each_class = pytest.mark.parametrize("kind", SECTIONS, ids=lambda kind: kind.__name__)
 
 
 def declared_keys(kind: type) -> dict[str, Any]:
@@ -108,9 +95,7 @@ def test_a_key_that_is_left_out_means_the_default_of_the_class(kind: type):
             assert default is PydanticUndefined, name
         else:
             converted = default if key.read is None else key.read(default)
-            as_stored = (
-                tuple(converted) if isinstance(converted, list) else converted
-            )
+            as_stored = tuple(converted) if isinstance(converted, list) else converted
             assert as_stored == field.default, name
 
 
@@ -120,28 +105,18 @@ def test_a_key_is_described_as_the_field_of_its_class(kind: type):
     for name, key in declared_keys(kind).items():
         same_name = key.name == name
         if same_name and (kind, name) not in OTHER_TEXTS:
-            assert SECTIONS[kind].model_fields[
-                name
-            ].description == described.get(name), name
+            assert SECTIONS[kind].model_fields[name].description == described.get(name), name
 
 
-@pytest.mark.parametrize(
-    "section", SECTIONS.values(), ids=lambda section: section.__name__
-)
+@pytest.mark.parametrize("section", SECTIONS.values(), ids=lambda section: section.__name__)
 def test_a_table_states_a_file_or_a_constant(section: type[Section]):
     kind = next(each for each in SECTIONS if SECTIONS[each] is section)
     for _, key in keys_of(kind):
         if key.constant is not None:
             either = f"expected exactly one of {key.constant}, {key.name}"
-            nodes = {
-                word: "top"
-                for word in ("nodes", "faces")
-                if word in section.model_fields
-            }
+            nodes = {word: "top" for word in ("nodes", "faces") if word in section.model_fields}
             points = {"points_m": [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]}
-            others = nodes | (
-                points if "points_m" in section.model_fields else {}
-            )
+            others = nodes | (points if "points_m" in section.model_fields else {})
             with pytest.raises(ValueError, match=either):
                 section.model_validate(others)
             assert section.model_validate(others | {key.name: "table.csv"})
@@ -160,9 +135,7 @@ def test_parameters_have_the_keys_of_unknowns():
     for field in fields(Unknown):
         assert table[field.name].default == field.default
         if field.name != "prior":  # mean and deviation, as a table
-            assert (
-                table[field.name].description == documented(Unknown)[field.name]
-            )
+            assert table[field.name].description == documented(Unknown)[field.name]
 
 
 @pytest.mark.parametrize(
@@ -173,12 +146,8 @@ def test_parameters_have_the_keys_of_unknowns():
         (schema.AssumptionsSection, Assumptions),
     ],
 )
-def test_tables_of_options_are_the_options(
-    section: type[Section], options: Any
-):
-    assert list(section.model_fields) == [
-        field.name for field in fields(options)
-    ]
+def test_tables_of_options_are_the_options(section: type[Section], options: Any):
+    assert list(section.model_fields) == [field.name for field in fields(options)]
     assert options(**section().model_dump()) == options()
     with pytest.raises(ValueError, match="frozen"):
         setattr(section(), next(iter(section.model_fields)), None)

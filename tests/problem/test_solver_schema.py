@@ -20,29 +20,18 @@ each_method = pytest.mark.parametrize("method", METHODS)
 
 
 def solver_of(tables: str) -> SolverSection:
-    content = tomllib.loads(
-        PROBLEM.replace('[solver]\nmethod = "interior-point"', tables)
-    )
-    return ProblemFile.model_validate(
-        content | tomllib.loads(EXPERIMENT)
-    ).solver
+    content = tomllib.loads(PROBLEM.replace('[solver]\nmethod = "interior-point"', tables))
+    return ProblemFile.model_validate(content | tomllib.loads(EXPERIMENT)).solver
 
 
 @each_method
 def test_the_schema_tells_what_the_method_does_by_default(method: str):
     schema = json.loads(run_command("schema").out)
     table = schema["$defs"]["SolverSection"]["properties"][method]
-    defaults = {
-        name: option["default"] for name, option in table["properties"].items()
-    }
-    descriptions = {
-        name: option["description"]
-        for name, option in table["properties"].items()
-    }
+    defaults = {name: option["default"] for name, option in table["properties"].items()}
+    descriptions = {name: option["description"] for name, option in table["properties"].items()}
     kind = METHODS[method]
-    expected = {
-        field.name: getattr(kind(), field.name) for field in fields(kind)
-    }
+    expected = {field.name: getattr(kind(), field.name) for field in fields(kind)}
     assert defaults == json.loads(json.dumps(expected))
     assert descriptions == documented(kind)
     assert table["additionalProperties"] is False
@@ -78,9 +67,7 @@ def test_tables_of_several_methods_stand_side_by_side():
     assert solver.methods["augmented-lagrangian"].rho == 1e5
     assert solver.methods["reduced-space"].ladder == (0.5, 1.0)
     assert solver.methods["casadi:sqpmethod"].casadi == {"min_iter": 1}
-    assert solver.methods["continuation"].method == METHODS["shooting"](
-        gradient="adjoint"
-    )
+    assert solver.methods["continuation"].method == METHODS["shooting"](gradient="adjoint")
 
 
 @pytest.mark.parametrize(
@@ -105,27 +92,16 @@ def test_tables_of_several_methods_stand_side_by_side():
             "'reduced-space' has no option 'ladde'; expected one of toler",
         ),
         ("solver.reduced-space.ladde=[1]", "did you mean 'ladder'?"),
-        (
-            "solver.reduced_space.ladder=[1]",
-            "unknown key; did you mean 'reduced-space'?",
-        ),
-        (
-            "solver.penalty=3",
-            "solver.penalty: found 3; expected a table of options",
-        ),
+        ("solver.reduced_space.ladder=[1]", "unknown key; did you mean 'reduced-space'?"),
+        ("solver.penalty=3", "solver.penalty: found 3; expected a table of options"),
         (
             "solver.penalty.rho_max=1",
             "solver.penalty.rho_max: found 1, which is less than rho = 100; expected",
         ),
-        (
-            "solver.penalty.rho_factor=1",
-            "solver.penalty.rho_factor: found 1; expected a number ab",
-        ),
+        ("solver.penalty.rho_factor=1", "solver.penalty.rho_factor: found 1; expected a number ab"),
     ],
 )
-def test_what_does_not_belong_in_a_table_is_refused(
-    tiny, override: str, message: str
-):
+def test_what_does_not_belong_in_a_table_is_refused(tiny, override: str, message: str):
     with pytest.raises(InputError) as refused:
         read_problem_file("problem.toml", [override])
     assert message in str(refused.value)
@@ -137,10 +113,7 @@ def test_what_does_not_belong_in_a_table_is_refused(
 def test_the_methods_are_listed_with_a_line_on_each():
     listed = run_command("methods").out
     assert all(method in listed for method in METHODS)
-    assert (
-        "Interior-point method (IPOPT) for parameters and trajectories together."
-        in listed
-    )
+    assert "Interior-point method (IPOPT) for parameters and trajectories together." in listed
     told = json.loads(run_command("methods", "--json").out)
     assert list(told) == list(METHODS)
     assert (
@@ -152,9 +125,7 @@ def test_the_methods_are_listed_with_a_line_on_each():
 @each_method
 def test_a_method_tells_its_options(method: str):
     text = run_command("methods", method).out
-    told = json.loads(run_command("methods", method, "--json").out)[
-        "properties"
-    ]
+    told = json.loads(run_command("methods", method, "--json").out)["properties"]
     assert list(told) == [field.name for field in fields(METHODS[method])]
     for name in told:
         assert f"\n{name} " in text
@@ -162,10 +133,7 @@ def test_a_method_tells_its_options(method: str):
 
 def test_an_option_is_told_with_its_default_and_what_it_can_be():
     told = " ".join(run_command("methods", "reduced-space").out.split())
-    assert (
-        "ladder [0.25, 0.5, 1] list, each a number above 0; Shares of the recording"
-        in told
-    )
+    assert "ladder [0.25, 0.5, 1] list, each a number above 0; Shares of the recording" in told
     assert (
         "hessian gauss-newton gauss-newton, exact; Second derivatives that Gauss–Newton neglects"
         in told
@@ -173,9 +141,7 @@ def test_an_option_is_told_with_its_default_and_what_it_can_be():
     assert "by more than 10 %" in told
     assert "coarse_start auto auto, false; " in told
     reference = " ".join(run_command("methods", "interior-point").out.split())
-    assert (
-        "all of them once parameters move by less than `warm_up`" in reference
-    )
+    assert "all of them once parameters move by less than `warm_up`" in reference
     assert "under [solver.reduced-space]" in told
 
 

@@ -22,22 +22,16 @@ def lines(header: str = HEADER, rows: list[str] | None = None) -> str:
     return "\n".join([header, *(ROWS if rows is None else rows)]) + "\n"
 
 
-def with_sensor(
-    folder: Path, text: str | None = None, sensor: str = SENSOR
-) -> Path:
+def with_sensor(folder: Path, text: str | None = None, sensor: str = SENSOR) -> Path:
     """The tiny problem with a sensor at its grasp."""
     file = folder / "problem.toml"
-    file.write_text(
-        file.read_text().replace("poses =", f"{sensor}, poses =", 1)
-    )
+    file.write_text(file.read_text().replace("poses =", f"{sensor}, poses =", 1))
     if text is not None:
         (folder / "force.csv").write_text(text)
     return file
 
 
-def test_what_is_written_is_read_again(
-    tmp_path: Path, rng: np.random.Generator
-):
+def test_what_is_written_is_read_again(tmp_path: Path, rng: np.random.Generator):
     t_s, values = np.arange(5) / 3, rng.normal(size=(5, 6))
     values[2, 1] = np.nan
     write_wrench_csv(tmp_path / "w.csv", t_s, values)
@@ -56,18 +50,12 @@ def test_components_that_are_not_measured_are_left_out(tmp_path: Path):
 
 
 BAD = {
-    "no unit": (
-        lines("t_s,fx,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),
-        ["fx names no unit", "fx_n"],
-    ),
+    "no unit": (lines("t_s,fx,fy_n,fz_n,tx_nm,ty_nm,tz_nm"), ["fx names no unit", "fx_n"]),
     "a mass": (
         lines("t_s,fx_kg,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),
         ["fx_kg has the unit kg", "a unit of force", "kgf", "fx_n"],
     ),
-    "a length": (
-        lines("t_s,fx_n,fy_n,fz_n,tx_mm,ty_nm,tz_nm"),
-        ["tx_mm has the unit mm", "tx_nm"],
-    ),
+    "a length": (lines("t_s,fx_n,fy_n,fz_n,tx_mm,ty_nm,tz_nm"), ["tx_mm has the unit mm", "tx_nm"]),
     "unknown column": (
         lines("t_s,fx_n,fy_n,fz_n,mx_nm,ty_nm,tz_nm"),
         ["mx_nm is not among them", "did you mean 'tx_nm'"],
@@ -80,31 +68,20 @@ BAD = {
         lines("time,fx_n,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),
         ["column time names no unit", "t_s"],
     ),
-    "only times": (
-        "t_s\n0\n1\n",
-        ["the columns are t_s; expected t_s and any of"],
-    ),
-    "text": (
-        lines(rows=[*ROWS[:3], "0.03,0,0,much,0,0,0"]),
-        ["line 5", "fz_n holds 'much'"],
-    ),
+    "only times": ("t_s\n0\n1\n", ["the columns are t_s; expected t_s and any of"]),
+    "text": (lines(rows=[*ROWS[:3], "0.03,0,0,much,0,0,0"]), ["line 5", "fz_n holds 'much'"]),
     "time stands still": (
         lines(rows=[*ROWS[:3], "0.02,0,0,0,0,0,0"]),
         ["line 5", "time must increase"],
     ),
     "short row": (lines(rows=[*ROWS[:3], "0.03,0"]), ["line 5", "2 cells"]),
-    "blank column": (
-        lines(rows=[f"{k},,0,0,0,0,0" for k in range(4)]),
-        ["fx_n has no values"],
-    ),
+    "blank column": (lines(rows=[f"{k},,0,0,0,0,0" for k in range(4)]), ["fx_n has no values"]),
     "empty": ("", ["is empty"]),
 }
 
 
 @pytest.mark.parametrize(("text", "words"), BAD.values(), ids=BAD)
-def test_a_file_that_cannot_be_read_says_why(
-    tmp_path: Path, text: str, words: list[str]
-):
+def test_a_file_that_cannot_be_read_says_why(tmp_path: Path, text: str, words: list[str]):
     file = tmp_path / "force.csv"
     file.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -130,21 +107,13 @@ SLIPS = {
         'wrench = { file = "force.csv", sigma_n = 0.001 }',
         ["grasp.wrench", "sigma_nm is missing"],
     ),
-    "no sigma": (
-        lines(),
-        'wrench = { file = "force.csv" }',
-        ["grasp.wrench.sigma_n"],
-    ),
+    "no sigma": (lines(), 'wrench = { file = "force.csv" }', ["grasp.wrench.sigma_n"]),
     "no sense in sigma": (
         lines(),
         'wrench = { file = "force.csv", sigma_n = 0.0 }',
         ["grasp.wrench.sigma_n", "0"],
     ),
-    "no file": (
-        None,
-        SENSOR,
-        ["force.csv", "does not exist", "grasp.wrench.file"],
-    ),
+    "no file": (None, SENSOR, ["force.csv", "does not exist", "grasp.wrench.file"]),
     "another frame": (
         lines(),
         SENSOR.replace(" }", ', frame = "tool" }'),
@@ -155,9 +124,7 @@ SLIPS = {
 
 
 @pytest.mark.parametrize(("text", "sensor", "words"), SLIPS.values(), ids=SLIPS)
-def test_a_slip_in_the_problem_is_named(
-    tiny: Path, text: str, sensor: str, words: list[str]
-):
+def test_a_slip_in_the_problem_is_named(tiny: Path, text: str, sensor: str, words: list[str]):
     file = with_sensor(tiny, text, sensor)
     with pytest.raises(InputError) as caught:
         Problem.read(file)
@@ -170,10 +137,7 @@ def test_a_slip_in_the_problem_is_named(
     [
         ({"values": np.zeros((3, 4))}, "shape"),
         ({"t_s": [0.0, 0.2, 0.1]}, "time must increase"),
-        (
-            {"values": np.full((3, 6), np.nan)},
-            "all values of the measured wrench are missing",
-        ),
+        ({"values": np.full((3, 6), np.nan)}, "all values of the measured wrench are missing"),
         ({"sigma_nm": None}, "sigma_nm is missing"),
         ({"sigma_n": -1.0}, "sigma_n of a wrench is -1"),
         ({"frame": "hand"}, "expected one of world, grasp"),
@@ -182,12 +146,7 @@ def test_a_slip_in_the_problem_is_named(
     ],
 )
 def test_a_wrench_is_checked(changes: dict, words: str):
-    given = {
-        "t_s": [0.0, 0.1, 0.2],
-        "values": np.zeros((3, 6)),
-        "sigma_n": 1.0,
-        "sigma_nm": 1.0,
-    }
+    given = {"t_s": [0.0, 0.1, 0.2], "values": np.zeros((3, 6)), "sigma_n": 1.0, "sigma_nm": 1.0}
     with pytest.raises(InputError, match=words):
         Wrench(**(given | changes))
 
@@ -201,9 +160,7 @@ def test_simulate_writes_wrenches_that_the_problem_reads(tiny: Path):
     (experiment,) = problem.experiments
     np.testing.assert_allclose(t_s, experiment.t_s)
     # The body starts at rest: the grasp carries its weight.
-    assert values[0, 2] == pytest.approx(
-        9.81 * experiment.body.mass_kg, abs=0.01
-    )
+    assert values[0, 2] == pytest.approx(9.81 * experiment.body.mass_kg, abs=0.01)
     (tiny / "data" / "swing_wrench.csv").rename(tiny / "force.csv")
     (grasp,) = Problem.read(file).experiments[0].grasps
     assert grasp.wrench is not None

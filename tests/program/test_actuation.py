@@ -59,17 +59,10 @@ def tip_of_the_elastica(tension_n: float, arm_m: float) -> np.ndarray:
     stretch 1 − T / EA all along, a circle that scipy integrates.
     """
     area, second = THICK_M**2, THICK_M**4 / 12
-    bend, stretch = (
-        tension_n * arm_m / (YOUNG_PA * second),
-        1 - tension_n / (YOUNG_PA * area),
-    )
+    bend, stretch = (tension_n * arm_m / (YOUNG_PA * second), 1 - tension_n / (YOUNG_PA * area))
     s = np.linspace(0, LENGTH_M, 20)
     found = solve_bvp(
-        lambda s, y: [
-            stretch * np.cos(y[2]),
-            stretch * np.sin(y[2]),
-            np.full_like(s, bend),
-        ],
+        lambda s, y: [stretch * np.cos(y[2]), stretch * np.sin(y[2]), np.full_like(s, bend)],
         lambda at_clamp, at_tip: at_clamp,
         s,
         np.zeros((3, len(s))),
@@ -83,25 +76,17 @@ def tip_of_the_elastica(tension_n: float, arm_m: float) -> np.ndarray:
 def test_a_tendon_bends_a_thin_beam_as_the_elastica(tension_n):
     mesh = box_mesh((LENGTH_M, THICK_M, THICK_M), (20, 1, 1))
     body, arm = Body(mesh, density_kg_m3=1e3, element="tet10"), 0.003
-    points = [
-        (x, THICK_M / 2 + arm, THICK_M / 2)
-        for x in np.linspace(0, LENGTH_M, 41)
-    ]
+    points = [(x, THICK_M / 2 + arm, THICK_M / 2) for x in np.linspace(0, LENGTH_M, 41)]
     grasps = [Grasp(plane(body, 0), STILL)]
     experiment = driven(body, grasps, tendons=[Tendon(points, tension_n)])
     x = equilibrium(
-        experiment,
-        body.theta_from_values({"young_pa": YOUNG_PA, "poisson": 0.0} | REST),
+        experiment, body.theta_from_values({"young_pa": YOUNG_PA, "poisson": 0.0} | REST)
     )
     middle = plane(body, 0, LENGTH_M)
     tip = x.reshape(-1, 3)[middle].mean(axis=0)
-    expected = tip_of_the_elastica(tension_n, arm) + np.array(
-        [0.0, THICK_M / 2]
-    )
+    expected = tip_of_the_elastica(tension_n, arm) + np.array([0.0, THICK_M / 2])
     assert expected[1] > 0.018
-    np.testing.assert_allclose(
-        tip[:2], expected, atol=0.02 * (expected[1] - THICK_M / 2)
-    )
+    np.testing.assert_allclose(tip[:2], expected, atol=0.02 * (expected[1] - THICK_M / 2))
 
 
 REST = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
@@ -127,9 +112,7 @@ def test_a_thick_sphere_that_keeps_its_volume_inflates_as_rivlin_says():
         experiment = driven(body, grasps, pressures=[wall])
         theta = body.theta_from_values({"mu_pa": mu, "poisson": 0.4999} | REST)
         x = equilibrium(experiment, theta).reshape(-1, 3)
-        radii = np.linalg.norm(
-            x[np.flatnonzero(mesh.point_arrays["wall"])], axis=1
-        )
+        radii = np.linalg.norm(x[np.flatnonzero(mesh.point_arrays["wall"])], axis=1)
         errors.append(radii.mean() - stretch * inner)
     assert np.log(errors[0] / errors[1]) / np.log(1.5) > 1.4
     assert abs(errors[1]) < 0.15 * (stretch - 1) * inner
@@ -155,16 +138,10 @@ def test_tensions_are_applied_in_parts_where_newton_fails_at_once():
     mesh = box_mesh((0.1, 0.01, 0.01), (8, 1, 1))
     body = Body(mesh, density_kg_m3=1e3, element="tet10")
     points = [(x, 0.008, 0.005) for x in np.linspace(0, 0.1, 17)]
-    experiment = driven(
-        body, [Grasp(plane(body, 0), STILL)], tendons=[Tendon(points, 0.6)]
-    )
-    theta = body.theta_from_values(
-        {"young_pa": YOUNG_PA, "poisson": 0.3} | REST
-    )
+    experiment = driven(body, [Grasp(plane(body, 0), STILL)], tendons=[Tendon(points, 0.6)])
+    theta = body.theta_from_values({"young_pa": YOUNG_PA, "poisson": 0.3} | REST)
     x = equilibrium(experiment, theta)
-    forces = Forces.from_experiment(experiment, [0.0], theta).total(
-        x[None], np.zeros((1, x.size))
-    )
+    forces = Forces.from_experiment(experiment, [0.0], theta).total(x[None], np.zeros((1, x.size)))
     assert np.abs(forces[0, NewtonSolver(experiment).free]).max() < 1e-8
     assert np.linalg.norm(x.reshape(-1, 3)[-1] - body.nodes_m[-1]) > 0.05
 
@@ -172,10 +149,7 @@ def test_tensions_are_applied_in_parts_where_newton_fails_at_once():
 def lagging_pressure(lag_s: float) -> Pressure:
     """A pressure that rises from 5 to 20 Pa, rests, and falls."""
     return Pressure(
-        Named("cavity"),
-        [5.0, 5.0, 20.0, 20.0, 12.0],
-        [0, 0.1, 0.11, 0.3, 0.5],
-        lag_s=lag_s,
+        Named("cavity"), [5.0, 5.0, 20.0, 20.0, 12.0], [0, 0.1, 0.11, 0.3, 0.5], lag_s=lag_s
     )
 
 
@@ -184,9 +158,7 @@ def test_a_lagging_pressure_solves_its_differential_equation():
     pressure = lagging_pressure(0.04)
     t_s = np.linspace(0, 0.5, 51)
     found = solve_ivp(
-        lambda t, p: (
-            (np.interp(t, pressure.t_s, pressure.pressure_pa) - p) / 0.04
-        ),
+        lambda t, p: (np.interp(t, pressure.t_s, pressure.pressure_pa) - p) / 0.04,
         (0.0, 0.5),
         [5.0],
         t_eval=t_s,
@@ -194,9 +166,7 @@ def test_a_lagging_pressure_solves_its_differential_equation():
         rtol=1e-10,
         atol=1e-10,
     )
-    np.testing.assert_allclose(
-        -pressure.energy_amplitude_at(t_s), found.y[0], rtol=1e-5
-    )
+    np.testing.assert_allclose(-pressure.energy_amplitude_at(t_s), found.y[0], rtol=1e-5)
 
 
 def test_a_vanishing_lag_leaves_the_stated_pressure():

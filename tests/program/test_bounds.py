@@ -6,14 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kit.problems import (
-    IDEAL,
-    box,
-    measured_with,
-    nodes_where,
-    times,
-    vertex_markers,
-)
+from kit.problems import IDEAL, box, measured_with, nodes_where, times, vertex_markers
 
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.pipeline import run
@@ -30,22 +23,12 @@ def let_go(seed: int) -> Experiment:
     body, t_s = box((0.15, 0.03, 0.03), (3, 1, 1), "tet10"), times(60)
     markers = vertex_markers(body, nodes_where(body, 0, 0.15)[:4], t_s)
     grasp = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
-    bar = Experiment(
-        body,
-        t_s,
-        [grasp],
-        markers,
-        start="undeformed",
-        nuisance=IDEAL,
-        name="bar",
-    )
+    bar = Experiment(body, t_s, [grasp], markers, start="undeformed", nuisance=IDEAL, name="bar")
     made = measured_with(bar, TRUTH)
     tracks = made.markers.positions_m
     noise = SIGMA_M * np.random.default_rng(seed).normal(size=tracks.shape)
     seen = with_markers(made, tracks + noise)
-    return replace(
-        seen, markers=replace(seen.markers, sigma_m=np.full(4, SIGMA_M))
-    )
+    return replace(seen, markers=replace(seen.markers, sigma_m=np.full(4, SIGMA_M)))
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(4, marks=pytest.mark.slow)])
@@ -60,9 +43,7 @@ def test_a_damping_at_its_bound_does_not_make_the_other_falsely_certain(seed):
     experiment = let_go(seed)
     made = RolloutOptions("scheme")  # by which the tracks are made
     wrong, found = (
-        run(
-            Problem([experiment], Parameters((*free, last)), rollout=made)
-        ).estimates
+        run(Problem([experiment], Parameters((*free, last)), rollout=made)).estimates
         for last in (known, bounded)
     )
     assert found["gamma_m_1_s"].at_bound

@@ -22,9 +22,7 @@ from kit.problems import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.kernels.combine import combine_with_numpy
-from collocation_sysid.fem.laws.moduli import (
-    engineering_constants as engineering_moduli,
-)
+from collocation_sysid.fem.laws.moduli import engineering_constants as engineering_moduli
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
@@ -36,14 +34,10 @@ from collocation_sysid.recording import Experiment
 THETA = as_theta(TRUTH)
 
 
-def marched(
-    collocation: Collocation, q: np.ndarray | None = None
-) -> np.ndarray:
+def marched(collocation: Collocation, q: np.ndarray | None = None) -> np.ndarray:
     q = collocation.parameters.guess_q if q is None else q
     motions = [
-        simulate_scheme(
-            s.experiment, s.dynamics.with_theta(s.constants.theta(q))
-        )
+        simulate_scheme(s.experiment, s.dynamics.with_theta(s.constants.theta(q)))
         for s in collocation.transcriptions
     ]
     return collocation.pack(q, motions)
@@ -52,15 +46,11 @@ def marched(
 # Feasibility
 
 
-@pytest.mark.parametrize(
-    ("scheme", "start", "explicit_grasps", "substeps"), LAYOUTS
-)
+@pytest.mark.parametrize(("scheme", "start", "explicit_grasps", "substeps"), LAYOUTS)
 def test_a_marched_trajectory_satisfies_the_constraints(
     scheme: str, start: str, explicit_grasps: bool, substeps: int
 ):
-    collocation = Collocation(
-        [swung(start)], GUESS, scheme, substeps, explicit_grasps
-    )
+    collocation = Collocation([swung(start)], GUESS, scheme, substeps, explicit_grasps)
     z = marched(collocation)
     assert np.abs(collocation.constraint_values(z)).max() < 1e-12
     lower, upper = collocation.bounds()
@@ -71,10 +61,7 @@ def test_a_marched_trajectory_satisfies_the_constraints(
 
 def test_a_marched_trajectory_with_several_grasps_satisfies_the_constraints():
     collocation = Collocation([bar_in_two_hands()], GUESS)
-    assert (
-        np.abs(collocation.constraint_values(marched(collocation))).max()
-        < 1e-12
-    )
+    assert np.abs(collocation.constraint_values(marched(collocation))).max() < 1e-12
 
 
 def test_the_loss_is_zero_where_the_tracks_came_from():
@@ -101,24 +88,20 @@ def test_variables_and_rows_are_in_the_documented_order():
     z = some_point(collocation)
     q, positions = collocation.unpack(z)
     expected_z, expected_g = [q], []
-    for segment, x in zip(collocation.transcriptions, positions, strict=True):
-        residual = segment.dynamics.with_theta(
-            segment.constants.theta(q)
-        ).residual(x)
-        expected_z.append(x.ravel() / segment.length_m)
-        rows = residual[segment.dynamics.first_row :, segment.free_dofs]
-        expected_g.append(rows.ravel() / segment.force_n)
+    for transcription, x in zip(collocation.transcriptions, positions, strict=True):
+        residual = transcription.dynamics.with_theta(transcription.constants.theta(q)).residual(x)
+        expected_z.append(x.ravel() / transcription.length_m)
+        rows = residual[transcription.dynamics.first_row :, transcription.free_dofs]
+        expected_g.append(rows.ravel() / transcription.force_n)
     np.testing.assert_allclose(z, np.concatenate(expected_z))
-    np.testing.assert_allclose(
-        collocation.constraint_values(z), np.concatenate(expected_g)
-    )
+    np.testing.assert_allclose(collocation.constraint_values(z), np.concatenate(expected_g))
     assert [s.dynamics.first_row for s in collocation.transcriptions] == [1, 0]
 
 
 def test_lengths_are_scaled_by_the_mean_edge():
-    segment = Collocation([swung()], GUESS).transcriptions[0]
-    ends = segment.body.nodes_m[segment.body.mesh.edges]
-    assert segment.length_m == pytest.approx(
+    transcription = Collocation([swung()], GUESS).transcriptions[0]
+    ends = transcription.body.nodes_m[transcription.body.mesh.edges]
+    assert transcription.length_m == pytest.approx(
         np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean()
     )
 
@@ -137,14 +120,9 @@ def test_gauss_newtons_model_of_wild_samples_is_nowhere_below_their_loss(rng):
 
 
 def test_gauss_newtons_hessian_is_the_exact_one_where_readings_are_met():
-    truth = Parameters(
-        tuple(replace(item, guess=TRUTH[item.name]) for item in GUESS.items)
-    )
+    truth = Parameters(tuple(replace(item, guess=TRUTH[item.name]) for item in GUESS.items))
     collocation = Collocation([measured(cube_with_nuisance(4))], truth)
-    (start, _), none = (
-        initial_variables(collocation),
-        np.zeros(collocation.constraint_count),
-    )
+    (start, _), none = (initial_variables(collocation), np.zeros(collocation.constraint_count))
     exact = collocation.hessian(start, 1.0, none).toarray()
     found = collocation.hessian(start, 1.0, None).toarray()
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.abs(exact).max())
@@ -165,33 +143,27 @@ def test_values_are_written_where_they_are_wanted():
 @pytest.mark.parametrize("make", [swung, bar_in_two_hands])
 def test_held_nodes_are_bound_to_the_grasp(make):
     collocation = Collocation([make()], GUESS, substeps=2)
-    segment = collocation.transcriptions[0]
-    (lower,), (upper,) = (
-        collocation.unpack(bound)[1] for bound in collocation.bounds()
-    )
-    held = segment.experiment.prescribed_positions(segment.dynamics.t_s)
+    transcription = collocation.transcriptions[0]
+    (lower,), (upper,) = (collocation.unpack(bound)[1] for bound in collocation.bounds())
+    held = transcription.experiment.prescribed_positions(transcription.dynamics.t_s)
     np.testing.assert_allclose(
-        lower[:, segment.prescribed_dofs], held, rtol=1e-14, atol=1e-17
+        lower[:, transcription.prescribed_dofs], held, rtol=1e-14, atol=1e-17
     )
     np.testing.assert_array_equal(
-        lower[:, segment.prescribed_dofs], upper[:, segment.prescribed_dofs]
+        lower[:, transcription.prescribed_dofs], upper[:, transcription.prescribed_dofs]
     )
-    assert (lower[:, segment.free_dofs] == -np.inf).all()
-    assert (upper[:, segment.free_dofs] == np.inf).all()
+    assert (lower[:, transcription.free_dofs] == -np.inf).all()
+    assert (upper[:, transcription.free_dofs] == np.inf).all()
 
 
 @pytest.mark.parametrize("start", ["undeformed", "given"])
 def test_a_known_start_is_bound_too(start: str):
     collocation = Collocation([swung(start)], GUESS, has_grasp_constraints=True)
-    (lower,), (upper,) = (
-        collocation.unpack(bound)[1] for bound in collocation.bounds()
-    )
+    (lower,), (upper,) = (collocation.unpack(bound)[1] for bound in collocation.bounds())
     expected = collocation.transcriptions[0].experiment.start_positions_m
     if expected is None:
         expected = collocation.transcriptions[0].body.nodes_m
-    np.testing.assert_allclose(
-        lower[0], np.ravel(expected), rtol=1e-14, atol=1e-17
-    )
+    np.testing.assert_allclose(lower[0], np.ravel(expected), rtol=1e-14, atol=1e-17)
     np.testing.assert_array_equal(lower[0], upper[0])
     assert np.isinf(lower[1:]).all()
 
@@ -217,12 +189,8 @@ def test_experiments_share_nothing_but_the_parameters():
         block = alone.jacobian(alone.pack(q, [x])).toarray()
         by_theta.append(block[:, :4])
         by_position.append(block[:, 4:])
-    expected = np.hstack(
-        [np.vstack(by_theta), sp.block_diag(by_position).toarray()]
-    )
-    np.testing.assert_allclose(
-        jacobian, expected, atol=1e-13 * np.abs(expected).max()
-    )
+    expected = np.hstack([np.vstack(by_theta), sp.block_diag(by_position).toarray()])
+    np.testing.assert_allclose(jacobian, expected, atol=1e-13 * np.abs(expected).max())
 
 
 def test_losses_of_experiments_add_up():
@@ -233,25 +201,15 @@ def test_losses_of_experiments_add_up():
     total = 0.0
     for experiment, x in zip(experiments, positions, strict=True):
         alone = Collocation([experiment], GUESS)
-        total += (
-            alone.objective(alone.pack(q, [x])) * alone.count_measurements()
-        )
+        total += alone.objective(alone.pack(q, [x])) * alone.count_measurements()
     assert both.objective(z) * both.count_measurements() == pytest.approx(total)
 
 
 def test_validation_experiments_are_left_out():
-    fitted, held_out = (
-        swung(),
-        replace(swung(steps=7), name="held out", validation=True),
-    )
+    fitted, held_out = (swung(), replace(swung(steps=7), name="held out", validation=True))
     collocation = Collocation([held_out, fitted], GUESS)
-    assert [segment.experiment for segment in collocation.transcriptions] == [
-        fitted
-    ]
-    assert (
-        collocation.variable_count
-        == Collocation([fitted], GUESS).variable_count
-    )
+    assert [transcription.experiment for transcription in collocation.transcriptions] == [fitted]
+    assert collocation.variable_count == Collocation([fitted], GUESS).variable_count
 
 
 def test_nothing_to_fit_is_refused():
@@ -267,23 +225,19 @@ def test_nothing_to_fit_is_refused():
 def test_the_loss_counts_present_samples_only():
     collocation = Collocation([swung()], GUESS)
     z = some_point(collocation)
-    segment, (_, (x,)) = collocation.transcriptions[0], collocation.unpack(z)
-    markers = segment.experiment.markers
+    transcription, (_, (x,)) = collocation.transcriptions[0], collocation.unpack(z)
+    markers = transcription.experiment.markers
     predicted = markers.predict_positions(x.reshape(len(x), -1, 3))
     squares = np.sum((predicted - markers.positions_m) ** 2, axis=2)
     present = np.isfinite(squares)
     assert 0 < present.sum() < present.size
     assert collocation.count_measurements() == 3 * present.sum()
-    expected = (squares / markers.sigma_m**2)[
-        present
-    ].sum() / collocation.count_measurements()
+    expected = (squares / markers.sigma_m**2)[present].sum() / collocation.count_measurements()
     assert collocation.objective(z) == pytest.approx(expected)
     np.testing.assert_allclose(
-        segment.markers.squared_distances_m2(x, np.zeros(0)), squares[present]
+        transcription.markers.squared_distances_m2(x, np.zeros(0)), squares[present]
     )
-    assert collocation.rms_marker_distance_m(z) == pytest.approx(
-        np.sqrt(squares[present].mean())
-    )
+    assert collocation.rms_marker_distance_m(z) == pytest.approx(np.sqrt(squares[present].mean()))
 
 
 def test_a_frame_without_samples_pulls_on_nothing():
@@ -291,31 +245,23 @@ def test_a_frame_without_samples_pulls_on_nothing():
     tracks = experiment.markers.positions_m.copy()
     tracks[3] = np.nan
     collocation = Collocation([with_markers(experiment, tracks)], GUESS)
-    _, (gradient,) = collocation.unpack(
-        collocation.gradient(some_point(collocation))
-    )
+    _, (gradient,) = collocation.unpack(collocation.gradient(some_point(collocation)))
     assert (gradient[3] == 0).all()
     assert (np.abs(gradient[[0, 1, 2, 4, 5]]).max(axis=1) > 0).all()
 
 
 def test_with_substeps_only_the_rows_at_samples_are_measured():
     collocation = Collocation([swung()], GUESS, substeps=3)
-    _, (gradient,) = collocation.unpack(
-        collocation.gradient(some_point(collocation))
-    )
+    _, (gradient,) = collocation.unpack(collocation.gradient(some_point(collocation)))
     moved = np.flatnonzero(np.abs(gradient).max(axis=1))
     assert len(moved)
     assert (moved % 3 == 0).all()
 
 
 def test_a_prior_adds_its_squared_residual():
-    with_prior, without = (
-        Collocation([swung()], p) for p in (WITH_PRIOR, GUESS)
-    )
+    with_prior, without = (Collocation([swung()], p) for p in (WITH_PRIOR, GUESS))
     z = some_point(without)
-    difference = (
-        with_prior.objective(z) - without.objective(z)
-    ) * without.count_measurements()
+    difference = (with_prior.objective(z) - without.objective(z)) * without.count_measurements()
     assert difference == pytest.approx(((z[0] - np.log(300.0)) / 0.2) ** 2)
 
 
@@ -323,42 +269,28 @@ def test_a_prior_adds_its_squared_residual():
 
 
 def test_fixing_parameters_drops_their_columns():
-    fixed = Parameters(
-        (*GUESS.items[:3], Parameter("gamma_m_1_s", 0.5, is_fixed=True))
-    )
-    all_free, reduced = (
-        Collocation([swung()], GUESS),
-        Collocation([swung()], fixed),
-    )
+    fixed = Parameters((*GUESS.items[:3], Parameter("gamma_m_1_s", 0.5, is_fixed=True)))
+    all_free, reduced = (Collocation([swung()], GUESS), Collocation([swung()], fixed))
     z = some_point(all_free)
     z[3] = np.log(0.5)
     shorter = np.delete(z, 3)
     assert reduced.variable_count == all_free.variable_count - 1
     np.testing.assert_allclose(
-        reduced.constraint_values(shorter),
-        all_free.constraint_values(z),
-        atol=1e-14,
+        reduced.constraint_values(shorter), all_free.constraint_values(z), atol=1e-14
     )
     expected = np.delete(all_free.jacobian(z).toarray(), 3, axis=1)
-    np.testing.assert_allclose(
-        reduced.jacobian(shorter).toarray(), expected, atol=1e-14
-    )
+    np.testing.assert_allclose(reduced.jacobian(shorter).toarray(), expected, atol=1e-14)
 
 
 def test_both_elastic_pairs_describe_the_same_constraints():
-    lame, engineering = (
-        Collocation([swung()], GUESS),
-        Collocation([swung()], ENGINEERING),
-    )
+    lame, engineering = (Collocation([swung()], GUESS), Collocation([swung()], ENGINEERING))
     z = some_point(lame)
     lambda_pa, mu_pa, *damping = lame.parameter_values(z).values()
     q = np.log([*engineering_moduli(lambda_pa, mu_pa), *damping])
     other = engineering.pack(q, lame.unpack(z)[1])
     newtons = lame.residuals_n(z)[0]
     np.testing.assert_allclose(
-        engineering.residuals_n(other)[0],
-        newtons,
-        atol=1e-12 * np.abs(newtons).max(),
+        engineering.residuals_n(other)[0], newtons, atol=1e-12 * np.abs(newtons).max()
     )
 
 
@@ -366,22 +298,14 @@ def test_both_elastic_pairs_describe_the_same_constraints():
 
 
 def test_the_largest_violation_is_named():
-    collocation = Collocation(
-        [swung(), replace(swung(steps=7), name="second")], GUESS
-    )
+    collocation = Collocation([swung(), replace(swung(steps=7), name="second")], GUESS)
     z = marched(collocation)
     q, positions = collocation.unpack(z)
     node = int(collocation.transcriptions[1].experiment.free_dofs[6]) // 3
     positions[1][-1, 3 * node + 1] += 1e-3
-    worst = collocation.largest_violations(
-        collocation.pack(q, positions), count=3
-    )
+    worst = collocation.largest_violations(collocation.pack(q, positions), count=3)
     assert len(worst) == 3
-    assert (worst[0].experiment, worst[0].node, worst[0].axis) == (
-        "second",
-        node,
-        "y",
-    )
+    assert (worst[0].experiment, worst[0].node, worst[0].axis) == ("second", node, "y")
     assert worst[0].time_s == pytest.approx(0.07)
     assert str(worst[0]).startswith(f"second: t = 0.07 s, node {node}, y: -")
     assert str(worst[0]).endswith(" N")
@@ -397,9 +321,7 @@ def test_the_numpy_combiner_fills_the_same_values(monkeypatch):
         collocation = Collocation([experiment], GUESS, "bdf2")
         z = some_point(collocation)
         y = np.random.default_rng(0).normal(size=collocation.constraint_count)
-        return collocation.jacobian_values(z), collocation.hessian_values(
-            z, 1.0, y
-        )
+        return collocation.jacobian_values(z), collocation.hessian_values(z, 1.0, y)
 
     natively = values(swung())
     monkeypatch.setattr(block_band, "make_combiner", combine_with_numpy)
@@ -426,9 +348,6 @@ def test_a_program_with_other_associations_equals_one_made_for_them(rng):
     multipliers = rng.normal(size=moved.constraint_count)
     np.testing.assert_array_equal(moved.gradient(z), fresh.gradient(z))
     np.testing.assert_array_equal(
-        moved.hessian(z, 1.0, multipliers).toarray(),
-        fresh.hessian(z, 1.0, multipliers).toarray(),
+        moved.hessian(z, 1.0, multipliers).toarray(), fresh.hessian(z, 1.0, multipliers).toarray()
     )
-    np.testing.assert_array_equal(
-        moved.jacobian(z).toarray(), fresh.jacobian(z).toarray()
-    )
+    np.testing.assert_array_equal(moved.jacobian(z).toarray(), fresh.jacobian(z).toarray())

@@ -15,14 +15,7 @@ from collocation_sysid.program.forward import condensed_steps, newton_solver
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.linear_algebra.factorisation import Factoriser
 from collocation_sysid.program.linear_algebra.lapack import solve_band_in_blocks
-from collocation_sysid.recording import (
-    Cuboid,
-    Experiment,
-    Grasp,
-    Obstacle,
-    Plane,
-    PoseSequence,
-)
+from collocation_sysid.recording import Cuboid, Experiment, Grasp, Obstacle, Plane, PoseSequence
 
 STEPS = 12
 SCHEME = "bdf2"
@@ -64,9 +57,7 @@ def counted_factorisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-def test_steps_in_contact_take_hardly_more_factorisations_than_without(
-    friction, monkeypatch
-):
+def test_steps_in_contact_take_hardly_more_factorisations_than_without(friction, monkeypatch):
     """After the equilibrium at the start and two steps at most one in three steps."""
     calls = counted_factorisations(monkeypatch)
     simulated(pressed_cube(3, 2, friction))
@@ -77,9 +68,7 @@ def test_steps_in_contact_take_hardly_more_factorisations_than_without(
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-def test_condensed_steps_have_the_solution_of_the_complete_equations(
-    friction, monkeypatch
-):
+def test_condensed_steps_have_the_solution_of_the_complete_equations(friction, monkeypatch):
     experiment = pressed_cube(3, STEPS, friction)
     x = simulated(experiment)
     assert residual_n(experiment, x).max() < 1e-9
@@ -100,9 +89,7 @@ def test_dofs_along_axes_without_a_force_are_not_condensed(monkeypatch):
         sizes.append(len(stiffness))
         return factorise(compliance, stiffness)
 
-    monkeypatch.setattr(
-        condensed_steps.CondensedStiffness, "from_matrices", counting
-    )
+    monkeypatch.setattr(condensed_steps.CondensedStiffness, "from_matrices", counting)
     largest = []
     for friction in (0.0, 0.3):
         simulated(pressed_cube(3, 2, friction))
@@ -115,10 +102,7 @@ def test_steps_that_cannot_be_condensed_are_solved_completely(monkeypatch):
     """Here the dofs that touch are too many, or never converge."""
     experiment = pressed_cube(3, 4, 0.3)
     x = simulated(experiment)
-    for name, value in (
-        ("MAX_ACTIVE_DOFS", 3),
-        ("MAX_LOCAL_ITERATIONS", 0),
-    ):
+    for name, value in (("MAX_ACTIVE_DOFS", 3), ("MAX_LOCAL_ITERATIONS", 0)):
         with monkeypatch.context() as patched:
             patched.setattr(condensed_steps, name, value)
             np.testing.assert_allclose(simulated(experiment), x, atol=1e-12)
@@ -155,9 +139,7 @@ def between_two_obstacles() -> Experiment:
 
 def moved(t_s: np.ndarray, way_m: np.ndarray) -> PoseSequence:
     """Poses along a way (T, 3), without rotation."""
-    return PoseSequence(
-        t_s, way_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
-    )
+    return PoseSequence(t_s, way_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)))
 
 
 def test_two_obstacles_touch_at_once(monkeypatch):
@@ -176,9 +158,7 @@ def test_stored_columns_of_the_compliance_are_limited(monkeypatch):
     size = 6
     factor = Mock()
     factor.solve = lambda right: 2.0 * right
-    compliance = condensed_steps.Compliance(
-        factor, np.arange(size), dof_count=size
-    )
+    compliance = condensed_steps.Compliance(factor, np.arange(size), dof_count=size)
     monkeypatch.setattr(condensed_steps, "MAX_COLUMN_ENTRIES", 3 * size)
     for dofs in ([0, 1], [1, 2], [3, 4, 5], [0, 5], [0, 4, 5]):
         np.testing.assert_array_equal(
@@ -189,8 +169,7 @@ def test_stored_columns_of_the_compliance_are_limited(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("size", "half_bandwidth"),
-    [(5, 0), (9, 8), (200, 30), (200, 64), (200, 130)],
+    ("size", "half_bandwidth"), [(5, 0), (9, 8), (200, 30), (200, 64), (200, 130)]
 )
 def test_a_band_is_solved_in_blocks_as_a_full_matrix(size, half_bandwidth):
     rng = np.random.default_rng(size + half_bandwidth)

@@ -33,9 +33,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
 from collocation_sysid.program.depth.depth_comparison import camera_residuals
-from collocation_sysid.program.depth.surface_correspondences import (
-    SurfaceCorrespondences,
-)
+from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.statistics.uncertainty import uncertainty_at
@@ -44,50 +42,35 @@ from collocation_sysid.statistics.uncertainty import uncertainty_at
 @pytest.mark.long
 def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
     axis, way = np.array([0.1, 0.8, -0.6]), np.array([0.5, 0.6, 0.6])
-    pose = moved(
-        np.radians(10) * axis / np.linalg.norm(axis),
-        0.02 * way / np.linalg.norm(way),
-    )
+    pose = moved(np.radians(10) * axis / np.linalg.norm(axis), 0.02 * way / np.linalg.norm(way))
     solution = fitted(noisy(rng), pose)
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
     (part,) = solution.collocation.iterates(solution.z)
-    (reading,) = camera_residuals(part.segment)
+    (reading,) = camera_residuals(part.transcription)
     apart = reading.signed_distances_m(part.observables[-1], part.phi)
     assert np.sqrt(np.nanmean(apart**2)) < 2e-4
-    bars = uncertainty_at(solution.collocation, solution.z).estimates[
-        "young_pa"
-    ]
+    bars = uncertainty_at(solution.collocation, solution.z).estimates["young_pa"]
     low, high = bars.statistical95
     assert low < TRUTH["young_pa"] < high < 1.2 * low
 
 
 @pytest.mark.parametrize(
     ("axis", "way"),
-    [
-        ((0.61, -0.71, 0.36), (-0.54, 0.48, -0.7)),
-        ((0.83, 0.31, 0.46), (-0.09, 0.53, -0.84)),
-    ],
+    [((0.61, -0.71, 0.36), (-0.54, 0.48, -0.7)), ((0.83, 0.31, 0.46), (-0.09, 0.53, -0.84))],
 )
-def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(
-    axis, way, rng
-):
+def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(axis, way, rng):
     """Not to where it is said to be: 20 mm and 10 degrees off, it would not see the bar's top."""
     camera = cs.DepthCamera(
-        MATRIX,
-        pose=moved(np.radians(10) * np.array(axis), 0.02 * np.array(way)),
+        MATRIX, pose=moved(np.radians(10) * np.array(axis), 0.02 * np.array(way))
     )
-    depth = cs.Depth.of_images(
-        "front", noisy(rng), camera, NOISE_M, spacing_m=0.004
-    )
+    depth = cs.Depth.of_images("front", noisy(rng), camera, NOISE_M, spacing_m=0.004)
     experiment = hanging((depth,))
     nuisance = NuisanceMap.from_experiment(experiment)
     view, nothing = (
         DepthCameraModel.from_experiment(experiment, 0, nuisance),
         np.zeros(nuisance.size),
     )
-    sighting = SurfaceCorrespondences.from_alignment(
-        view, bar(), hanging_m()[None], nothing
-    )
+    sighting = SurfaceCorrespondences.from_alignment(view, bar(), hanging_m()[None], nothing)
     assert sighting.gate_m == depth.gate_m
     assert sighting.is_compared.sum() > 0.95 * len(depth.points_m[0])
 
@@ -97,29 +80,21 @@ def test_what_is_beside_the_body_is_left_out_and_counted(rng):
     image = noisy(rng)
     image[:20] = 0.34  # a wall above the bar, nearer than it
     solution = fitted(image, POSE)
-    (sighting,) = solution.collocation.transcriptions[
-        0
-    ].association.correspondences
+    (sighting,) = solution.collocation.transcriptions[0].association.correspondences
     assert sighting.excluded_counts["far"] > 20
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
 
 
 def test_a_point_whose_normal_is_turned_from_that_of_the_surface_is_left_out():
     camera = cs.DepthCamera(MATRIX, pose=POSE)
-    depth = cs.Depth.of_images(
-        "front", image_m(), camera, NOISE_M, spacing_m=0.004
-    )
+    depth = cs.Depth.of_images("front", image_m(), camera, NOISE_M, spacing_m=0.004)
 
     def sighting(depth: cs.Depth) -> SurfaceCorrespondences:
         experiment = hanging((depth,))
         nuisance = NuisanceMap.from_experiment(experiment)
         view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
         return SurfaceCorrespondences.from_shapes(
-            view,
-            bar(),
-            hanging_m()[None],
-            np.zeros(nuisance.size),
-            depth.gate_m,
+            view, bar(), hanging_m()[None], np.zeros(nuisance.size), depth.gate_m
         )
 
     plain = sighting(depth)
@@ -135,30 +110,18 @@ def test_a_point_whose_normal_is_turned_from_that_of_the_surface_is_left_out():
 def test_an_interior_point_method_finds_the_same(rng):
     image = noisy(rng)
     reduced = fitted(image, POSE)
-    unknown = {
-        **TRUTH,
-        "young_pa": cs.Unknown(1.05 * reduced.parameters["young_pa"]),
-    }
+    unknown = {**TRUTH, "young_pa": cs.Unknown(1.05 * reduced.parameters["young_pa"])}
     seen = reduced.collocation.experiments
-    other = cs.solve(
-        cs.Problem(
-            seen, cs.Parameters.from_mapping(unknown), method="interior-point"
-        )
-    )
+    other = cs.solve(cs.Problem(seen, cs.Parameters.from_mapping(unknown), method="interior-point"))
     assert other.status.converged
-    assert (
-        abs(other.parameters["young_pa"] / reduced.parameters["young_pa"] - 1)
-        < 5e-3
-    )
+    assert abs(other.parameters["young_pa"] / reduced.parameters["young_pa"] - 1) < 5e-3
 
 
 def test_pixels_at_edges_and_without_depth_are_left_out():
     image = np.full((8, 10), 0.5)
     image[:, 5:] = 0.6
     image[3, 2] = 0.0
-    points = points_from_image(
-        image, cs.DepthCamera([[100, 0, 5], [0, 100, 4], [0, 0, 1]])
-    )
+    points = points_from_image(image, cs.DepthCamera([[100, 0, 5], [0, 100, 4], [0, 0, 1]]))
     # Rows 1 to 6, columns 1 to 8, without both beside the jump, nor the hole and its neighbours.
     assert len(points) == 6 * 6 - 5
     assert set(points[:, 2]) == {0.5, 0.6}
@@ -171,24 +134,17 @@ def test_a_lens_bends_the_rays_as_its_distortion_says():
     radial = 1 + 0.1 * r2 - 0.02 * r2 * r2
     u = x * radial + 2 * 1e-3 * x * y + 2e-3 * (r2 + 2 * x * x)
     v = y * radial + 1e-3 * (r2 + 2 * y * y) + 2 * 2e-3 * x * y
-    np.testing.assert_allclose(
-        [300 * u + 80, 300 * v + 60], [20, 100], atol=1e-6
-    )
+    np.testing.assert_allclose([300 * u + 80, 300 * v + 60], [20, 100], atol=1e-6)
 
 
 def written(folder: Path) -> dict[str, Path]:
     """One cloud of three points with normals, and an image, in all formats."""
     points, normals = np.arange(9.0).reshape(3, 3), np.tile([0.0, 0, 1], (3, 1))
-    files = {
-        kind: folder / f"cloud.{kind}"
-        for kind in ("npy", "xyz", "ply", "pcd", "npz", "png")
-    }
+    files = {kind: folder / f"cloud.{kind}" for kind in ("npy", "xyz", "ply", "pcd", "npz", "png")}
     np.save(files["npy"], np.hstack([points, normals]))
     np.savetxt(files["xyz"], points)
     columns = {f"n{axis}": normals[:, k] for k, axis in enumerate("xyz")}
-    meshio.write(
-        files["ply"], meshio.Mesh(points, [("triangle", [[0, 1, 2]])], columns)
-    )
+    meshio.write(files["ply"], meshio.Mesh(points, [("triangle", [[0, 1, 2]])], columns))
     head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 3\nDATA binary\n"
     files["pcd"].write_bytes(head.encode() + points.astype("<f4").tobytes())
     np.savez(files["npz"], depth_counts=np.full((4, 5), 500), count_m=1e-3)
@@ -218,9 +174,7 @@ def test_clouds_and_images_are_read_from_every_format(tmp_path):
         ("image.exr", "OpenEXR"),
     ],
 )
-def test_files_that_cannot_be_read_are_refused_with_a_remedy(
-    tmp_path, monkeypatch, name, said
-):
+def test_files_that_cannot_be_read_are_refused_with_a_remedy(tmp_path, monkeypatch, name, said):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)  # as where it is missing
     file = tmp_path / name
     if name == "flat.npy":
@@ -230,19 +184,14 @@ def test_files_that_cannot_be_read_are_refused_with_a_remedy(
     elif name == "two.npz":
         np.savez(file, other=np.zeros(3))
     else:
-        file.write_text(
-            "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n"
-        )
+        file.write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n")
     with pytest.raises(InputError, match=said):
         read_depth(file, None, 1.0)
 
 
 def test_an_exr_image_is_read(tmp_path):
     library = pytest.importorskip("OpenEXR")
-    header = {
-        "compression": library.ZIP_COMPRESSION,
-        "type": library.scanlineimage,
-    }
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
     with library.File(header, {"Z": image_m().astype(np.float32)}) as image:
         image.write(str(tmp_path / "image.exr"))
     read = read_depth(tmp_path / "image.exr", None, 1.0)
@@ -251,10 +200,7 @@ def test_an_exr_image_is_read(tmp_path):
 
 def test_of_a_damaged_exr_image_only_the_refusal_is_said(tmp_path, capfd):
     library, file = pytest.importorskip("OpenEXR"), tmp_path / "image.exr"
-    header = {
-        "compression": library.ZIP_COMPRESSION,
-        "type": library.scanlineimage,
-    }
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
     with library.File(header, {"Z": image_m().astype(np.float32)}) as image:
         image.write(str(file))
     file.write_bytes(file.read_bytes()[:308])
@@ -265,12 +211,7 @@ def test_of_a_damaged_exr_image_only_the_refusal_is_said(tmp_path, capfd):
 
 def test_a_problem_file_states_depth(tmp_path):
     bar().mesh.write(tmp_path / "bar.vtu")
-    np.savez(
-        tmp_path / "front.npz",
-        depth_m=image_m(),
-        camera_matrix=MATRIX,
-        camera_pose=POSE,
-    )
+    np.savez(tmp_path / "front.npz", depth_m=image_m(), camera_matrix=MATRIX, camera_pose=POSE)
     more = "spacing_m = 0.005\n[experiment.nuisance]\ndepth_pose = { prior_m = 0.01 }\n"
     text = PROBLEM.replace('name = "front"\n', "") + more
     file = tmp_path / "problem.toml"
@@ -297,32 +238,18 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
     for share in (0.0, 0.9):
         noise, images = noisy(rng) - image_m(), []
         for _ in range(20):
-            noise = share * noise + np.sqrt(1 - share**2) * (
-                noisy(rng) - BIAS_M - image_m()
-            )
+            noise = share * noise + np.sqrt(1 - share**2) * (noisy(rng) - BIAS_M - image_m())
             images.append(image_m() + noise)
         camera, t_s = cs.DepthCamera(MATRIX, pose=POSE), np.arange(20.0)
-        depth = cs.Depth.of_images(
-            "front", images, camera, NOISE_M, t_s=t_s, spacing_m=0.006
-        )
-        depth = replace(
-            depth, background="unknown"
-        )  # outlines have their own noise
-        held = cs.Grasp(
-            np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
-        )
+        depth = cs.Depth.of_images("front", images, camera, NOISE_M, t_s=t_s, spacing_m=0.006)
+        depth = replace(depth, background="unknown")  # outlines have their own noise
+        held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
         kept = hanging((NOTHING,)).nuisance
-        experiment = cs.Experiment(
-            bar(), t_s, [held], kind="static", depths=[depth], nuisance=kept
-        )
+        experiment = cs.Experiment(bar(), t_s, [held], kind="static", depths=[depth], nuisance=kept)
         unknown = {**TRUTH, "young_pa": cs.Unknown(1.6e5)}
-        solution = cs.solve(
-            cs.Problem([experiment], cs.Parameters.from_mapping(unknown))
-        )
+        solution = cs.solve(cs.Problem([experiment], cs.Parameters.from_mapping(unknown)))
         low, high = (
-            uncertainty_at(solution.collocation, solution.z)
-            .estimates["young_pa"]
-            .statistical95
+            uncertainty_at(solution.collocation, solution.z).estimates["young_pa"].statistical95
         )
         widths.append(np.log(high / low))
     # Both autocorrelations are estimated, which moves the ratio by some percent.
@@ -348,16 +275,10 @@ def test_a_dropout_is_a_cloud_without_points():
 @pytest.mark.parametrize(("guess_pa", "is_best"), [(1e5, False), (1.5e5, True)])
 def test_a_search_that_ended_at_a_jump_of_the_loss_says_so(guess_pa, is_best):
     """Few points from a camera whose stated pose is far off have several minima."""
-    pose = moved(
-        np.array([0.15, -0.09, 0.06]), np.array([0.012, 0.006, -0.009])
-    )
+    pose = moved(np.array([0.15, -0.09, 0.06]), np.array([0.012, 0.006, -0.009]))
     image = image_m() + NOISE_M * np.random.default_rng(2).normal(size=SHAPE)
     depth = cs.Depth.of_images(
-        "front",
-        image,
-        cs.DepthCamera(MATRIX, pose=pose),
-        NOISE_M,
-        spacing_m=0.02,
+        "front", image, cs.DepthCamera(MATRIX, pose=pose), NOISE_M, spacing_m=0.02
     )
     unknown = TRUTH | {"young_pa": cs.Unknown(guess_pa)}
     run = cs.run(cs.Problem([hanging((depth,))], unknown), seek_causes=False)

@@ -26,12 +26,8 @@ def test_steps_are_those_of_linear_least_squares():
     weights = rng.uniform(size=(starts, points))
     prior = np.array([11.0, 11.0, 1e6, 50.0, 50.0, 50.0])
     errors = 0.01 * rng.normal(size=(starts, 6))
-    matched = _MatchedSurface(
-        arms_m, distances_m, is_facing=np.ones((starts, points), dtype=bool)
-    )
-    steps = _alignment_steps(
-        matched, normals, weights=weights, prior=prior, errors=errors
-    )
+    matched = _MatchedSurface(arms_m, distances_m, is_facing=np.ones((starts, points), dtype=bool))
+    steps = _alignment_steps(matched, normals, weights=weights, prior=prior, errors=errors)
     for k in range(starts):
         rows = []
         right = []
@@ -44,8 +40,7 @@ def test_steps_are_those_of_linear_least_squares():
             rows += [weight * normal @ by, *(SLIDING * weight * by)]
             right += [weight * normal @ away, *(SLIDING * weight * away)]
         expected = np.linalg.lstsq(
-            np.vstack([rows, np.diag(prior)]),
-            -np.concatenate([right, prior * errors[k]]),
+            np.vstack([rows, np.diag(prior)]), -np.concatenate([right, prior * errors[k]])
         )[0]
         np.testing.assert_allclose(steps[k], expected, rtol=1e-9, atol=1e-12)
 
@@ -91,14 +86,10 @@ def test_starts_do_not_influence_each_other():
         np.testing.assert_allclose(
             each.rotation.as_rotvec(), alone.rotation.as_rotvec(), atol=1e-12
         )
-        np.testing.assert_allclose(
-            each.translation_m, alone.translation_m, atol=1e-12
-        )
+        np.testing.assert_allclose(each.translation_m, alone.translation_m, atol=1e-12)
         assert abs(each.mismatch - alone.mismatch) < 1e-12
     # The cloud is the surface, moved: the alignment undoes that.
-    np.testing.assert_allclose(
-        together[0].rotation.as_rotvec(), [-0.05, 0.02, -0.03], atol=2e-3
-    )
+    np.testing.assert_allclose(together[0].rotation.as_rotvec(), [-0.05, 0.02, -0.03], atol=2e-3)
 
 
 def test_points_of_a_gridded_cloud_are_nearly_the_nearest():
@@ -109,8 +100,7 @@ def test_points_of_a_gridded_cloud_are_nearly_the_nearest():
     exact = camera_alignment.ExactCloud(points)
     places = rng.uniform(-0.3, 1.3, size=(40, 10, 3))
     distances = [
-        np.linalg.norm(points[cloud.nearest(places)] - places, axis=2)
-        for cloud in (gridded, exact)
+        np.linalg.norm(points[cloud.nearest(places)] - places, axis=2) for cloud in (gridded, exact)
     ]
     assert np.all(distances[0] <= distances[1] + 2 * np.sqrt(3) * cell)
     # Beyond the grid as well, there is a point.
@@ -127,9 +117,7 @@ def test_poses_that_hardly_differ_count_once():
     near = pose([0.1, 0.002, 0], [0, 0, 0.0105], 0.2)
     turned = pose([0.2, 0, 0], [0, 0, 0.01], 0.3)
     beside = pose([0.1, 0, 0], [0.005, 0, 0.01], 0.4)
-    kept = camera_alignment.distinct_poses(
-        [beside, near, turned, best], size_m=0.1, same_m=0.002
-    )
+    kept = camera_alignment.distinct_poses([beside, near, turned, best], size_m=0.1, same_m=0.002)
     assert kept == [best, turned, beside]
 
 
@@ -138,17 +126,12 @@ def displacement_m(rng: np.random.Generator) -> float:
     whose stated pose is off by some degrees and centimetres.
     """
     pose = moved(0.09 * rng.normal(size=3), 0.02 * rng.normal(size=3))
-    depth = cs.Depth.of_images(
-        "front", image_m(), cs.DepthCamera(MATRIX, pose=pose), 1e-4
-    )
+    depth = cs.Depth.of_images("front", image_m(), cs.DepthCamera(MATRIX, pose=pose), 1e-4)
     experiment = hanging((depth,))
     nuisance = NuisanceMap.from_experiment(experiment)
     camera = DepthCameraModel.from_experiment(experiment, 0, nuisance=nuisance)
     turn, shift_m = camera_alignment.align_camera(
-        camera,
-        VisibleSurface.from_body(experiment.body, depth),
-        x=hanging_m(),
-        image=0,
+        camera, VisibleSurface.from_body(experiment.body, depth), x=hanging_m(), image=0
     )
     phi = camera.with_pose(np.zeros(nuisance.size), turn, shift_m=shift_m)
     points_m = depth.points_m[0]

@@ -22,37 +22,27 @@ SAMPLES, SEEN = 15, [2, 5, 8, 11, 14]
 
 def swung(depth: cs.Depth) -> cs.Experiment:
     t_s = times(SAMPLES)
-    held = cs.Grasp(
-        np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), smooth_poses(t_s)
-    )
+    held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), smooth_poses(t_s))
     kept = cs.Nuisance.none(depth_bias_m=0.005)
-    return cs.Experiment(
-        bar(), t_s, [held], name="swing", depths=[depth], nuisance=kept
-    )
+    return cs.Experiment(bar(), t_s, [held], name="swing", depths=[depth], nuisance=kept)
 
 
 @cache
 def problem() -> cs.Problem:
     camera, at_s = cs.DepthCamera(MATRIX, pose=POSE), times(SAMPLES)[SEEN]
     blind = cs.Depth("none", at_s, [np.zeros((1, 3))] * len(at_s), 1e-3)
-    x, skin = (
-        cs.simulate(swung(blind), MADE).positions_m,
-        VisibleSurface.from_body(bar(), blind),
-    )
+    x, skin = (cs.simulate(swung(blind), MADE).positions_m, VisibleSurface.from_body(bar(), blind))
     images_m = [
         cs.depth_image(
             camera,
             SHAPE,
-            (skin.subdivided_triangles(x[k][skin.nodes], 2) - POSE[:3, 3])
-            @ POSE[:3, :3],
+            (skin.subdivided_triangles(x[k][skin.nodes], 2) - POSE[:3, 3]) @ POSE[:3, :3],
         )
         for k in SEEN
     ]
     noise = NOISE_M * np.random.default_rng(0).normal(size=np.shape(images_m))
     seen = images_m + noise
-    depth = cs.Depth.of_images(
-        "front", seen, camera, NOISE_M, at_s, spacing_m=0.008
-    )
+    depth = cs.Depth.of_images("front", seen, camera, NOISE_M, at_s, spacing_m=0.008)
     unknown = {**MADE, "young_pa": cs.Unknown(2.9e5)}
     return cs.Problem([swung(depth)], unknown, substeps=1)
 
@@ -96,20 +86,11 @@ def test_first_samples_have_the_images_of_their_time():
     (whole,) = problem().experiments
     for count, samples, images in ((3, 9, 3), (12, 12, 4), (15, 15, 5)):
         part = first_samples(whole, count)
-        assert (len(part.t_s), len(part.depths[0].sample_times_s)) == (
-            samples,
-            images,
-        )
+        assert (len(part.t_s), len(part.depths[0].sample_times_s)) == (samples, images)
 
 
 def test_images_that_are_held_out_are_not_fitted():
     known, start_s = reserve_test_data(problem(), "swing")
     (whole,), (left,) = problem().experiments, known.experiments
-    np.testing.assert_array_equal(
-        left.depths[0].sample_times_s, times(SAMPLES)[[2, 5, 8]]
-    )
-    assert (
-        left.depths[0].sample_times_s[-1]
-        <= start_s
-        < whole.depths[0].sample_times_s[3]
-    )
+    np.testing.assert_array_equal(left.depths[0].sample_times_s, times(SAMPLES)[[2, 5, 8]])
+    assert left.depths[0].sample_times_s[-1] <= start_s < whole.depths[0].sample_times_s[3]

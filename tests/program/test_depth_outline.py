@@ -7,36 +7,21 @@ from functools import cache
 
 import numpy as np
 import pytest
-from kit.depth import (
-    MATRIX,
-    NOISE_M,
-    POSE,
-    PROBLEM,
-    SHAPE,
-    TRUTH,
-    bar,
-    hanging,
-    image_m,
-)
+from kit.depth import MATRIX, NOISE_M, POSE, PROBLEM, SHAPE, TRUTH, bar, hanging, image_m
 from kit.problem_files import run_command
 from PIL import Image
 from scipy.ndimage import binary_erosion
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.features.camera_feature import (
-    camera_pose_concerns,
-    outline_concerns,
-)
+from collocation_sysid.features.camera_feature import camera_pose_concerns, outline_concerns
 from collocation_sysid.methods.stiffness_scan import other_starts
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
 from collocation_sysid.program.depth.depth_outline import no_depth_is_empty
 from collocation_sysid.program.depth.outline_residual import OutlineResidual
-from collocation_sysid.program.depth.surface_correspondences import (
-    SurfaceCorrespondences,
-)
+from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.recording.depth_camera import (
     MOST_OUTLINE_IMAGES,
@@ -45,16 +30,12 @@ from collocation_sysid.recording.depth_camera import (
 )
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
 
-UNKNOWN = cs.Nuisance.none(
-    depth_turn_rad=0.09, depth_shift_m=0.02, depth_edge_px=1.0
-)
+UNKNOWN = cs.Nuisance.none(depth_turn_rad=0.09, depth_shift_m=0.02, depth_edge_px=1.0)
 CAMERA = cs.DepthCamera(MATRIX, pose=POSE)
 
 
 def seen_by(image: np.ndarray, **options) -> cs.Experiment:
-    depth = cs.Depth.of_images(
-        "front", image, CAMERA, NOISE_M, spacing_m=0.004, **options
-    )
+    depth = cs.Depth.of_images("front", image, CAMERA, NOISE_M, spacing_m=0.004, **options)
     return hanging((depth,), nuisance=UNKNOWN)
 
 
@@ -62,9 +43,7 @@ def seen_by(image: np.ndarray, **options) -> cs.Experiment:
 def surface_m(young_pa: float) -> np.ndarray:
     """Positions of the surface's nodes of the hanging bar."""
     nothing = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
-    x = cs.simulate(
-        hanging((nothing,)), {**TRUTH, "young_pa": young_pa}
-    ).positions_m[0]
+    x = cs.simulate(hanging((nothing,)), {**TRUTH, "young_pa": young_pa}).positions_m[0]
     return x[VisibleSurface.from_body(bar(), nothing).nodes]
 
 
@@ -76,23 +55,19 @@ def sighting(
     nuisance = NuisanceMap.from_experiment(experiment)
     view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
     shapes_m = surface_m(young_pa)[None]
-    return SurfaceCorrespondences.from_shapes(
-        view, bar(), shapes_m, np.zeros(nuisance.size), 0.01
-    )
+    return SurfaceCorrespondences.from_shapes(view, bar(), shapes_m, np.zeros(nuisance.size), 0.01)
 
 
 def outside_px(found: SurfaceCorrespondences) -> np.ndarray:
     """How many pixels outline points are outside of their edges."""
     outline = found.outline
     shape_m = found.shapes_m[0]
-    points_m = np.einsum(
-        "ea,eai->ei", outline.weights[0], shape_m[outline.nodes[0]]
-    )
+    points_m = np.einsum("ea,eai->ei", outline.weights[0], shape_m[outline.nodes[0]])
     edges_m = outline.points[0] @ POSE[:3, :3].T + POSE[:3, 3]
     way_m = np.sum(outline.normals[0] * (points_m - edges_m), axis=1)
-    return (
-        way_m / np.where(outline.is_compared[0], outline.pixel_m[0], np.inf)
-    )[outline.is_compared[0]]
+    return (way_m / np.where(outline.is_compared[0], outline.pixel_m[0], np.inf))[
+        outline.is_compared[0]
+    ]
 
 
 def test_the_outline_of_the_true_shape_is_at_the_edges_in_the_image():
@@ -114,9 +89,7 @@ def test_noise_along_the_rays_does_not_choose_the_points_beside_a_crease():
         cloud_m = points_from_image(image_m(), CAMERA)
         rays = cloud_m / cloud_m[:, 2:]
         moved_m = cloud_m + sign * rays * noise_m.ravel()[: len(rays), None]
-        depth = cs.Depth(
-            "front", [0.0], [moved_m], NOISE_M, CAMERA, spacing_m=5e-4
-        )
+        depth = cs.Depth("front", [0.0], [moved_m], NOISE_M, CAMERA, spacing_m=5e-4)
         experiment = hanging((depth,), nuisance=UNKNOWN)
         nuisance = NuisanceMap.from_experiment(experiment)
         view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
@@ -183,9 +156,7 @@ def test_outlines_beyond_the_margin_of_the_image_are_no_evidence():
     nuisance = NuisanceMap.from_experiment(experiment)
     view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
     shapes_m = surface_m(TRUTH["young_pa"])[None]
-    found = SurfaceCorrespondences.from_shapes(
-        view, bar(), shapes_m, np.zeros(nuisance.size), 0.01
-    )
+    found = SurfaceCorrespondences.from_shapes(view, bar(), shapes_m, np.zeros(nuisance.size), 0.01)
     apart_px = outside_px(found)
     assert 20 < len(apart_px) < len(outside_px(sighting(image_m())))
     assert np.abs(apart_px).max() < 1.0
@@ -197,27 +168,17 @@ def test_slopes_of_outline_residuals_agree_with_differences():
     collocation: Collocation = cs.Problem(
         [experiment], cs.Parameters.from_mapping(unknown)
     ).collocation()
-    (segment,) = collocation.transcriptions
-    (reading,) = (
-        each for each in segment.unlabelled if isinstance(each, OutlineResidual)
-    )
+    (transcription,) = collocation.transcriptions
+    (reading,) = (each for each in transcription.unlabelled if isinstance(each, OutlineResidual))
     rng = np.random.default_rng(0)
-    values = segment.body.nodes_m[reading.correspondences.surface.nodes][None]
-    phi = 0.1 * rng.normal(size=segment.nuisance.size)
+    values = transcription.body.nodes_m[reading.correspondences.surface.nodes][None]
+    phi = 0.1 * rng.normal(size=transcription.nuisance.size)
     by_values, by_phi = reading.loss_gradient(values, phi)
     way, turn = rng.normal(size=values.shape), rng.normal(size=len(phi))
     step = 1e-7
     for by, here, there in (
-        (
-            np.sum(by_values * way),
-            (values + step * way, phi),
-            (values - step * way, phi),
-        ),
-        (
-            by_phi @ turn,
-            (values, phi + step * turn),
-            (values, phi - step * turn),
-        ),
+        (np.sum(by_values * way), (values + step * way, phi), (values - step * way, phi)),
+        (by_phi @ turn, (values, phi + step * turn), (values, phi - step * turn)),
     ):
         difference = (reading.loss(*here) - reading.loss(*there)) / (2 * step)
         assert by == pytest.approx(difference, rel=1e-5)
@@ -225,46 +186,32 @@ def test_slopes_of_outline_residuals_agree_with_differences():
 
 
 @pytest.mark.long
-def test_silhouettes_that_are_smaller_all_around_do_not_make_the_body_stiffer(
-    rng,
-):
+def test_silhouettes_that_are_smaller_all_around_do_not_make_the_body_stiffer(rng):
     """As those of sensors that lose depths at the edges of things."""
     image = image_m() + NOISE_M * rng.normal(size=SHAPE)
     image[~binary_erosion(np.isfinite(image_m()), iterations=2)] = np.nan
     unknown = {**TRUTH, "young_pa": cs.Unknown(1.2 * TRUTH["young_pa"])}
-    solution = cs.solve(
-        cs.Problem([seen_by(image)], cs.Parameters.from_mapping(unknown))
-    )
+    solution = cs.solve(cs.Problem([seen_by(image)], cs.Parameters.from_mapping(unknown)))
     (part,) = solution.parts
     (edge_px,) = part.phi[
-        [e.row.name == "depth_edge_px" for e in part.segment.nuisance.entries]
+        [e.row.name == "depth_edge_px" for e in part.transcription.nuisance.entries]
     ]
     assert 1.0 < edge_px < 2.5
-    assert solution.parameters["young_pa"] == pytest.approx(
-        TRUTH["young_pa"], rel=0.08
-    )
+    assert solution.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=0.08)
 
 
 @pytest.mark.long
-def test_missing_depths_at_the_free_end_that_count_as_evidence_ask_for_a_check(
-    rng,
-):
+def test_missing_depths_at_the_free_end_that_count_as_evidence_ask_for_a_check(rng):
     """A dark end gives no depth: taken for the end of the body it is contradicted by the rest."""
     image = image_m() + NOISE_M * rng.normal(size=SHAPE)
     columns = np.flatnonzero(np.isfinite(image).any(axis=0))
     image[:, columns[-20] :] = np.nan
     unknown = {**TRUTH, "young_pa": cs.Unknown(1.2 * TRUTH["young_pa"])}
-    problem = cs.Problem(
-        [seen_by(image, background="empty")],
-        cs.Parameters.from_mapping(unknown),
-    )
+    problem = cs.Problem([seen_by(image, background="empty")], cs.Parameters.from_mapping(unknown))
     answer = cs.run(problem, seek_causes=False)
     assert answer.trust.verdict != "good"
     assert any("model's outline" in reason for reason in answer.trust.reasons)
-    known = cs.Problem(
-        [seen_by(image, background="unknown")],
-        cs.Parameters.from_mapping(unknown),
-    )
+    known = cs.Problem([seen_by(image, background="unknown")], cs.Parameters.from_mapping(unknown))
     found = cs.solve(known).parameters["young_pa"]
     assert found == pytest.approx(TRUTH["young_pa"], rel=0.2)
 
@@ -292,12 +239,8 @@ def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
     solution = cs.solve(soft_problem(0))
     known = cs.solve(soft_problem(0, SOFT_TRUTH["young_pa"]))
     assert robust_loss(solution) < robust_loss(known) + SAME_LOSS
-    assert solution.parameters["young_pa"] == pytest.approx(
-        SOFT_TRUTH["young_pa"], rel=0.2
-    )
-    (said,) = (
-        note for note in solution.notes if "initial values of the scan" in note
-    )
+    assert solution.parameters["young_pa"] == pytest.approx(SOFT_TRUTH["young_pa"], rel=0.2)
+    (said,) = (note for note in solution.notes if "initial values of the scan" in note)
     assert "were solved to the end" in said
     assert solution.scan is not None
 
@@ -311,9 +254,7 @@ def test_points_left_out_beside_creases_do_not_end_the_search():
     above = cs.solve(soft_problem(1, 3.5e4))
     below = cs.solve(soft_problem(1, 1.8e4))
     assert robust_loss(above) == pytest.approx(robust_loss(below), abs=2.0)
-    assert above.parameters["young_pa"] == pytest.approx(
-        below.parameters["young_pa"], rel=0.02
-    )
+    assert above.parameters["young_pa"] == pytest.approx(below.parameters["young_pa"], rel=0.02)
 
 
 def test_a_camera_more_than_two_deviations_off_asks_for_a_check():
@@ -328,9 +269,7 @@ def test_the_lens_projects_points_to_the_pixels_of_their_rays():
     camera = cs.DepthCamera(MATRIX, distortion=[0.1, -0.02, 1e-3, 2e-3, 0.01])
     pixels = np.array([[20.0, 100.0], [80.0, 60.0], [150.0, 5.0]])
     np.testing.assert_allclose(
-        camera.distorted_pixels(0.4 * camera.points_at_unit_depth(pixels)),
-        pixels,
-        atol=1e-5,
+        camera.distorted_pixels(0.4 * camera.points_at_unit_depth(pixels)), pixels, atol=1e-5
     )
 
 
@@ -344,12 +283,9 @@ def test_only_some_images_of_a_long_recording_are_kept():
 @pytest.mark.parametrize("factor", [1000.0, 0.001, 10.0, 0.1])
 def test_depth_in_a_wrong_unit_is_refused_with_the_power_of_ten(factor):
     camera = cs.DepthCamera(MATRIX, pose=POSE)
-    depth = cs.Depth.of_images(
-        "front", factor * image_m(), camera, NOISE_M, spacing_m=0.004
-    )
+    depth = cs.Depth.of_images("front", factor * image_m(), camera, NOISE_M, spacing_m=0.004)
     problem = cs.Problem(
-        [hanging((depth,))],
-        cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown()}),
+        [hanging((depth,))], cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown()})
     )
     with pytest.raises(InputError, match=f"multiply count_m by {1 / factor:g}"):
         cs.solve(problem)
@@ -358,9 +294,7 @@ def test_depth_in_a_wrong_unit_is_refused_with_the_power_of_ten(factor):
 @pytest.mark.long
 def test_a_wrong_count_m_of_a_png_ends_with_one_message(tmp_path):
     bar().mesh.write(tmp_path / "bar.vtu")
-    counts = np.nan_to_num(1e4 * image_m()).astype(
-        np.uint16
-    )  # tenths of a millimetre
+    counts = np.nan_to_num(1e4 * image_m()).astype(np.uint16)  # tenths of a millimetre
     Image.fromarray(counts).save(tmp_path / "front.png")
     camera = f"[experiment.depth.camera]\nmatrix = {MATRIX}\npose = {POSE.tolist()}\n"
     file = tmp_path / "problem.toml"
@@ -371,10 +305,6 @@ def test_a_wrong_count_m_of_a_png_ends_with_one_message(tmp_path):
     checked = run_command("check", file, "--out", tmp_path / "seen")
     assert checked.code == 1
     assert "0.1 times as far away" in " ".join(checked.out.split())
-    file.write_text(
-        file.read_text().replace("sigma_m =", "count_m = 1e-4\nsigma_m =")
-    )
+    file.write_text(file.read_text().replace("sigma_m =", "count_m = 1e-4\nsigma_m ="))
     (experiment,) = cs.Problem.read(file).experiments
-    assert np.nanmedian(experiment.depths[0].images_m[0]) == pytest.approx(
-        0.34, abs=0.05
-    )
+    assert np.nanmedian(experiment.depths[0].images_m[0]) == pytest.approx(0.34, abs=0.05)

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from collocation_sysid.program.linear_algebra.sparse_assembly import (
-    SparseAssembly,
-)
+from collocation_sysid.program.linear_algebra.sparse_assembly import SparseAssembly
 
 SHAPE = (5, 7)
 
@@ -25,17 +23,9 @@ def group(rng, columns: range, count: int) -> tuple[np.ndarray, np.ndarray]:
 def test_values_of_all_groups_add_up_where_their_entries_are(rng, columns):
     smaller = sp.csc_array(sp.random_array((5, 4), density=0.5, rng=rng))
     smaller.sort_indices()
-    groups = [
-        group(rng, columns, 6),
-        group(rng, columns, 9),
-        group(rng, columns, 0),
-    ]
-    found = SparseAssembly.from_groups(
-        (smaller.indptr, smaller.indices), SHAPE, groups
-    )
-    values, own = found.allocate(
-        np.full(len(found.indices), np.nan), smaller.nnz
-    )
+    groups = [group(rng, columns, 6), group(rng, columns, 9), group(rng, columns, 0)]
+    found = SparseAssembly.from_groups((smaller.indptr, smaller.indices), SHAPE, groups)
+    values, own = found.allocate(np.full(len(found.indices), np.nan), smaller.nnz)
     own[:] = smaller.data
     further = [rng.normal(size=len(rows)) for rows, _ in groups]
     found.assemble(values, own, further)
@@ -46,28 +36,21 @@ def test_values_of_all_groups_add_up_where_their_entries_are(rng, columns):
     for (rows, places), more in zip(groups, further, strict=True):
         expected[rows, places] += more
     np.testing.assert_array_equal(whole.toarray(), expected)
-    untouched = SparseAssembly.from_groups(
-        (smaller.indptr, smaller.indices), SHAPE, []
-    )
+    untouched = SparseAssembly.from_groups((smaller.indptr, smaller.indices), SHAPE, [])
     np.testing.assert_array_equal(untouched.indices, smaller.indices)
 
 
-def test_the_values_of_a_matrix_are_written_in_place_where_nothing_comes_between(
-    rng,
-):
+def test_the_values_of_a_matrix_are_written_in_place_where_nothing_comes_between(rng):
     smaller = sp.csc_array(np.triu(np.ones((4, 4))))
     after = SparseAssembly.from_groups(
         (smaller.indptr, smaller.indices), SHAPE, [group(rng, range(4, 7), 5)]
     )
     between = SparseAssembly.from_groups(
-        (smaller.indptr, smaller.indices),
-        SHAPE,
-        [(np.array([4]), np.array([0]))],
+        (smaller.indptr, smaller.indices), SHAPE, [(np.array([4]), np.array([0]))]
     )
     for entries, in_place in ((after, True), (between, False)):
         values, own = entries.allocate(None, smaller.nnz)
         assert np.shares_memory(values, own) == in_place
         np.testing.assert_array_equal(
-            entries.indices[entries.positions_of(np.arange(smaller.nnz))],
-            smaller.indices,
+            entries.indices[entries.positions_of(np.arange(smaller.nnz))], smaller.indices
         )

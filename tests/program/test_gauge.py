@@ -9,22 +9,10 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from kit.problem_files import (
-    AT_TRUTH,
-    replace_text,
-    run_command,
-    settings,
-    write,
-)
+from kit.problem_files import AT_TRUTH, replace_text, run_command, settings, write
 from kit.problem_files import TRUTH as TINY_TRUTH
 from kit.problems import GUESS, IDEAL, TRUTH, hung_cube
-from kit.sensors import (
-    CLAMPED,
-    accelerometer,
-    instrumented,
-    noisy,
-    strain_gauge,
-)
+from kit.sensors import CLAMPED, accelerometer, instrumented, noisy, strain_gauge
 from kit.static import HANGING, block
 
 from collocation_sysid.errors import InputError
@@ -42,9 +30,7 @@ from collocation_sysid.recording import (
     PointQuantities,
     Wrench,
 )
-from collocation_sysid.result.pictures.album import (
-    experiment_pictures as album_pictures,
-)
+from collocation_sysid.result.pictures.album import experiment_pictures as album_pictures
 from collocation_sysid.result.pictures.over_time import sensor_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.solving import solve
@@ -65,12 +51,8 @@ def swung(steps: int = 24) -> Experiment:
     inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
     gauges = accelerometer(inner), strain_gauge(cube.t_s[::2])
     made = replace(cube, markers=Markers.none(cube.t_s), readings=gauges)
-    accelerations, strains = simulate(
-        made, TRUTH, "midpoint", substeps=1
-    ).custom_sensor_values
-    return with_readings(
-        made, [accelerations + np.array([0, 0, 0.3]), 1.04 * strains]
-    )
+    accelerations, strains = simulate(made, TRUTH, "midpoint", substeps=1).custom_sensor_values
+    return with_readings(made, [accelerations + np.array([0, 0, 0.3]), 1.04 * strains])
 
 
 def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
@@ -80,42 +62,28 @@ def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
     (found,) = simulate(
         instrumented(cube, at_top), TRUTH, "midpoint", substeps=1
     ).custom_sensor_values
-    carried = cube.grasps[0].positions_at(
-        cube.body.nodes_m, np.linspace(0, cube.t_s[-1], 2001)
-    )[:, 0]
-    expected = (
-        np.gradient(np.gradient(carried, axis=0), axis=0)[::100]
-        / (cube.t_s[-1] / 2000) ** 2
-    )
+    carried = cube.grasps[0].positions_at(cube.body.nodes_m, np.linspace(0, cube.t_s[-1], 2001))[
+        :, 0
+    ]
+    expected = np.gradient(np.gradient(carried, axis=0), axis=0)[::100] / (cube.t_s[-1] / 2000) ** 2
     inside = slice(3, -3)
     error = np.abs(found - expected - [0, 0, 9.81])[inside].max()
     assert error < 0.05 * np.abs(expected[inside]).max()
 
 
-@pytest.mark.parametrize(
-    "method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name
-)
+@pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)
 def test_the_truth_is_found_from_an_accelerometer_and_a_foil_alone(method):
     solution = method(Collocation([swung()], GUESS))
     (part,) = solution.collocation.iterates(solution.z)
-    found = part.phi * part.segment.nuisance.scales
+    found = part.phi * part.transcription.nuisance.scales
     np.testing.assert_allclose(found, [0.3, 0.04], atol=0.02)
-    full = part.segment.nuisance.names[0]
-    for name in (
-        "bias_m_s2",
-        full,
-        full.partition(": ")[2],
-        "bias of accelerometer",
-    ):
+    full = part.transcription.nuisance.names[0]
+    for name in ("bias_m_s2", full, full.partition(": ")[2], "bias of accelerometer"):
         assert solution.nuisance(name) == found[0]
     assert solution.nuisance("scale") == found[1]
-    with pytest.raises(
-        InputError, match="'reading' is ambiguous; expected one of"
-    ):
+    with pytest.raises(InputError, match="'reading' is ambiguous; expected one of"):
         solution.nuisance("reading")
-    with pytest.raises(
-        InputError, match="no nuisance parameter 'gain'; expected one of"
-    ):
+    with pytest.raises(InputError, match="no nuisance parameter 'gain'; expected one of"):
         solution.nuisance("gain")
     for name in ("lambda_pa", "mu_pa"):
         assert solution.parameters[name] == pytest.approx(TRUTH[name], rel=0.05)
@@ -149,44 +117,23 @@ def test_error_bars_and_verdict_know_them():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (
-            {"sigma": 0.0},
-            "sigma of the reading 'accelerometer' is 0; expected a number above 0",
-        ),
-        (
-            {"unknowns": {"bias_m_s2": -1.0}},
-            "bias_m_s2 of the reading 'accelerometer' is -1",
-        ),
+        ({"sigma": 0.0}, "sigma of the reading 'accelerometer' is 0; expected a number above 0"),
+        ({"unknowns": {"bias_m_s2": -1.0}}, "bias_m_s2 of the reading 'accelerometer' is -1"),
         ({"points_m": [[0.0, 0.0]]}, "points_m of the reading 'accelerometer'"),
-        (
-            {"values": np.full((9, 3), np.nan)},
-            "all values of the reading .* are missing",
-        ),
+        ({"values": np.full((9, 3), np.nan)}, "all values of the reading .* are missing"),
         ({"t_s": np.zeros(9)}, "of the reading 'accelerometer'"),
         ({"values": np.zeros((9, 2))}, "gives 3 numbers; expected 2"),
-        (
-            {"expression": lambda at: at.position_m},
-            "cannot be evaluated .*bias_m_s2",
-        ),
+        ({"expression": lambda at: at.position_m}, "cannot be evaluated .*bias_m_s2"),
         (
             {"expression": pull, "unknowns": {"gain": 1.0}},
             "with the attributes t_s, position_m, velocity_m_s",
         ),
-        (
-            {"expression": speed, "unknowns": {}, "values": np.zeros(9)},
-            "not finite for .* at rest",
-        ),
+        ({"expression": speed, "unknowns": {}, "values": np.zeros(9)}, "not finite for .* at rest"),
         ({"grasp": 0}, "has both points_m and grasp"),
-        (
-            {"expression": lambda at, bias_m_s2: None},
-            "the function returns None",
-        ),
+        ({"expression": lambda at, bias_m_s2: None}, "the function returns None"),
         ({"unknowns": None}, r"of its unknowns \(none\)"),
         ({"points_m": ()}, "has neither points_m nor grasp"),
-        (
-            {"sigma": "1e-3"},
-            "sigma of the reading 'accelerometer' is '1e-3'; expected a number",
-        ),
+        ({"sigma": "1e-3"}, "sigma of the reading 'accelerometer' is '1e-3'; expected a number"),
         (
             {"frame": "hand"},
             "frame of the reading 'accelerometer' is 'hand'; expected one of world",
@@ -204,8 +151,7 @@ def test_a_grasp_has_a_number_from_one_on():
     last = replace(accelerometer(cube.t_s), points_m=(), grasp=1, **CLAMPED)
     assert instrumented(cube, last).find_instrumented_grasps() == (0,)
     with pytest.raises(
-        InputError,
-        match="refers to grasp 0; expected the number of a grasp, 1 to 1",
+        InputError, match="refers to grasp 0; expected the number of a grasp, 1 to 1"
     ):
         instrumented(cube, replace(last, grasp=0))
 
@@ -216,14 +162,12 @@ def test_a_reading_of_another_time_or_place_is_refused():
         instrumented(cube, accelerometer(cube.t_s + 100))
     nobody = replace(accelerometer(cube.t_s), points_m=(), grasp=2, **CLAMPED)
     with pytest.raises(
-        InputError,
-        match="refers to grasp 2; expected the number of a grasp, 1 to 1",
+        InputError, match="refers to grasp 2; expected the number of a grasp, 1 to 1"
     ):
         instrumented(cube, nobody)
     far = instrumented(cube, accelerometer(cube.t_s, points_m=[[1.0, 0, 0]]))
     with pytest.raises(
-        InputError,
-        match=r"point 1 of the reading 'accelerometer' at .*expected points_m on",
+        InputError, match=r"point 1 of the reading 'accelerometer' at .*expected points_m on"
     ):
         simulate(far, TRUTH, "midpoint", substeps=1)
 
@@ -248,9 +192,7 @@ def test_a_sensor_without_values_is_simulated_but_not_fitted():
 def test_the_number_of_values_is_that_of_the_sensors():
     cube = hung_cube(9)
     made = instrumented(cube, accelerometer(cube.t_s))
-    with pytest.raises(
-        InputError, match=r"are 9 arrays; expected a list .*: accelerometer"
-    ):
+    with pytest.raises(InputError, match=r"are 9 arrays; expected a list .*: accelerometer"):
         with_readings(made, np.zeros((9, 3)))
 
 
@@ -261,23 +203,9 @@ def clamped(steps: int = 16) -> Experiment:
     """The cube in a hand, a load cell of one axis in it and a foil on the cube; nothing sees it."""
     cube = replace(hung_cube(steps), nuisance=IDEAL)
     inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
-    cell = Gauge(
-        "cell",
-        pull,
-        inner,
-        np.zeros(len(inner)),
-        1e-3,
-        unknowns={"gain": 0.1},
-        grasp=1,
-    )
-    made = replace(
-        cube,
-        markers=Markers.none(cube.t_s),
-        readings=[cell, strain_gauge(cube.t_s)],
-    )
-    felt, strains = simulate(
-        made, TRUTH, "midpoint", substeps=1
-    ).custom_sensor_values
+    cell = Gauge("cell", pull, inner, np.zeros(len(inner)), 1e-3, unknowns={"gain": 0.1}, grasp=1)
+    made = replace(cube, markers=Markers.none(cube.t_s), readings=[cell, strain_gauge(cube.t_s)])
+    felt, strains = simulate(made, TRUTH, "midpoint", substeps=1).custom_sensor_values
     return with_readings(made, [1.05 * felt, 1.04 * strains])
 
 
@@ -295,30 +223,19 @@ def test_a_load_cell_in_the_clamp_reads_what_a_sensor_there_does():
             grasp=1,
             frame=frame,
         )
-        made = replace(
-            cube, grasps=[replace(grasp, wrench=wrench)], readings=[both]
-        )
+        made = replace(cube, grasps=[replace(grasp, wrench=wrench)], readings=[both])
         found = simulate(made, TRUTH, "midpoint", substeps=20)
-        there = np.isfinite(found.wrenches[0]) & np.isfinite(
-            found.custom_sensor_values[0]
-        )
+        there = np.isfinite(found.wrenches[0]) & np.isfinite(found.custom_sensor_values[0])
         assert there.any(axis=0).all()
         size = np.nanmax(np.abs(found.wrenches[0]))
-        assert (
-            np.abs(found.wrenches[0] - found.custom_sensor_values[0])[
-                there
-            ].max()
-            < 1e-4 * size
-        )
+        assert np.abs(found.wrenches[0] - found.custom_sensor_values[0])[there].max() < 1e-4 * size
 
 
-@pytest.mark.parametrize(
-    "method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name
-)
+@pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)
 def test_the_truth_is_found_from_a_load_cell_and_a_foil_alone(method):
     solution = method(Collocation([clamped()], GUESS))
     (part,) = solution.collocation.iterates(solution.z)
-    found = part.phi * part.segment.nuisance.scales
+    found = part.phi * part.transcription.nuisance.scales
     np.testing.assert_allclose(found, [0.05, 0.04], atol=2e-3)
     for name in ("lambda_pa", "mu_pa"):
         assert solution.parameters[name] == pytest.approx(TRUTH[name], rel=0.02)
@@ -363,52 +280,27 @@ def worn(tiny: Path) -> Path:
     """The tiny bar with a chip in it and a load cell in its clamp, without markers."""
     write("mine.py", MINE)(tiny)
     text = (tiny / "problem.toml").read_text()
-    (tiny / "problem.toml").write_text(
-        text.partition("\n[experiment.markers]")[0] + READINGS
-    )
-    truth = settings(
-        *AT_TRUTH, "transcription.substeps=1"
-    )  # the step that it is solved with
-    done = run_command(
-        "simulate",
-        *ALLOWED,
-        *truth,
-        "--integrator",
-        "midpoint",
-        "--out",
-        "data",
-    )
+    (tiny / "problem.toml").write_text(text.partition("\n[experiment.markers]")[0] + READINGS)
+    truth = settings(*AT_TRUTH, "transcription.substeps=1")  # the step that it is solved with
+    done = run_command("simulate", *ALLOWED, *truth, "--integrator", "midpoint", "--out", "data")
     assert done.code == 0, done.err
     return tiny
 
 
 def test_readings_in_a_file_are_simulated_and_identified_from(worn: Path):
-    head = (
-        (worn / "data" / "swing_reading_cell.csv").read_text().splitlines()[0]
-    )
+    head = (worn / "data" / "swing_reading_cell.csv").read_text().splitlines()[0]
     assert head == "t_s,pull_n"
-    done = run_command(
-        "solve", *ALLOWED, "--out", "found", "--method", "reduced-space"
-    )
+    done = run_command("solve", *ALLOWED, "--out", "found", "--method", "reduced-space")
     assert done.code == 0, done.err
     result = json.loads((worn / "found" / "result.json").read_text())
     for name, value in TINY_TRUTH.items():
-        assert result["parameters"][name]["value"] == pytest.approx(
-            value, rel=0.05
-        )
-    assert (
-        abs(result["nuisance"]["swing"]["bias of chip [m/s²]"]["value"]) < 0.02
-    )
+        assert result["parameters"][name]["value"] == pytest.approx(value, rel=0.05)
+    assert abs(result["nuisance"]["swing"]["bias of chip [m/s²]"]["value"]) < 0.02
     sizes = result["fit"]["experiments"]["swing"]["reading_rms"]
     assert sizes.keys() == {"chip", "cell"}
-    assert (
-        f"chip of 'swing': {sizes['chip']:.2g} m/s² RMS (sigma 0.02 m/s²)"
-        in done.out
-    )
+    assert f"chip of 'swing': {sizes['chip']:.2g} m/s² RMS (sigma 0.02 m/s²)" in done.out
     assert f"cell of 'swing': {sizes['cell']:.2g} RMS (sigma 0.001)" in done.out
-    assert "nuisance parameters of 'swing': bias of chip" in " ".join(
-        done.out.split()
-    )
+    assert "nuisance parameters of 'swing': bias of chip" in " ".join(done.out.split())
     with np.load(worn / "found" / "trajectory.npz") as arrays:
         drawn = (
             sensor_picture(arrays["reading_chip"], "xyz"),
@@ -436,35 +328,21 @@ def blank_cell(folder: Path) -> None:
             replace_text('"pull"', '"pul"'),
             "no function 'pul'; expected one of specific_force, pull",
         ),
-        (
-            replace_text("bias_m_s2 = 0.5", "bias = 0.5"),
-            "reading.0: the reading 'chip' cannot be",
-        ),
-        (
-            replace_text("at.force_n[0]", "at.force_n", "mine.py"),
-            "gives 3 numbers; expected 1",
-        ),
+        (replace_text("bias_m_s2 = 0.5", "bias = 0.5"), "reading.0: the reading 'chip' cannot be"),
+        (replace_text("at.force_n[0]", "at.force_n", "mine.py"), "gives 3 numbers; expected 1"),
         (
             replace_text("grasp = 1", "grasp = 2"),
             "reading.1.grasp: found 2; expected the number of a grasp, 1 to 1",
         ),
         (replace_text("grasp = 1\n", ""), "has neither points_m nor grasp"),
         (replace_text('"cell"', '"chip"'), "two readings are called 'chip'"),
-        (
-            replace_text('"pull_n"', '"pull"'),
-            "swing_reading_cell.csv: line 1: there is no column",
-        ),
+        (replace_text('"pull_n"', '"pull"'), "swing_reading_cell.csv: line 1: there is no column"),
         (replace_text("ing_cell.csv", "ing_sell.csv"), "reading.1.file: "),
-        (
-            replace_text("points_m = [[0.03,", "points_m = [[0.9,"),
-            "point 1 of the reading 'chip'",
-        ),
+        (replace_text("points_m = [[0.03,", "points_m = [[0.9,"), "point 1 of the reading 'chip'"),
         (blank_cell, "swing_reading_cell.csv: line 2: column pull_n holds"),
     ],
 )
-def test_what_is_no_reading_in_a_file_is_one_message(
-    worn: Path, edit, words: str
-):
+def test_what_is_no_reading_in_a_file_is_one_message(worn: Path, edit, words: str):
     edit(worn)
     done = run_command("check", *ALLOWED)
     assert done.code == 2

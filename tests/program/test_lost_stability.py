@@ -43,10 +43,7 @@ def compressed(
     grasps = [
         cs.Grasp(face(0, 0.0), fixed, axes=axes),
         cs.Grasp(
-            face(0, size_m[0]),
-            ends,
-            axes=axes,
-            wrench=cs.Wrench(t_s, np.zeros((15, 3)), 1.0),
+            face(0, size_m[0]), ends, axes=axes, wrench=cs.Wrench(t_s, np.zeros((15, 3)), 1.0)
         ),
         cs.Grasp(face(1, 0.0), fixed, axes="y"),
         cs.Grasp(face(1, size_m[1]), fixed, axes="y"),
@@ -54,19 +51,12 @@ def compressed(
     if not slender:
         grasps.append(cs.Grasp(face(2, 0.0), fixed, axes="z"))
     return cs.Experiment(
-        body,
-        t_s,
-        grasps,
-        kind="static",
-        gravity_m_s2=(0.0, 0.0, 0.0),
-        nuisance=cs.Nuisance.none(),
+        body, t_s, grasps, kind="static", gravity_m_s2=(0.0, 0.0, 0.0), nuisance=cs.Nuisance.none()
     )
 
 
 @cache
-def failure(
-    divisions: tuple[int, int, int], size_m: tuple[float, float, float]
-) -> SimulationError:
+def failure(divisions: tuple[int, int, int], size_m: tuple[float, float, float]) -> SimulationError:
     with pytest.raises(SimulationError) as failed:
         cs.simulate(compressed(divisions, size_m), LAW)
     return failed.value
@@ -137,9 +127,7 @@ def test_critical_stretches_are_biots(stretch, across, critical):
 
 @pytest.mark.long
 def test_a_picture_shows_the_mode():
-    from collocation_sysid.result.pictures.instability import (
-        instability_picture,
-    )
+    from collocation_sysid.result.pictures.instability import instability_picture
 
     figure = instability_picture(failure((8, 1, 6), SIZE_M).stability_loss)
     assert "wavelength" in figure.axes[0].texts[0].get_text()

@@ -34,9 +34,7 @@ KINDS = {
 def collocation(request: pytest.FixtureRequest) -> Collocation:
     kind, scheme = request.param
     name, changes = KINDS[kind]
-    return Collocation(
-        [remembering(name, 5, 2, **changes)], guesses(TWO, 1.1), scheme
-    )
+    return Collocation([remembering(name, 5, 2, **changes)], guesses(TWO, 1.1), scheme)
 
 
 def some_parameters(collocation: Collocation) -> np.ndarray:
@@ -46,93 +44,77 @@ def some_parameters(collocation: Collocation) -> np.ndarray:
 
 def marched(collocation: Collocation, p: np.ndarray) -> ExperimentIterate:
     """The experiment simulated at p."""
-    (segment,) = collocation.transcriptions
-    (part,) = collocation.iterates_at(p, [np.zeros((0, segment.dof_count))])
-    x = simulate_scheme(segment.experiment, part.equations.dynamics)
-    return ExperimentIterate(segment, part.q, part.phi, x)
+    (transcription,) = collocation.transcriptions
+    (part,) = collocation.iterates_at(p, [np.zeros((0, transcription.dof_count))])
+    x = simulate_scheme(transcription.experiment, part.equations.dynamics)
+    return ExperimentIterate(transcription, part.q, part.phi, x)
 
 
 def disturbed(part: ExperimentIterate, size_m: float = 1e-4) -> np.ndarray:
     """Positions that do not satisfy the equations of motion."""
-    segment = part.segment
+    transcription = part.transcription
     change = np.zeros_like(part.x)
-    free = (len(part.x), len(segment.free_dofs))
-    change[:, segment.free_dofs] = np.random.default_rng(0).standard_normal(
-        free
-    )
-    first = segment.dynamics.first_row
+    free = (len(part.x), len(transcription.free_dofs))
+    change[:, transcription.free_dofs] = np.random.default_rng(0).standard_normal(free)
+    first = transcription.dynamics.first_row
     x = part.x.copy()
-    x[first:] += (
-        size_m * segment.dynamics.zero_prescribed_forces(change)[first:]
-    )
+    x[first:] += size_m * transcription.dynamics.zero_prescribed_forces(change)[first:]
     return x
 
 
 def test_marched_trajectories_satisfy_the_equations(collocation: Collocation):
     part = marched(collocation, some_parameters(collocation))
-    assert (
-        np.abs(part.compute_residual_n()).max() < 1e-12 * part.segment.force_n
-    )
+    assert np.abs(part.compute_residual_n()).max() < 1e-12 * part.transcription.force_n
 
 
 @pytest.mark.long
 def test_sensitivities_are_those_of_simulations(collocation: Collocation):
     p = some_parameters(collocation)
     part = marched(collocation, p)
-    found = Sweep(part.segment).forward(part.x, part.equations).by_p
-    for k, place in enumerate(part.segment.dynamic_parameters):
+    found = Sweep(part.transcription).forward(part.x, part.equations).by_p
+    for k, place in enumerate(part.transcription.dynamic_parameters):
         expected = directional_derivative(
             lambda at: marched(collocation, at).x, p, np.eye(len(p))[place]
         )
         assert relative_error(found[:, :, k], expected) < 1e-6
-    rows = Sweep(part.segment).sensitivities(part.x, part.equations)
+    rows = Sweep(part.transcription).sensitivities(part.x, part.equations)
     np.testing.assert_array_equal(np.stack(list(rows)), found)
 
 
 def test_a_sweep_may_be_continued(collocation: Collocation):
     part = marched(collocation, some_parameters(collocation))
     x, setting = disturbed(part), part.equations
-    known = Sweep(part.segment, 3).forward(x[:3], setting)
-    continued = Sweep(part.segment).forward(x, setting, known)
-    whole = Sweep(part.segment).forward(x, setting)
-    np.testing.assert_allclose(
-        continued.by_p, whole.by_p, rtol=1e-12, atol=1e-15
-    )
-    np.testing.assert_allclose(
-        continued.step, whole.step, rtol=1e-12, atol=1e-15
-    )
+    known = Sweep(part.transcription, 3).forward(x[:3], setting)
+    continued = Sweep(part.transcription).forward(x, setting, known)
+    whole = Sweep(part.transcription).forward(x, setting)
+    np.testing.assert_allclose(continued.by_p, whole.by_p, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(continued.step, whole.step, rtol=1e-12, atol=1e-15)
 
 
-def test_the_feasibility_step_solves_the_linearised_equations(
-    collocation: Collocation,
-):
+def test_the_feasibility_step_solves_the_linearised_equations(collocation: Collocation):
     part = marched(collocation, some_parameters(collocation))
-    segment, setting, x = part.segment, part.equations, disturbed(part)
-    step = Sweep(segment).forward(x, setting).step
-    change = directional_derivative(
-        lambda at: segment.residual_n(at, setting), x, step
-    )
-    assert relative_error(change, -segment.residual_n(x, setting)) < 1e-9
+    transcription, setting, x = part.transcription, part.equations, disturbed(part)
+    step = Sweep(transcription).forward(x, setting).step
+    change = directional_derivative(lambda at: transcription.residual_n(at, setting), x, step)
+    assert relative_error(change, -transcription.residual_n(x, setting)) < 1e-9
 
 
 def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     part = marched(collocation, some_parameters(collocation))
-    segment, setting, x = part.segment, part.equations, disturbed(part)
+    transcription, setting, x = part.transcription, part.equations, disturbed(part)
     gradient = rng.standard_normal(x.shape)
-    y = Sweep(segment).backward(x, setting, gradient)
-    step = Sweep(segment).forward(x, setting).step
+    y = Sweep(transcription).backward(x, setting, gradient)
+    step = Sweep(transcription).forward(x, setting).step
     residual = setting.dynamics.residual(x)
-    residual[:, segment.prescribed_dofs] = 0
+    residual[:, transcription.prescribed_dofs] = 0
     residual = setting.dynamics.zero_prescribed_forces(residual)
     expected = float(
-        np.sum(gradient[:, segment.free_dofs] * step[:, segment.free_dofs])
+        np.sum(gradient[:, transcription.free_dofs] * step[:, transcription.free_dofs])
     )
     assert float(np.sum(y * residual)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_derivatives_are_pulled_back_through_the_memory(
-    collocation: Collocation, rng
-):
+def test_derivatives_are_pulled_back_through_the_memory(collocation: Collocation, rng):
     part = marched(collocation, some_parameters(collocation))
     p = some_parameters(collocation)
     z = collocation.pack(p, [disturbed(part)])
@@ -140,9 +122,7 @@ def test_derivatives_are_pulled_back_through_the_memory(
         rng.standard_normal(n) for n in (collocation.constraint_count, len(z))
     )
     expected = directional_derivative(
-        lambda at: multipliers @ collocation.constraint_values(at),
-        z,
-        0.1 * direction,
+        lambda at: multipliers @ collocation.constraint_values(at), z, 0.1 * direction
     )
     found = collocation.jacobian_vjp(z, multipliers) @ (0.1 * direction)
     assert found == pytest.approx(float(expected), rel=1e-8)
@@ -158,9 +138,7 @@ def test_the_memory_that_made_a_recording_is_found():
 
 
 @pytest.mark.parametrize(
-    "method",
-    [Shooting(), Continuation(stage={"method": "reduced-space"})],
-    ids=lambda m: m.name,
+    "method", [Shooting(), Continuation(stage={"method": "reduced-space"})], ids=lambda m: m.name
 )
 def test_other_methods_find_the_same(method):
     collocation = Collocation([recorded("hung-cube", 20)], guesses(ONE, 1.2))
@@ -183,9 +161,7 @@ def test_newmark_and_the_schemes_meet_as_the_step_shrinks(kind: str):
     moved = np.abs(fine - fine[0]).max()
     for integrator, count in (("newmark", 8), ("bdf2", 16)):
         step_s = experiment.timestep_s / count
-        found = simulate(
-            experiment, TWO, integrator, timestep_s=step_s, substeps=count
-        )
+        found = simulate(experiment, TWO, integrator, timestep_s=step_s, substeps=count)
         assert np.abs(found.positions_m - fine).max() < 8e-3 * moved
 
 

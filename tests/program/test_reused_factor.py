@@ -21,10 +21,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward import newton_solver
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
-from collocation_sysid.program.linear_algebra import (
-    factorisation,
-    reused_factor,
-)
+from collocation_sysid.program.linear_algebra import factorisation, reused_factor
 from collocation_sysid.program.linear_algebra.block_band import full_matrix
 from collocation_sysid.program.linear_algebra.factorisation import Factoriser
 from collocation_sysid.program.linear_algebra.reused_factor import (
@@ -54,9 +51,7 @@ def _forget_analyses():
 def wide(monkeypatch):
     """All bodies are treated as large ones: in single precision, with factors that are reused."""
     monkeypatch.setattr(factorisation, "NARROW", 0)
-    monkeypatch.setattr(
-        "collocation_sysid.program.sweep.LEAST_COST_OF_FACTOR", 0.0
-    )
+    monkeypatch.setattr("collocation_sysid.program.sweep.LEAST_COST_OF_FACTOR", 0.0)
     monkeypatch.setattr(newton_solver, "LEAST_COST_OF_FACTOR", 0.0)
 
 
@@ -64,9 +59,7 @@ def rotated_points(angle_rad: float) -> np.ndarray:
     return BODY.nodes_m @ Rotation.from_rotvec(angle_rad * AXIS).as_matrix().T
 
 
-def matrix_at(
-    points_m: np.ndarray, skew: float = 0.0, mass: float = 20.0
-) -> Matrix:
+def matrix_at(points_m: np.ndarray, skew: float = 0.0, mass: float = 20.0) -> Matrix:
     """Matrix of a time step at positions of the nodes, with a random skew part of a given size."""
     theta = BODY.theta_from_values(TRUTH)
     at = BODY.linearise(points_m.reshape(-1), np.zeros(points_m.size), theta)
@@ -96,9 +89,7 @@ def dense(matrix: Matrix) -> np.ndarray:
 def test_a_rotation_and_a_translation_are_recovered():
     turn = Rotation.from_rotvec(AXIS)
     moved = turn.apply(np.array(BODY.nodes_m)) + np.arange(3.0)
-    assert best_rotation(BODY.nodes_m, moved) == pytest.approx(
-        turn.as_matrix(), abs=1e-12
-    )
+    assert best_rotation(BODY.nodes_m, moved) == pytest.approx(turn.as_matrix(), abs=1e-12)
     flat = BODY.nodes_m * [1.0, 1.0, 0.0]
     assert np.linalg.det(best_rotation(flat, -flat)) == pytest.approx(1.0)
 
@@ -134,9 +125,7 @@ def test_systems_of_a_rotating_body_are_solved_with_few_factors(
         right[:, 2] *= 1e-30
         factor = ReusedFactor(factors, matrix, points_m=points_m)
         complete = dense(matrix)
-        expected = np.linalg.solve(
-            complete.T if transposed else complete, right
-        )
+        expected = np.linalg.solve(complete.T if transposed else complete, right)
         for start in (None, guess):
             solution = factor.solve(right, transposed=transposed, guess=start)
             for k in range(3):
@@ -157,9 +146,7 @@ def test_another_matrix_is_factorised_anew(monkeypatch, rng):
     for count, mass in enumerate((20.0, 1e6), 1):
         matrix = matrix_at(points_m, mass=mass)
         solution = ReusedFactor(factors, matrix, points_m=points_m).solve(right)
-        assert solution == pytest.approx(
-            np.linalg.solve(dense(matrix), right), rel=1e-8
-        )
+        assert solution == pytest.approx(np.linalg.solve(dense(matrix), right), rel=1e-8)
         assert factors.factorisation_count == count
 
 
@@ -174,9 +161,7 @@ def test_an_indefinite_matrix_is_solved_and_recognised(monkeypatch, rng):
         factor = ReusedFactor(factors, matrix, points_m=points_m)
         solution = factor.solve(right)
         expected = np.linalg.solve(dense(matrix), right)
-        assert solution == pytest.approx(
-            expected, abs=1e-9 * np.abs(expected).max()
-        )
+        assert solution == pytest.approx(expected, abs=1e-9 * np.abs(expected).max())
         assert factor.positive_definite == is_definite
 
 
@@ -191,38 +176,34 @@ def test_a_matrix_that_is_not_finite_is_refused(monkeypatch):
 
 
 @pytest.mark.parametrize("damping", ["rayleigh", "kelvin-voigt"])
-def test_sweeps_and_simulations_agree_with_a_factor_for_each_step(
-    request, damping: str
-):
+def test_sweeps_and_simulations_agree_with_a_factor_for_each_step(request, damping: str):
     experiment = hung_cube(16)
     if damping == "rayleigh":
         experiment = with_papers_damping(experiment)
     collocation = Collocation([measured(experiment)], GUESS)
-    (segment,) = collocation.transcriptions
-    dynamics = segment.dynamics.with_theta(as_theta(TRUTH))
-    x = simulate_scheme(segment.experiment, dynamics)
-    free = segment.free_dofs
+    (transcription,) = collocation.transcriptions
+    dynamics = transcription.dynamics.with_theta(as_theta(TRUTH))
+    x = simulate_scheme(transcription.experiment, dynamics)
+    free = transcription.free_dofs
     disturbance = np.sin(np.arange(x[1:, free].size)).reshape(len(x) - 1, -1)
     x[1:, free] += 1e-4 * disturbance
     (part,) = collocation.iterates(collocation.pack(collocation.guess_p, [x]))
     x = part.x
     gradient = np.cos(np.arange(x.size)).reshape(x.shape)
-    direct = Sweep(segment)
+    direct = Sweep(transcription)
     assert not direct.reuses_factors
     expected = direct.forward(x, part.equations)
     expected_y = direct.backward(x, part.equations, gradient)
     simulated = simulate(experiment, TRUTH)
     factorisation._cached_analysis.cache_clear()
     request.getfixturevalue("wide")
-    solver = Sweep(segment, factorisation="band")
+    solver = Sweep(transcription, factorisation="band")
     assert solver.reuses_factors
     for similar in (None, expected):
         result = solver.forward(x, part.equations, similar=similar)
         for name in ("step", "by_p"):
             values = getattr(expected, name)
-            assert getattr(result, name) == pytest.approx(
-                values, abs=1e-8 * np.abs(values).max()
-            )
+            assert getattr(result, name) == pytest.approx(values, abs=1e-8 * np.abs(values).max())
         assert result.indefinite_count == expected.indefinite_count
     y = solver.backward(x, part.equations, gradient)
     assert y == pytest.approx(expected_y, abs=1e-8 * np.abs(expected_y).max())
@@ -232,16 +213,12 @@ def test_sweeps_and_simulations_agree_with_a_factor_for_each_step(
 
 def test_the_answer_of_a_large_body_is_the_same(request):
     problem = Problem(
-        [noisy(hung_cube(16, divisions=(4, 4, 4)))],
-        {name: Unknown() for name in TRUTH},
+        [noisy(hung_cube(16, divisions=(4, 4, 4)))], {name: Unknown() for name in TRUTH}
     )
     options = {"coarse_start_nodes": 60, "coarse_start_tolerance": 1e-8}
     expected = solve(problem, ReducedSpace(coarse_start=False))
     request.getfixturevalue("wide")
-    for method in (
-        ReducedSpace(coarse_start=False),
-        ReducedSpace(**options),
-    ):
+    for method in (ReducedSpace(coarse_start=False), ReducedSpace(**options)):
         solution = solve(problem, method)
         assert solution.status.converged
         assert solution.q == pytest.approx(expected.q, abs=1e-7)

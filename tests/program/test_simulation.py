@@ -29,19 +29,10 @@ from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
-from collocation_sysid.program.forward.newton_solver import (
-    NewtonOptions,
-    NewtonSolver,
-)
+from collocation_sysid.program.forward.newton_solver import NewtonOptions, NewtonSolver
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import (
-    Experiment,
-    Force,
-    Grasp,
-    PoseSequence,
-    prescribed_nodes,
-)
+from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence, prescribed_nodes
 
 THETA = as_theta(TRUTH)
 ABSURDLY_SOFT = np.array([0.02, 0.03, 0.009, 1.0])
@@ -80,20 +71,14 @@ def test_a_hanging_bar_stretches_by_half_its_weight(young_pa: float):
     )  # Poisson's ratio 0
     tip = nodes_where(bar.body, 2, 0.0)
     stretch = (bar.body.nodes_m - x)[tip, 2].mean()
-    assert stretch == pytest.approx(
-        30.0 * 9.81 * 0.12**2 / (2 * young_pa), rel=1e-3
-    )
+    assert stretch == pytest.approx(30.0 * 9.81 * 0.12**2 / (2 * young_pa), rel=1e-3)
 
 
-def assert_stable_equilibrium(
-    experiment: Experiment, theta: np.ndarray, x: np.ndarray
-) -> None:
+def assert_stable_equilibrium(experiment: Experiment, theta: np.ndarray, x: np.ndarray) -> None:
     """No net force on free nodes, and a positive definite stiffness there."""
     body, solver = experiment.body, NewtonSolver(experiment)
     still = np.zeros_like(x)
-    load = Forces.from_experiment(
-        experiment, experiment.t_s[:1]
-    ).weight.external_n[0]
+    load = Forces.from_experiment(experiment, experiment.t_s[:1]).weight.external_n[0]
     net = (body.force(x, still, theta)[0] + load)[solver.free]
     assert np.abs(net).max() < 1e-9 * np.abs(load).max()
     stiffness = -body.linearise(x, still, theta).by_position[0]
@@ -102,10 +87,7 @@ def assert_stable_equilibrium(
 
 @pytest.mark.parametrize("softness", [1, 10, 100])
 def test_the_rest_state_is_a_stable_equilibrium(softness: int):
-    cube, theta = (
-        hung_cube(),
-        np.array([200 / softness, 300 / softness, 0.0, 0.0]),
-    )
+    cube, theta = (hung_cube(), np.array([200 / softness, 300 / softness, 0.0, 0.0]))
     assert_stable_equilibrium(cube, theta, equilibrium(cube, theta))
 
 
@@ -126,29 +108,20 @@ def test_where_newton_fails_the_load_is_applied_in_steps():
     in_steps = equilibrium(cube, soft, solver=NewtonSolver(cube, hurried))
     np.testing.assert_allclose(in_steps, direct, atol=1e-9)
     with pytest.raises(
-        SimulationError,
-        match="initial equilibrium failed: Newton's method took more than 3",
+        SimulationError, match="initial equilibrium failed: Newton's method took more than 3"
     ):
-        equilibrium(
-            cube,
-            soft,
-            solver=NewtonSolver(cube, replace(hurried, max_halvings=0)),
-        )
+        equilibrium(cube, soft, solver=NewtonSolver(cube, replace(hurried, max_halvings=0)))
 
 
 def test_without_load_the_body_rests_where_the_grasp_carries_it():
     cube = hung_cube(gravity_m_s2=np.zeros(3))
     x = equilibrium(cube, THETA, time_s=0.07)
-    np.testing.assert_allclose(
-        x, cube.rigid_positions([0.07]).ravel(), atol=1e-12
-    )
+    np.testing.assert_allclose(x, cube.rigid_positions([0.07]).ravel(), atol=1e-12)
 
 
 def test_external_forces_deform_the_rest_state():
     weight = box().node_mass[:, None] * np.array(GRAVITY_M_S2)
-    carried = hung_cube(
-        forces=tuple(Force([k], -w) for k, w in enumerate(weight))
-    )
+    carried = hung_cube(forces=tuple(Force([k], -w) for k, w in enumerate(weight)))
     np.testing.assert_allclose(
         equilibrium(carried, THETA), carried.body.nodes_m.ravel(), atol=1e-12
     )
@@ -157,10 +130,7 @@ def test_external_forces_deform_the_rest_state():
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_body_at_rest_stays_there(integrator: str):
     cube = hung_cube()
-    still = replace(
-        cube,
-        grasps=(Grasp(prescribed_nodes(cube.grasps), PoseSequence.fixed()),),
-    )
+    still = replace(cube, grasps=(Grasp(prescribed_nodes(cube.grasps), PoseSequence.fixed()),))
     motion = simulate(still, TRUTH, integrator)
     expected = np.broadcast_to(motion.positions_m[0], motion.positions_m.shape)
     np.testing.assert_allclose(motion.positions_m, expected, atol=1e-9)
@@ -168,29 +138,19 @@ def test_a_body_at_rest_stays_there(integrator: str):
 
 
 def bar_in_two_grasps(
-    way_m: tuple[float, float, float],
-    turn_rad: tuple[float, float, float],
-    element: str = "tet4",
+    way_m: tuple[float, float, float], turn_rad: tuple[float, float, float], element: str = "tet4"
 ) -> Experiment:
     """A bar of small elements, one end held and the other moved and turned about its middle."""
     divisions = (12, 4, 4) if element == "tet4" else (6, 2, 2)
     body, t_s = box((0.15, 0.05, 0.05), divisions, element), times(2)
-    middle, turn = (
-        np.array([0.15, 0.025, 0.025]),
-        Rotation.from_rotvec(turn_rad),
-    )
+    middle, turn = (np.array([0.15, 0.025, 0.025]), Rotation.from_rotvec(turn_rad))
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = (
-        turn.as_matrix(),
-        middle + way_m - turn.apply(middle),
-    )
+    pose[:3, :3], pose[:3, 3] = (turn.as_matrix(), middle + way_m - turn.apply(middle))
     grasps = [
         Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed()),
         Grasp(nodes_where(body, 0, 0.15), np.tile(pose, (len(t_s), 1, 1))),
     ]
-    return Experiment(
-        body, t_s, grasps, vertex_markers(body, [0], t_s), nuisance=IDEAL
-    )
+    return Experiment(body, t_s, grasps, vertex_markers(body, [0], t_s), nuisance=IDEAL)
 
 
 STRAINED = {
@@ -204,18 +164,12 @@ STRAINED = {
 
 @pytest.mark.parametrize("way", STRAINED)
 def test_two_grasps_may_strain_the_body_at_the_start(way: str):
-    bar, theta = (
-        bar_in_two_grasps(*STRAINED[way]),
-        np.array([2e4, 3e4, 0.0, 0.0]),
-    )
+    bar, theta = (bar_in_two_grasps(*STRAINED[way]), np.array([2e4, 3e4, 0.0, 0.0]))
     x = equilibrium(bar, theta)
     assert_stable_equilibrium(bar, theta, x)
     at = x.reshape(-1, 3)[prescribed_nodes(bar.grasps)]
     np.testing.assert_allclose(
-        at,
-        bar.prescribed_positions([0.0])[0].reshape(-1, 3),
-        rtol=1e-15,
-        atol=1e-17,
+        at, bar.prescribed_positions([0.0])[0].reshape(-1, 3), rtol=1e-15, atol=1e-17
     )
 
 
@@ -226,15 +180,9 @@ def test_quadratic_elements_may_be_strained_at_the_start_too():
 
 
 def test_a_stretched_bar_pulls_as_its_material_does():
-    bar, young_pa, stretch = (
-        bar_in_two_grasps((0.03, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        6e4,
-        1.2,
-    )
+    bar, young_pa, stretch = (bar_in_two_grasps((0.03, 0.0, 0.0), (0.0, 0.0, 0.0)), 6e4, 1.2)
     light = replace(bar, gravity_m_s2=np.zeros(3))
-    theta = np.array(
-        [0.0, young_pa / 2, 0.0, 0.0]
-    )  # Poisson's ratio 0: no lateral strain
+    theta = np.array([0.0, young_pa / 2, 0.0, 0.0])  # Poisson's ratio 0: no lateral strain
     x = equilibrium(light, theta)
     force = light.body.force(x, np.zeros_like(x), theta)[0].reshape(-1, 3)
     pull = force[nodes_where(light.body, 0, 0.15), 0].sum()
@@ -261,13 +209,9 @@ def test_a_body_thrown_along_with_its_grasp_stays_undeformed(integrator: str):
         start_velocities_m_s=np.broadcast_to(speed, cube.body.nodes_m.shape),
     )
     motion = simulate(thrown, {**TRUTH, "gamma_m_1_s": 0.0}, integrator)
+    np.testing.assert_allclose(motion.positions_m, thrown.rigid_positions(t_s), atol=1e-10)
     np.testing.assert_allclose(
-        motion.positions_m, thrown.rigid_positions(t_s), atol=1e-10
-    )
-    np.testing.assert_allclose(
-        motion.velocities_m_s,
-        np.broadcast_to(speed, motion.velocities_m_s.shape),
-        atol=1e-7,
+        motion.velocities_m_s, np.broadcast_to(speed, motion.velocities_m_s.shape), atol=1e-7
     )
 
 
@@ -288,17 +232,13 @@ def test_markers_are_observed_at_every_sample_also_where_none_was_measured():
     assert motion.markers_m.shape == cube.markers.positions_m.shape
     assert np.isfinite(motion.markers_m).all()
     np.testing.assert_array_equal(motion.t_s, cube.t_s)
-    np.testing.assert_allclose(
-        motion.markers_m, cube.markers.predict_positions(motion.positions_m)
-    )
+    np.testing.assert_allclose(motion.markers_m, cube.markers.predict_positions(motion.positions_m))
 
 
 def test_velocities_are_the_slopes_of_the_positions():
     cube = hung_cube(20)
     motion = simulate(cube, TRUTH, timestep_s=0.001)
-    slopes = (motion.positions_m[2:] - motion.positions_m[:-2]) / (
-        2 * cube.timestep_s
-    )
+    slopes = (motion.positions_m[2:] - motion.positions_m[:-2]) / (2 * cube.timestep_s)
     error = np.abs(motion.velocities_m_s[1:-1] - slopes).max()
     assert error < 0.1 * np.abs(slopes).max()
 
@@ -315,9 +255,7 @@ def test_parameters_may_be_guesses_names_or_numbers():
 def test_progress_is_reported_up_to_one():
     for integrator in INTEGRATORS:
         shares: list[float] = []
-        simulate(
-            hung_cube(4), TRUTH, integrator, substeps=1, progress=shares.append
-        )
+        simulate(hung_cube(4), TRUTH, integrator, substeps=1, progress=shares.append)
         assert shares == pytest.approx([0.25, 0.5, 0.75, 1.0])
 
 
@@ -341,12 +279,8 @@ def test_newmark_halves_steps_that_are_too_large():
         cube.prescribed_positions(cube.t_s).reshape(len(cube.t_s), -1, 3),
         atol=1e-15,
     )
-    with pytest.raises(
-        SimulationError, match="an element is inverted before the first iter"
-    ):
-        simulate(
-            cube, TRUTH, timestep_s=0.04, options=NewtonOptions(max_halvings=0)
-        )
+    with pytest.raises(SimulationError, match="an element is inverted before the first iter"):
+        simulate(cube, TRUTH, timestep_s=0.04, options=NewtonOptions(max_halvings=0))
 
 
 def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
@@ -354,14 +288,8 @@ def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
     dynamics = Dynamics.from_experiment(cube, "midpoint").with_theta(THETA)
     x = simulate_scheme(cube, dynamics)
     residual = dynamics.residual(x)[:, NewtonSolver(cube).free]
-    assert (
-        np.abs(residual).max()
-        < 1e-9 * np.abs(dynamics.forces.weight.external_n).max()
-    )
-    with pytest.raises(
-        SimulationError,
-        match="time step 3 failed: an element is inverted",
-    ):
+    assert np.abs(residual).max() < 1e-9 * np.abs(dynamics.forces.weight.external_n).max()
+    with pytest.raises(SimulationError, match="time step 3 failed: an element is inverted"):
         simulate_scheme(cube, dynamics, NewtonOptions(max_halvings=0))
 
 
@@ -371,9 +299,7 @@ def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
 @pytest.mark.long
 def test_a_missing_rest_state_names_time_and_element():
     cube = hung_cube()
-    with pytest.raises(
-        SimulationError, match=r"loses its stability.*element"
-    ) as caught:
+    with pytest.raises(SimulationError, match=r"loses its stability.*element") as caught:
         simulate(cube, ABSURDLY_SOFT)
     assert caught.value.time_s == 0.0
     assert 0 <= (caught.value.element or 0) < len(cube.body.cells)
@@ -390,9 +316,7 @@ def test_a_missing_rest_state_names_time_and_element():
 def test_a_failed_step_names_time_and_element(integrator: str, message: str):
     violent = jerked_cube(2.0, timestep_s=0.04, start="undeformed")
     with pytest.raises(SimulationError, match=message) as caught:
-        simulate(
-            violent, ABSURDLY_SOFT, integrator, timestep_s=0.04, substeps=1
-        )
+        simulate(violent, ABSURDLY_SOFT, integrator, timestep_s=0.04, substeps=1)
     assert 0.0 <= caught.value.time_s <= violent.t_s[-1]
     assert caught.value.element is not None
     assert f"element {caught.value.element})" in str(caught.value)
@@ -406,10 +330,6 @@ def test_unknown_integrators_are_refused():
 def test_other_tracks_must_have_the_markers_shape():
     cube = hung_cube(10)
     tracks = np.ones_like(cube.markers.positions_m)
-    np.testing.assert_array_equal(
-        with_markers(cube, tracks).markers.positions_m, tracks
-    )
-    with pytest.raises(
-        InputError, match=r"shape \(10, 9, 3\), expected \(11, 9, 3\)"
-    ):
+    np.testing.assert_array_equal(with_markers(cube, tracks).markers.positions_m, tracks)
+    with pytest.raises(InputError, match=r"shape \(10, 9, 3\), expected \(11, 9, 3\)"):
         with_markers(cube, tracks[1:])

@@ -17,10 +17,7 @@ from collocation_sysid import (
     box_mesh,
 )
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
-from collocation_sysid.program.forward.newton_solver import (
-    NewtonOptions,
-    NewtonSolver,
-)
+from collocation_sysid.program.forward.newton_solver import NewtonOptions, NewtonSolver
 from collocation_sysid.program.forward.retraction import Retraction
 from collocation_sysid.program.linear_algebra.factorisation import Factoriser
 
@@ -32,43 +29,26 @@ MU_PA = 30.7e3
 def notched_bar(element: str) -> Experiment:
     """A bar with deep notches, clamped horizontally at one end, that sags by most of its length."""
     mesh = box_mesh(SIZE_M, CELLS)
-    centres = mesh.points_m[mesh.tetrahedra].mean(axis=1) - mesh.points_m.min(
-        axis=0
-    )
+    centres = mesh.points_m[mesh.tetrahedra].mean(axis=1) - mesh.points_m.min(axis=0)
     column = (centres[:, 0] * CELLS[0] / SIZE_M[0]).astype(int)
     notched = (column % 2 == 1) & (centres[:, 2] > SIZE_M[2] / 3)
     body = Body(
-        TetMesh(mesh.points_m, mesh.tetrahedra[~notched]),
-        density_kg_m3=1080.0,
-        element=element,
+        TetMesh(mesh.points_m, mesh.tetrahedra[~notched]), density_kg_m3=1080.0, element=element
     )
-    clamped = np.flatnonzero(
-        body.nodes_m[:, 0] < body.nodes_m[:, 0].min() + 1e-9
-    )
+    clamped = np.flatnonzero(body.nodes_m[:, 0] < body.nodes_m[:, 0].min() + 1e-9)
     t_s = np.array([0.0, 0.1, 0.2])
-    tip = Markers(
-        t_s, np.zeros((3, 1, 3)), sigma_m=1e-3, places_m=[body.nodes_m[-1]]
-    )
+    tip = Markers(t_s, np.zeros((3, 1, 3)), sigma_m=1e-3, places_m=[body.nodes_m[-1]])
     return Experiment(body, t_s, [Grasp(clamped, PoseSequence.fixed())], tip)
 
 
 def theta_of(body: Body, poisson: float) -> NDArray[np.float64]:
     lame = 2 * MU_PA * poisson / (1 - 2 * poisson)
-    values = {
-        "mu_pa": MU_PA,
-        "lambda_pa": lame,
-        "gamma_r_s": 1e-3,
-        "gamma_m_1_s": 0.1,
-    }
+    values = {"mu_pa": MU_PA, "lambda_pa": lame, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
     return body.theta_from_values(values)
 
 
-@pytest.mark.parametrize(
-    ("element", "poisson"), [("tet4", 0.45), ("tet10-p0", 0.49)]
-)
-def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(
-    element, poisson, monkeypatch
-):
+@pytest.mark.parametrize(("element", "poisson"), [("tet4", 0.45), ("tet10-p0", 0.49)])
+def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(element, poisson, monkeypatch):
     bar = notched_bar(element)
     factorised = []
     factorise = Factoriser.factorise
@@ -101,16 +81,10 @@ def test_a_rotation_of_the_whole_body_is_applied_without_strain(element):
     spin = np.array([[0.0, 0.0, 0.8], [0.0, 0.0, 0.0], [-0.8, 0.0, 0.0]])
     free = np.zeros(x.shape, dtype=bool)
     free[0] = True  # one node stays where the increment has it
-    turned = Retraction(body, free)(
-        x.ravel(), ((x - x[0]) @ spin.T).ravel()
-    ).reshape(-1, 3)
+    turned = Retraction(body, free)(x.ravel(), ((x - x[0]) @ spin.T).ravel()).reshape(-1, 3)
     lengths = np.linalg.norm(turned - turned[0], axis=1)
-    np.testing.assert_allclose(
-        lengths, np.linalg.norm(x - x[0], axis=1), rtol=1e-6, atol=1e-9
-    )
-    np.testing.assert_allclose(
-        body.volume_ratios(turned.ravel()), 1.0, rtol=1e-6
-    )
+    np.testing.assert_allclose(lengths, np.linalg.norm(x - x[0], axis=1), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(body.volume_ratios(turned.ravel()), 1.0, rtol=1e-6)
 
 
 def test_small_increments_are_added():
@@ -127,6 +101,5 @@ def test_small_increments_are_added():
         errors_m.append(np.abs(moved - body.nodes_m.ravel() - increment).max())
     assert errors_m[1] < 0.02 * errors_m[0]  # of second order
     np.testing.assert_array_equal(
-        moved.reshape(-1, 3)[:4],
-        (body.nodes_m.ravel() + increment).reshape(-1, 3)[:4],
+        moved.reshape(-1, 3)[:4], (body.nodes_m.ravel() + increment).reshape(-1, 3)[:4]
     )

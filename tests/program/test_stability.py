@@ -17,10 +17,7 @@ from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.modes import stability
-from collocation_sysid.program.modes.stability import (
-    find_instabilities,
-    growth_rate_1_s,
-)
+from collocation_sysid.program.modes.stability import find_instabilities, growth_rate_1_s
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.assessment import stability_concerns
@@ -58,21 +55,15 @@ def bar(damping: str | DampingLaw = "kelvin-voigt", across: int = 1) -> Body:
 
 
 def held(body: Body) -> np.ndarray:
-    return np.union1d(
-        nodes_where(body, 2, 0.0), nodes_where(body, 2, SIZE_M[2])
-    )
+    return np.union1d(nodes_where(body, 2, 0.0), nodes_where(body, 2, SIZE_M[2]))
 
 
-def held_at_both_ends(
-    body: Body, disturbed_m: float = 0.0, samples: int = 101
-) -> Experiment:
+def held_at_both_ends(body: Body, disturbed_m: float = 0.0, samples: int = 101) -> Experiment:
     """The bar between its ends at a stretch of 1.6, let go near its equilibrium."""
     ends, t_s = held(body), 2e-3 * np.arange(samples)
     start = equilibrium(body, ends)
     free = np.setdiff1d(np.arange(len(start)), ends)
-    start[free] += disturbed_m * np.random.default_rng(1).uniform(
-        -1, 1, (len(free), 3)
-    )
+    start[free] += disturbed_m * np.random.default_rng(1).uniform(-1, 1, (len(free), 3))
     bottom, top = (nodes_where(body, 2, z) for z in (0.0, SIZE_M[2]))
     up = PoseSequence.fixed().with_shift((0, 0, (STRETCH - 1) * SIZE_M[2]))
     stretched = [Grasp(bottom, PoseSequence.fixed()), Grasp(top, up)]
@@ -91,16 +82,11 @@ def held_at_both_ends(
 
 def equilibrium(body: Body, ends: np.ndarray) -> np.ndarray:
     """Positions (n, 3) of the bar stretched between its ends, by Newton's method."""
-    x, forces = (
-        body.nodes_m * [1, 1, STRETCH],
-        Forces.of_body_alone(body, theta_of(body)),
-    )
+    x, forces = (body.nodes_m * [1, 1, STRETCH], Forces.of_body_alone(body, theta_of(body)))
     free = free_dofs(body, ends)
     for _ in range(40):
         at = forces.linearise(x.reshape(1, -1), np.zeros((1, x.size)))
-        stiffness = -forces.pattern.matrix(at.by_position[0]).toarray()[
-            np.ix_(free, free)
-        ]
+        stiffness = -forces.pattern.matrix(at.by_position[0]).toarray()[np.ix_(free, free)]
         step = np.linalg.solve(stiffness, at.force[0][free])
         x.ravel()[free] += step * min(1.0, 2e-3 / np.abs(step).max())
     return x
@@ -111,9 +97,7 @@ def theta_of(body: Body) -> np.ndarray:
 
 
 def free_dofs(body: Body, held: np.ndarray) -> np.ndarray:
-    return np.flatnonzero(
-        ~np.repeat(np.isin(np.arange(len(body.nodes_m)), held), 3)
-    )
+    return np.flatnonzero(~np.repeat(np.isin(np.arange(len(body.nodes_m)), held), 3))
 
 
 def fastest(forces: Forces, x: np.ndarray, free: np.ndarray) -> float:
@@ -121,8 +105,7 @@ def fastest(forces: Forces, x: np.ndarray, free: np.ndarray) -> float:
     at = forces.linearise(x.reshape(1, -1), np.zeros((1, x.size)))
     mass = forces.mass.inertia_kg[0, free]
     K, D = (
-        -forces.pattern.matrix(lower).toarray()[np.ix_(free, free)]
-        / mass[:, None]
+        -forces.pattern.matrix(lower).toarray()[np.ix_(free, free)] / mass[:, None]
         for lower in (at.by_position[0], at.by_velocity[0])
     )
     one = np.eye(len(free))
@@ -135,28 +118,18 @@ def energy_j(body: Body, x: np.ndarray, step_s: float) -> np.ndarray:
     for moved in np.diff(x, axis=0) / step_s:
         v.append(2 * moved - v[-1])
     elastic = [
-        body.energy(
-            row, lambda_pa=CONSTANTS["lambda_pa"], mu_pa=CONSTANTS["mu_pa"]
-        )
-        for row in x
+        body.energy(row, lambda_pa=CONSTANTS["lambda_pa"], mu_pa=CONSTANTS["mu_pa"]) for row in x
     ]
-    return (
-        np.array(elastic)
-        + (body.node_mass[:, None] * np.array(v) ** 2).sum(axis=(1, 2)) / 2
-    )
+    return np.array(elastic) + (body.node_mass[:, None] * np.array(v) ** 2).sum(axis=(1, 2)) / 2
 
 
 @pytest.mark.parametrize(("law", "grows"), [(LAWS[0], False), (LAWS[1], True)])
-def test_only_a_law_that_is_not_dissipative_feeds_energy_into_a_stretched_bar(
-    law, grows
-):
+def test_only_a_law_that_is_not_dissipative_feeds_energy_into_a_stretched_bar(law, grows):
     body = bar(law, across=2)
     experiment = held_at_both_ends(body, disturbed_m=1e-5)
     x = simulate(experiment, CONSTANTS, "midpoint", substeps=1).positions_m
     energy = energy_j(body, x, experiment.timestep_s)
-    disturbed = (
-        energy[0] - energy_j(body, equilibrium(body, held(body))[None], 1.0)[0]
-    )
+    disturbed = energy[0] - energy_j(body, equilibrium(body, held(body))[None], 1.0)[0]
     if grows:
         assert energy[-1] > energy[0] + 100 * disturbed
     else:
@@ -169,11 +142,7 @@ def test_only_a_law_that_is_not_dissipative_feeds_energy_into_a_stretched_bar(
 def test_growth_is_the_eigenvalue_of_dense_algebra(law, dense, monkeypatch):
     monkeypatch.setattr(stability, "DENSE", 10**6 if dense else 0)
     body = bar(law, across=2)
-    x, free, theta = (
-        equilibrium(body, held(body)),
-        free_dofs(body, held(body)),
-        theta_of(body),
-    )
+    x, free, theta = (equilibrium(body, held(body)), free_dofs(body, held(body)), theta_of(body))
     expected = fastest(Forces.of_body_alone(body, theta), x, free)
     found = growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free)
     assert (expected > 0) == (law is RATE_OF_STRESS)
@@ -183,56 +152,36 @@ def test_growth_is_the_eigenvalue_of_dense_algebra(law, dense, monkeypatch):
 @pytest.mark.parametrize("law", ["kelvin-voigt", "rayleigh"])
 def test_a_bar_pressed_beyond_buckling_is_not_stable(law, monkeypatch):
     monkeypatch.setattr(stability, "DENSE", 0)
-    body = Body(
-        box_mesh((0.01, 0.01, 0.1), (1, 1, 6)),
-        "stable-neo-hookean",
-        1000.0,
-        damping=law,
-    )
+    body = Body(box_mesh((0.01, 0.01, 0.1), (1, 1, 6)), "stable-neo-hookean", 1000.0, damping=law)
     held = np.union1d(nodes_where(body, 2, 0.0), nodes_where(body, 2, 0.1))
     free, theta, found = free_dofs(body, held), theta_of(body), []
     for squeezed in (0.999, 0.7):
         x = body.nodes_m * [1, 1, squeezed]
-        found.append(
-            growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free)
-        )
+        found.append(growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free))
         expected = fastest(Forces.of_body_alone(body, theta), x, free)
         assert found[-1] == pytest.approx(max(expected, 0.0), rel=1e-6)
     assert found[0] == 0 < found[1]
 
 
-def test_growth_is_found_where_the_search_for_directions_ends_early(
-    monkeypatch,
-):
+def test_growth_is_found_where_the_search_for_directions_ends_early(monkeypatch):
     def ended(matrix, *_, **__):
-        raise ArpackNoConvergence(
-            "ended", np.zeros(0), np.zeros((matrix.shape[0], 0))
-        )
+        raise ArpackNoConvergence("ended", np.zeros(0), np.zeros((matrix.shape[0], 0)))
 
     monkeypatch.setattr(stability, "DENSE", 0)
     monkeypatch.setattr(stability, "eigsh", ended)
     body = bar(RATE_OF_STRESS, across=2)
-    x, free, theta = (
-        equilibrium(body, held(body)),
-        free_dofs(body, held(body)),
-        theta_of(body),
-    )
+    x, free, theta = (equilibrium(body, held(body)), free_dofs(body, held(body)), theta_of(body))
     expected = fastest(Forces.of_body_alone(body, theta), x, free)
-    assert growth_rate_1_s(
-        Forces.of_body_alone(body, theta), x.ravel(), free
-    ) == pytest.approx(expected)
+    assert growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free) == pytest.approx(
+        expected
+    )
 
 
 def test_a_body_that_nobody_holds_is_stable():
     body = bar()
     free = np.arange(3 * len(body.nodes_m))
     assert (
-        growth_rate_1_s(
-            Forces.of_body_alone(body, theta_of(body)),
-            body.nodes_m.ravel(),
-            free,
-        )
-        == 0
+        growth_rate_1_s(Forces.of_body_alone(body, theta_of(body)), body.nodes_m.ravel(), free) == 0
     )
 
 
@@ -240,13 +189,8 @@ def test_a_body_that_nobody_holds_is_stable():
 def test_what_grows_is_told_with_its_rate(law, told):
     experiment = held_at_both_ends(bar(law, across=2))
     given = {name: value for name, value in CONSTANTS.items() if value}
-    items = [
-        Parameter(name, value, 0.5 * value, 2 * value)
-        for name, value in given.items()
-    ]
-    parameters = Parameters(
-        (*items, Parameter("gamma_m_1_s", 0.0, is_fixed=True))
-    )
+    items = [Parameter(name, value, 0.5 * value, 2 * value) for name, value in given.items()]
+    parameters = Parameters((*items, Parameter("gamma_m_1_s", 0.0, is_fixed=True)))
     collocation = Collocation([experiment], parameters)
     start = experiment.start_positions_m
     assert start is not None
@@ -267,9 +211,7 @@ def test_a_body_without_damping_is_stable():
     free = free_dofs(body, held(body))
     assert (
         growth_rate_1_s(
-            Forces.of_body_alone(body, theta),
-            equilibrium(body, held(body)).ravel(),
-            free,
+            Forces.of_body_alone(body, theta), equilibrium(body, held(body)).ravel(), free
         )
         == 0
     )

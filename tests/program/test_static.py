@@ -77,12 +77,8 @@ def test_sticking_platens_hold_every_axis_and_let_the_side_bulge():
     experiment = block("xyz")
     positions = simulate(experiment, TRUTH).positions_m
     ends = np.concatenate([g.nodes for g in experiment.grasps[:2]])
-    np.testing.assert_allclose(
-        positions[-1, ends, :2], experiment.body.nodes_m[ends, :2]
-    )
-    middle = np.flatnonzero(
-        np.abs(experiment.body.nodes_m[:, 2] - EDGE_M / 2) < 1e-9
-    )
+    np.testing.assert_allclose(positions[-1, ends, :2], experiment.body.nodes_m[ends, :2])
+    middle = np.flatnonzero(np.abs(experiment.body.nodes_m[:, 2] - EDGE_M / 2) < 1e-9)
     assert positions[-1, middle, 0].max() > 1.05 * EDGE_M
 
 
@@ -91,18 +87,14 @@ def test_a_body_goes_along_with_platens_that_press_it_far_at_once(monkeypatch):
     tried = []
     newton = NewtonSolver.solve_equilibrium
     monkeypatch.setattr(
-        NewtonSolver,
-        "solve_equilibrium",
-        lambda *a, **k: (tried.append(1), newton(*a, **k))[1],
+        NewtonSolver, "solve_equilibrium", lambda *a, **k: (tried.append(1), newton(*a, **k))[1]
     )
     experiment = block("xyz", np.array([0.0, 1.0]), np.array([0.0, -0.03]))
     rubber = TRUTH | {"lambda_pa": 100 * TRUTH["mu_pa"]}
     far = simulate(experiment, rubber).positions_m[-1]
     assert len(tried) == 2  # one for each sample
     near = block("xyz", np.arange(7.0), np.linspace(0.0, -0.03, 7))
-    np.testing.assert_allclose(
-        far, simulate(near, rubber).positions_m[-1], atol=1e-9
-    )
+    np.testing.assert_allclose(far, simulate(near, rubber).positions_m[-1], atol=1e-9)
 
 
 def test_each_static_sample_is_the_rest_state_of_its_time():
@@ -115,33 +107,24 @@ def test_each_static_sample_is_the_rest_state_of_its_time():
 
 def test_static_constraints_vanish_at_the_simulation_alone():
     experiment = block("xyz")
-    segment = Collocation(
-        [experiment], GUESS.with_guess(TRUTH), substeps=3
-    ).transcriptions[0]
-    assert segment.grid_times == len(TIMES)
+    transcription = Collocation([experiment], GUESS.with_guess(TRUTH), substeps=3).transcriptions[0]
+    assert transcription.grid_times == len(TIMES)
     x = simulate(experiment, TRUTH).positions_m.reshape(len(TIMES), -1)
-    residual = segment.residual_n(
-        x, segment.equations_at(segment.parameters.guess_q, np.zeros(0))
+    residual = transcription.residual_n(
+        x, transcription.equations_at(transcription.parameters.guess_q, np.zeros(0))
     )
-    assert np.abs(residual).max() < 1e-9 * segment.force_n
+    assert np.abs(residual).max() < 1e-9 * transcription.force_n
     x[2, experiment.free_dofs] += 1e-3 * EDGE_M
-    moved = segment.residual_n(
-        x, segment.equations_at(segment.parameters.guess_q, np.zeros(0))
+    moved = transcription.residual_n(
+        x, transcription.equations_at(transcription.parameters.guess_q, np.zeros(0))
     )
-    assert (np.abs(moved).max(axis=1) > 1e-6 * segment.force_n).tolist() == [
-        0,
-        0,
-        1,
-        0,
-    ]
+    assert (np.abs(moved).max(axis=1) > 1e-6 * transcription.force_n).tolist() == [0, 0, 1, 0]
 
 
 def test_one_sample_is_enough():
     experiment = block(t_s=np.array([2.0]), z_m=np.array([-0.03]))
     positions = simulate(experiment, TRUTH).positions_m
-    np.testing.assert_allclose(
-        positions[0, :, 2], 0.7 * experiment.body.nodes_m[:, 2], atol=1e-11
-    )
+    np.testing.assert_allclose(positions[0, :, 2], 0.7 * experiment.body.nodes_m[:, 2], atol=1e-11)
 
 
 def drooping_bar() -> Experiment:
@@ -149,26 +132,17 @@ def drooping_bar() -> Experiment:
     body, t_s = box((0.3, 0.02, 0.02), (15, 1, 1)), np.zeros(1)
     grasp = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
     markers = vertex_markers(body, nodes_where(body, 0, 0.3), t_s)
-    bar = Experiment(
-        body, t_s, [grasp], markers, name="bar", nuisance=IDEAL, kind="static"
-    )
+    bar = Experiment(body, t_s, [grasp], markers, name="bar", nuisance=IDEAL, kind="static")
     seen_m = simulate(bar, DROOPING).markers_m
     assert (seen_m[0, :, 2] < -seen_m[0, :, 0]).all()
     return with_markers(bar, seen_m)
 
 
-DROOPING = {
-    "lambda_pa": 2e3,
-    "mu_pa": 2e3,
-    "gamma_r_s": 0.0,
-    "gamma_m_1_s": 0.0,
-}
+DROOPING = {"lambda_pa": 2e3, "mu_pa": 2e3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 
 
 # Declares that the bar was simulated with the elements that are fitted.
-SIMULATED = cs.UncertaintyOptions(
-    assumptions=cs.Assumptions(damping_law="none")
-)
+SIMULATED = cs.UncertaintyOptions(assumptions=cs.Assumptions(damping_law="none"))
 
 
 @pytest.mark.long
@@ -176,12 +150,9 @@ def test_a_body_that_bends_far_is_found_in_few_sweeps_and_saved(tmp_path):
     """A step along the tangent stretches it, and would be refused unless it were short."""
     guess = {"lambda_pa": cs.Unknown(guess=3e3), "mu_pa": cs.Unknown(guess=3e3)}
     found = run(
-        cs.Problem([drooping_bar()], DROOPING | guess, uncertainty=SIMULATED),
-        seek_causes=False,
+        cs.Problem([drooping_bar()], DROOPING | guess, uncertainty=SIMULATED), seek_causes=False
     )
-    assert found.parameters["mu_pa"] == pytest.approx(
-        DROOPING["mu_pa"], rel=1e-6
-    )
+    assert found.parameters["mu_pa"] == pytest.approx(DROOPING["mu_pa"], rel=1e-6)
     assert found.solution.iterations < 10
     with pictures_drawn():
         found.save(tmp_path / "run")
@@ -191,17 +162,13 @@ def test_a_body_that_bends_far_is_found_in_few_sweeps_and_saved(tmp_path):
     bar = found.problem.experiments[0]
     coarse = replace(bar, markers=replace(bar.markers, sigma_m=0.005))
     allowed = run(cs.Problem([coarse], DROOPING | guess), seek_causes=False)
-    assert "sigma_m = 5 mm is 0.017 of the body's size" in " ".join(
-        allowed.trust.reasons
-    )
+    assert "sigma_m = 5 mm is 0.017 of the body's size" in " ".join(allowed.trust.reasons)
 
 
 def test_a_large_step_of_a_platen_is_taken_in_parts():
     once = block("xyz", t_s=np.array([0.0, 1.0]), z_m=np.array([0.0, -0.05]))
     slowly = block("xyz", t_s=np.arange(11.0), z_m=-0.005 * np.arange(11))
-    found, expected = (
-        simulate(e, TRUTH).positions_m[-1] for e in (once, slowly)
-    )
+    found, expected = (simulate(e, TRUTH).positions_m[-1] for e in (once, slowly))
     np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
@@ -217,12 +184,9 @@ def noisy(experiment: Experiment, sigma_m: float = 1e-4) -> Experiment:
 
 
 def test_interior_point_reduced_space_and_shooting_find_the_same_static_optimum():
-    collocation = Collocation(
-        [noisy(block("xyz", gravity_m_s2=HANGING))], ELASTIC_ONLY
-    )
+    collocation = Collocation([noisy(block("xyz", gravity_m_s2=HANGING))], ELASTIC_ONLY)
     found = [
-        method(collocation).parameters
-        for method in (ReducedSpace(), InteriorPoint(), Shooting())
+        method(collocation).parameters for method in (ReducedSpace(), InteriorPoint(), Shooting())
     ]
     for other in found[1:]:
         assert other == pytest.approx(found[0], rel=1e-6)
@@ -241,15 +205,10 @@ def test_static_and_dynamic_experiments_share_their_parameters():
 
 
 def test_the_zero_of_a_displacement_is_found_with_its_derivatives():
-    true, experiment = (
-        0.5e-3,
-        block("xyz", nuisance=Nuisance.none(displacement_zero_m=1e-3)),
-    )
+    true, experiment = (0.5e-3, block("xyz", nuisance=Nuisance.none(displacement_zero_m=1e-3)))
     top = experiment.grasps[1]
     shifted = replace(top, poses=top.poses.with_shift([0.0, 0.0, true]))
-    tracks = measured(
-        replace(experiment, grasps=replaced(experiment.grasps, shifted))
-    ).markers
+    tracks = measured(replace(experiment, grasps=replaced(experiment.grasps, shifted))).markers
     unsure = replaced(experiment.grasps, replace(top, zero="z"))
     seen = with_markers(replace(experiment, grasps=unsure), tracks.positions_m)
     collocation = Collocation([seen], ELASTIC_ONLY.with_guess(TRUTH))
@@ -257,9 +216,7 @@ def test_the_zero_of_a_displacement_is_found_with_its_derivatives():
     assert max(derivative_errors(collocation, z)) < 1e-6
     solution = ReducedSpace()(collocation)
     (phi,) = [part.phi for part in collocation.iterates(solution.z)]
-    assert collocation.transcriptions[0].nuisance.names == (
-        "block: zero of grasp 2, z [m]",
-    )
+    assert collocation.transcriptions[0].nuisance.names == ("block: zero of grasp 2, z [m]",)
     # The prior, about zero, has its say beside markers of a millimetre.
     assert phi[0] * 1e-3 == pytest.approx(true, rel=0.1)
 
@@ -269,9 +226,7 @@ def replaced(grasps, top):
 
 
 def test_a_static_problem_tells_nothing_of_damping_before_and_after():
-    problem = cs.Problem(
-        [noisy(block("xyz", gravity_m_s2=HANGING))], parameters=GUESS
-    )
+    problem = cs.Problem([noisy(block("xyz", gravity_m_s2=HANGING))], parameters=GUESS)
     (note,) = static_concerns(problem.experiments, GUESS)
     assert note.message.startswith(
         "'block' is static: no information on damping; fix gamma_r_s and"
@@ -279,25 +234,17 @@ def test_a_static_problem_tells_nothing_of_damping_before_and_after():
     found = run(problem, seek_causes=False)
     assert found.estimates["gamma_r_s"].statistical_std_error is None
     assert any(
-        reason.startswith(
-            "the data do not determine gamma_r_s and gamma_m_1_s:"
-        )
+        reason.startswith("the data do not determine gamma_r_s and gamma_m_1_s:")
         for reason in found.trust.reasons
     )
     assert isinstance(found.rollouts["block"], ForwardSimulation)
-    assert found.rollouts["block"].rms_m == pytest.approx(
-        found.solution.rms_m, rel=1e-6
-    )
+    assert found.rollouts["block"].rms_m == pytest.approx(found.solution.rms_m, rel=1e-6)
 
 
 def test_a_held_block_relaxes_as_the_standard_linear_solid():
     share, tau_s = 0.5, 2.0
     t_s = np.array([0.0, 0.3, 1.0, 2.5, 7.0])
-    body = Body(
-        box_mesh((EDGE_M,) * 3, (1, 1, 1)),
-        density_kg_m3=30.0,
-        prony=["prony_1"],
-    )
+    body = Body(box_mesh((EDGE_M,) * 3, (1, 1, 1)), density_kg_m3=30.0, prony=["prony_1"])
     everywhere = Grasp(np.arange(len(body.nodes_m)), pressed(t_s, 0.0 * t_s))
     free = Experiment(
         body,
@@ -321,19 +268,13 @@ def test_a_held_block_relaxes_as_the_standard_linear_solid():
 
 
 def test_a_relaxing_block_between_platens_creeps_towards_its_rest():
-    body = Body(
-        box_mesh((EDGE_M,) * 3, (2, 2, 2)),
-        density_kg_m3=30.0,
-        prony=["prony_1"],
-    )
+    body = Body(box_mesh((EDGE_M,) * 3, (2, 2, 2)), density_kg_m3=30.0, prony=["prony_1"])
     values = TRUTH | {"prony_1.share": 0.5, "prony_1.tau_s": 2.0}
     t_s = np.array([0.0, 0.1, 1.0, 40.0])
     z_m = np.array([0.0, -0.02, -0.02, -0.02])
     pressing = block("xyz", t_s, z_m, body=body, gravity_m_s2=(0.0, 0.0, -9.81))
     x = simulate(pressing, values).positions_m
-    rest = equilibrium(pressing, body.theta_from_values(values), 40.0).reshape(
-        -1, 3
-    )
+    rest = equilibrium(pressing, body.theta_from_values(values), 40.0).reshape(-1, 3)
     off = np.abs(x[1:] - rest).max(axis=(1, 2))
     # Over the last interval the stress is taken to fall evenly.
     assert off[2] < 0.05 * off[1] < 0.05 * off[0]
@@ -343,22 +284,10 @@ def test_a_relaxing_block_between_platens_creeps_towards_its_rest():
     ("change", "message"),
     [
         ({"kind": "slow"}, "kind is 'slow'; expected one of dynamic, static"),
-        (
-            {"start": "undeformed"},
-            "start is 'undeformed', but the experiment is static",
-        ),
-        (
-            {"start_rule": "paper"},
-            "start_rule is 'paper', but the experiment is static",
-        ),
-        (
-            {"t_s": TIMES[[0, 2, 1, 3]]},
-            "row 3: t_s: t_s = 1 follows 1.5; time must increase",
-        ),
-        (
-            {"markers": None},
-            "nothing is measured: there are no markers, no measured wrench",
-        ),
+        ({"start": "undeformed"}, "start is 'undeformed', but the experiment is static"),
+        ({"start_rule": "paper"}, "start_rule is 'paper', but the experiment is static"),
+        ({"t_s": TIMES[[0, 2, 1, 3]]}, "row 3: t_s: t_s = 1 follows 1.5; time must increase"),
+        ({"markers": None}, "nothing is measured: there are no markers, no measured wrench"),
     ],
 )
 def test_static_experiments_that_make_no_sense_are_refused(change, message):
@@ -369,10 +298,7 @@ def test_static_experiments_that_make_no_sense_are_refused(change, message):
 @pytest.mark.parametrize(
     ("kept", "free"),
     [
-        (
-            [1],
-            "it can translate along x and translate along y and rotate about z",
-        ),
+        ([1], "it can translate along x and translate along y and rotate about z"),
         ([1, 2], "it can translate along y"),
         ([2, 3], "it can translate along z"),
         ([], "it can translate and rotate as a rigid body"),
@@ -387,42 +313,21 @@ def test_the_motion_that_is_left_free_is_named(kept, free):
 def test_grasps_may_share_nodes_along_different_axes_only():
     experiment = block()
     top = experiment.grasps[1]
-    replace(
-        experiment,
-        grasps=(
-            *experiment.grasps[:3],
-            replace(experiment.grasps[3], axes="y"),
-        ),
-    )
-    with pytest.raises(
-        InputError, match="held by the grasps 2 and 5 at the same time along z"
-    ):
-        replace(
-            experiment, grasps=(*experiment.grasps, replace(top, axes="xz"))
-        )
-    with pytest.raises(
-        InputError, match="axes of a grasp is 'zx'; expected one of x, y, z, xy"
-    ):
+    replace(experiment, grasps=(*experiment.grasps[:3], replace(experiment.grasps[3], axes="y")))
+    with pytest.raises(InputError, match="held by the grasps 2 and 5 at the same time along z"):
+        replace(experiment, grasps=(*experiment.grasps, replace(top, axes="xz")))
+    with pytest.raises(InputError, match="axes of a grasp is 'zx'; expected one of x, y, z, xy"):
         replace(top, axes="zx")
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "t_s,z\n0,0\n1,1\n",
-            "column z names no unit; expected one of m, cm, mm",
-        ),
-        (
-            "t_s,q_m\n0,0\n",
-            "expected t_s and any of x_m, y_m, z_m, displacement_m",
-        ),
+        ("t_s,z\n0,0\n1,1\n", "column z names no unit; expected one of m, cm, mm"),
+        ("t_s,q_m\n0,0\n", "expected t_s and any of x_m, y_m, z_m, displacement_m"),
         ("t_s,z_m,z_mm\n0,0,0\n", "the columns z_m, z_mm could all be z"),
         ("z_m\n0\n", "expected t_s and any of"),
-        (
-            "t_s,z_m\n0,0\n0,1\n",
-            "line 3: t_s = 0 follows 0; time must increase",
-        ),
+        ("t_s,z_m\n0,0\n0,1\n", "line 3: t_s = 0 follows 0; time must increase"),
         ("t_s,z_m\n0,\n", "line 2"),
         ("t_s\n0\n", "expected t_s and any of"),
     ],
@@ -490,29 +395,16 @@ def bench(folder, zero_m: float = 1e-3) -> Path:
     """A block pressed between lubricated platens, its load from the analytic solution."""
     box_mesh((EDGE_M,) * 3, (1, 1, 1)).write(folder / "block.vtu")
     lame, mu = 1e5 * 0.3 / 1.3 / 0.4, 1e5 / 2.6  # of E = 1e5 Pa, ν = 0.3
-    t_s, z_m = (
-        np.array([0.0, 1.0, 3.0, 4.0, 8.0]),
-        -np.array([0.005, 0.01, 0.02, 0.03, 0.035]),
-    )
+    t_s, z_m = (np.array([0.0, 1.0, 3.0, 4.0, 8.0]), -np.array([0.005, 0.01, 0.02, 0.03, 0.035]))
     force_n = []
     for z in z_m:
         along = 1 + (z + zero_m) / EDGE_M
         across = lateral(along, mu, lame)
-        stress = (
-            mu * (along - 1 / along) + lame * np.log(along * across**2) / along
-        )
+        stress = mu * (along - 1 / along) + lame * np.log(along * across**2) / along
         force_n.append(EDGE_M**2 * stress)
-    for file, name, values in (
-        ("crosshead", "z_m", z_m),
-        ("force", "fz_n", force_n),
-    ):
-        rows = "".join(
-            f"{t},{value!r}\n"
-            for t, value in zip(t_s, map(float, values), strict=True)
-        )
-        (folder / f"{file}.csv").write_text(
-            f"t_s,{name}\n{rows}", encoding="utf-8"
-        )
+    for file, name, values in (("crosshead", "z_m", z_m), ("force", "fz_n", force_n)):
+        rows = "".join(f"{t},{value!r}\n" for t, value in zip(t_s, map(float, values), strict=True))
+        (folder / f"{file}.csv").write_text(f"t_s,{name}\n{rows}", encoding="utf-8")
     (folder / "problem.toml").write_text(BENCH, encoding="utf-8")
     return folder / "problem.toml"
 
@@ -522,11 +414,9 @@ def test_a_test_bench_without_markers_tells_stiffness_and_zero(tmp_path):
     found = run(cs.Problem.read(bench(tmp_path)), seek_causes=False)
     assert found.estimates["young_pa"].value == pytest.approx(1e5, rel=2e-3)
     (part,) = found.solution.collocation.iterates(found.solution.z)
-    nuisance = part.segment.nuisance
+    nuisance = part.transcription.nuisance
     (zero,) = nuisance.displacement_zero_indices(1)
-    assert part.phi[zero] * nuisance.scales[zero] == pytest.approx(
-        1e-3, rel=0.05
-    )
+    assert part.phi[zero] * nuisance.scales[zero] == pytest.approx(1e-3, rel=0.05)
     with pictures_drawn():
         found.save(tmp_path / "run")
     assert (tmp_path / "run" / "wrench_press.png").is_file()
@@ -557,10 +447,7 @@ def test_a_run_without_markers_speaks_of_forces(tmp_path):
     assert re.search(r"wrench of 'press': \S+ N RMS \(sigma 0.01 N\)", said)
     assert re.search(r"forward simulation 'press': \S+ N RMS", said)
     assert "a finer step" not in said
-    assert re.search(
-        r"zero error of a displacement: up to 1(\.0)? mm \(prior ±2(\.0)? mm\)",
-        said,
-    )
+    assert re.search(r"zero error of a displacement: up to 1(\.0)? mm \(prior ±2(\.0)? mm\)", said)
     assert found.solution.max_violation_relative < 1e-6
 
 
@@ -573,36 +460,16 @@ def test_a_run_without_markers_speaks_of_forces(tmp_path):
             'kind = "static"\nstart = "undeformed"',
             'together with kind = "static"',
         ),
-        (
-            'kind = "static"',
-            'kind = "static"\nresample_hz = 10.0',
-            "found resample_hz together",
-        ),
-        (
-            "displacement_zero =",
-            "time_shift = { prior_s = 1.0 }  #",
-            "found nuisance.time_shift",
-        ),
-        (
-            'displacement = "',
-            'poses = "p.csv"\ndisplacement = "',
-            "poses and displacement",
-        ),
-        (
-            'displacement = "',
-            'length_unit = "mm"\ndisplacement = "',
-            "length_unit without poses",
-        ),
+        ('kind = "static"', 'kind = "static"\nresample_hz = 10.0', "found resample_hz together"),
+        ("displacement_zero =", "time_shift = { prior_s = 1.0 }  #", "found nuisance.time_shift"),
+        ('displacement = "', 'poses = "p.csv"\ndisplacement = "', "poses and displacement"),
+        ('displacement = "', 'length_unit = "mm"\ndisplacement = "', "length_unit without poses"),
         (
             "wrench =",
             "# wrench =",
             "nothing is measured: expected markers, a wrench, a reading, or depth",
         ),
-        (
-            'axes = "x"',
-            'axes = "xz"',
-            "held by the grasps 1 and 3 at the same time along z",
-        ),
+        ('axes = "x"', 'axes = "xz"', "held by the grasps 1 and 3 at the same time along z"),
         ('axes = "x"', 'axes = "w"', "grasp.2.axes"),
         ('axes = "y"', 'axes = "y"\nfrom_s = 7.0', "it can translate along y"),
         (
@@ -613,9 +480,7 @@ def test_a_run_without_markers_speaks_of_forces(tmp_path):
         ('"crosshead.csv"', '"lost.csv"', "lost.csv does not exist"),
     ],
 )
-def test_test_benches_that_make_no_sense_are_refused(
-    tmp_path, old, new, message
-):
+def test_test_benches_that_make_no_sense_are_refused(tmp_path, old, new, message):
     file = bench(tmp_path)
     text = file.read_text(encoding="utf-8")
     assert old in text

@@ -16,34 +16,21 @@ from collocation_sysid.program.forward.newton_solver import (
     NewtonOptions,
     NewtonSolver,
 )
-from collocation_sysid.program.forward.scheme_simulation import (
-    continue_simulation,
-)
+from collocation_sysid.program.forward.scheme_simulation import continue_simulation
 
 EDGE_M = 0.03
 DEPTHS_M = np.linspace(0.0, 0.004, 7)
-TRUTH = {
-    "lambda_pa": 2e4,
-    "mu_pa": 1e4,
-    "gamma_r_s": 0.0,
-    "gamma_m_1_s": 0.0,
-}
+TRUTH = {"lambda_pa": 2e4, "mu_pa": 1e4, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 
 
 def pressed_by_a_rough_plate() -> cs.Experiment:
     """A block that is glued below, and a plate with friction that comes down on it."""
-    body = cs.Body(
-        cs.box_mesh((EDGE_M,) * 3, (2, 2, 2)),
-        density_kg_m3=1000.0,
-        element="tet10",
-    )
+    body = cs.Body(cs.box_mesh((EDGE_M,) * 3, (2, 2, 2)), density_kg_m3=1000.0, element="tet10")
     t_s = np.arange(len(DEPTHS_M), dtype=float)
     up = np.array([0.0, 0.0, 1.0])
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
     down = cs.PoseSequence(t_s, np.outer(-DEPTHS_M, up), still)
-    glued = cs.Grasp(
-        np.flatnonzero(body.nodes_m[:, 2] < 1e-9), cs.PoseSequence.fixed()
-    )
+    glued = cs.Grasp(np.flatnonzero(body.nodes_m[:, 2] < 1e-9), cs.PoseSequence.fixed())
     plate = cs.Obstacle(
         poses=down,
         shape=cs.Plane(-up, EDGE_M * up),
@@ -132,9 +119,7 @@ def double_well(solver: NewtonSolver, factor: float):
 
 
 @pytest.mark.parametrize("checks_stability", [True, False])
-def test_an_unstable_equilibrium_is_found_out_by_its_own_factor(
-    checks_stability,
-):
+def test_an_unstable_equilibrium_is_found_out_by_its_own_factor(checks_stability):
     """A known factor leads to the middle of two wells; only there is the stiffness negative."""
     experiment = pressed_by_a_rough_plate()
     options = NewtonOptions(checks_stability=checks_stability)
@@ -166,24 +151,18 @@ def test_a_sweep_along_unstable_equilibria_searches_stable_ones(monkeypatch):
     def sweep(solver, transcription, p, trajectory, previous, **options):
         swept.append(float(trajectory[0, 0]))
         unstable = int(len(swept) == 1)
-        return SimpleNamespace(
-            report=SimpleNamespace(indefinite_steps=unstable)
-        )
+        return SimpleNamespace(report=SimpleNamespace(indefinite_steps=unstable))
 
     part = SimpleNamespace(
         x=np.zeros((1, 3)),
         equations=SimpleNamespace(
-            dynamics=SimpleNamespace(
-                is_static=True, truncated_to=lambda rows: None
-            )
+            dynamics=SimpleNamespace(is_static=True, truncated_to=lambda rows: None)
         ),
     )
     module = trajectory_sweeps
     monkeypatch.setattr(module, "continue_simulation", continued)
     monkeypatch.setattr(module, "sweep", sweep)
-    monkeypatch.setattr(
-        module, "ExperimentIterate", lambda *args, **kwargs: part
-    )
+    monkeypatch.setattr(module, "ExperimentIterate", lambda *args, **kwargs: part)
     monkeypatch.setattr(module, "extrapolate", lambda *args, **kwargs: None)
     nothing = SimpleNamespace(experiment=None, stopwatch=None, nq=0)
     result = module.sweep_after_step(

@@ -29,17 +29,10 @@ SOFT = {"mu_pa": cs.Unknown(400.0), "gamma_r_s": cs.Unknown(0.005)}
 def twin(noise_m: float, substeps: int | str = "auto") -> Problem:
     """A cube that another integrator has simulated at a sixteenth of the samples' distance."""
     cube = hung_cube(25, divisions=(1, 1, 2))
-    tracks_m = cs.simulate(
-        cube, TRUTH, timestep_s=cube.timestep_s / 16
-    ).markers_m
-    tracks_m = tracks_m + np.random.default_rng(3).normal(
-        scale=noise_m, size=tracks_m.shape
-    )
+    tracks_m = cs.simulate(cube, TRUTH, timestep_s=cube.timestep_s / 16).markers_m
+    tracks_m = tracks_m + np.random.default_rng(3).normal(scale=noise_m, size=tracks_m.shape)
     sigma_m = np.full(len(cube.markers.names), noise_m)
-    seen = replace(
-        cube,
-        markers=replace(cube.markers, positions_m=tracks_m, sigma_m=sigma_m),
-    )
+    seen = replace(cube, markers=replace(cube.markers, positions_m=tracks_m, sigma_m=sigma_m))
     return Problem([seen], {**TRUTH, **SOFT}, substeps=substeps)  # type: ignore[arg-type]
 
 
@@ -60,39 +53,24 @@ def swung_block() -> cs.Experiment:
     """A block of 200 kg/m³ that is swung 12 cm at 2 Hz and sampled at 50 Hz."""
     t_s = np.linspace(0.0, 0.5, 26)
     way_m = np.outer(0.06 * (1 - np.cos(4 * np.pi * t_s)), [1, 0, 0])
-    body = cs.Body(
-        cs.box_mesh((0.05, 0.05, 0.15), (1, 1, 3)), density_kg_m3=200.0
-    )
+    body = cs.Body(cs.box_mesh((0.05, 0.05, 0.15), (1, 1, 3)), density_kg_m3=200.0)
     top = np.flatnonzero(body.nodes_m[:, 2] > 0.149)
     low = body.nodes_m[body.nodes_m[:, 2] < 0.06][::4]
     swing = cs.PoseSequence(t_s, way_m, np.tile([0, 0, 0, 1.0], (len(t_s), 1)))
-    markers = cs.Markers(
-        t_s, np.zeros((len(t_s), len(low), 3)), 3e-4, places_m=low
-    )
-    return cs.Experiment(
-        body, t_s, [cs.Grasp(top, swing)], markers, nuisance=cs.Nuisance.none()
-    )
+    markers = cs.Markers(t_s, np.zeros((len(t_s), len(low), 3)), 3e-4, places_m=low)
+    return cs.Experiment(body, t_s, [cs.Grasp(top, swing)], markers, nuisance=cs.Nuisance.none())
 
 
-BLOCK = {
-    "young_pa": 20e3,
-    "poisson": 0.3,
-    "gamma_r_s": 4e-3,
-    "gamma_m_1_s": 0.2,
-}
+BLOCK = {"young_pa": 20e3, "poisson": 0.3, "gamma_r_s": 4e-3, "gamma_m_1_s": 0.2}
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("integrator", ["midpoint", "newmark"])
-def test_a_run_recovers_what_a_simulation_was_made_with_both_with_their_default_steps(
-    integrator,
-):
+def test_a_run_recovers_what_a_simulation_was_made_with_both_with_their_default_steps(integrator):
     """With one step a sample the midpoint rule's twin gave E = 18.7 kPa (18.5 to 18.9)."""
     block = swung_block()
     tracks_m = cs.simulate(block, BLOCK, integrator).markers_m
-    tracks_m = tracks_m + np.random.default_rng(0).normal(
-        scale=3e-4, size=tracks_m.shape
-    )
+    tracks_m = tracks_m + np.random.default_rng(0).normal(scale=3e-4, size=tracks_m.shape)
     unknown = {"young_pa": cs.Unknown(10e3), "gamma_r_s": cs.Unknown(2e-3)}
     problem = Problem([cs.with_markers(block, tracks_m)], {**BLOCK, **unknown})
     answer = run(problem, seek_causes=False)
@@ -117,17 +95,10 @@ def test_where_every_parameter_ends_at_a_bound_the_steps_are_checked_too():
     """Coarse steps may have driven it there, and no error bar tells whether they did."""
     block = hung_cube(10, divisions=(1, 1, 1))
     seen = cs.with_markers(block, cs.simulate(block, TRUTH).markers_m)
-    bounded = cs.Unknown(
-        TRUTH["mu_pa"] / 3, TRUTH["mu_pa"] / 4, TRUTH["mu_pa"] / 2
-    )
-    answer = run(
-        Problem([seen], {**TRUTH, "mu_pa": bounded}), seek_causes=False
-    )
+    bounded = cs.Unknown(TRUTH["mu_pa"] / 3, TRUTH["mu_pa"] / 4, TRUTH["mu_pa"] / 2)
+    answer = run(Problem([seen], {**TRUTH, "mu_pa": bounded}), seek_causes=False)
     assert answer.solution.collocation.substeps == MOST_SUBSTEPS
-    assert any(
-        "every parameter ends at a bound" in note
-        for note in answer.solution.notes
-    )
+    assert any("every parameter ends at a bound" in note for note in answer.solution.notes)
     assert answer.trust.verdict != "good"
 
 
@@ -161,9 +132,7 @@ def test_the_value_is_corrected_for_the_step_and_lies_within_both_intervals():
 
 
 def test_a_scheme_of_first_order_has_its_error_in_the_interval_too():
-    euler = run(
-        replace(twin(3e-4, 4), scheme="backward-euler"), seek_causes=False
-    )
+    euler = run(replace(twin(3e-4, 4), scheme="backward-euler"), seek_causes=False)
     noise = euler.optimum["gamma_r_s"]
     assert not holds(noise.statistical95, TRUTH["gamma_r_s"])
     assert holds(euler.interval("gamma_r_s"), TRUTH["gamma_r_s"])
@@ -175,10 +144,7 @@ def test_what_was_not_estimated_is_not_said_to_be_held():
     blind = run(unseen, seek_causes=False)
     assert blind.result.list_discretisation_kinds() == ()
     assert blind.estimates["mu_pa"].value == blind.optimum["mu_pa"].value
-    assert (
-        blind.estimates["mu_pa"].statistical95
-        == blind.optimum["mu_pa"].statistical95
-    )
+    assert blind.estimates["mu_pa"].statistical95 == blind.optimum["mu_pa"].statistical95
     assert "but not the step error and the mesh error" in blind.table()
 
 
@@ -198,13 +164,9 @@ def test_as_many_steps_are_taken_as_leave_half_a_standard_error():
 
 def test_it_is_told_what_was_chosen_and_why():
     finer = found(3e-4)
-    (said,) = [
-        note for note in finer.solution.notes if "standard errors" in note
-    ]
+    (said,) = [note for note in finer.solution.notes if "standard errors" in note]
     many = finer.solution.collocation.substeps
-    assert said.startswith(
-        "with one time step per sample, the estimated time-step error of "
-    )
+    assert said.startswith("with one time step per sample, the estimated time-step error of ")
     assert f"solved again with {many} " in said
     assert finer.result.problem.substeps == many
     assert finer.result.iterations > found(3e-4, many).solution.iterations
@@ -212,9 +174,7 @@ def test_it_is_told_what_was_chosen_and_why():
 
 def test_the_guess_and_the_way_from_it_are_kept():
     finer = found(3e-4)
-    assert finer.solution.collocation.parameters.guesses[
-        "mu_pa"
-    ] == pytest.approx(400.0)
+    assert finer.solution.collocation.parameters.guesses["mu_pa"] == pytest.approx(400.0)
     numbers = [line.number for line in finer.solution.history]
     assert numbers == sorted(numbers)
     assert finer.solution.history[0].parameters["mu_pa"] == pytest.approx(400.0)
@@ -244,19 +204,9 @@ def test_a_number_that_is_stated_is_kept():
 
 def test_there_are_no_more_than_the_most():
     estimates = {"mu_pa": Estimate(100.0, 0.1, (99.8, 100.2))}
-    for half, order, needed in (
-        (100.01, 2, 1),
-        (100.14, 2, 2),
-        (100.14, 1, 6),
-        (110.0, 2, 8),
-    ):
-        error = discretisation_error(
-            "mu_pa", estimates["mu_pa"], [half], [], order
-        )
-        assert (
-            Refinement({"mu_pa": error}).suggested_substeps(estimates, order)
-            == needed
-        )
+    for half, order, needed in ((100.01, 2, 1), (100.14, 2, 2), (100.14, 1, 6), (110.0, 2, 8)):
+        error = discretisation_error("mu_pa", estimates["mu_pa"], [half], [], order)
+        assert Refinement({"mu_pa": error}).suggested_substeps(estimates, order) == needed
     nothing = {"mu_pa": replace(estimates["mu_pa"], statistical_std_error=None)}
     assert Refinement({"mu_pa": error}).suggested_substeps(nothing, order) == 1
 
@@ -274,28 +224,18 @@ def fails_at_finer_steps(how: BaseException | cs.Status) -> Method:
 
 
 def test_the_first_answer_counts_where_the_finer_is_not_found():
-    kept = run(
-        twin(3e-4), fails_at_finer_steps(cs.Status.STALLED), seek_causes=False
-    )
-    assert kept.parameters["mu_pa"] == pytest.approx(
-        found(3e-4, 1).parameters["mu_pa"]
-    )
+    kept = run(twin(3e-4), fails_at_finer_steps(cs.Status.STALLED), seek_causes=False)
+    assert kept.parameters["mu_pa"] == pytest.approx(found(3e-4, 1).parameters["mu_pa"])
     assert kept.solution.status.converged
-    assert any(
-        "the solve with" in note and "failed" in note for note in kept.notes
-    )
+    assert any("the solve with" in note and "failed" in note for note in kept.notes)
 
 
 @pytest.mark.parametrize("how", [cs.Status.INTERRUPTED, KeyboardInterrupt()])
 def test_an_interrupt_at_finer_steps_leaves_the_first_answer_and_says_so(how):
     kept = run(twin(3e-4), fails_at_finer_steps(how), seek_causes=False)
-    assert kept.parameters["mu_pa"] == pytest.approx(
-        found(3e-4, 1).parameters["mu_pa"]
-    )
+    assert kept.parameters["mu_pa"] == pytest.approx(found(3e-4, 1).parameters["mu_pa"])
     assert "a finer time step" in kept.omitted_checks
-    assert np.isnan(
-        kept.interval("mu_pa")
-    ).all()  # systematic effects were not evaluated
+    assert np.isnan(kept.interval("mu_pa")).all()  # systematic effects were not evaluated
     assert "systematic effects were not evaluated" in kept.table()
 
 
@@ -330,10 +270,7 @@ def test_every_view_has_value_interval_verdict_and_what_the_interval_holds():
         assert f"{coarse.parameters['mu_pa']:.5g}" in said
         assert f"{low:.5g} … {high:.5g}" in said
         assert "Verdict: good" in said
-        assert (
-            "noise, the step error and systematic effects, but not the mesh error"
-            in said
-        )
+        assert "noise, the step error and systematic effects, but not the mesh error" in said
     assert coarse.result.parameters["mu_pa"].combined95 == (low, high)
     assert f"[{low:.5g}, {high:.5g}]" in repr(coarse)
     assert ", good: " in repr(coarse)

@@ -21,9 +21,7 @@ from kit.problems import (
 
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.solution import constraint_multipliers
-from collocation_sysid.model.equations_at_parameters import (
-    EquationsAtParameters,
-)
+from collocation_sysid.model.equations_at_parameters import EquationsAtParameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program import sweep
 from collocation_sysid.program.collocation import Collocation
@@ -46,18 +44,16 @@ def disturbed(
     """Variables near the truth whose free dofs do not satisfy the equations of motion."""
     rng = np.random.default_rng(seed)
     positions = []
-    for segment in collocation.transcriptions:
+    for transcription in collocation.transcriptions:
         x = simulate_scheme(
-            segment.experiment, segment.dynamics.with_theta(as_theta(TRUTH))
+            transcription.experiment, transcription.dynamics.with_theta(as_theta(TRUTH))
         )
         change = np.zeros_like(x)
-        change[:, segment.free_dofs] = rng.standard_normal(
-            (len(x), len(segment.free_dofs))
+        change[:, transcription.free_dofs] = rng.standard_normal(
+            (len(x), len(transcription.free_dofs))
         )
-        change = segment.dynamics.zero_prescribed_forces(change)
-        x[segment.dynamics.first_row :] += (
-            size_m * change[segment.dynamics.first_row :]
-        )
+        change = transcription.dynamics.zero_prescribed_forces(change)
+        x[transcription.dynamics.first_row :] += size_m * change[transcription.dynamics.first_row :]
         positions.append(x)
     return collocation.pack(some_parameters(collocation), positions), positions
 
@@ -69,32 +65,19 @@ def some_parameters(collocation: Collocation) -> np.ndarray:
 
 
 def only_setting(collocation: Collocation) -> EquationsAtParameters:
-    (segment,) = collocation.transcriptions
-    return segment.equations_at(
-        *np.split(some_parameters(collocation), [collocation.nq])
-    )
+    (transcription,) = collocation.transcriptions
+    return transcription.equations_at(*np.split(some_parameters(collocation), [collocation.nq]))
 
 
-def forward(
-    collocation: Collocation, positions: list[np.ndarray]
-) -> list[SweepResult]:
+def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[SweepResult]:
     parts = collocation.iterates_at(some_parameters(collocation), positions)
-    return [
-        Sweep(part.segment).forward(part.x, part.equations) for part in parts
-    ]
+    return [Sweep(part.transcription).forward(part.x, part.equations) for part in parts]
 
 
 @pytest.fixture(
     scope="module",
-    params=[
-        (*pair, "bounds")
-        for pair in [*EXPERIMENTS_AND_SCHEMES, ("bar-loaded", "bdf2")]
-    ]
-    + [
-        ("hung-cube", scheme, layout)
-        for scheme in SCHEMES
-        for layout in list(LAYOUTS)[1:]
-    ],
+    params=[(*pair, "bounds") for pair in [*EXPERIMENTS_AND_SCHEMES, ("bar-loaded", "bdf2")]]
+    + [("hung-cube", scheme, layout) for scheme in SCHEMES for layout in list(LAYOUTS)[1:]],
     ids="-".join,
 )
 def collocation(request: pytest.FixtureRequest) -> Collocation:
@@ -102,35 +85,25 @@ def collocation(request: pytest.FixtureRequest) -> Collocation:
     return Collocation([EXPERIMENTS[name](5)], GUESS, scheme, **LAYOUTS[layout])
 
 
-def test_the_feasibility_step_solves_the_linearised_constraints(
-    collocation: Collocation,
-):
+def test_the_feasibility_step_solves_the_linearised_constraints(collocation: Collocation):
     z, positions = disturbed(collocation)
     step = [tangent.step for tangent in forward(collocation, positions)]
     values = collocation.constraint_values(z)
     still = np.zeros_like(collocation.guess_p)
     change = collocation.jacobian(z) @ collocation.pack(still, step)
     assert np.abs(values).max() > 1e-4
-    np.testing.assert_allclose(
-        change, -values, atol=1e-9 * np.abs(values).max()
-    )
+    np.testing.assert_allclose(change, -values, atol=1e-9 * np.abs(values).max())
 
 
-def test_multipliers_make_the_lagrangian_stationary_in_the_positions(
-    collocation: Collocation,
-):
-    collocation = replace(
-        collocation, experiments=[*map(measured, collocation.experiments)]
-    )
+def test_multipliers_make_the_lagrangian_stationary_in_the_positions(collocation: Collocation):
+    collocation = replace(collocation, experiments=[*map(measured, collocation.experiments)])
     z, _ = disturbed(collocation)
     multipliers = constraint_multipliers(collocation, z)
     gradient = collocation.gradient(z)
     slope = gradient + collocation.jacobian(z).T @ multipliers
     lower, upper = collocation.bounds()
     first = collocation.nq
-    free = first + np.flatnonzero(
-        (lower < upper)[first : len(z) - collocation.nphi]
-    )
+    free = first + np.flatnonzero((lower < upper)[first : len(z) - collocation.nphi])
     assert np.abs(gradient[free]).max() > 0
     assert np.abs(slope[free]).max() < 1e-9 * np.abs(gradient[free]).max()
 
@@ -138,18 +111,16 @@ def test_multipliers_make_the_lagrangian_stationary_in_the_positions(
 def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     """gᵀ p = yᵀ c for y with c_xᵀ y = −g and p = −c_x⁻¹ c."""
     _, (x,) = disturbed(collocation)
-    (segment,) = collocation.transcriptions
+    (transcription,) = collocation.transcriptions
     setting = only_setting(collocation)
     goals = (
         setting.prescribed.positions_m
     )  # what is grasped is where it should be: no step of its own
-    x[:, setting.prescribed.dofs] = np.where(
-        np.isnan(goals), x[:, setting.prescribed.dofs], goals
-    )
+    x[:, setting.prescribed.dofs] = np.where(np.isnan(goals), x[:, setting.prescribed.dofs], goals)
     gradient = rng.standard_normal(x.shape)
-    y = Sweep(segment).backward(x, setting, gradient)
+    y = Sweep(transcription).backward(x, setting, gradient)
     (found,) = forward(collocation, [x])
-    residual, free = segment.residual_n(x, setting), segment.free_dofs
+    residual, free = transcription.residual_n(x, setting), transcription.free_dofs
     left = np.sum(gradient[:, free] * found.step[:, free])
     assert left == pytest.approx(np.sum(y[:, free] * residual), rel=1e-9)
 
@@ -159,12 +130,7 @@ def test_what_is_given_does_not_move():
     _, positions = disturbed(collocation)
     (found,) = forward(collocation, positions)
     held = collocation.transcriptions[0].prescribed_dofs
-    for part in (
-        found.step[0],
-        found.by_p[0],
-        found.step[:, held],
-        found.by_p[:, held],
-    ):
+    for part in (found.step[0], found.by_p[0], found.step[:, held], found.by_p[:, held]):
         assert not part.any()
 
 
@@ -177,9 +143,7 @@ def test_chunks_do_not_show(monkeypatch: pytest.MonkeyPatch):
     (parts,) = forward(collocation, positions)
     np.testing.assert_allclose(parts.step, whole.step, rtol=1e-10, atol=1e-15)
     np.testing.assert_allclose(parts.by_p, whole.by_p, rtol=1e-10, atol=1e-15)
-    np.testing.assert_allclose(
-        constraint_multipliers(collocation, z), multipliers, rtol=1e-9
-    )
+    np.testing.assert_allclose(constraint_multipliers(collocation, z), multipliers, rtol=1e-9)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -187,8 +151,8 @@ def test_the_first_rows_do_not_depend_on_later_ones(scheme: str):
     collocation = Collocation([hung_cube(8)], GUESS, scheme)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    (segment,) = collocation.transcriptions
-    part = Sweep(segment, rows=5).forward(x[:5], only_setting(collocation))
+    (transcription,) = collocation.transcriptions
+    part = Sweep(transcription, rows=5).forward(x[:5], only_setting(collocation))
     np.testing.assert_allclose(part.step, whole.step[:5], rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(part.by_p, whole.by_p[:5], rtol=1e-9, atol=1e-15)
 
@@ -199,16 +163,12 @@ def test_the_first_rows_can_be_continued(scheme: str, done: int):
     collocation = Collocation([hung_cube(8)], GUESS, scheme)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    (segment,) = collocation.transcriptions
+    (transcription,) = collocation.transcriptions
     setting = only_setting(collocation)
-    first = Sweep(segment, done).forward(x[:done], setting)
-    continued = Sweep(segment).forward(x, setting, first)
-    np.testing.assert_allclose(
-        continued.step, whole.step, rtol=1e-9, atol=1e-15
-    )
-    np.testing.assert_allclose(
-        continued.by_p, whole.by_p, rtol=1e-9, atol=1e-15
-    )
+    first = Sweep(transcription, done).forward(x[:done], setting)
+    continued = Sweep(transcription).forward(x, setting, first)
+    np.testing.assert_allclose(continued.step, whole.step, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(continued.by_p, whole.by_p, rtol=1e-9, atol=1e-15)
     assert continued.violation_n == pytest.approx(whole.violation_n)
 
 
@@ -216,26 +176,20 @@ def test_rows_one_by_one_are_the_same_sensitivities():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    rows = Sweep(collocation.transcriptions[0]).sensitivities(
-        x, only_setting(collocation)
-    )
-    np.testing.assert_allclose(
-        np.stack(list(rows)), whole.by_p, rtol=1e-9, atol=1e-15
-    )
+    rows = Sweep(collocation.transcriptions[0]).sensitivities(x, only_setting(collocation))
+    np.testing.assert_allclose(np.stack(list(rows)), whole.by_p, rtol=1e-9, atol=1e-15)
 
 
 def test_indefinite_blocks_are_counted():
     """Rayleigh's damping makes them so where elements are squashed; the objective law does not."""
     collocation = Collocation([with_papers_damping(hung_cube(6))], GUESS)
-    (segment,) = collocation.transcriptions
-    x = np.tile(segment.body.nodes_m.ravel(), (segment.grid_times, 1))
+    (transcription,) = collocation.transcriptions
+    x = np.tile(transcription.body.nodes_m.ravel(), (transcription.grid_times, 1))
     x.reshape(len(x), -1, 3)[3:, :, 2] *= 0.05
-    jacobian = collocation.jacobian(
-        collocation.pack(GUESS.guess_q, [x])
-    ).toarray()
-    count, expected = len(segment.free_dofs), 0
-    for t in range(segment.grid_times):
-        columns = collocation.nq + t * segment.dof_count + segment.free_dofs
+    jacobian = collocation.jacobian(collocation.pack(GUESS.guess_q, [x])).toarray()
+    count, expected = len(transcription.free_dofs), 0
+    for t in range(transcription.grid_times):
+        columns = collocation.nq + t * transcription.dof_count + transcription.free_dofs
         block = jacobian[t * count : (t + 1) * count, columns]
         expected += int(np.linalg.eigvalsh(-block)[0] <= 0)
     assert expected > 0
@@ -261,30 +215,26 @@ def test_time_is_accounted_for():
 
 
 @pytest.mark.parametrize("has_papers_damping", [True, False])
-def test_sweeps_in_single_precision_are_as_accurate(
-    monkeypatch, has_papers_damping: bool
-):
+def test_sweeps_in_single_precision_are_as_accurate(monkeypatch, has_papers_damping: bool):
     """As for bodies with wide bands; with Kelvin–Voigt damping matrices have a skew part."""
     experiment = hung_cube(6)
     if has_papers_damping:
         experiment = with_papers_damping(experiment)
     assert experiment.body.is_unsymmetric != has_papers_damping
     collocation = Collocation([measured(experiment)], GUESS)
-    (segment,) = collocation.transcriptions
+    (transcription,) = collocation.transcriptions
     z, (x,) = disturbed(collocation)
     part = collocation.iterates(z)[0]
-    expected = Sweep(segment).forward(x, part.equations)
+    expected = Sweep(transcription).forward(x, part.equations)
     monkeypatch.setattr(factorisation, "NARROW", 0)
     factorisation._cached_analysis.cache_clear()
-    solver = Sweep(segment, factorisation="band")
+    solver = Sweep(transcription, factorisation="band")
     assert solver.has_single_precision
     for accuracy, tolerance in ((1e-10, 1e-8), (1e-4, 1e-3)):
         result = solver.forward(x, part.equations, accuracy=accuracy)
         for name in ("step", "by_p"):
             values = getattr(expected, name)
             np.testing.assert_allclose(
-                getattr(result, name),
-                values,
-                atol=tolerance * np.abs(values).max(),
+                getattr(result, name), values, atol=tolerance * np.abs(values).max()
             )
     factorisation._cached_analysis.cache_clear()

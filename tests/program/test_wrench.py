@@ -8,24 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kit.checks import relative_error
-from kit.problems import (
-    GUESS,
-    TRUTH,
-    as_theta,
-    bar_in_two_hands,
-    bar_let_go,
-    hung_cube,
-    times,
-)
+from kit.problems import GUESS, TRUTH, as_theta, bar_in_two_hands, bar_let_go, hung_cube, times
 from kit.wrench_kinds import pressed
-from kit.wrenches import (
-    EVERYTHING,
-    felt,
-    fitted,
-    predicted_wrenches,
-    sensing,
-    wristed_cube,
-)
+from kit.wrenches import EVERYTHING, felt, fitted, predicted_wrenches, sensing, wristed_cube
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.methods.comparison.shooting import simulate_variables
@@ -44,23 +29,16 @@ from collocation_sysid.recording import Experiment, PoseSequence
 def at_truth(
     experiment: Experiment, scheme: str = "midpoint", substeps: int = 1
 ) -> ExperimentIterate:
-    collocation = Collocation(
-        [experiment], Parameters.from_mapping(TRUTH), scheme, substeps
-    )
-    (segment,) = collocation.transcriptions
-    x = simulate_scheme(
-        experiment, segment.dynamics.with_theta(as_theta(TRUTH))
-    )
+    collocation = Collocation([experiment], Parameters.from_mapping(TRUTH), scheme, substeps)
+    (transcription,) = collocation.transcriptions
+    x = simulate_scheme(experiment, transcription.dynamics.with_theta(as_theta(TRUTH)))
     (part,) = collocation.iterates_at(np.zeros(collocation.nphi), [x])
     return part
 
 
 def total_on_grid(part: ExperimentIterate) -> tuple[np.ndarray, np.ndarray]:
     """Grid times and the wrenches (n, 6) of all grasps together."""
-    forced, channels = (
-        part.reactions,
-        [s.observable for s in part.segment.sensors],
-    )
+    forced, channels = (part.reactions, [s.observable for s in part.transcription.sensors])
     return channels[0].known_rows, np.sum(
         [c.evaluate_without_tool(forced) for c in channels], axis=0
     )
@@ -76,17 +54,17 @@ def test_all_grasps_together_give_weight_and_rate_of_momentum(
     part = at_truth(sensing(experiment, point_m=(0, 0, 0)), scheme)
     undragged = TRUTH | {"gamma_m_1_s": 0.0}
     theta = as_theta(undragged)
-    x = simulate_scheme(experiment, part.segment.dynamics.with_theta(theta))
+    x = simulate_scheme(experiment, part.transcription.dynamics.with_theta(theta))
     collocation = Collocation(
-        [part.segment.experiment], Parameters.from_mapping(undragged), scheme
+        [part.transcription.experiment], Parameters.from_mapping(undragged), scheme
     )
     (part,) = collocation.iterates_at(np.zeros(0), [x])
     grid, found = total_on_grid(part)
-    dynamics = part.segment.dynamics
+    dynamics = part.transcription.dynamics
     mass = dynamics.mass.inertia_kg[0, ::3]
     stencil = dynamics.combine(dynamics.tables.s, x) / dynamics.step_s**2
     acceleration = stencil[
-        grid + part.segment.sensors[0].observable.reaction_grid.delay_steps
+        grid + part.transcription.sensors[0].observable.reaction_grid.delay_steps
     ].reshape(len(grid), -1, 3)
     pull = mass[:, None] * (acceleration - experiment.gravity_m_s2)
     weight_n = 9.81 * mass.sum()
@@ -95,17 +73,15 @@ def test_all_grasps_together_give_weight_and_rate_of_momentum(
 
 def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
     part = at_truth(sensing(bar_in_two_hands(14), point_m=(0.1, 0.2, -0.1)))
-    experiment = part.segment.experiment
+    experiment = part.transcription.experiment
     theta = as_theta(TRUTH | {"gamma_m_1_s": 0.0})
-    x = simulate_scheme(experiment, part.segment.dynamics.with_theta(theta))
-    collocation = Collocation(
-        [experiment], Parameters.from_mapping(TRUTH | {"gamma_m_1_s": 0.0})
-    )
+    x = simulate_scheme(experiment, part.transcription.dynamics.with_theta(theta))
+    collocation = Collocation([experiment], Parameters.from_mapping(TRUTH | {"gamma_m_1_s": 0.0}))
     (part,) = collocation.iterates_at(np.zeros(0), [x])
     grid, found = total_on_grid(part)
     dynamics, mass = (
-        part.segment.dynamics,
-        part.segment.dynamics.mass.inertia_kg[0, ::3],
+        part.transcription.dynamics,
+        part.transcription.dynamics.mass.inertia_kg[0, ::3],
     )
     at = x.reshape(len(x), -1, 3)
     second = (at[2:] - 2 * at[1:-1] + at[:-2]) / dynamics.step_s**2
@@ -121,21 +97,12 @@ def test_torques_of_the_midpoint_rule_give_the_rate_of_angular_momentum():
 def test_a_body_at_rest_is_carried(scheme: str):
     still = hung_cube(8)
     (grasp,) = still.grasps
-    at_rest = replace(
-        grasp,
-        poses=replace(grasp.poses, positions_m=0 * grasp.poses.positions_m),
-    )
+    at_rest = replace(grasp, poses=replace(grasp.poses, positions_m=0 * grasp.poses.positions_m))
     turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(still.t_s), 1))
-    at_rest = replace(
-        at_rest, poses=replace(at_rest.poses, quaternions_xyzw=turns)
-    )
-    _, found = total_on_grid(
-        at_truth(sensing(replace(still, grasps=[at_rest])), scheme)
-    )
+    at_rest = replace(at_rest, poses=replace(at_rest.poses, quaternions_xyzw=turns))
+    _, found = total_on_grid(at_truth(sensing(replace(still, grasps=[at_rest])), scheme))
     weight_n = 9.81 * still.body.mass_kg
-    np.testing.assert_allclose(
-        found[:, :3], np.tile([0, 0, weight_n], (len(found), 1)), atol=1e-9
-    )
+    np.testing.assert_allclose(found[:, :3], np.tile([0, 0, weight_n], (len(found), 1)), atol=1e-9)
 
 
 def test_the_frame_of_the_grasp_moves_along():
@@ -143,25 +110,21 @@ def test_the_frame_of_the_grasp_moves_along():
     moving = at_truth(wristed_cube(frame="grasp"))
     grid, in_world = total_on_grid(world)
     _, in_grasp = total_on_grid(moving)
-    turns, shifts = world.segment.experiment.grasps[0].poses.at(
-        world.segment.dynamics.t_s[grid]
+    turns, shifts = world.transcription.experiment.grasps[0].poses.at(
+        world.transcription.dynamics.t_s[grid]
     )
     np.testing.assert_allclose(
-        np.einsum("kij,kj->ki", turns, in_grasp[:, :3]),
-        in_world[:, :3],
-        atol=1e-12,
+        np.einsum("kij,kj->ki", turns, in_grasp[:, :3]), in_world[:, :3], atol=1e-12
     )
-    point = world.segment.sensors[0].wrench.point_m
+    point = world.transcription.sensors[0].wrench.point_m
     arm = shifts + turns @ point - point
-    about = np.einsum("kij,kj->ki", turns, in_grasp[:, 3:]) + np.cross(
-        arm, in_world[:, :3]
-    )
+    about = np.einsum("kij,kj->ki", turns, in_grasp[:, 3:]) + np.cross(arm, in_world[:, :3])
     np.testing.assert_allclose(about, in_world[:, 3:], atol=1e-12)
 
 
 def test_a_grasp_that_lets_go_tells_its_wrench_while_it_holds():
     part = at_truth(sensing(bar_let_go(12)))
-    still, moving = part.segment.sensors
+    still, moving = part.transcription.sensors
     assert still.observable.known_rows[-1] == 11
     # It holds up to the third grid time; the first two rows are those of the start.
     np.testing.assert_array_equal(moving.observable.known_rows, [1])
@@ -169,13 +132,8 @@ def test_a_grasp_that_lets_go_tells_its_wrench_while_it_holds():
 
 def some_p(collocation: Collocation) -> np.ndarray:
     low, high = collocation.compute_parameter_bounds()
-    phi = (
-        np.abs(0.3 * np.random.default_rng(1).standard_normal(collocation.nphi))
-        + 0.1
-    )
-    return np.clip(
-        np.concatenate([collocation.parameters.guess_q, phi]), low, high
-    )
+    phi = np.abs(0.3 * np.random.default_rng(1).standard_normal(collocation.nphi)) + 0.1
+    return np.clip(np.concatenate([collocation.parameters.guess_q, phi]), low, high)
 
 
 def test_rows_that_are_continued_sense_the_same():
@@ -187,12 +145,8 @@ def test_rows_that_are_continued_sense_the_same():
     continued = whole.evaluate(p, [x], part)
     afresh = whole.evaluate(p, [x])
     ours, theirs = continued.fit, afresh.fit
-    np.testing.assert_allclose(
-        ours.residual, theirs.residual, rtol=1e-9, atol=1e-9
-    )
-    np.testing.assert_allclose(
-        ours.jacobian, theirs.jacobian, rtol=1e-9, atol=1e-7
-    )
+    np.testing.assert_allclose(ours.residual, theirs.residual, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(ours.jacobian, theirs.jacobian, rtol=1e-9, atol=1e-7)
 
 
 # At the samples -----------------------------------------------------------------------------------
@@ -215,12 +169,8 @@ def test_samples_between_grid_times_are_read_to_the_third_order():
     assert errors[1] < 0.4 * errors[0]
 
 
-def low_passed(
-    signal: np.ndarray, lag_s: float, step_s: float = 0.01
-) -> RecursionTrajectory:
-    data = np.stack(
-        [np.arange(len(signal)) == 0, np.full(len(signal), 1 / step_s)]
-    )
+def low_passed(signal: np.ndarray, lag_s: float, step_s: float = 0.01) -> RecursionTrajectory:
+    data = np.stack([np.arange(len(signal)) == 0, np.full(len(signal), 1 / step_s)])
     return RecursionTrajectory.from_signal(
         LOW_PASS, np.array([lag_s]), data[..., None], signal[None, :, None]
     )
@@ -229,36 +179,23 @@ def low_passed(
 def test_a_low_pass_follows_a_ramp_by_its_time_constant():
     lag_s, ramp = 0.025, 0.01 * np.arange(60)
     lag = ramp - low_passed(ramp, lag_s).states.ravel()
-    assert lag[-1] == pytest.approx(
-        lag_s * (1 - np.exp(-ramp[-1] / lag_s)), rel=1e-12
-    )
+    assert lag[-1] == pytest.approx(lag_s * (1 - np.exp(-ramp[-1] / lag_s)), rel=1e-12)
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.002, 0.05])
 def test_the_slope_of_a_low_pass_is_its_derivative(lag_s: float, rng):
     signal, step = rng.normal(size=20), 1e-6
     still = np.zeros((1, len(signal), 1, 1))
-    slope = (
-        low_passed(signal, lag_s)
-        .jacobian_vector_product(still, np.ones((1, 1)))
-        .ravel()
-    )
-    ahead, behind = (
-        low_passed(signal, at).states
-        for at in (lag_s + step, max(0, lag_s - step))
-    )
+    slope = low_passed(signal, lag_s).jacobian_vector_product(still, np.ones((1, 1))).ravel()
+    ahead, behind = (low_passed(signal, at).states for at in (lag_s + step, max(0, lag_s - step)))
     expected = (ahead - behind).ravel() / (step + min(step, lag_s))
     np.testing.assert_allclose(slope, expected, rtol=1e-3, atol=0.02)
 
 
 def test_a_low_pass_lets_what_is_steady_through_and_nothing_without_a_lag(rng):
     signal = rng.normal(size=20)
-    np.testing.assert_allclose(
-        low_passed(signal, 0.0).states.ravel(), signal, rtol=1e-14
-    )
-    np.testing.assert_allclose(
-        low_passed(np.full(9, 3.0), 0.05).states, 3.0, rtol=1e-14
-    )
+    np.testing.assert_allclose(low_passed(signal, 0.0).states.ravel(), signal, rtol=1e-14)
+    np.testing.assert_allclose(low_passed(np.full(9, 3.0), 0.05).states, 3.0, rtol=1e-14)
 
 
 # Static experiments and single axes ---------------------------------------------------------------
@@ -275,43 +212,28 @@ def test_a_platen_gives_what_the_plate_and_the_weight_take():
 
 
 def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
-    (segment,) = fitted(
-        felt(wristed_cube(8, frame="grasp")), GUESS
-    ).transcriptions
-    (sensor,) = segment.sensors
+    (transcription,) = fitted(felt(wristed_cube(8, frame="grasp")), GUESS).transcriptions
+    (sensor,) = transcription.sensors
     grasp, rows, dofs = (
         sensor.observable.grasp,
-        segment.grid_times,
-        len(segment.sensed_dofs),
+        transcription.grid_times,
+        len(transcription.sensed_dofs),
     )
     poses = grasp.poses
-    forced = ReactionForces(
-        rng.normal(size=(rows, dofs)), rng.normal(size=(rows, dofs))
-    )
-    motion, phi = (
-        ObservedMotion(np.zeros((rows, segment.dof_count)), forced),
-        np.zeros(0),
-    )
+    forced = ReactionForces(rng.normal(size=(rows, dofs)), rng.normal(size=(rows, dofs)))
+    motion, phi = (ObservedMotion(np.zeros((rows, transcription.dof_count)), forced), np.zeros(0))
     shift, turn = rng.normal(size=(2, 3))
 
     def residual(size: float) -> np.ndarray:
-        turned = Rotation.from_rotvec(size * turn) * Rotation.from_quat(
-            poses.quaternions_xyzw
-        )
-        off = PoseSequence(
-            poses.t_s, poses.positions_m + size * shift, turned.as_quat()
-        )
+        turned = Rotation.from_rotvec(size * turn) * Rotation.from_quat(poses.quaternions_xyzw)
+        off = PoseSequence(poses.t_s, poses.positions_m + size * shift, turned.as_quat())
         other = replace(sensor.observable, grasp=replace(grasp, poses=off))
         return sensor.residuals(other.evaluate(motion, phi), phi)
 
     given = [np.tile(each, (rows, 1, 1)) for each in (shift, turn)]
     carried = sensor.observable.frame_changes(grasp, motion, phi, *given)
-    found = sensor.residual_changes(
-        sensor.observable.evaluate(motion, phi), carried, phi
-    )[..., 0]
-    assert (
-        relative_error(found, (residual(1e-4) - residual(-1e-4)) / 2e-4) < 1e-5
-    )
+    found = sensor.residual_changes(sensor.observable.evaluate(motion, phi), carried, phi)[..., 0]
+    assert relative_error(found, (residual(1e-4) - residual(-1e-4)) / 2e-4) < 1e-5
 
 
 @pytest.mark.parametrize("count", [0, 2])

@@ -1,4 +1,4 @@
-"""Import order of the packages, the interface of the core, and unique class names."""
+"""Import order of the packages, the interface of the core, and independence of the tests."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import ast
 import re
 import subprocess
 import sys
-from collections import Counter
 from functools import cache
 from graphlib import TopologicalSorter
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -17,6 +16,7 @@ import pytest
 import collocation_sysid
 
 PACKAGE = Path(collocation_sysid.__file__).parent
+TESTS = Path(__file__).parents[1]
 # As in CONTRIBUTING.md.
 LAYERS = (
     {"errors"},
@@ -59,17 +59,13 @@ def tree_of(name: str) -> ast.Module:
 def imports(name: str) -> set[str]:
     """Modules of the package that one imports, also those inside functions and for types alone."""
     path = MODULES[name]
-    folder = (
-        name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
-    )
+    folder = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
     found = set()
     for statement in ast.walk(tree_of(name)):
         if not isinstance(statement, ast.ImportFrom) or statement.level == 0:
             continue
         base = folder[: len(folder) - statement.level + 1]
-        target = ".".join([*base, *(statement.module or "").split(".")]).strip(
-            "."
-        )
+        target = ".".join([*base, *(statement.module or "").split(".")]).strip(".")
         for alias in statement.names:
             inner = f"{target}.{alias.name}".strip(".")
             found.add(inner if inner in MODULES else target)
@@ -89,24 +85,13 @@ def test_a_module_imports_nothing_from_above(name):
 
 
 def test_no_imports_go_in_circles():
-    graph = {
-        name: {other for other in imports(name) if other} for name in MODULES
-    }
+    graph = {name: {other for other in imports(name) if other} for name in MODULES}
     assert len([*TopologicalSorter(graph).static_order()]) >= len(MODULES)
 
 
 # Packages with the mathematics of an identification, and those that use it; see docs/core.md.
 CORE = ("fem", "recording", "model", "program", "methods", "statistics")
-OUTER = (
-    "features",
-    "runs",
-    "result",
-    "extras",
-    "cli",
-    "testing",
-    "pipeline",
-    "installation_check",
-)
+OUTER = ("features", "runs", "result", "extras", "cli", "testing", "pipeline", "installation_check")
 # The module of `program` that live estimation imports, and the largest number of its names.
 STREAMING = "program.streaming"
 STREAMING_NAMES = 12
@@ -121,9 +106,7 @@ def test_the_core_is_loaded_without_the_packages_that_use_it():
         "ours = [name for name in sys.modules if name.startswith('collocation_sysid.')]\n"
         "print(*{name.split('.')[1] for name in ours})"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert set(CORE) <= loaded
     assert not loaded & {*OUTER, "problem"}
@@ -143,18 +126,12 @@ LIFTING = (
 
 def test_only_methods_with_sparse_matrices_import_lifted_variables():
     importing = {
-        name
-        for name in MODULES
-        if any(each.startswith("program.lifted") for each in imports(name))
+        name for name in MODULES if any(each.startswith("program.lifted") for each in imports(name))
     }
     assert {"methods.interior_point", "methods.comparison.merit"} <= importing
     assert [n for n in importing if not n.startswith(LIFTING)] == []
     reached = set()
-    pending = {
-        "methods.reduced_space",
-        "program.streaming",
-        "program.simulation",
-    }
+    pending = {"methods.reduced_space", "program.streaming", "program.simulation"}
     while pending:
         name = pending.pop()
         reached.add(name)
@@ -169,13 +146,10 @@ def test_no_module_imports_the_package_by_its_name():
         for statement in ast.walk(tree_of(name)):
             if isinstance(statement, ast.Import):
                 assert not any(
-                    each.name.startswith("collocation_sysid")
-                    for each in statement.names
+                    each.name.startswith("collocation_sysid") for each in statement.names
                 )
             if isinstance(statement, ast.ImportFrom) and not statement.level:
-                assert not (statement.module or "").startswith(
-                    "collocation_sysid"
-                ), name
+                assert not (statement.module or "").startswith("collocation_sysid"), name
 
 
 def test_live_estimation_uses_a_small_interface_of_the_program():
@@ -183,9 +157,7 @@ def test_live_estimation_uses_a_small_interface_of_the_program():
     for name in MODULES:
         if not name.startswith("extras.live"):
             continue
-        assert {
-            each for each in imports(name) if each.startswith("program")
-        } <= {STREAMING}, name
+        assert {each for each in imports(name) if each.startswith("program")} <= {STREAMING}, name
         for statement in ast.walk(tree_of(name)):
             if not isinstance(statement, ast.ImportFrom):
                 continue
@@ -210,27 +182,19 @@ def imported_names(name: str, packages: tuple[str, ...]) -> dict[str, str]:
         base = folder[: len(folder) - statement.level + 1]
         target = [*base, *(statement.module or "").split(".")]
         if target[0] in packages:
-            found |= dict.fromkeys(
-                (each.name for each in statement.names), ".".join(target)
-            )
+            found |= dict.fromkeys((each.name for each in statement.names), ".".join(target))
     return found
 
 
 def test_extras_import_from_the_program_only_the_names_on_the_page_of_the_core():
     page = (PACKAGE.parent / "docs" / "core.md").read_text()
-    (paragraph,) = (
-        part
-        for part in page.split("\n- ")
-        if "extras import only these names" in part
-    )
+    (paragraph,) = (part for part in page.split("\n- ") if "extras import only these names" in part)
     listed = set(re.findall(r"`(\w+)`", paragraph.split(":", 1)[1]))
     extras = [name for name in MODULES if name.startswith("extras.")]
     imported = {
         name: module
         for extra in extras
-        for name, module in imported_names(
-            extra, ("model", "program", "methods")
-        ).items()
+        for name, module in imported_names(extra, ("model", "program", "methods")).items()
         if module != STREAMING
     }
     assert set(imported) == listed
@@ -238,23 +202,46 @@ def test_extras_import_from_the_program_only_the_names_on_the_page_of_the_core()
 
 def test_the_contribution_guide_names_the_layers():
     guide = (PACKAGE.parent / "CONTRIBUTING.md").read_text()
-    drawn = next(
-        line for line in guide.splitlines() if line.strip().startswith("fem →")
-    )
-    order = [
-        name.strip() for part in drawn.split("→") for name in part.split(",")
-    ]
+    drawn = next(line for line in guide.splitlines() if line.strip().startswith("fem →"))
+    order = [name.strip() for part in drawn.split("→") for name in part.split(",")]
     assert all(layer(a) <= layer(b) for a, b in pairwise(order))
 
 
-# Names that two classes of different rooms still have.
-TWICE = "Branch Columns Design Grid Model Motion Picture Replay Scatter Section Slopes View _Emitter"
+@cache
+def trees_of_tests() -> list[tuple[Path, ast.Module]]:
+    return [(path, ast.parse(path.read_text())) for path in sorted(TESTS.rglob("*.py"))]
 
 
-def test_a_class_name_occurs_once():
-    nodes = chain.from_iterable(ast.walk(tree_of(name)) for name in MODULES)
-    names = Counter(
-        node.name for node in nodes if isinstance(node, ast.ClassDef)
-    )
-    twice = {name for name, count in names.items() if count > 1}
-    assert twice <= set(TWICE.split())
+def test_no_test_module_imports_another_one():
+    """What several tests share is in tests/kit."""
+    names = {path.stem for path in TESTS.glob("*/test_*.py")}
+    imported = [
+        f"{path.name}: {module}"
+        for path, tree in trees_of_tests()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom | ast.Import)
+        for module in (
+            [node.module]
+            if isinstance(node, ast.ImportFrom)
+            else [alias.name for alias in node.names]
+        )
+        if module in names
+    ]
+    assert imported == []
+
+
+def test_no_test_replaces_a_private_function():
+    """What tests replace is public, so that its docstring states what it may be replaced by."""
+    replaced = [
+        f"{path.name}:{node.lineno}"
+        for path, tree in trees_of_tests()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and node.func.attr in ("setattr", "object")
+        and len(node.args) > 1
+        and isinstance(node.args[1], ast.Constant)
+        and str(node.args[1].value).startswith("_")
+        and not str(node.args[1].value).startswith("__")
+    ]
+    assert replaced == []

@@ -48,10 +48,7 @@ def test_notebooks_on_github_open_in_colab_and_binder(suffix):
     ("url", "place"),
     [
         ("https://gitlab.com/a/b/soft", "gl/a%2Fb%2Fsoft"),
-        (
-            "https://git.example.org/a/soft",
-            "git/https%3A%2F%2Fgit.example.org%2Fa%2Fsoft",
-        ),
+        ("https://git.example.org/a/soft", "git/https%3A%2F%2Fgit.example.org%2Fa%2Fsoft"),
     ],
 )
 def test_notebooks_on_other_hosts_open_in_binder_alone(url, place):

@@ -40,16 +40,9 @@ def track_of(*factors: float, has_ended: bool = True) -> Track:
 
 @pytest.mark.parametrize(
     ("factors", "entry"),
-    [
-        ((2.0, 1.005, 1.5, 1.002, 1.0), 3),
-        ((1.0, 1.009), 0),
-        ((1.0, 1.011), None),
-        ((), None),
-    ],
+    [((2.0, 1.005, 1.5, 1.002, 1.0), 3), ((1.0, 1.009), 0), ((1.0, 1.011), None), ((), None)],
 )
-def test_an_answer_is_reached_when_the_search_stays_within_one_percent(
-    factors, entry
-):
+def test_an_answer_is_reached_when_the_search_stays_within_one_percent(factors, entry):
     """The second entry of the first search is within 1 %, but the third one is not."""
     assert reached_entry(track_of(*factors), TRUTH) == entry
 
@@ -76,9 +69,7 @@ def test_the_table_says_what_was_reached_and_what_is_not_installed():
     assert len({len(line) for line in cells}) == 1
 
 
-def test_candidates_that_are_missing_or_fail_do_not_stop_the_others(
-    monkeypatch, capsys, tmp_path
-):
+def test_candidates_that_are_missing_or_fail_do_not_stop_the_others(monkeypatch, capsys, tmp_path):
     def measure(name: str) -> Track:
         if name == "calculix":
             raise subprocess.CalledProcessError(3, "ccx")
@@ -136,9 +127,7 @@ def test_held_nodes_follow_the_hand_and_rates_are_those_of_the_motion():
     np.testing.assert_allclose(rest_m[:, 2], HEIGHT_M)
     along_m, angle = hand_motion(0.3).coordinates
     centre = np.argmin(np.hypot(*rest_m.T[:2]))
-    np.testing.assert_allclose(
-        held_m[1, centre], [along_m, 0.0, HEIGHT_M], atol=1e-12
-    )
+    np.testing.assert_allclose(held_m[1, centre], [along_m, 0.0, HEIGHT_M], atol=1e-12)
     outermost = np.argmax(rest_m[:, 0])
     reach_m = rest_m[outermost, 0]
     lowered_m = HEIGHT_M - reach_m * np.sin(angle)

@@ -38,13 +38,11 @@ def test_the_page_is_that_of_the_json_file(catalogue):
 
 def test_a_changed_value_changes_the_page(catalogue):
     first = catalogue.entries[0]
-    constants = [
-        replace(each, value=1.5 * each.value) for each in first.constants
-    ]
+    constants = [replace(each, value=1.5 * each.value) for each in first.constants]
     changed = replace(first, constants=tuple(constants))
-    assert catalogue_page(
-        replace(catalogue, entries=(changed,))
-    ) != catalogue_page(replace(catalogue, entries=(first,)))
+    assert catalogue_page(replace(catalogue, entries=(changed,))) != catalogue_page(
+        replace(catalogue, entries=(first,))
+    )
 
 
 def test_every_problem_of_the_catalogue_has_an_entry_or_a_reason(catalogue):
@@ -55,9 +53,7 @@ def test_every_problem_of_the_catalogue_has_an_entry_or_a_reason(catalogue):
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda each: each.name)
-def test_an_entry_names_law_unit_interval_source_and_licence(
-    entry: CatalogueEntry,
-):
+def test_an_entry_names_law_unit_interval_source_and_licence(entry: CatalogueEntry):
     assert entry.law
     assert all(entry.law)
     assert len(entry.source) > 5
@@ -80,16 +76,10 @@ def test_an_entry_names_law_unit_interval_source_and_licence(
 
 
 @pytest.mark.parametrize(
-    "entry",
-    [each for each in ENTRIES if not each.is_measured],
-    ids=lambda each: each.name,
+    "entry", [each for each in ENTRIES if not each.is_measured], ids=lambda each: each.name
 )
-def test_the_intervals_of_a_twin_contain_its_true_constants(
-    entry: CatalogueEntry,
-):
-    known = [
-        each for each in entry.constants if each.true_value and each.combined95
-    ]
+def test_the_intervals_of_a_twin_contain_its_true_constants(entry: CatalogueEntry):
+    known = [each for each in entry.constants if each.true_value and each.combined95]
     assert known
     for constant in known:
         low, high = constant.combined95 or (0.0, 0.0)
@@ -100,43 +90,30 @@ def test_the_licences_are_those_of_the_page_on_licences():
     page = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
     for source in SOURCES:
         folder = str(Path(source.problem).parent)
-        row = next(
-            (line for line in page.splitlines() if f"(`{folder}`)" in line), ""
-        )
+        row = next((line for line in page.splitlines() if f"(`{folder}`)" in line), "")
         if row:
             assert source.licence in row
         else:
             assert source.licence == "MIT"
-            assert (
-                folder.startswith("collocation_sysid/datasets")
-                or source.twin_script
-            )
+            assert folder.startswith("collocation_sysid/datasets") or source.twin_script
 
 
 # Ranges -------------------------------------------------------------------------------------------
 
 
-def record_of(
-    body: Body, t_s: np.ndarray, positions_m: np.ndarray
-) -> MotionRecord:
+def record_of(body: Body, t_s: np.ndarray, positions_m: np.ndarray) -> MotionRecord:
     """A record of a prescribed motion of the nodes."""
     wall = Grasp([0, 1, 2], np.tile(np.eye(4), (len(t_s), 1, 1)))
     tracks_m = positions_m[:, :1]
-    markers = Markers(
-        t_s, tracks_m, sigma_m=1e-3, places_m=body.nodes.points_m[:1]
-    )
-    experiment = Experiment(
-        body, t_s, [wall], markers, name="motion", kind="static"
-    )
+    markers = Markers(t_s, tracks_m, sigma_m=1e-3, places_m=body.nodes.points_m[:1])
+    experiment = Experiment(body, t_s, [wall], markers, name="motion", kind="static")
     return MotionRecord.from_experiment(experiment, (positions_m, tracks_m))
 
 
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 def test_ranges_of_a_homogeneous_motion(element):
     """A stretch of 1 + t along x and shrinking across, rotated more and more."""
-    body = Body(
-        box_mesh((1.0, 2.0, 3.0), (1, 2, 1)), density_kg_m3=1.0, element=element
-    )
+    body = Body(box_mesh((1.0, 2.0, 3.0), (1, 2, 1)), density_kg_m3=1.0, element=element)
     t_s = np.array([0.0, 0.1, 0.2, 0.3])
     gradients = []
     for now_s in t_s:
@@ -159,9 +136,7 @@ def test_quantiles_are_weighted_by_volume():
     """One of two regions has 1 % of the volume: its stretch is an extreme, not a quantile."""
     mesh = box_mesh((1.0, 1.0, 1.0), (2, 1, 1))
     points_m = mesh.points_m.copy()
-    points_m[:, 0] = np.where(
-        np.isclose(points_m[:, 0], 0.5), 0.01, points_m[:, 0]
-    )
+    points_m[:, 0] = np.where(np.isclose(points_m[:, 0], 0.5), 0.01, points_m[:, 0])
     body = Body(TetMesh(points_m, mesh.tetrahedra), density_kg_m3=1.0)
     x = points_m[:, 0]
     moved = points_m.copy()
@@ -174,18 +149,14 @@ def test_quantiles_are_weighted_by_volume():
 
 def test_positions_of_another_mesh_are_refused():
     body = Body(box_mesh((1.0, 1.0, 1.0), (1, 1, 1)), density_kg_m3=1.0)
-    with pytest.raises(
-        ValueError, match="found positions of 3 nodes; expected 8"
-    ):
+    with pytest.raises(ValueError, match="found positions of 3 nodes; expected 8"):
         make_catalogue.deformation_gradients(body, np.zeros((1, 3, 3)))
 
 
 # Entries ------------------------------------------------------------------------------------------
 
 
-def test_a_problem_without_its_data_is_omitted_with_the_reason(
-    tmp_path, monkeypatch
-):
+def test_a_problem_without_its_data_is_omitted_with_the_reason(tmp_path, monkeypatch):
     monkeypatch.setattr(make_catalogue, "RUNS", tmp_path)
     (source,) = (each for each in SOURCES if each.name == "twin_wrist_sensor")
     text = source.problem_file.read_text(encoding="utf-8")
@@ -218,7 +189,4 @@ def test_an_entry_is_that_of_the_run(tmp_path, monkeypatch):
     assert entry.law == ("neo-hookean",)
     assert entry.damping == ("kelvin-voigt",)
     # A second call reads the run folder; a changed problem file does not.
-    assert (
-        make_catalogue.make_entry(source, reuse=True, time_limit_s=0.01)
-        == entry
-    )
+    assert make_catalogue.make_entry(source, reuse=True, time_limit_s=0.01) == entry

@@ -25,11 +25,7 @@ FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    return [
-        code
-        for name, code in FENCE.findall(page.read_text())
-        if name == language
-    ]
+    return [code for name, code in FENCE.findall(page.read_text()) if name == language]
 
 
 def name_of(page: Path) -> str:
@@ -42,11 +38,7 @@ WHOLE_RUN = ROOT / "docs" / "howto" / "from_simulator.md"
 
 def pages_with(language: str) -> list:
     return [
-        pytest.param(
-            page,
-            id=name_of(page),
-            marks=[pytest.mark.long] * (page == WHOLE_RUN),
-        )
+        pytest.param(page, id=name_of(page), marks=[pytest.mark.long] * (page == WHOLE_RUN))
         for page in PAGES
         if blocks(page, language)
     ]
@@ -62,9 +54,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", pages_with("python"))
-def test_python_blocks_of_a_page_run_one_after_the_other(
-    page: Path, checkout: Path
-):
+def test_python_blocks_of_a_page_run_one_after_the_other(page: Path, checkout: Path):
     names: dict[str, object] = {"__name__": "docs"}
     if "import mujoco\n" in page.read_text():
         pytest.importorskip("mujoco")
@@ -82,15 +72,7 @@ SHORT = {
     "compare-models": ["--dry-run"],
     "sweep": ["--dry-run"],
     "solve": ["--method", "reduced-space"],
-    "design": [
-        "--duration",
-        "0.05",
-        "--evaluations",
-        "1",
-        "--pairs",
-        "0",
-        "--no-film",
-    ],
+    "design": ["--duration", "0.05", "--evaluations", "1", "--pairs", "0", "--no-film"],
 }
 
 
@@ -98,23 +80,16 @@ SHORT = {
 @pytest.mark.parametrize("page", pages_with("console"))
 def test_commands_of_a_page_run(page: Path, checkout: Path):
     for block in blocks(page, "console"):
-        for line in re.findall(
-            r"^\$ collocation-sysid (.*)$", block, re.MULTILINE
-        ):
+        for line in re.findall(r"^\$ collocation-sysid (.*)$", block, re.MULTILINE):
             words = shlex.split(line)
             outcome = run_command(*words, *SHORT.get(words[0], []))
             assert outcome.code == 0, f"{line}: {outcome.err}"
             said = re.findall(r"^written to .*$", block, re.MULTILINE)
-            assert said == [each for each in said if each in outcome.out], (
-                outcome.out
-            )
+            assert said == [each for each in said if each in outcome.out], outcome.out
 
 
 def test_pages_agree_on_how_often_the_verdict_is_right():
-    pages = [
-        ROOT / name
-        for name in ("README.md", "docs/howto/verdict.md", "docs/studies.md")
-    ]
+    pages = [ROOT / name for name in ("README.md", "docs/howto/verdict.md", "docs/studies.md")]
     counts = [
         re.search(
             r"(\d+) (?:faultless|were called good|correct simulated).*?none of (\d+)",
@@ -123,9 +98,7 @@ def test_pages_agree_on_how_often_the_verdict_is_right():
         )
         for each in pages
     ]
-    assert [found and found.groups() for found in counts] == [
-        ("200", "207")
-    ] * 3
+    assert [found and found.groups() for found in counts] == [("200", "207")] * 3
 
 
 def in_a_problem(code: str) -> dict[str, Any]:
@@ -134,9 +107,7 @@ def in_a_problem(code: str) -> dict[str, Any]:
     experiment = block.pop("experiment", {})
     if isinstance(experiment, dict):
         experiment = [whole["experiment"][0] | experiment]
-    if not {"mesh", "surface", "cylinder", "box_m"} & set(
-        block.get("object", ["mesh"])
-    ):
+    if not {"mesh", "surface", "cylinder", "box_m"} & set(block.get("object", ["mesh"])):
         block["object"] |= whole["object"]
     return whole | block | {"experiment": experiment}
 
@@ -149,11 +120,7 @@ def test_toml_blocks_are_valid_in_a_problem_file(page: Path):
 
 @pytest.mark.parametrize(
     ("table", "key"),
-    [
-        ("object", "mes"),
-        ("experiment.nuisance", "gravit"),
-        ("solver.penalty", "ro"),
-    ],
+    [("object", "mes"), ("experiment.nuisance", "gravit"), ("solver.penalty", "ro")],
 )
 def test_a_misspelt_key_of_a_block_is_found(table: str, key: str):
     with pytest.raises(ValidationError, match=rf"\b{key}\b"):
@@ -162,85 +129,58 @@ def test_a_misspelt_key_of_a_block_is_found(table: str, key: str):
 
 def test_links_between_pages_lead_somewhere():
     for page in PAGES:
-        for target in re.findall(
-            r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text()
-        ):
+        for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text()):
             if "://" not in target:
-                assert (page.parent / target).exists(), (
-                    f"{name_of(page)}: {target}"
-                )
+                assert (page.parent / target).exists(), f"{name_of(page)}: {target}"
 
 
 def test_every_page_stands_in_the_list_of_pages():
     index = (ROOT / "docs" / "index.md").read_text()
     pages = sorted((ROOT / "docs" / "howto").glob("*.md"))
-    assert [
-        name_of(each) for each in pages if f"\nhowto/{each.stem}\n" not in index
-    ] == []
+    assert [name_of(each) for each in pages if f"\nhowto/{each.stem}\n" not in index] == []
 
 
 def test_links_to_a_section_lead_to_its_heading():
     broken = []
     for page in PAGES:
-        for target, section in re.findall(
-            r"\]\(([\w/.]*)#([\w-]+)\)", page.read_text()
-        ):
+        for target, section in re.findall(r"\]\(([\w/.]*)#([\w-]+)\)", page.read_text()):
             file = (page.parent / target) if target else page
             if file.suffix == ".md":
                 heads = re.findall(r"(?m)^#+ (.+)$", file.read_text())
-                known = {
-                    re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-")
-                    for head in heads
-                }
-                broken += [f"{name_of(page)}: {target}#{section}"] * (
-                    section not in known
-                )
+                known = {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+                broken += [f"{name_of(page)}: {target}#{section}"] * (section not in known)
     assert broken == []
 
 
 def test_the_glossary_is_in_order_and_its_words_stand_on_the_pages_they_lead_to():
     glossary = ROOT / "docs" / "glossary.md"
     rows = re.findall(
-        r"^\| (.+?) \| .+ \| \[.+?\]\((.+?)\) \|$",
-        glossary.read_text(),
-        re.MULTILINE,
+        r"^\| (.+?) \| .+ \| \[.+?\]\((.+?)\) \|$", glossary.read_text(), re.MULTILINE
     )
     words = [word for word, _ in rows]
-    assert words == sorted(
-        words, key=lambda word: word.lower().replace("γ", "gamma")
-    )
+    assert words == sorted(words, key=lambda word: word.lower().replace("γ", "gamma"))
 
     def alike(text: str) -> str:
         return re.sub(r"[\s–-]+", " ", text.lower())
 
     for word, target in rows:
         page = alike((glossary.parent / target).read_text())
-        assert any(name in page for name in alike(word).split(", ")), (
-            f"{word}: not on {target}"
-        )
+        assert any(name in page for name in alike(word).split(", ")), f"{word}: not on {target}"
     for page in (ROOT / "README.md", ROOT / "docs" / "index.md"):
         assert "glossary.md" in page.read_text()
 
 
 def test_the_core_page_names_classes_that_there_are():
     page = (ROOT / "docs" / "core.md").read_text()
-    paths = re.findall(
-        r"^\| `collocation_sysid\.([\w.]+)\.(\w+)` \|", page, re.MULTILINE
-    )
+    paths = re.findall(r"^\| `collocation_sysid\.([\w.]+)\.(\w+)` \|", page, re.MULTILINE)
     assert len(paths) > 11
     for module, name in paths:
         assert isinstance(
-            getattr(
-                importlib.import_module(f"collocation_sysid.{module}"), name
-            ),
-            type,
+            getattr(importlib.import_module(f"collocation_sysid.{module}"), name), type
         )
     figure = page.partition("```text\n")[2].partition("```")[0]
     boxes = set(re.findall(r"^ ([A-Z]\w+)", figure, re.MULTILINE))
-    assert boxes - {name for _, name in paths} == {
-        "PointPositions",
-        "ReactionResultant",
-    }
+    assert boxes - {name for _, name in paths} == {"PointPositions", "ReactionResultant"}
 
 
 def test_the_front_page_shows_the_answer_that_the_readme_shows():
@@ -284,9 +224,7 @@ def test_the_reference_of_the_problem_file_has_every_key(reference):
     assert "## `[solver.reduced-space]`" in page
 
 
-def test_the_page_on_motion_capture_has_the_table_of_nuisance_parameters(
-    reference,
-):
+def test_the_page_on_motion_capture_has_the_table_of_nuisance_parameters(reference):
     page = (ROOT / "docs" / "howto" / "motion_capture.md").read_text()
     assert reference.nuisances() in page
 
@@ -294,9 +232,7 @@ def test_the_page_on_motion_capture_has_the_table_of_nuisance_parameters(
 def test_the_reference_lists_what_is_public_and_nothing_else():
     page = (ROOT / "docs" / "api.md").read_text()
     listed = re.findall(r"^   ([\w.]+)$", page, re.MULTILINE)
-    listed += re.findall(
-        r"^\.\. py:data:: collocation_sysid\.([\w.]+)$", page, re.MULTILINE
-    )
+    listed += re.findall(r"^\.\. py:data:: collocation_sysid\.([\w.]+)$", page, re.MULTILINE)
     live = [f"live.{name}" for name in cs.live.__all__]
     checks = [f"testing.{name}" for name in cs.testing.__all__]
     datasets = [f"datasets.{name}" for name in cs.datasets.__all__]
@@ -305,9 +241,7 @@ def test_the_reference_lists_what_is_public_and_nothing_else():
     assert sorted(listed) == sorted([*public, *live, *datasets, *checks])
 
 
-def test_the_reference_of_the_command_line_has_every_command_and_option(
-    reference,
-):
+def test_the_reference_of_the_command_line_has_every_command_and_option(reference):
     page = reference.command_line()
     for command in (
         "solve",
@@ -321,32 +255,20 @@ def test_the_reference_of_the_command_line_has_every_command_and_option(
         assert f"\n## {command}\n" in page
     for option in ("--start", "--allow-code", "--time-limit", "--over"):
         assert f"`{option}`" in page
-    assert (
-        "collocation-sysid solve problem.toml --method interior-point" in page
-    )
+    assert "collocation-sysid solve problem.toml --method interior-point" in page
 
 
 # Scripts
 
 
-SCRIPTS = [
-    each
-    for folder in ("scripts", "docs")
-    for each in sorted((ROOT / folder).rglob("*.py"))
-]
+SCRIPTS = [each for folder in ("scripts", "docs") for each in sorted((ROOT / folder).rglob("*.py"))]
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=name_of)
 def test_scripts_import_what_there_is(script: Path):
     for node in ast.walk(ast.parse(script.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
-            "collocation_sysid"
-        ):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("collocation_sysid"):
             module = importlib.import_module(str(node.module))
             for name in node.names:
-                there = hasattr(module, name.name) or find_spec(
-                    f"{node.module}.{name.name}"
-                )
-                assert there, (
-                    f"line {node.lineno}: {node.module} has no {name.name}"
-                )
+                there = hasattr(module, name.name) or find_spec(f"{node.module}.{name.name}")
+                assert there, f"line {node.lineno}: {node.module} has no {name.name}"

@@ -25,17 +25,11 @@ def test_the_gallery_opens_with_the_first_identification_and_its_picture():
 @pytest.mark.parametrize(
     "script",
     [
-        pytest.param(
-            script,
-            id=script.stem,
-            marks=[pytest.mark.slow] * (script.stem in LONG),
-        )
+        pytest.param(script, id=script.stem, marks=[pytest.mark.slow] * (script.stem in LONG))
         for script in SCRIPTS
     ],
 )
-def test_a_script_of_the_gallery_runs_and_draws_a_picture(
-    script, tmp_path, monkeypatch
-):
+def test_a_script_of_the_gallery_runs_and_draws_a_picture(script, tmp_path, monkeypatch):
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
     drawn = []

@@ -31,24 +31,15 @@ def script_cells(name: str) -> list[tuple[str, str]]:
     cells = []
     for marker, text in zip(parts[::2], parts[1::2], strict=True):
         if marker:
-            cells.append(
-                (
-                    "markdown",
-                    re.sub(r"^# ?", "", text, flags=re.MULTILINE).strip(),
-                )
-            )
+            cells.append(("markdown", re.sub(r"^# ?", "", text, flags=re.MULTILINE).strip()))
         else:
-            cells.append(
-                ("code", text.replace("# %matplotlib", "%matplotlib").strip())
-            )
+            cells.append(("code", text.replace("# %matplotlib", "%matplotlib").strip()))
     return cells
 
 
 def notebook_cells(name: str) -> list[dict]:
     """Return the cells of an executed notebook."""
-    return json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))[
-        "cells"
-    ]
+    return json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
 
 
 def internal_names(source: str) -> set[str]:
@@ -61,36 +52,22 @@ def internal_names(source: str) -> set[str]:
     for node in ast.walk(ast.parse(source)):
         match node:
             case ast.Import(names=names):
-                imported = {(each.name, each.asname) for each in names} - {
-                    (PACKAGE, "cs")
-                }
-                found |= {
-                    module
-                    for module, _ in imported
-                    if module.split(".")[0] == PACKAGE
-                }
-            case ast.ImportFrom(module=str(module)) if (
-                module.split(".")[0] == PACKAGE
-            ):
+                imported = {(each.name, each.asname) for each in names} - {(PACKAGE, "cs")}
+                found |= {module for module, _ in imported if module.split(".")[0] == PACKAGE}
+            case ast.ImportFrom(module=str(module)) if module.split(".")[0] == PACKAGE:
                 found.add(module)
             case ast.Attribute(value=ast.Name(id="cs"), attr=name):
-                found |= {f"cs.{name}"} - {
-                    f"cs.{public}" for public in collocation_sysid.__all__
-                }
+                found |= {f"cs.{name}"} - {f"cs.{public}" for public in collocation_sysid.__all__}
     return found
 
 
 def test_all_notebooks_are_tested() -> None:
-    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == sorted(
-        FIGURES
-    )
+    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == sorted(FIGURES)
 
 
 @pytest.mark.long
 @each_notebook
-def test_the_cells_run_from_top_to_bottom(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cells_run_from_top_to_bottom(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The texts state numbers; the assertions of the cells check them."""
     count = 0
 
@@ -111,43 +88,25 @@ def test_the_cells_run_from_top_to_bottom(
 
 @each_notebook
 def test_a_notebook_holds_the_cells_of_its_script(name: str) -> None:
-    cells = [
-        (cell["cell_type"], "".join(cell["source"]).strip())
-        for cell in notebook_cells(name)
-    ]
-    assert cells == script_cells(name), (
-        f"run scripts/notebooks/execute.py {name}"
-    )
+    cells = [(cell["cell_type"], "".join(cell["source"]).strip()) for cell in notebook_cells(name)]
+    assert cells == script_cells(name), f"run scripts/notebooks/execute.py {name}"
 
 
 @each_notebook
-def test_a_notebook_was_executed_in_order_without_errors_and_warnings(
-    name: str,
-) -> None:
-    code = [
-        cell for cell in notebook_cells(name) if cell["cell_type"] == "code"
-    ]
-    assert [cell["execution_count"] for cell in code] == list(
-        range(1, len(code) + 1)
-    )
+def test_a_notebook_was_executed_in_order_without_errors_and_warnings(name: str) -> None:
+    code = [cell for cell in notebook_cells(name) if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
     outputs = [output for cell in code for output in cell["outputs"]]
     assert "error" not in {output["output_type"] for output in outputs}
-    assert not [
-        output["text"] for output in outputs if output.get("name") == "stderr"
-    ]
-    pictures = [
-        output for output in outputs if "image/png" in output.get("data", {})
-    ]
+    assert not [output["text"] for output in outputs if output.get("name") == "stderr"]
+    pictures = [output for output in outputs if "image/png" in output.get("data", {})]
     assert len(pictures) == FIGURES[name]
     assert (FOLDER / f"{name}.ipynb").stat().st_size < LARGEST_BYTES
 
 
 @each_notebook
 def test_a_notebook_uses_public_names_only(name: str) -> None:
-    assert (
-        internal_names((FOLDER / f"{name}.py").read_text(encoding="utf-8"))
-        == set()
-    )
+    assert internal_names((FOLDER / f"{name}.py").read_text(encoding="utf-8")) == set()
 
 
 def test_internal_names_are_found() -> None:
@@ -157,11 +116,7 @@ def test_internal_names_are_found() -> None:
         "from collocation_sysid.runs.check import check_problem\n"
         "cs.run(cs.compute)\n"
     )
-    expected = {
-        "collocation_sysid.fem.laws.moduli",
-        "collocation_sysid.runs.check",
-        "cs.compute",
-    }
+    expected = {"collocation_sysid.fem.laws.moduli", "collocation_sysid.runs.check", "cs.compute"}
     assert internal_names(source) == expected
 
 
@@ -180,6 +135,4 @@ def test_a_notebook_executes_in_a_kernel(name: str) -> None:
     nbclient = pytest.importorskip("nbclient")
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     resources = {"metadata": {"path": str(FOLDER)}}
-    nbclient.NotebookClient(
-        notebook, timeout=600, resources=resources
-    ).execute()
+    nbclient.NotebookClient(notebook, timeout=600, resources=resources).execute()

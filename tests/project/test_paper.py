@@ -20,18 +20,12 @@ LONGEST_WORDS = 1750
 
 def test_every_citation_has_a_reference_and_every_reference_is_cited():
     cited = set(re.findall(r"@([a-z]+\d{4})", PAPER.split("---", 2)[2]))
-    assert cited == set(
-        re.findall(r"^@\w+\{(\w+),", REFERENCES, flags=re.MULTILINE)
-    )
+    assert cited == set(re.findall(r"^@\w+\{(\w+),", REFERENCES, flags=re.MULTILINE))
 
 
 def test_every_reference_has_an_identifier():
     entries = re.split(r"^@", REFERENCES, flags=re.MULTILINE)[1:]
-    assert [
-        each
-        for each in entries
-        if not re.search(r"doi\s*= \{10\.\d{4,5}/\S+\}", each)
-    ] == []
+    assert [each for each in entries if not re.search(r"doi\s*= \{10\.\d{4,5}/\S+\}", each)] == []
 
 
 def test_the_sections_are_those_of_the_journal():

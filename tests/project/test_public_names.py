@@ -18,18 +18,14 @@ FILE = Path(cs.__file__)
 
 def run_python(code: str) -> str:
     """Output of a program in a new process."""
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 
 def test_every_public_name_is_imported_for_type_checkers_and_has_a_value():
     tree = ast.parse(FILE.read_text())
     blocks = [each for each in tree.body if isinstance(each, ast.If)]
-    imports = [
-        each for each in blocks[0].body if isinstance(each, ast.ImportFrom)
-    ]
+    imports = [each for each in blocks[0].body if isinstance(each, ast.ImportFrom)]
     names = [alias.name for each in imports for alias in each.names]
     assert sorted(names) == sorted(cs.__all__)
     assert all(getattr(cs, name) is not None for name in names)
@@ -42,9 +38,7 @@ def test_there_is_no_stub_beside_the_modules():
 
 
 def test_a_misspelt_name_is_no_attribute():
-    with pytest.raises(
-        AttributeError, match="'collocation_sysid' has no attribute 'Bdoy'"
-    ):
+    with pytest.raises(AttributeError, match="'collocation_sysid' has no attribute 'Bdoy'"):
         cs.Bdoy  # noqa: B018
 
 
@@ -60,9 +54,7 @@ def test_solving_does_not_import_scipys_statistics():
 
 
 @pytest.mark.long
-def test_pyright_knows_the_types_of_public_names_and_reports_misspelt_ones(
-    tmp_path,
-):
+def test_pyright_knows_the_types_of_public_names_and_reports_misspelt_ones(tmp_path):
     if find_spec("pyright") is None:
         pytest.skip("pyright is not installed")
     program = tmp_path / "program.py"
@@ -74,26 +66,12 @@ def test_pyright_knows_the_types_of_public_names_and_reports_misspelt_ones(
         "cs.Bdoy\n"
     )
     (tmp_path / "pyrightconfig.json").write_text(
-        json.dumps(
-            {
-                "extraPaths": [str(FILE.parents[1])],
-                "reportUnusedExpression": False,
-            }
-        )
+        json.dumps({"extraPaths": [str(FILE.parents[1])], "reportUnusedExpression": False})
     )
-    command = [
-        sys.executable,
-        "-m",
-        "pyright",
-        "--outputjson",
-        "--project",
-        str(tmp_path),
-    ]
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--project", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     reports = json.loads(done.stdout)["generalDiagnostics"]
-    lines = {
-        each["range"]["start"]["line"]: each["message"] for each in reports
-    }
+    lines = {each["range"]["start"]["line"]: each["message"] for each in reports}
     assert [*lines] == [1, 2, 3, 4]
     assert '"type[Body]" is not assignable to type "int"' in lines[1]
     assert "material: str | Energy | Material" in lines[2]

@@ -22,33 +22,24 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 def test_the_version_stands_in_one_place():
     assert cs.__version__ == PROJECT["version"]
-    assert "version:" not in (ROOT / "CITATION.cff").read_text().replace(
-        "cff-version:", ""
-    )
+    assert "version:" not in (ROOT / "CITATION.cff").read_text().replace("cff-version:", "")
     for file in (ROOT / "collocation_sysid").rglob("*.py"):
         assert f'"{PROJECT["version"]}"' not in file.read_text()
 
 
 def test_the_changelog_tells_of_the_version():
-    dated = re.findall(
-        r"^## \[([\d.]+)\] - \d{4}-\d\d-\d\d$", CHANGELOG, re.MULTILINE
-    )
+    dated = re.findall(r"^## \[([\d.]+)\] - \d{4}-\d\d-\d\d$", CHANGELOG, re.MULTILINE)
     assert dated[0] == PROJECT["version"]
 
 
 @pytest.mark.long
-def test_the_wheel_explains_every_page_of_the_documentation(
-    tmp_path: Path, monkeypatch
-):
+def test_the_wheel_explains_every_page_of_the_documentation(tmp_path: Path, monkeypatch):
     hatchling = pytest.importorskip("hatchling.build")
     monkeypatch.chdir(ROOT)  # the project that is built
     wheel = tmp_path / hatchling.build_wheel(str(tmp_path))
     installed = tmp_path / "installed"
     zipfile.ZipFile(wheel).extractall(installed)
-    pages = [
-        *(ROOT / "docs").glob("*.md"),
-        *(ROOT / "docs" / "howto").glob("*.md"),
-    ]
+    pages = [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "howto").glob("*.md")]
     program = "from collocation_sysid.cli import main; main()"
 
     def explain(*topic: str) -> str:
@@ -63,9 +54,7 @@ def test_the_wheel_explains_every_page_of_the_documentation(
         ).stdout
 
     listed = [line.split()[0] for line in explain().splitlines()[1:]]
-    assert sorted(listed) == sorted(
-        {page.stem for page in pages} - {"index", "api"}
-    )
+    assert sorted(listed) == sorted({page.stem for page in pages} - {"index", "api"})
     assert explain("verdict").startswith("# Reading the verdict\n")
 
 
@@ -78,12 +67,8 @@ def test_every_dependency_states_the_lowest_version():
     lowest, pins = script["lowest_pins"], script["project_pins"]()
     assert len(lowest(PROJECT["dependencies"])) == len(PROJECT["dependencies"])
     assert all(re.fullmatch(r"[\w-]+==[\d.]+", pin) for pin in pins)
-    assert len({pin.partition("==")[0] for pin in pins}) == len(
-        set(pins)
-    )  # none has two
-    assert {"casadi", "mcap", "mujoco", "distributed"} <= {
-        pin.partition("==")[0] for pin in pins
-    }
+    assert len({pin.partition("==")[0] for pin in pins}) == len(set(pins))  # none has two
+    assert {"casadi", "mcap", "mujoco", "distributed"} <= {pin.partition("==")[0] for pin in pins}
     with pytest.raises(ValueError, match="no lowest version"):
         lowest(["numpy"])
 
@@ -99,27 +84,18 @@ def test_all_extras_for_users_are_in_all():
 
 
 def test_hosted_checks_run_targets_that_are_there():
-    targets = re.findall(
-        r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), re.MULTILINE
-    )
+    targets = re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), re.MULTILINE)
     workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()
     called = re.findall(r"run: make ([a-z-]+)", workflow)
     assert {"check", "test", "docs", "dist"} <= set(called) <= set(targets)
     stated = [c for c in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", c)]
     matrix = re.search(r"python: \[(.*)\]", workflow)
     assert matrix is not None
-    assert [each.rpartition(" ")[2] for each in stated] == re.findall(
-        r"[\d.]+", matrix[1]
-    )
+    assert [each.rpartition(" ")[2] for each in stated] == re.findall(r"[\d.]+", matrix[1])
 
 
 def test_no_package_host_is_named():
-    for name in (
-        "pyproject.toml",
-        "Makefile",
-        ".github/workflows/ci.yml",
-        "SECURITY.md",
-    ):
+    for name in ("pyproject.toml", "Makefile", ".github/workflows/ci.yml", "SECURITY.md"):
         text = (ROOT / name).read_text()
         assert "index-url" not in text
         assert "://" not in text
@@ -128,37 +104,17 @@ def test_no_package_host_is_named():
 def test_the_conda_recipe_has_the_same_dependencies():
     """Under the names that conda has for them."""
     recipe = (ROOT / "scripts" / "conda" / "meta.yaml").read_text()
-    listed = re.findall(
-        r"^    - ([\w-]+) >=([\d.]+)$",
-        recipe.partition("  run:")[2],
-        re.MULTILINE,
-    )
+    listed = re.findall(r"^    - ([\w-]+) >=([\d.]+)$", recipe.partition("  run:")[2], re.MULTILINE)
     renamed = {"matplotlib": "matplotlib-base"}
-    wanted = [
-        re.fullmatch(r"([\w-]+)>=([\d.]+)", each)
-        for each in PROJECT["dependencies"]
-    ]
+    wanted = [re.fullmatch(r"([\w-]+)>=([\d.]+)", each) for each in PROJECT["dependencies"]]
     python = ("python", PROJECT["requires-python"].removeprefix(">="))
-    assert listed == [
-        python,
-        *((renamed.get(m[1], m[1]), m[2]) for m in wanted if m),
-    ]
+    assert listed == [python, *((renamed.get(m[1], m[1]), m[2]) for m in wanted if m)]
 
 
 def test_every_dependency_has_its_licence_told():
     page = (ROOT / "docs" / "licences.md").read_text()
     extras = PROJECT["optional-dependencies"]
-    told = [
-        "surface",
-        "c3d",
-        "logs",
-        "cluster",
-        "view",
-        "film",
-        "usd",
-        "mujoco",
-        "large",
-    ]
+    told = ["surface", "c3d", "logs", "cluster", "view", "film", "usd", "mujoco", "large"]
     for requirement in [
         *PROJECT["dependencies"],
         *(each for extra in told for each in extras[extra]),
@@ -168,9 +124,6 @@ def test_every_dependency_has_its_licence_told():
 
 def test_all_data_of_others_have_their_licence_told():
     page = (ROOT / "docs" / "licences.md").read_text()
-    scripts = [
-        file.stem.removeprefix("get_")
-        for file in (ROOT / "scripts").glob("get_*.py")
-    ]
+    scripts = [file.stem.removeprefix("get_") for file in (ROOT / "scripts").glob("get_*.py")]
     assert len(scripts) >= 4
     assert [name for name in scripts if f"`problems/{name}`" not in page] == []

@@ -100,11 +100,7 @@ def test_no_constructor_of_a_problem_accepts_anything(name: str):
 
 
 def test_the_types_that_are_found_include_those_of_parts():
-    for stated in (
-        "dict[str, Any]",
-        "Callable[[Any], float]",
-        "list[Any] | None",
-    ):
+    for stated in ("dict[str, Any]", "Callable[[Any], float]", "list[Any] | None"):
         assert mentions_any(resolved(stated, __name__))
     for stated in ("dict[str, object]", "Callable[..., float] | ArrayLike"):
         assert not mentions_any(resolved(stated, __name__))

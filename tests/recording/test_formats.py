@@ -94,13 +94,7 @@ t_s,marker,x_mm,y_mm,z_mm
 0.03,Tip 1,130,200,300
 0.03,base,430,500,600
 """
-TEXTS = {
-    "trc": TRC,
-    "qualisys": QUALISYS,
-    "motive": MOTIVE,
-    "wide": WIDE,
-    "long": LONG,
-}
+TEXTS = {"trc": TRC, "qualisys": QUALISYS, "motive": MOTIVE, "wide": WIDE, "long": LONG}
 UNIT_GIVEN = {"qualisys": {"length_unit": "mm"}}
 
 
@@ -149,25 +143,15 @@ def test_windows_line_ends_and_a_byte_order_mark_are_tolerated(file, name):
 def test_markers_are_chosen_ordered_and_renamed(file, name):
     path, options = file(TEXTS[name]), UNIT_GIVEN.get(name, {})
     table = read_markers(
-        path,
-        names=["foot", "tip"],
-        labels={"base": "foot", "Tip 1": "tip"},
-        **options,
+        path, names=["foot", "tip"], labels={"base": "foot", "Tip 1": "tip"}, **options
     )
     assert table.names == ("foot", "tip")
     np.testing.assert_allclose(table.positions_m, TRACKS_M[:, ::-1], rtol=1e-12)
-    assert read_markers(path, labels={"Tip 1": "tip"}, **options).names == (
-        "tip",
-        "base",
-    )
+    assert read_markers(path, labels={"Tip 1": "tip"}, **options).names == ("tip", "base")
     assert "no label 'Tip1'" in refusal(path, labels={"Tip1": "tip"}, **options)
-    assert "did you mean 'Tip 1'?" in refusal(
-        path, labels={"Tip1": "tip"}, **options
-    )
+    assert "did you mean 'Tip 1'?" in refusal(path, labels={"Tip1": "tip"}, **options)
     assert "did you mean 'base'?" in refusal(path, names=["bas"], **options)
-    assert "two markers are named 'base'" in refusal(
-        path, labels={"Tip 1": "base"}, **options
-    )
+    assert "two markers are named 'base'" in refusal(path, labels={"Tip 1": "base"}, **options)
 
 
 @pytest.mark.parametrize(
@@ -183,13 +167,10 @@ def test_markers_are_chosen_ordered_and_renamed(file, name):
 def test_missing_samples_are_counted(file, name, lost):
     table = read_markers(file(TEXTS[name]), **UNIT_GIVEN.get(name, {}))
     if lost[0] == lost[1]:
-        assert table.notes == (
-            f"Tip 1 and base: each 1 of 4 samples missing ({lost[0]})",
-        )
+        assert table.notes == (f"Tip 1 and base: each 1 of 4 samples missing ({lost[0]})",)
     else:
         assert table.notes == (
-            f"Tip 1: 1 of 4 samples missing ({lost[0]}); "
-            f"base: 1 of 4 samples missing ({lost[1]})",
+            f"Tip 1: 1 of 4 samples missing ({lost[0]}); base: 1 of 4 samples missing ({lost[1]})",
         )
 
 
@@ -199,9 +180,7 @@ def test_markers_that_miss_as_many_samples_share_a_note(file):
     rows = [f"{t},{','.join(['1,2,3'] * 6)}" for t in range(3)]
     lost = f"3,{',' * 14},4,5,6"
     table = read_markers(file("\n".join([f"t_s,{head}", *rows, lost, ""])))
-    assert table.notes == (
-        "a, b, c, d and e: each 1 of 4 samples missing (1 blank)",
-    )
+    assert table.notes == ("a, b, c, d and e: each 1 of 4 samples missing (1 blank)",)
 
 
 def test_the_origin_is_a_place_in_a_plain_file(file):
@@ -214,16 +193,13 @@ def test_the_origin_is_a_place_in_a_plain_file(file):
 
 
 @pytest.mark.parametrize(
-    ("name", "key"),
-    [("trc", "Units"), ("motive", "Length Units"), ("long", "columns' names")],
+    ("name", "key"), [("trc", "Units"), ("motive", "Length Units"), ("long", "columns' names")]
 )
 def test_a_unit_that_contradicts_the_file_is_refused(file, name, key):
     path = file(TEXTS[name])
     message = refusal(path, length_unit="m")
     assert all(word in message for word in ("length_unit is 'm'", key, "'mm'"))
-    np.testing.assert_allclose(
-        read_markers(path, length_unit="mm").positions_m, TRACKS_M
-    )
+    np.testing.assert_allclose(read_markers(path, length_unit="mm").positions_m, TRACKS_M)
 
 
 @pytest.mark.parametrize(
@@ -240,9 +216,7 @@ def test_a_unit_is_asked_for_and_never_guessed(file, name, old, new):
     message = refusal(path)
     assert "no unit of length" in message
     assert "expected length_unit, one of m, cm, mm, in" in message
-    np.testing.assert_allclose(
-        read_markers(path, length_unit="mm").positions_m, TRACKS_M
-    )
+    np.testing.assert_allclose(read_markers(path, length_unit="mm").positions_m, TRACKS_M)
 
 
 def test_a_plain_wide_file_is_in_metres_unless_told_otherwise(file):
@@ -267,28 +241,20 @@ def test_a_rate_is_asked_for_where_nothing_tells_the_time(file):
 
 def test_a_rate_that_contradicts_the_file_is_refused(file):
     message = refusal(file(QUALISYS), length_unit="mm", rate_hz=120.0)
-    assert all(
-        word in message for word in ("rate_hz is 120", "FREQUENCY says 100")
-    )
+    assert all(word in message for word in ("rate_hz is 120", "FREQUENCY says 100"))
     message = refusal(file(WIDE), rate_hz=120.0)
-    assert all(
-        word in message for word in ("rate_hz is 120", "0.01 s apart, 100 Hz")
-    )
+    assert all(word in message for word in ("rate_hz is 120", "0.01 s apart, 100 Hz"))
     assert len(read_markers(file(WIDE), rate_hz=100.0).t_s) == 4
     message = refusal(file(TRC.replace("100.00", "50.00")))
     assert all(word in message for word in ("DataRate is 50 Hz", "100 Hz"))
-    message = refusal(
-        file(replaced(MOTIVE, "Export Frame Rate,100", "Export Frame Rate,50"))
-    )
+    message = refusal(file(replaced(MOTIVE, "Export Frame Rate,100", "Export Frame Rate,50")))
     assert "Export Frame Rate is 50 Hz" in message
 
 
 @pytest.mark.parametrize(
     ("rate", "decimals", "lost"), [(240, 3, ()), (30, 2, ()), (100, 2, (5, 6))]
 )
-def test_printed_times_may_be_coarse_and_frames_lost(
-    file, rate, decimals, lost
-):
+def test_printed_times_may_be_coarse_and_frames_lost(file, rate, decimals, lost):
     kept = [k for k in range(40) if k not in lost]
     rows = "".join(f"{k + 1}\t{k / rate:.{decimals}f}\t1\t2\t3\n" for k in kept)
     text = (
@@ -304,44 +270,16 @@ def test_printed_times_may_be_coarse_and_frames_lost(
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (
-            "mm\t100.00",
-            "furlong\t100.00",
-            ["line 3", "'furlong'", "one of m, cm, mm, in"],
-        ),
-        (
-            "DataRate\tCameraRate",
-            "Rate\tCameraRate",
-            ["line 2", "lacks DataRate", "found Rate"],
-        ),
+        ("mm\t100.00", "furlong\t100.00", ["line 3", "'furlong'", "one of m, cm, mm, in"]),
+        ("DataRate\tCameraRate", "Rate\tCameraRate", ["line 2", "lacks DataRate", "found Rate"]),
         ("4\t2\tmm", "5\t2\tmm", ["line 3", "NumFrames is 5", "4 frames"]),
-        (
-            "4\t2\tmm",
-            "4\t3\tmm",
-            ["line 4", "NumMarkers is 3", "2 marker names"],
-        ),
-        (
-            "4\t2\tmm",
-            "four\t2\tmm",
-            ["line 3", "NumFrames is 'four'", "number above 0"],
-        ),
-        (
-            "Frame#\tTime",
-            "Number\tTime",
-            ["line 4", "found Number, Time", "expected Frame#"],
-        ),
+        ("4\t2\tmm", "4\t3\tmm", ["line 4", "NumMarkers is 3", "2 marker names"]),
+        ("4\t2\tmm", "four\t2\tmm", ["line 3", "NumFrames is 'four'", "number above 0"]),
+        ("Frame#\tTime", "Number\tTime", ["line 4", "found Number, Time", "expected Frame#"]),
         ("base\t\t", "Tip 1\t\t", ["two markers are labelled 'Tip 1'"]),
-        (
-            "130\t200",
-            "13O\t200",
-            ["line 10", "column Tip 1 X", "'13O'", "a blank cell"],
-        ),
+        ("130\t200", "13O\t200", ["line 10", "column Tip 1 X", "'13O'", "a blank cell"]),
         ("130\t200", "200", ["line 10", "7 cells", "expected 8"]),
-        (
-            "4\t0.030",
-            "4\t0.020",
-            ["line 10", "0.02 follows 0.02", "time must increase"],
-        ),
+        ("4\t0.030", "4\t0.020", ["line 10", "0.02 follows 0.02", "time must increase"]),
         ("4\t0.030", "4\t", ["line 10", "column Time holds ''"]),
     ],
 )
@@ -367,12 +305,8 @@ def test_tabs_at_the_end_of_all_rows_are_no_cells(file):
 def with_time(text=QUALISYS, titles=True):
     """The same file with Frame and Time columns."""
     lines = text.splitlines()
-    frames = [
-        f"{k + 1}\t{k / 100:.5f}\t{row}" for k, row in enumerate(lines[11:])
-    ]
-    title = "Frame\tTime\t" + "\t".join(
-        f"{n} {a}" for n in ("Tip 1", "base") for a in "XYZ"
-    )
+    frames = [f"{k + 1}\t{k / 100:.5f}\t{row}" for k, row in enumerate(lines[11:])]
+    title = "Frame\tTime\t" + "\t".join(f"{n} {a}" for n in ("Tip 1", "base") for a in "XYZ")
     return "\n".join(lines[:11] + [title] * titles + frames) + "\n"
 
 
@@ -384,9 +318,7 @@ def test_frame_and_time_columns_are_recognised(file, titles):
 
 
 def test_a_frame_without_any_marker_is_a_frame(file):
-    text = replaced(
-        QUALISYS, "0.000\t0.000\t0.000\t410\t500\t600", "\t\t\t\t\t"
-    )
+    text = replaced(QUALISYS, "0.000\t0.000\t0.000\t410\t500\t600", "\t\t\t\t\t")
     table = read_markers(file(text), length_unit="mm")
     assert np.isnan(table.positions_m[1]).all()
     assert len(table.t_s) == 4
@@ -395,31 +327,15 @@ def test_a_frame_without_any_marker_is_a_frame(file):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (
-            "NO_OF_FRAMES\t4",
-            "NO_OF_FRAMES\t400",
-            ["line 1", "NO_OF_FRAMES is 400", "4 frames"],
-        ),
-        (
-            "NO_OF_MARKERS\t2",
-            "NO_OF_MARKERS\t3",
-            ["line 3", "NO_OF_MARKERS is 3", "2 marker"],
-        ),
+        ("NO_OF_FRAMES\t4", "NO_OF_FRAMES\t400", ["line 1", "NO_OF_FRAMES is 400", "4 frames"]),
+        ("NO_OF_MARKERS\t2", "NO_OF_MARKERS\t3", ["line 3", "NO_OF_MARKERS is 3", "2 marker"]),
         ("MARKER_NAMES", "MARKERS", ["lacks MARKER_NAMES"]),
         ("NO_OF_MARKERS\t2", "NO_OF_MARKERS\ttwo", ["line 3", "'two'"]),
         ("Tip 1\tbase", "base\tbase", ["two markers are labelled 'base'"]),
         ("430\t500", "43O\t500", ["line 15", "column base X", "'43O'"]),
         ("430\t500", "430\t500\t7", ["line 15", "7 cells", "expected 6"]),
-        (
-            "100\t200\t300\t400",
-            "100\t200\t300\t400\t1",
-            ["line 12", "7 cells", "6 coordinates"],
-        ),
-        (
-            "FREQUENCY\t100\nNO",
-            "FREQUENCY\t-1\nNO",
-            ["line 4", "FREQUENCY is '-1'"],
-        ),
+        ("100\t200\t300\t400", "100\t200\t300\t400\t1", ["line 12", "7 cells", "6 coordinates"]),
+        ("FREQUENCY\t100\nNO", "FREQUENCY\t-1\nNO", ["line 4", "FREQUENCY is '-1'"]),
     ],
 )
 def test_a_bad_qualisys_file_is_named_by_its_line(file, old, new, words):
@@ -431,9 +347,7 @@ def test_a_bad_qualisys_file_is_named_by_its_line(file, old, new, words):
 
 
 def test_measured_markers_come_before_those_of_a_solved_body(file):
-    solved = MOTIVE.replace(
-        "Tip 1,Tip 1,Tip 1,base,base,base", "Tip 1,Tip 1,Tip 1,foot,foot,foot"
-    )
+    solved = MOTIVE.replace("Tip 1,Tip 1,Tip 1,base,base,base", "Tip 1,Tip 1,Tip 1,foot,foot,foot")
     table = read_markers(file(solved))
     assert table.names == ("base", "Tip 1", "foot")
     np.testing.assert_allclose(table.positions_m[:, 0], 0.009)
@@ -446,17 +360,11 @@ def test_unlabelled_markers_are_taken_only_if_asked_for(file):
     table = read_markers(file(MOTIVE), labels={"Unlabeled 7": "tip"})
     assert table.names == ("Tip 1", "base", "tip")
     np.testing.assert_allclose(table.positions_m[1, 2], [0.001, 0.002, 0.003])
-    assert read_markers(file(MOTIVE), names=["Unlabeled 7"]).names == (
-        "Unlabeled 7",
-    )
+    assert read_markers(file(MOTIVE), names=["Unlabeled 7"]).names == ("Unlabeled 7",)
 
 
 def test_older_headers_do_not_say_which_row_is_which(file):
-    text = (
-        MOTIVE.replace("\n,Type,", "\n,,")
-        .replace("\n,Name,", "\n,,")
-        .replace("\n,ID,", "\n,,")
-    )
+    text = MOTIVE.replace("\n,Type,", "\n,,").replace("\n,Name,", "\n,,").replace("\n,ID,", "\n,,")
     np.testing.assert_allclose(read_markers(file(text)).positions_m, TRACKS_M)
 
 
@@ -464,38 +372,14 @@ def test_older_headers_do_not_say_which_row_is_which(file):
     ("old", "new", "words"),
     [
         ("Millimeters", "Feet", ["line 1, Length Units", "'Feet'"]),
-        (
-            "Exported Frames,4",
-            "Exported Frames,9",
-            ["line 1", "Frames is 9", "4 frames"],
-        ),
-        (
-            "Capture Frame Rate,100.000000,Export Frame Rate,100",
-            "Export Frame Rate,x",
-            ["'x"],
-        ),
-        (
-            "Frame,Time (Seconds)",
-            "Row,Time (Seconds)",
-            ["Frame,Time (Seconds)"],
-        ),
+        ("Exported Frames,4", "Exported Frames,9", ["line 1", "Frames is 9", "4 frames"]),
+        ("Capture Frame Rate,100.000000,Export Frame Rate,100", "Export Frame Rate,x", ["'x"]),
+        ("Frame,Time (Seconds)", "Row,Time (Seconds)", ["Frame,Time (Seconds)"]),
         ("0.030000,", "0.010000,", ["line 11", "0.01 follows 0.02"]),
-        (
-            "130,200,300",
-            "130,200,left",
-            ["line 11", "column Tip 1 Position Z", "'left'"],
-        ),
+        ("130,200,300", "130,200,left", ["line 11", "column Tip 1 Position Z", "'left'"]),
         ("130,200,300", "130,200", ["line 11", "22 cells", "expected 23"]),
-        (
-            "Tip 1,Tip 1,Tip 1,base",
-            "base,base,base,base",
-            ["two markers are named 'base'"],
-        ),
-        (
-            "X,Y,Z,X,Y,Z,X,Y,Z",
-            "X,Y,Z,X,Y,Z,X,Y,W",
-            ["'Unlabeled 7'", "X, Y, W"],
-        ),
+        ("Tip 1,Tip 1,Tip 1,base", "base,base,base,base", ["two markers are named 'base'"]),
+        ("X,Y,Z,X,Y,Z,X,Y,Z", "X,Y,Z,X,Y,Z,X,Y,W", ["'Unlabeled 7'", "X, Y, W"]),
     ],
 )
 def test_a_bad_motive_file_is_named_by_its_line(file, old, new, words):
@@ -504,12 +388,8 @@ def test_a_bad_motive_file_is_named_by_its_line(file, old, new, words):
 
 
 def test_a_motive_file_with_bodies_only_has_no_markers(file):
-    text = MOTIVE.replace("Rigid Body Marker", "Bone").replace(
-        "Marker,", "Bone,"
-    )
-    assert "contains no markers" in refusal(
-        file(text.replace(",Marker\n", ",Bone\n"))
-    )
+    text = MOTIVE.replace("Rigid Body Marker", "Bone").replace("Marker,", "Bone,")
+    assert "contains no markers" in refusal(file(text.replace(",Marker\n", ",Bone\n")))
 
 
 # Long plain CSV -----------------------------------------------------------------------------------
@@ -519,11 +399,7 @@ def test_a_motive_file_with_bodies_only_has_no_markers(file):
     ("old", "new", "words"),
     [
         ("z_mm", "z_m", ["line 1", "z_m", "expected t_s, marker, and x_m"]),
-        (
-            "0.03,base",
-            "0.02,base",
-            ["line 8", "marker 'base'", "0.02 follows 0.02"],
-        ),
+        ("0.03,base", "0.02,base", ["line 8", "marker 'base'", "0.02 follows 0.02"]),
         ("0.02,base", "0.02,", ["line 6", "column marker is blank"]),
         ("430,500", "43O,500", ["line 8", "column x_mm", "'43O'"]),
         ("0.03,base", ",base", ["line 8", "column t_s"]),
@@ -548,9 +424,7 @@ def test_an_unknown_text_file_is_answered_with_the_formats_known(file):
 # C3D ----------------------------------------------------------------------------------------------
 
 
-def write_c3d(
-    path, tracks_mm=1000 * TRACKS_M, labels=("Tip 1", "base"), unit="mm"
-):
+def write_c3d(path, tracks_mm=1000 * TRACKS_M, labels=("Tip 1", "base"), unit="mm"):
     ezc3d = pytest.importorskip("ezc3d")
     frames, markers, _ = tracks_mm.shape
     c3d = ezc3d.c3d()
@@ -567,25 +441,20 @@ def write_c3d(
 
 def without_rate(path):
     """Set both places of the rate to zero; ezc3d itself cannot write that."""
-    path.write_bytes(
-        path.read_bytes().replace(struct.pack("<f", 100.0), bytes(4))
-    )
+    path.write_bytes(path.read_bytes().replace(struct.pack("<f", 100.0), bytes(4)))
     return path
 
 
 def test_c3d_is_read_with_its_unit_rate_and_gaps(tmp_path):
     tracks_mm = 1000 * TRACKS_M
     tracks_mm[2, 1] = 0.0
-    path = write_c3d(tmp_path / "take.c3d", tracks_mm).rename(
-        tmp_path / "take.csv"
-    )
+    path = write_c3d(tmp_path / "take.c3d", tracks_mm).rename(tmp_path / "take.csv")
     table = read_markers(path)
     assert table.names == ("Tip 1", "base")
     np.testing.assert_allclose(table.t_s, [0.0, 0.01, 0.02, 0.03])
     np.testing.assert_allclose(table.positions_m, TRACKS_M, rtol=1e-6)
     assert table.notes == (
-        "Tip 1: 1 of 4 samples missing (1 blank); "
-        "base: 1 of 4 samples missing (1 zeros)",
+        "Tip 1: 1 of 4 samples missing (1 blank); base: 1 of 4 samples missing (1 zeros)",
     )
 
 
@@ -611,30 +480,20 @@ def test_markers_of_a_c3d_are_chosen_and_renamed(tmp_path):
     [
         ({"unit": "furlong"}, {}, ["POINT:UNITS", "'furlong'"]),
         ({"unit": None}, {}, ["no unit of length is stated by POINT:UNITS"]),
-        (
-            {},
-            {"length_unit": "m"},
-            ["length_unit is 'm'", "POINT:UNITS says 'mm'"],
-        ),
+        ({}, {"length_unit": "m"}, ["length_unit is 'm'", "POINT:UNITS says 'mm'"]),
         ({}, {"rate_hz": 60.0}, ["rate_hz is 60", "POINT:RATE says 100"]),
         ({"labels": ("base", "base")}, {}, ["two markers are labelled 'base'"]),
     ],
 )
-def test_a_c3d_that_lacks_or_contradicts_is_refused(
-    tmp_path, written, options, words
-):
+def test_a_c3d_that_lacks_or_contradicts_is_refused(tmp_path, written, options, words):
     message = refusal(write_c3d(tmp_path / "take.c3d", **written), **options)
     assert all(word in message for word in words), message
 
 
 def test_a_c3d_without_unit_or_rate_is_read_with_those_given(tmp_path):
-    path = without_rate(
-        write_c3d(tmp_path / "take.c3d", TRACKS_M * 1000 + 0.5, unit=None)
-    )
+    path = without_rate(write_c3d(tmp_path / "take.c3d", TRACKS_M * 1000 + 0.5, unit=None))
     message = refusal(path, length_unit="mm")
-    assert all(
-        word in message for word in ("neither POINT:RATE", "expected rate_hz")
-    )
+    assert all(word in message for word in ("neither POINT:RATE", "expected rate_hz"))
     table = read_markers(path, length_unit="mm", rate_hz=50.0)
     np.testing.assert_allclose(table.positions_m, TRACKS_M + 0.0005, rtol=1e-6)
     np.testing.assert_allclose(table.t_s, [0.0, 0.02, 0.04, 0.06])
@@ -642,9 +501,7 @@ def test_a_c3d_without_unit_or_rate_is_read_with_those_given(tmp_path):
 
 @pytest.mark.parametrize("kept", [2, 100, 511, 600, 900, -600, -300])
 def test_a_c3d_cut_short_is_refused(tmp_path, kept):
-    path = write_c3d(
-        tmp_path / "take.c3d", np.random.default_rng(0).normal(size=(40, 2, 3))
-    )
+    path = write_c3d(tmp_path / "take.c3d", np.random.default_rng(0).normal(size=(40, 2, 3)))
     path.write_bytes(path.read_bytes()[:kept])
     refusal(path)
 
@@ -653,10 +510,7 @@ def test_c3d_without_ezc3d_names_the_extra(tmp_path, monkeypatch):
     path = write_c3d(tmp_path / "take.c3d")
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     message = refusal(path)
-    assert (
-        "reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'"
-        in message
-    )
+    assert "reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'" in message
 
 
 # Frames before the release, and the template in the data's README.
@@ -671,18 +525,13 @@ TEMPLATE_M = {
 
 
 @pytest.mark.skipif(
-    not [*MEASURED.glob("*_world_m.csv")],
-    reason="the measured beam is not here, or not converted",
+    not [*MEASURED.glob("*_world_m.csv")], reason="the measured beam is not here, or not converted"
 )
-@pytest.mark.parametrize(
-    ("trial", "release"), [("gravity", 71), ("load52", 44), ("load101", 51)]
-)
+@pytest.mark.parametrize(("trial", "release"), [("gravity", 71), ("load52", 44), ("load101", 51)])
 def test_the_measured_beam_comes_out_in_the_worlds_frame(trial, release):
     pytest.importorskip("ezc3d")
     labels = {
-        name.replace("1", " - 1")
-        .replace("2", " - 2")
-        .replace("3", " - 3"): name
+        name.replace("1", " - 1").replace("2", " - 2").replace("3", " - 3"): name
         for name in TEMPLATE_M
     }
     table = read_markers(MEASURED / f"beam_{trial}_V2_a.c3d", labels=labels)
@@ -691,7 +540,5 @@ def test_the_measured_beam_comes_out_in_the_worlds_frame(trial, release):
     assert table.notes == ()
     fit = align_to_template(table, TEMPLATE_M, (0.0, (release - 1) / 100))
     expected = read_markers(MEASURED / f"beam_{trial}_V2_a_world_m.csv")
-    np.testing.assert_allclose(
-        fit.apply(table).positions_m, expected.positions_m, atol=1e-4
-    )
+    np.testing.assert_allclose(fit.apply(table).positions_m, expected.positions_m, atol=1e-4)
     assert fit.residual_m.max() < 0.003

@@ -128,25 +128,18 @@ def jittered_problem(folder: Path) -> tuple[Path, np.ndarray]:
     tracks_m = CubicSpline(table.t_s, table.positions_m)(at_s)
     kept = np.delete(np.arange(len(at_s)), 9)
     write_markers_csv(
-        folder / "swing_markers.csv",
-        at_s[kept],
-        names=table.names,
-        positions_m=tracks_m[kept],
+        folder / "swing_markers.csv", at_s[kept], names=table.names, positions_m=tracks_m[kept]
     )
     return file, tracks_m
 
 
-def test_the_model_is_evaluated_at_the_times_of_the_frames(
-    tmp_path: Path,
-) -> None:
+def test_the_model_is_evaluated_at_the_times_of_the_frames(tmp_path: Path) -> None:
     file, tracks_m = jittered_problem(tmp_path)
     problem = Problem.read(file, [*AT_TRUTH, "transcription.substeps=1"])
     (experiment,) = problem.experiments
     trajectory = simulate(experiment, TRUTH, "midpoint", substeps=1)
-    (segment,) = problem.collocation().transcriptions
-    predicted_m = segment.markers.predict_samples(
-        trajectory.positions_m, np.zeros(0)
-    )
+    (transcription,) = problem.collocation().transcriptions
+    predicted_m = transcription.markers.predict_samples(trajectory.positions_m, np.zeros(0))
     present = experiment.markers.is_present
     miss_m = np.abs(predicted_m - tracks_m)[present]
     ignored_m = np.abs(trajectory.markers_m - tracks_m)[present]
@@ -156,9 +149,7 @@ def test_the_model_is_evaluated_at_the_times_of_the_frames(
     assert interpolated_m.max() < 0.5 * ignored_m.max()
 
 
-def test_jitter_and_lost_frames_hardly_change_an_estimate(
-    tmp_path: Path,
-) -> None:
+def test_jitter_and_lost_frames_hardly_change_an_estimate(tmp_path: Path) -> None:
     file, _ = jittered_problem(tmp_path)
     problem = Problem.read(file, ["transcription.substeps=1"])
     values = cs.solve(problem, "reduced-space").parameters

@@ -15,10 +15,7 @@ TIMES_S = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
 
 def positions(t_s):
     """Return positions (T, 2, 3) of two points that move at constant velocities."""
-    return (
-        np.arange(6.0).reshape(2, 3)
-        + np.ones((2, 3)) * np.asarray(t_s)[:, None, None]
-    )
+    return np.arange(6.0).reshape(2, 3) + np.ones((2, 3)) * np.asarray(t_s)[:, None, None]
 
 
 def test_values_between_consecutive_samples_are_linear():
@@ -29,9 +26,7 @@ def test_values_between_consecutive_samples_are_linear():
 
 @pytest.mark.parametrize("at_s", [-0.1, 2.5, 3.0, 3.999, 5.1])
 def test_values_in_gaps_and_beyond_the_samples_are_missing(at_s):
-    found = interpolate_without_gaps(
-        np.array([at_s]), TIMES_S, positions(TIMES_S)
-    )
+    found = interpolate_without_gaps(np.array([at_s]), TIMES_S, positions(TIMES_S))
     assert np.isnan(found).all()
 
 
@@ -52,9 +47,7 @@ def test_rounding_of_a_time_gives_the_sample_itself():
 
 
 def test_a_single_sample_is_found_at_its_time_alone():
-    found = interpolate_without_gaps(
-        np.array([0.0, 1e-3]), np.zeros(1), positions(np.zeros(1))
-    )
+    found = interpolate_without_gaps(np.array([0.0, 1e-3]), np.zeros(1), positions(np.zeros(1)))
     np.testing.assert_array_equal(found[0], positions([0.0])[0])
     assert np.isnan(found[1]).all()
 

@@ -25,9 +25,7 @@ POINTS = np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.3]])
 def turning_poses(interpolation: Any = "smooth", m=5, dt=0.1):
     """A quarter turn about z in all, while moving along x at 1 m/s."""
     t = dt * np.arange(float(m))
-    quaternions = Rotation.from_rotvec(
-        np.outer(np.linspace(0, np.pi / 2, m), [0, 0, 1])
-    ).as_quat()
+    quaternions = Rotation.from_rotvec(np.outer(np.linspace(0, np.pi / 2, m), [0, 0, 1])).as_quat()
     positions = np.column_stack([t, np.zeros(m), np.zeros(m)])
     return PoseSequence(t, positions, quaternions, interpolation)
 
@@ -36,9 +34,7 @@ def test_samples_are_returned_exactly():
     poses = turning_poses()
     rotations, translations = poses.at(poses.t_s)
     np.testing.assert_allclose(
-        rotations,
-        Rotation.from_quat(poses.quaternions_xyzw).as_matrix(),
-        atol=1e-14,
+        rotations, Rotation.from_quat(poses.quaternions_xyzw).as_matrix(), atol=1e-14
     )
     np.testing.assert_allclose(translations, poses.positions_m, atol=1e-15)
 
@@ -51,27 +47,19 @@ def test_linear_is_slerp_in_rotation_and_linear_in_position():
     poses = PoseSequence(t, positions, turns.as_quat(), "linear")
     asked = np.linspace(0.0, 0.3, 37)
     rotations, translations = poses.at(asked)
-    np.testing.assert_allclose(
-        rotations, Slerp(t, turns)(asked).as_matrix(), atol=1e-13
-    )
+    np.testing.assert_allclose(rotations, Slerp(t, turns)(asked).as_matrix(), atol=1e-13)
     for axis in range(3):
         np.testing.assert_allclose(
-            translations[:, axis],
-            np.interp(asked, t, positions[:, axis]),
-            atol=1e-14,
+            translations[:, axis], np.interp(asked, t, positions[:, axis]), atol=1e-14
         )
 
 
 def waving(t_s):
     """An analytic motion that neither starts nor ends at rest."""
     rates = np.array([9.0, 7.0, 11.0])
-    positions_m = 0.05 * np.sin(
-        np.outer(t_s, rates) + np.array([0.3, 1.5, 1.0])
-    )
+    positions_m = 0.05 * np.sin(np.outer(t_s, rates) + np.array([0.3, 1.5, 1.0]))
     phases = np.array([0.2, 1.6, 0.5])
-    turns = Rotation.from_rotvec(
-        0.7 * np.sin(np.outer(t_s, rates[::-1]) + phases)
-    )
+    turns = Rotation.from_rotvec(0.7 * np.sin(np.outer(t_s, rates[::-1]) + phases))
     return positions_m, turns
 
 
@@ -81,16 +69,12 @@ def carried(poses, t_s):
 
 def truly_carried(t_s):
     positions_m, turns = waving(t_s)
-    return np.stack(
-        [turns.apply(point) + positions_m for point in POINTS], axis=1
-    )
+    return np.stack([turns.apply(point) + positions_m for point in POINTS], axis=1)
 
 
 def acceleration(motion, t_s, step_s=1e-3):
     """By central differences, as an integrator sees it."""
-    return (
-        motion(t_s + step_s) - 2 * motion(t_s) + motion(t_s - step_s)
-    ) / step_s**2
+    return (motion(t_s + step_s) - 2 * motion(t_s) + motion(t_s - step_s)) / step_s**2
 
 
 def recorded(rate_hz, interpolation: Any = "smooth"):
@@ -107,9 +91,7 @@ def test_smooth_converges_with_the_fourth_order_in_position_and_the_second_in_ac
             return carried(recorded(rate_hz), t_s)
 
         off = acceleration(motion, asked) - acceleration(truly_carried, asked)
-        return np.abs(motion(asked) - truly_carried(asked)).max(), np.sqrt(
-            np.mean(off**2)
-        )
+        return np.abs(motion(asked) - truly_carried(asked)).max(), np.sqrt(np.mean(off**2))
 
     coarse, fine = np.array(errors(50)), np.array(errors(100))
     orders = np.log2(coarse / fine)
@@ -141,9 +123,7 @@ def test_smooth_is_the_same_motion_in_any_frame():
     rotations, positions_m = poses.at(asked)
     found, moved_m = turned.at(asked)
     np.testing.assert_allclose(
-        found,
-        (camera * Rotation.from_matrix(rotations) * body).as_matrix(),
-        atol=1e-13,
+        found, (camera * Rotation.from_matrix(rotations) * body).as_matrix(), atol=1e-13
     )
     np.testing.assert_allclose(moved_m, camera.apply(positions_m), atol=1e-14)
 
@@ -169,12 +149,8 @@ def test_smooth_does_not_overshoot_a_jump():
     rotations, positions_m = poses.at(asked)
     angles = Rotation.from_matrix(rotations).as_rotvec()[:, 2]
     still = (asked <= 0.5) | (asked >= 0.6)
-    np.testing.assert_allclose(
-        positions_m[still, 0], 0.2 * (asked[still] > 0.55), atol=1e-15
-    )
-    np.testing.assert_allclose(
-        angles[still], 1.0 * (asked[still] > 0.55), atol=1e-14
-    )
+    np.testing.assert_allclose(positions_m[still, 0], 0.2 * (asked[still] > 0.55), atol=1e-15)
+    np.testing.assert_allclose(angles[still], 1.0 * (asked[still] > 0.55), atol=1e-14)
     assert 0 <= positions_m[:, 0].min() <= positions_m[:, 0].max() <= 0.2
     np.testing.assert_allclose(positions_m[asked == 0.55, 0], 0.1)
 
@@ -183,18 +159,14 @@ def test_smooth_does_not_overshoot_a_jump():
 def test_a_motion_that_samples_resolve_has_no_jumps(rate_hz):
     assert recorded(rate_hz).jumps_s.size == 0
     t_s = np.arange(rate_hz + 1) / rate_hz
-    started = np.outer(
-        np.maximum(t_s - 0.5, 0.0), [1.0, 0, 0]
-    )  # at full speed from rest
+    started = np.outer(np.maximum(t_s - 0.5, 0.0), [1.0, 0, 0])  # at full speed from rest
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
     assert PoseSequence(t_s, started, upright).jumps_s.size == 0
 
 
 def test_matrices_in_place_of_positions_and_quaternions_name_the_constructor():
     matrices: Any = np.eye(4)[None]
-    with pytest.raises(
-        TypeError, match=r"PoseSequence: missing .*PoseSequence\.from_matrices"
-    ):
+    with pytest.raises(TypeError, match=r"PoseSequence: missing .*PoseSequence\.from_matrices"):
         PoseSequence([0.0], matrices)  # pyright: ignore[reportCallIssue]
 
 
@@ -211,17 +183,11 @@ def test_after_moves_by_the_matrix_first():
         atol=1e-14,
     )
     np.testing.assert_allclose(body.first_motion, of_body, atol=1e-14)
-    np.testing.assert_allclose(
-        body.after(of_body).first_motion, of_body @ of_body, atol=1e-14
-    )
+    np.testing.assert_allclose(body.after(of_body).first_motion, of_body @ of_body, atol=1e-14)
     quaternion = Rotation.from_matrix(of_body[:3, :3]).as_quat()
     by_pose = gripper.after(PoseSequence([0.0], [of_body[:3, 3]], [quaternion]))
-    np.testing.assert_allclose(
-        by_pose.positions_m, body.positions_m, atol=1e-15
-    )
-    np.testing.assert_allclose(
-        by_pose.quaternions_xyzw, body.quaternions_xyzw, atol=1e-15
-    )
+    np.testing.assert_allclose(by_pose.positions_m, body.positions_m, atol=1e-15)
+    np.testing.assert_allclose(by_pose.quaternions_xyzw, body.quaternions_xyzw, atol=1e-15)
     held = replace(gripper, interpolation="hold").after(np.eye(4))
     assert held.interpolation == "hold"
     np.testing.assert_allclose(held.positions_m, gripper.positions_m)
@@ -230,9 +196,7 @@ def test_after_moves_by_the_matrix_first():
 def test_a_matrix_that_is_no_rigid_motion_is_refused():
     with pytest.raises(InputError, match="is a reflection"):
         recorded(20).after(np.diag([1.0, 1.0, -1.0, 1.0]))
-    with pytest.raises(
-        InputError, match=r"^the quaternion has the norm 2; expected 1"
-    ):
+    with pytest.raises(InputError, match=r"^the quaternion has the norm 2; expected 1"):
         PoseSequence([0.0], [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 2.0]])
 
 
@@ -253,9 +217,7 @@ def test_carry_rotates_then_moves_undeformed_points():
     carried = poses.moved_positions(POINTS, [0.0, 0.4])
     assert carried.shape == (2, 2, 3)
     np.testing.assert_allclose(carried[0], POINTS)
-    np.testing.assert_allclose(
-        carried[1], [[0.4, 0.1, 0.0], [0.2, 0.0, 0.3]], atol=1e-14
-    )
+    np.testing.assert_allclose(carried[1], [[0.4, 0.1, 0.0], [0.2, 0.0, 0.3]], atol=1e-14)
 
 
 def test_fixed_leaves_points_alone_at_any_time():
@@ -267,27 +229,19 @@ def test_fixed_leaves_points_alone_at_any_time():
 
 def test_a_single_pose_holds_for_all_time():
     poses = PoseSequence(
-        np.array([2.0]),
-        np.array([[0.0, 0.0, 1.0]]),
-        np.array([[0.0, 0.0, 1.0, 0.0]]),
+        np.array([2.0]), np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 1.0, 0.0]])
     )
     expected = POINTS * [-1, -1, 1] + [0, 0, 1]
-    np.testing.assert_allclose(
-        poses.moved_positions(POINTS, [0.0, 5.0])[1], expected, atol=1e-15
-    )
+    np.testing.assert_allclose(poses.moved_positions(POINTS, [0.0, 5.0])[1], expected, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("interpolation", "off"), [("linear", 1e-12), ("smooth", 1e-3)]
-)
+@pytest.mark.parametrize(("interpolation", "off"), [("linear", 1e-12), ("smooth", 1e-3)])
 def test_half_a_sample_beyond_the_ends_continues_the_motion(interpolation, off):
     poses = turning_poses(interpolation)
     rotations, translations = poses.at([-0.05, 0.45])
     np.testing.assert_allclose(translations[:, 0], [-0.05, 0.45])
     angles = Rotation.from_matrix(rotations).as_rotvec()[:, 2]
-    np.testing.assert_allclose(
-        angles, [-np.pi / 16, np.pi / 2 + np.pi / 16], atol=off
-    )
+    np.testing.assert_allclose(angles, [-np.pi / 16, np.pi / 2 + np.pi / 16], atol=off)
 
 
 @pytest.mark.parametrize("time", [-0.06, 0.46, np.nan])
@@ -301,24 +255,16 @@ def test_quaternion_signs_do_not_matter():
     poses = turning_poses()
     flipped = poses.quaternions_xyzw * np.array([1, -1, 1, -1, -1])[:, None]
     same = PoseSequence(poses.t_s, poses.positions_m, flipped)
-    steps = np.sum(
-        same.quaternions_xyzw[1:] * same.quaternions_xyzw[:-1], axis=1
-    )
+    steps = np.sum(same.quaternions_xyzw[1:] * same.quaternions_xyzw[:-1], axis=1)
     assert (steps > 0).all()
     asked = np.linspace(0, 0.4, 21)
-    np.testing.assert_allclose(
-        same.at(asked)[0], poses.at(asked)[0], atol=1e-14
-    )
+    np.testing.assert_allclose(same.at(asked)[0], poses.at(asked)[0], atol=1e-14)
 
 
 def test_nearly_unit_quaternions_are_normalised():
     poses = turning_poses()
-    slightly_off = PoseSequence(
-        poses.t_s, poses.positions_m, 1.0005 * poses.quaternions_xyzw
-    )
-    np.testing.assert_allclose(
-        np.linalg.norm(slightly_off.quaternions_xyzw, axis=1), 1.0
-    )
+    slightly_off = PoseSequence(poses.t_s, poses.positions_m, 1.0005 * poses.quaternions_xyzw)
+    np.testing.assert_allclose(np.linalg.norm(slightly_off.quaternions_xyzw, axis=1), 1.0)
 
 
 def test_a_quaternion_off_unit_norm_is_named_with_its_norm():
@@ -332,11 +278,7 @@ def test_a_quaternion_off_unit_norm_is_named_with_its_norm():
 def test_time_must_increase():
     poses = turning_poses()
     with pytest.raises(InputError, match=r"row 4: t_s = 0\.2 follows 0\.2"):
-        PoseSequence(
-            np.array([0.0, 0.1, 0.2, 0.2, 0.3]),
-            poses.positions_m,
-            poses.quaternions_xyzw,
-        )
+        PoseSequence(np.array([0.0, 0.1, 0.2, 0.2, 0.3]), poses.positions_m, poses.quaternions_xyzw)
 
 
 def test_values_must_be_finite():
@@ -361,17 +303,13 @@ def test_shapes_must_agree(t_s, positions, quaternions):
 
 
 def test_an_unknown_interpolation_is_refused():
-    with pytest.raises(
-        InputError, match="'cubic'; expected one of smooth, linear, hold"
-    ):
+    with pytest.raises(InputError, match="'cubic'; expected one of smooth, linear, hold"):
         turning_poses("cubic")
 
 
 def test_a_pose_sequence_keeps_its_own_read_only_copy():
     t = np.array([0.0, 1.0])
-    poses = PoseSequence(
-        t, np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
-    )
+    poses = PoseSequence(t, np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
     t[1] = 7.0
     assert poses.t_s[1] == 1.0
     with pytest.raises(ValueError, match="read-only"):
@@ -399,12 +337,8 @@ def test_held_nodes_is_the_sorted_union():
 
 def test_a_node_in_two_grasps_is_refused_by_name():
     poses = PoseSequence.fixed()
-    grasps = [
-        Grasp(np.array(nodes), poses) for nodes in ([9], [3, 1, 7], [7, 3])
-    ]
-    with pytest.raises(
-        InputError, match="node 3 is held by the grasps 2 and 3"
-    ):
+    grasps = [Grasp(np.array(nodes), poses) for nodes in ([9], [3, 1, 7], [7, 3])]
+    with pytest.raises(InputError, match="node 3 is held by the grasps 2 and 3"):
         prescribed_nodes(grasps)
 
 
@@ -412,9 +346,7 @@ def measured_grasp() -> Grasp:
     """A grasp whose sensor measures forces at five times, and no torque."""
     t_s = 0.1 * np.arange(5)
     forces_n = np.arange(15.0).reshape(5, 3)
-    return Grasp(
-        np.array([0]), turning_poses(), wrench=Wrench(t_s, forces_n, 0.1)
-    )
+    return Grasp(np.array([0]), turning_poses(), wrench=Wrench(t_s, forces_n, 0.1))
 
 
 def test_loads_of_a_grasp_are_cut_to_times():
@@ -422,18 +354,14 @@ def test_loads_of_a_grasp_are_cut_to_times():
     cut = grasp.with_loads_within(np.array([0.1, 0.35]), fewest=3)
     np.testing.assert_allclose(cut.list_load_times_s(), [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(cut.wrench.values, grasp.wrench.values[1:4])
-    assert (
-        grasp.with_loads_within(np.array([0.1, 0.35]), fewest=4).wrench is None
-    )
+    assert grasp.with_loads_within(np.array([0.1, 0.35]), fewest=4).wrench is None
     assert grasp.has_sensor()
 
 
 def test_loads_after_a_time_are_missing_and_times_stay():
     grasp = measured_grasp()
     early = grasp.without_loads_after(0.2)
-    np.testing.assert_array_equal(
-        early.list_load_times_s(), grasp.list_load_times_s()
-    )
+    np.testing.assert_array_equal(early.list_load_times_s(), grasp.list_load_times_s())
     np.testing.assert_array_equal(
         early.wrench.is_measured.any(axis=1), [True, True, True, False, False]
     )
@@ -467,8 +395,6 @@ def test_forces_of_an_obstacle_are_rotated_from_its_axes_to_the_world():
         sensor = Wrench(poses.t_s, forces_n, 0.1, frame=frame)
         measured = replace(wall, wrench=sensor).find_measured_forces()
         assert measured is not None
-        np.testing.assert_allclose(
-            measured.rotate_to_world_n(), expected_n, atol=1e-14
-        )
+        np.testing.assert_allclose(measured.rotate_to_world_n(), expected_n, atol=1e-14)
         np.testing.assert_array_equal(measured.forces_n, forces_n)
         assert measured.sigma_n == 0.1

@@ -26,26 +26,19 @@ CORNER = Box((-1, -1, 0.079), (0.021, 0.021, 1))
 Point = tuple[float, float, float]
 
 
-def held(
-    region: Box, *moves: tuple[Point, Point], axes: str = "xyz"
-) -> GraspCheck:
+def held(region: Box, *moves: tuple[Point, Point], axes: str = "xyz") -> GraspCheck:
     """A cube of 100 mm held by a region, after some of its nodes were moved."""
     mesh = box_mesh((0.1, 0.1, 0.1), (5, 5, 5))
     points_m = mesh.points_m.copy()
     for at, to in moves:
         (node,) = abs(points_m - at).max(axis=1).argsort()[:1]
         points_m[node] = to
-    body, t_s = (
-        Body(TetMesh(points_m, mesh.tetrahedra), density_kg_m3=30.0),
-        times(3),
-    )
+    body, t_s = (Body(TetMesh(points_m, mesh.tetrahedra), density_kg_m3=30.0), times(3))
     grasps = [Grasp(region, PoseSequence.fixed(), axes=axes)]
     if axes != "xyz":
         grasps.append(Grasp(BOTTOM, PoseSequence.fixed()))
     seen = vertex_markers(body, [100], t_s)
-    return check_grasps(
-        Experiment(body, t_s, grasps, seen, name="cube"), EDGE_M
-    )[0]
+    return check_grasps(Experiment(body, t_s, grasps, seen, name="cube"), EDGE_M)[0]
 
 
 @pytest.mark.parametrize(
@@ -65,12 +58,7 @@ def held(
         (TOP, [((0.04, 0.04, 0.08), (0.04, 0.04, 0.08 + 1e-9))], 0, 0),
         (TOP, [((0.04, 0.04, 0.08), (0.04, 0.04, 0.08 + 1e-5))], 0, 1),
         # Two nodes, and one at two faces, which counts once.
-        (
-            TOP,
-            [((x, 0.04, 0.06), (x, 0.04, 0.0785)) for x in (0.04, 0.06)],
-            2,
-            0,
-        ),
+        (TOP, [((x, 0.04, 0.06), (x, 0.04, 0.0785)) for x in (0.04, 0.06)], 2, 0),
         (CORNER, [((0.02, 0.02, 0.08), (0.0185, 0.0185, 0.0815))], 0, 1),
         (CORNER, [((0.04, 0.0, 0.1), (0.0215, 0.0, 0.1))], 1, 0),
         # Behind faces at which the body ends nothing is cut.
@@ -85,15 +73,10 @@ def test_nodes_beside_a_face_that_cuts_elements_are_counted(
     region, moves, nearly_held, nearly_free
 ):
     found = held(region, *moves)
-    assert (found.nearly_grasped, found.nearly_free) == (
-        nearly_held,
-        nearly_free,
-    )
+    assert (found.nearly_grasped, found.nearly_free) == (nearly_held, nearly_free)
     (said, *more) = [each.message for each in grasp_concerns(found)] or [""]
     assert not more
-    assert ("enlarged by a tenth of an element's edge" in said) == bool(
-        nearly_held + nearly_free
-    )
+    assert ("enlarged by a tenth of an element's edge" in said) == bool(nearly_held + nearly_free)
     if said:
         assert f"selects {found.nodes} nodes, but {nearly_held} more if" in said
         assert f"or {nearly_free} fewer if it is reduced by as much" in said

@@ -25,13 +25,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.recording import (
-    Experiment,
-    Force,
-    Grasp,
-    PointMass,
-    PoseSequence,
-)
+from collocation_sysid.recording import Experiment, Force, Grasp, PointMass, PoseSequence
 from collocation_sysid.recording.time_tables import read_forces
 
 INTEGRATORS = ["newmark", *SCHEMES]
@@ -41,9 +35,7 @@ TIP = nodes_where(box(), 2, 0.0)
 
 def flying(**changes) -> Experiment:
     """A cube that nobody holds, without gravity, at rest."""
-    cube = hung_cube(
-        **{"steps": 8, "start": "undeformed", "gravity_m_s2": np.zeros(3)}
-    )
+    cube = hung_cube(**{"steps": 8, "start": "undeformed", "gravity_m_s2": np.zeros(3)})
     return replace(cube, grasps=(), **changes)
 
 
@@ -54,15 +46,8 @@ def test_a_point_mass_pulls_like_its_weight():
     heavy = hung_cube(masses=(PointMass(TIP, 0.004),))
     pulled = hung_cube(forces=(Force(TIP, 0.004 * np.array(GRAVITY_M_S2)),))
     theta = as_theta(TRUTH)
-    np.testing.assert_allclose(
-        equilibrium(heavy, theta), equilibrium(pulled, theta), atol=1e-12
-    )
-    assert (
-        np.abs(
-            equilibrium(heavy, theta) - equilibrium(hung_cube(), theta)
-        ).max()
-        > 5e-4
-    )
+    np.testing.assert_allclose(equilibrium(heavy, theta), equilibrium(pulled, theta), atol=1e-12)
+    assert np.abs(equilibrium(heavy, theta) - equilibrium(hung_cube(), theta)).max() > 5e-4
 
 
 @pytest.mark.parametrize("integrator", ["newmark", "midpoint"])
@@ -77,9 +62,7 @@ def test_a_heavy_mass_swings_as_on_a_spring(integrator: str):
         start="undeformed",
         masses=(PointMass(TIP, mass),),
     )
-    sag = (body.nodes_m - equilibrium(spring, as_theta(stiff)).reshape(-1, 3))[
-        TIP, 2
-    ].mean()
+    sag = (body.nodes_m - equilibrium(spring, as_theta(stiff)).reshape(-1, 3))[TIP, 2].mean()
     period = 2 * np.pi * np.sqrt(sag / 9.81)  # m g = k sag
     motion = simulate(spring, stiff, integrator)
     drop = body.nodes_m[TIP, 2].mean() - motion.markers_m[:, :, 2].mean(axis=1)
@@ -110,16 +93,10 @@ def test_a_mass_that_joins_moves_along(integrator: str):
 def test_a_force_gives_its_impulse(integrator: str):
     table = np.array([[0.0, 0.0, 0.0], [0.03, -0.02, 0.04], [0.0, 0.0, 0.0]])
     pushed = flying(forces=(Force(TIP, table, [0.0, 0.025, 0.05]),))
-    motion = simulate(
-        pushed, UNDAMPED, integrator, timestep_s=0.0025, substeps=4
-    )
+    motion = simulate(pushed, UNDAMPED, integrator, timestep_s=0.0025, substeps=4)
     impulse = 0.025 * (table[:-1] + table[1:]).sum(axis=0) / 2
     mass = pushed.body.node_mass
-    momentum = (
-        mass
-        @ (motion.positions_m[-1] - motion.positions_m[-2])
-        / pushed.timestep_s
-    )
+    momentum = mass @ (motion.positions_m[-1] - motion.positions_m[-2]) / pushed.timestep_s
     np.testing.assert_allclose(momentum, impulse, rtol=0.02, atol=1e-6)
 
 
@@ -137,14 +114,8 @@ def test_a_force_is_linear_between_its_rows_and_nothing_outside():
         (lambda: PointMass([0], 0.0), "expected a number above 0"),
         (lambda: PointMass([], 1.0), "empty list of nodes"),
         (lambda: Force([0], [[0, 0, 0], [0, 0, 1]]), "expected t_s"),
-        (
-            lambda: Force([0], [[0, 0, 0], [0, 0, 1]], [1.0, 1.0]),
-            "row 2: .*time must increase",
-        ),
-        (
-            lambda: Grasp([0], PoseSequence.fixed(), 2.0, 1.0),
-            "expected from_s <= until_s",
-        ),
+        (lambda: Force([0], [[0, 0, 0], [0, 0, 1]], [1.0, 1.0]), "row 2: .*time must increase"),
+        (lambda: Grasp([0], PoseSequence.fixed(), 2.0, 1.0), "expected from_s <= until_s"),
     ],
 )
 def test_loads_that_mean_nothing_are_refused(make, message: str):
@@ -163,20 +134,12 @@ def test_force_files_are_read_by_column_name(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "t_s,fx_n,fy_n\n0,1,2\n",
-            "line 1: the columns are t_s, fx_n, fy_n; expected",
-        ),
+        ("t_s,fx_n,fy_n\n0,1,2\n", "line 1: the columns are t_s, fx_n, fy_n; expected"),
         ("t_s,fx_n,fy_n,fz_n\n0,1,2,x\n", "line 2: column fz_n holds 'x'"),
-        (
-            "t_s,fx_n,fy_n,fz_n\n0,1,2,3\n0,1,2,3\n",
-            "line 3: .*time must increase",
-        ),
+        ("t_s,fx_n,fy_n,fz_n\n0,1,2,3\n0,1,2,3\n", "line 3: .*time must increase"),
     ],
 )
-def test_force_files_that_are_wrong_name_the_line(
-    tmp_path, text: str, message: str
-):
+def test_force_files_that_are_wrong_name_the_line(tmp_path, text: str, message: str):
     file = tmp_path / "force.csv"
     file.write_text(text)
     with pytest.raises(InputError, match=message):
@@ -194,14 +157,10 @@ def test_two_grasps_may_hold_a_node_one_after_the_other():
     passed = replace(bar, grasps=(still, first, again))
     held, positions = passed.prescribed_displacements(passed.t_s)
     expected = (passed.t_s < 0.035) | (passed.t_s > 0.055)
-    np.testing.assert_array_equal(
-        held[:, moving.nodes[0]].all(axis=1), expected
-    )
+    np.testing.assert_array_equal(held[:, moving.nodes[0]].all(axis=1), expected)
     assert np.isnan(positions[~expected][:, moving.nodes]).all()
     np.testing.assert_array_equal(passed.prescribed_dofs, still.prescribed_dofs)
-    with pytest.raises(
-        InputError, match="held by the grasps 2 and 3 at the same time"
-    ):
+    with pytest.raises(InputError, match="held by the grasps 2 and 3 at the same time"):
         replace(bar, grasps=(still, first, replace(moving, from_s=0.02)))
 
 
@@ -210,17 +169,11 @@ def test_a_body_let_go_by_everyone_falls_freely(integrator: str):
     cube = hung_cube(16)
     (grasp,) = cube.grasps
     dropped = replace(cube, grasps=(replace(grasp, until_s=0.04),))
-    motion = simulate(
-        dropped, {**TRUTH, "gamma_m_1_s": 0.0}, integrator, timestep_s=0.01
-    )
+    motion = simulate(dropped, {**TRUTH, "gamma_m_1_s": 0.0}, integrator, timestep_s=0.01)
     centre = dropped.body.node_mass @ motion.positions_m / dropped.body.mass_kg
     acceleration = np.diff(centre, 2, axis=0) / dropped.timestep_s**2
-    remembers = (
-        0.01 if integrator == "bdf2" else 1e-6
-    )  # the last steps in hand fade slowly there
-    np.testing.assert_allclose(
-        acceleration[-2:], [GRAVITY_M_S2] * 2, atol=remembers
-    )
+    remembers = 0.01 if integrator == "bdf2" else 1e-6  # the last steps in hand fade slowly there
+    np.testing.assert_allclose(acceleration[-2:], [GRAVITY_M_S2] * 2, atol=remembers)
     np.testing.assert_allclose(
         motion.positions_m[:5, grasp.nodes],
         grasp.positions_at(cube.body.nodes_m, dropped.t_s[:5]),
@@ -236,15 +189,11 @@ def let_go_by_newmark_m() -> np.ndarray:
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_schemes_agree_with_newmark_where_hands_let_go_and_masses_join(
-    scheme: str,
-):
+def test_schemes_agree_with_newmark_where_hands_let_go_and_masses_join(scheme: str):
     bar, reference = bar_let_go(), let_go_by_newmark_m()
     moved = np.abs(reference - reference[0]).max()
     errors = [
-        np.abs(
-            simulate(bar, TRUTH, scheme, substeps=m).markers_m - reference
-        ).max()
+        np.abs(simulate(bar, TRUTH, scheme, substeps=m).markers_m - reference).max()
         for m in (4, 16)
     ]
     assert errors[1] < 0.4 * errors[0]
@@ -256,13 +205,10 @@ def test_a_release_starts_from_the_equilibrium_in_all_grasps():
     still, moving = bar.grasps
     let_go = replace(bar, grasps=(still, replace(moving, until_s=0.0)))
     both_hold, one_holds = (
-        equilibrium(e, as_theta(TRUTH))
-        for e in (let_go, replace(bar, grasps=(still,)))
+        equilibrium(e, as_theta(TRUTH)) for e in (let_go, replace(bar, grasps=(still,)))
     )
     motion = simulate(let_go, TRUTH, "midpoint", substeps=1)
-    np.testing.assert_allclose(
-        motion.positions_m[0].ravel(), both_hold, atol=1e-12
-    )
+    np.testing.assert_allclose(motion.positions_m[0].ravel(), both_hold, atol=1e-12)
     assert np.abs(both_hold - one_holds).max() > 1e-3
     tip = moving.nodes[0]
     drop = motion.positions_m[:3, tip, 2]

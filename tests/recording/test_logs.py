@@ -15,16 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kit.logs import (
-    KINDS,
-    START_S,
-    URDF,
-    Messages,
-    bag,
-    dataset,
-    json_mcap,
-    recorded,
-)
+from kit.logs import KINDS, START_S, URDF, Messages, bag, dataset, json_mcap, recorded
 from kit.problem_files import run_command, write_problem
 from kit.robot_log import POSES, robot_problem
 from PIL import Image
@@ -39,10 +30,7 @@ from collocation_sysid.recording import read_markers, read_poses, read_wrench
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.recording.formats.logs import stored_files
 from collocation_sysid.recording.formats.topics import list_topics
-from collocation_sysid.recording.time_tables import (
-    read_custom_sensor,
-    read_pressure,
-)
+from collocation_sysid.recording.time_tables import read_custom_sensor, read_pressure
 
 T_S = np.arange(40) / 50.0
 STILL = (0.0, 0.0, 0.0, 1.0)
@@ -58,9 +46,7 @@ def test_a_missing_log_is_not_called_damaged(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_problem_read_from_a_log_is_the_one_of_its_files(
-    tmp_path: Path, kind: str
-) -> None:
+def test_a_problem_read_from_a_log_is_the_one_of_its_files(tmp_path: Path, kind: str) -> None:
     file = write_problem(tmp_path, {"swing": 12})
     poses = read_poses(tmp_path / "swing_motion.csv")
     table = read_markers(tmp_path / "swing_markers.csv")
@@ -68,27 +54,19 @@ def test_a_problem_read_from_a_log_is_the_one_of_its_files(
     lost[3, 1] = np.nan
     table = replace(table, positions_m=lost)
     log = bag(tmp_path / "trial", recorded(poses, table, kind), kind)
-    text = file.read_text().replace(
-        "swing_motion.csv", f"{log.relative_to(tmp_path)}#/gripper"
-    )
-    text = text.replace(
-        "swing_markers.csv", f"{log.relative_to(tmp_path)}#/markers"
-    )
+    text = file.read_text().replace("swing_motion.csv", f"{log.relative_to(tmp_path)}#/gripper")
+    text = text.replace("swing_markers.csv", f"{log.relative_to(tmp_path)}#/markers")
     before = Problem.read(file).experiments[0]
     file.write_text(text)
     experiment = Problem.read(file).experiments[0]
     np.testing.assert_allclose(experiment.t_s, before.t_s, atol=1e-9)
     moved, moved_before = (e.grasps[0].poses for e in (experiment, before))
-    np.testing.assert_allclose(
-        moved.positions_m, moved_before.positions_m, atol=1e-12
-    )
+    np.testing.assert_allclose(moved.positions_m, moved_before.positions_m, atol=1e-12)
     measured, as_files = (e.markers.positions_m for e in (experiment, before))
     missing = np.isnan(measured)
     assert missing.sum() == 3
     assert missing[3, 1].all()
-    np.testing.assert_allclose(
-        measured[~missing], as_files[~missing], atol=1e-12
-    )
+    np.testing.assert_allclose(measured[~missing], as_files[~missing], atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -99,36 +77,24 @@ def test_a_frame_is_followed_through_a_tree_of_frames_at_rates_of_their_own(
 
     def messages():
         yield of.tree(
-            0.0,
-            of.transform(0.0, "flange", "tool", (0, 0, 0.1), STILL),
-            topic="/tf_static",
+            0.0, of.transform(0.0, "flange", "tool", (0, 0, 0.1), STILL), topic="/tf_static"
         )
         for t in np.arange(0, 0.8001, 0.1):  # a base that slides steadily
             yield of.tree(t, of.transform(t, "world", "base", (t, 0, 0), STILL))
         for t in T_S:
-            yield of.tree(
-                t, of.transform(t, "base", "flange", (0, 0, 1), about_z(2 * t))
-            )
+            yield of.tree(t, of.transform(t, "base", "flange", (0, 0, 1), about_z(2 * t)))
 
     log = bag(tmp_path / "trial", sorted(messages(), key=lambda m: m[0]), kind)
     poses = read_poses(f"{log}#/tf#world>tool")
     np.testing.assert_allclose(poses.t_s, T_S, atol=1e-6)
-    np.testing.assert_allclose(
-        poses.positions_m, [(t, 0, 1.1) for t in T_S], atol=1e-6
-    )
-    np.testing.assert_allclose(
-        poses.quaternions_xyzw, [about_z(2 * t) for t in T_S], atol=1e-6
-    )
+    np.testing.assert_allclose(poses.positions_m, [(t, 0, 1.1) for t in T_S], atol=1e-6)
+    np.testing.assert_allclose(poses.quaternions_xyzw, [about_z(2 * t) for t in T_S], atol=1e-6)
     back = read_poses(f"{log}#/tf#tool>world")
-    turned = Rotation.from_quat(back.quaternions_xyzw).apply(
-        poses.positions_m.copy()
-    )
+    turned = Rotation.from_quat(back.quaternions_xyzw).apply(poses.positions_m.copy())
     np.testing.assert_allclose(turned, -back.positions_m, atol=1e-9)
 
 
-def test_wrenches_pressures_and_joints_are_read_as_tables(
-    tmp_path: Path,
-) -> None:
+def test_wrenches_pressures_and_joints_are_read_as_tables(tmp_path: Path) -> None:
     of = Messages()
     messages = [
         each
@@ -149,24 +115,15 @@ def test_wrenches_pressures_and_joints_are_read_as_tables(
     np.testing.assert_allclose(values[:, 0], T_S)
 
 
-def test_joints_make_poses_of_a_link_by_the_robots_description(
-    tmp_path: Path,
-) -> None:
+def test_joints_make_poses_of_a_link_by_the_robots_description(tmp_path: Path) -> None:
     of = Messages()
-    log = bag(
-        tmp_path / "trial",
-        [of.joints(t, {"turn": t, "slide": 0.1 + t / 10}) for t in T_S],
-    )
+    log = bag(tmp_path / "trial", [of.joints(t, {"turn": t, "slide": 0.1 + t / 10}) for t in T_S])
     (tmp_path / "arm.urdf").write_text(URDF)
     poses = read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
     reach = 0.3 + T_S / 10
-    expected = np.column_stack(
-        [reach * np.cos(T_S), reach * np.sin(T_S), np.full(len(T_S), 0.5)]
-    )
+    expected = np.column_stack([reach * np.cos(T_S), reach * np.sin(T_S), np.full(len(T_S), 0.5)])
     np.testing.assert_allclose(poses.positions_m, expected, atol=1e-9)
-    np.testing.assert_allclose(
-        poses.quaternions_xyzw, [about_z(t) for t in T_S], atol=1e-9
-    )
+    np.testing.assert_allclose(poses.quaternions_xyzw, [about_z(t) for t in T_S], atol=1e-9)
 
 
 def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_its_joints_is_said(
@@ -175,36 +132,23 @@ def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_its_joints_is_said
     count = 20
     degrees = {"turn": [*np.linspace(0, 60, count)], "slide": [0.0] * count}
     folder = dataset(tmp_path / "pick", degrees)
-    (tmp_path / "arm.urdf").write_text(
-        URDF.replace('type="prismatic"', 'type="revolute"')
-    )
+    (tmp_path / "arm.urdf").write_text(URDF.replace('type="prismatic"', 'type="revolute"'))
     address = f"{folder}#observation.state#1#arm.urdf#base>upper"
-    with pytest.raises(
-        InputError, match="unit of the joint positions; expected #rad or #deg"
-    ):
+    with pytest.raises(InputError, match="unit of the joint positions; expected #rad or #deg"):
         read_poses(address)
     poses = read_poses(f"{address}#deg")
-    turned = Rotation.from_quat(poses.quaternions_xyzw).as_rotvec(degrees=True)[
-        :, 2
-    ]
-    np.testing.assert_allclose(
-        turned, np.array(degrees["turn"]) + 0.01, atol=1e-5
-    )
+    turned = Rotation.from_quat(poses.quaternions_xyzw).as_rotvec(degrees=True)[:, 2]
+    np.testing.assert_allclose(turned, np.array(degrees["turn"]) + 0.01, atol=1e-5)
     alone = dataset(tmp_path / "one", degrees, episodes=1)
-    with pytest.raises(
-        InputError, match="unit of the joint positions; expected #rad or #deg"
-    ):
+    with pytest.raises(InputError, match="unit of the joint positions; expected #rad or #deg"):
         read_poses(f"{alone}#observation.state#arm.urdf#base>upper")
     with pytest.raises(
-        InputError,
-        match="has 2 episodes; expected the index of one of them after the topic",
+        InputError, match="has 2 episodes; expected the index of one of them after the topic"
     ):
         read_custom_sensor(f"{folder}#observation.state")
 
 
-def test_json_messages_of_an_mcap_file_are_read_as_those_of_ros(
-    tmp_path: Path,
-) -> None:
+def test_json_messages_of_an_mcap_file_are_read_as_those_of_ros(tmp_path: Path) -> None:
     def message(t: float) -> dict:
         stamp = {"sec": int(START_S), "nsec": round(t * 1e9)}
         pose = {
@@ -214,12 +158,8 @@ def test_json_messages_of_an_mcap_file_are_read_as_those_of_ros(
         return {"timestamp": stamp, "frame_id": "world", "pose": pose}
 
     messages = [(t, message(t)) for t in T_S]
-    log = json_mcap(
-        tmp_path / "run.mcap", {"/tool": ("foxglove.PoseInFrame", messages)}
-    )
-    np.testing.assert_allclose(
-        read_poses(f"{log}#/tool").positions_m[:, 0], T_S, atol=1e-9
-    )
+    log = json_mcap(tmp_path / "run.mcap", {"/tool": ("foxglove.PoseInFrame", messages)})
+    np.testing.assert_allclose(read_poses(f"{log}#/tool").positions_m[:, 0], T_S, atol=1e-9)
 
 
 def test_a_log_tells_what_its_topics_can_serve_as(tmp_path: Path) -> None:
@@ -235,10 +175,7 @@ def test_a_log_tells_what_its_topics_can_serve_as(tmp_path: Path) -> None:
         )
     ]
     log = bag(tmp_path / "trial", messages)
-    topics = {
-        each["name"]: each
-        for each in json.loads(run_command("log", log, "--json").out)
-    }
+    topics = {each["name"]: each for each in json.loads(run_command("log", log, "--json").out)}
     assert topics["/markers"]["serves"] == "marker tracks: left, right"
     assert topics["/tf"]["write"] == ["trial#/tf#base>tool"]
     assert topics["/wrench"]["rate_hz"] == pytest.approx(50, rel=1e-3)
@@ -246,39 +183,25 @@ def test_a_log_tells_what_its_topics_can_serve_as(tmp_path: Path) -> None:
     assert "trial#/tf#base>tool" in run_command("log", log).out
 
 
-def test_topics_offer_the_chains_of_frames_that_can_be_read(
-    tmp_path: Path,
-) -> None:
+def test_topics_offer_the_chains_of_frames_that_can_be_read(tmp_path: Path) -> None:
     of = Messages()
     fixed = (
         of.transform(0.0, "world", "base", (1, 0, 0), STILL),
         of.transform(0.0, "world", "table", (0, 1, 0), STILL),
         of.transform(0.0, "flange", "tool0", (0, 0, 1), STILL),
     )
-    moving = [
-        of.tree(t, of.transform(t, "base", "flange", (0, t, 0), STILL))
-        for t in T_S
-    ]
-    log = bag(
-        tmp_path / "trial", [of.tree(0.0, *fixed, topic="/tf_static"), *moving]
-    )
+    moving = [of.tree(t, of.transform(t, "base", "flange", (0, t, 0), STILL)) for t in T_S]
+    log = bag(tmp_path / "trial", [of.tree(0.0, *fixed, topic="/tf_static"), *moving])
     topics = {each.name: each for each in list_topics(log)}
     addresses = topics["/tf"].write
     assert addresses == ("trial#/tf#world>tool0", "trial#/tf#world>flange")
     for address in addresses:  # each can be read as it is written
-        np.testing.assert_allclose(
-            read_poses(tmp_path / address).positions_m[:, 1], T_S, atol=1e-6
-        )
+        np.testing.assert_allclose(read_poses(tmp_path / address).positions_m[:, 1], T_S, atol=1e-6)
     assert topics["/tf_static"].write == ()
-    assert (
-        topics["/tf_static"].serves
-        == "static frames, part of the chains of /tf"
-    )
+    assert topics["/tf_static"].serves == "static frames, part of the chains of /tf"
 
 
-def test_topics_offer_chains_from_the_frame_of_the_markers(
-    tmp_path: Path,
-) -> None:
+def test_topics_offer_chains_from_the_frame_of_the_markers(tmp_path: Path) -> None:
     robot_problem(tmp_path)
     log = tmp_path / "trial"
     addresses = {each.name: each for each in list_topics(log)}["/tf"].write
@@ -295,19 +218,12 @@ def test_topics_offer_chains_from_the_frame_of_the_markers(
         assert len(read_poses(tmp_path / address).t_s) == 13
 
 
-def test_addresses_of_topics_are_lines_that_can_be_copied(
-    tmp_path: Path, monkeypatch
-) -> None:
+def test_addresses_of_topics_are_lines_that_can_be_copied(tmp_path: Path, monkeypatch) -> None:
     of = Messages()
     tool = "a_tool_with_a_name_as_long_as_those_of_robots_are"
     log = bag(
         tmp_path / "trial",
-        [
-            of.tree(
-                t, of.transform(t, "world_of_the_robot", tool, (0, 0, t), STILL)
-            )
-            for t in T_S
-        ],
+        [of.tree(t, of.transform(t, "world_of_the_robot", tool, (0, 0, t), STILL)) for t in T_S],
     )
     address = f"trial#/tf#world_of_the_robot>{tool}"
     out = run_command("log", log).out
@@ -316,17 +232,13 @@ def test_addresses_of_topics_are_lines_that_can_be_copied(
     assert "TFMessage" in row
     assert row.endswith("poses of one frame relative to another")
     file = io.StringIO()
-    console = PlainConsole(
-        file=file, width=40, force_terminal=True, color_system=None
-    )
+    console = PlainConsole(file=file, width=40, force_terminal=True, color_system=None)
     monkeypatch.setattr(common, "PlainConsole", lambda: console)
     run_command("log", log)
     assert f"  {address}" in file.getvalue().splitlines()
 
 
-def test_the_frame_of_the_markers_is_listed_and_begins_chains(
-    tmp_path: Path,
-) -> None:
+def test_the_frame_of_the_markers_is_listed_and_begins_chains(tmp_path: Path) -> None:
     camera = {"frame_id": "/camera", "stamp": {"sec": 0, "nanosec": 0}}
 
     def array(t: float) -> tuple[float, dict[str, Any]]:
@@ -342,10 +254,7 @@ def test_the_frame_of_the_markers_is_listed_and_begins_chains(
                 {
                     "header": {"frame_id": parent},
                     "child_frame_id": child,
-                    "transform": {
-                        "translation": {"x": x, "y": 0.0, "z": 0.0},
-                        "rotation": turn,
-                    },
+                    "transform": {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": turn},
                 }
                 for parent, child, x in pairs
             ]
@@ -355,10 +264,7 @@ def test_the_frame_of_the_markers_is_listed_and_begins_chains(
     log = json_mcap(
         tmp_path / "run.mcap",
         {
-            "/tags": (
-                "visualization_msgs/MarkerArray",
-                [array(t) for t in times_s],
-            ),
+            "/tags": ("visualization_msgs/MarkerArray", [array(t) for t in times_s]),
             "/tf": ("tf2_msgs/TFMessage", [transforms(t) for t in times_s]),
         },
     )
@@ -371,19 +277,11 @@ def test_the_frame_of_the_markers_is_listed_and_begins_chains(
     assert any("/tags" in line and " camera " in line for line in lines)
 
 
-def test_markers_of_several_namespaces_have_these_in_their_names(
-    tmp_path: Path,
-) -> None:
-    def array(
-        t: float, spaces: tuple[str, ...]
-    ) -> tuple[float, dict[str, Any]]:
+def test_markers_of_several_namespaces_have_these_in_their_names(tmp_path: Path) -> None:
+    def array(t: float, spaces: tuple[str, ...]) -> tuple[float, dict[str, Any]]:
         places = [(space, k) for space in spaces for k in range(2)]
         markers = [
-            {
-                "ns": space,
-                "id": k,
-                "pose": {"position": {"x": len(space), "y": k, "z": t}},
-            }
+            {"ns": space, "id": k, "pose": {"position": {"x": len(space), "y": k, "z": t}}}
             for space, k in places
         ]
         return t, {"markers": markers}
@@ -391,10 +289,7 @@ def test_markers_of_several_namespaces_have_these_in_their_names(
     name = "visualization_msgs/MarkerArray"
     several = [array(t, ("body", "robot")) for t in (0.0, 1.0, 2.0)]
     one = [array(t, ("body",)) for t in (0.0, 1.0, 2.0)]
-    log = json_mcap(
-        tmp_path / "run.mcap",
-        {"/several": (name, several), "/one": (name, one)},
-    )
+    log = json_mcap(tmp_path / "run.mcap", {"/several": (name, several), "/one": (name, one)})
     topics = {each.name: each.serves for each in list_topics(log)}
     assert topics == {
         "/several": "marker tracks: body/0, body/1; robot/0, robot/1",
@@ -402,15 +297,11 @@ def test_markers_of_several_namespaces_have_these_in_their_names(
     }
     table = read_markers(f"{log}#/several")
     assert table.names == ("body/0", "body/1", "robot/0", "robot/1")
-    np.testing.assert_allclose(
-        table.positions_m[1], [[4, 0, 1], [4, 1, 1], [5, 0, 1], [5, 1, 1]]
-    )
+    np.testing.assert_allclose(table.positions_m[1], [[4, 0, 1], [4, 1, 1], [5, 0, 1], [5, 1, 1]])
     assert read_markers(f"{log}#/one").names == ("0", "1")
 
 
-def point(
-    t: float, place: tuple[float, ...], frame: str = "world"
-) -> tuple[float, dict[str, Any]]:
+def point(t: float, place: tuple[float, ...], frame: str = "world") -> tuple[float, dict[str, Any]]:
     """A PointStamped as JSON."""
     stamp = {"sec": int(START_S + t), "nanosec": round((t % 1) * 1e9)}
     return t, {
@@ -419,30 +310,23 @@ def point(
     }
 
 
-def points_log(
-    folder: Path, base_times: tuple[float, ...], base_frame: str = "world"
-) -> Path:
+def points_log(folder: Path, base_times: tuple[float, ...], base_frame: str = "world") -> Path:
     """A log with two topics of points, of which one has its own times and frame."""
     kind = "geometry_msgs/PointStamped"
     tip = [point(t, (t, 0, 1)) for t in (0.0, 0.25, 0.5, 0.75)]
     base = [point(t, (0, 2 * t, 0), base_frame) for t in base_times]
     return json_mcap(
-        folder / "run.mcap",
-        {"/mocap/tip/point": (kind, tip), "/mocap/base/point": (kind, base)},
+        folder / "run.mcap", {"/mocap/tip/point": (kind, tip), "/mocap/base/point": (kind, base)}
     )
 
 
-def test_points_of_several_topics_are_one_set_of_markers(
-    tmp_path: Path,
-) -> None:
+def test_points_of_several_topics_are_one_set_of_markers(tmp_path: Path) -> None:
     log = points_log(tmp_path, (0.0, 0.25, 0.75))
     address = f"{log}#/mocap/tip/point,/mocap/base/point"
     table = read_markers(address)
     assert table.names == ("tip", "base")
     np.testing.assert_allclose(table.t_s, [0.0, 0.25, 0.5, 0.75])
-    np.testing.assert_allclose(
-        table.positions_m[:, 0], [[t, 0, 1] for t in table.t_s]
-    )
+    np.testing.assert_allclose(table.positions_m[:, 0], [[t, 0, 1] for t in table.t_s])
     base = table.positions_m[:, 1]
     np.testing.assert_allclose(base[[0, 1, 3], 1], [0, 0.5, 1.5])
     # The median interval is 0.375 s: 0.5 s is no gap.
@@ -453,9 +337,7 @@ def test_points_of_several_topics_are_one_set_of_markers(
     assert run_command("log", log).out.count(together) == 1
 
 
-def test_a_point_is_missing_where_its_topic_has_a_gap_or_has_ended(
-    tmp_path: Path,
-) -> None:
+def test_a_point_is_missing_where_its_topic_has_a_gap_or_has_ended(tmp_path: Path) -> None:
     log = points_log(tmp_path, (0.0, 0.01, 0.02, 0.6))
     table = read_markers(f"{log}#/mocap/tip/point,/mocap/base/point")
     is_missing = np.isnan(table.positions_m[:, 1, 0])
@@ -504,12 +386,7 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
         messages += [
             of.image(t, "16UC1", counts, raw),
             of.image(t, "32FC1", metres, rectified),
-            of.packed(
-                t,
-                "16UC1; compressedDepth png",
-                bytes(12) + squeezed,
-                f"{raw}/packed",
-            ),
+            of.packed(t, "16UC1; compressedDepth png", bytes(12) + squeezed, f"{raw}/packed"),
         ]
     log = bag(tmp_path / "trial", messages, kind)
     seen = read_depth(Path(f"{log}#{raw}"), None, 1.0)
@@ -519,12 +396,8 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
     np.testing.assert_array_equal(seen.matrix, RAYS["matrix"])
     np.testing.assert_array_equal(seen.distortion, RAYS["distortion"])
     straight = read_depth(Path(f"{log}#{rectified}"), None, 1.0)
-    np.testing.assert_allclose(
-        straight.images_m[1], counts * 1e-3 + 0.2, rtol=1e-6
-    )
-    np.testing.assert_array_equal(
-        straight.matrix, np.array(RAYS["projection"])[:, :3]
-    )
+    np.testing.assert_allclose(straight.images_m[1], counts * 1e-3 + 0.2, rtol=1e-6)
+    np.testing.assert_array_equal(straight.matrix, np.array(RAYS["projection"])[:, :3])
     assert straight.distortion is not None
     assert not len(straight.distortion)
     packed = read_depth(Path(f"{log}#{raw}/packed"), 2e-3, 1.0)
@@ -541,9 +414,7 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
 def test_clouds_of_a_topic_are_read_with_their_normals(tmp_path: Path) -> None:
     of, points = Messages(), np.arange(12.0).reshape(4, 3)
     columns = dict(zip("xyz", points.T, strict=True))
-    turned = {
-        f"normal_{axis}": np.full(4, float(axis == "z")) for axis in "xyz"
-    }
+    turned = {f"normal_{axis}": np.full(4, float(axis == "z")) for axis in "xyz"}
     messages = [
         of.cloud(0.0, columns, "/plain"),
         of.cloud(0.0, columns | turned, "/turned"),
@@ -553,17 +424,13 @@ def test_clouds_of_a_topic_are_read_with_their_normals(tmp_path: Path) -> None:
     (plain,) = read_depth(Path(f"{log}#/plain"), None, 1e-3).clouds_m
     np.testing.assert_allclose(plain, 1e-3 * points)
     (normal,) = read_depth(Path(f"{log}#/turned"), None, 1.0).clouds_m
-    np.testing.assert_allclose(
-        normal, np.hstack([points, np.tile([0.0, 0, 1], (4, 1))])
-    )
+    np.testing.assert_allclose(normal, np.hstack([points, np.tile([0.0, 0, 1], (4, 1))]))
     with pytest.raises(
-        InputError,
-        match=r"/chamber has other messages; expected depth images \(16UC1",
+        InputError, match=r"/chamber has other messages; expected depth images \(16UC1"
     ):
         read_depth(Path(f"{log}#/chamber"), None, 1.0)
     with pytest.raises(
-        InputError,
-        match="contains clouds of points; expected a topic with numbers",
+        InputError, match="contains clouds of points; expected a topic with numbers"
     ):
         read_poses(Path(f"{log}#/plain"))
 
@@ -573,24 +440,16 @@ def test_a_problem_states_depth_by_the_topic_of_a_log(tmp_path: Path) -> None:
     of, flat = Messages(), np.full((120, 160), 400, dtype="<u2")
     square = [[100, 0, 80], [0, 100, 60], [0, 0, 1]]
     messages = [of.camera(0.0, square)]
-    messages += [
-        of.image(t, "16UC1", flat, "/camera/depth")
-        for t in (0.0, 0.02, 0.04, 9.0)
-    ]
+    messages += [of.image(t, "16UC1", flat, "/camera/depth") for t in (0.0, 0.02, 0.04, 9.0)]
     bag(tmp_path / "trial", messages)
-    stated = (
-        '[[experiment.depth]]\nfile = "trial#/camera/depth"\nsigma_m = 0.001\n'
-    )
+    stated = '[[experiment.depth]]\nfile = "trial#/camera/depth"\nsigma_m = 0.001\n'
     file.write_text(f"{file.read_text()}\n{stated}")
     (depth,) = Problem.read(file).experiments[0].depths
     np.testing.assert_allclose(depth.t_s, (0.0, 0.02, 0.04), atol=1e-9)
     np.testing.assert_array_equal(depth.camera.matrix, square)
     np.testing.assert_allclose(depth.points_m[0][:, 2], 0.4)
     camera = "camera = { matrix = [[50, 0, 80], [0, 50, 60], [0, 0, 1]] }\n"
-    bag(
-        tmp_path / "halved",
-        [of.camera(0.0, square, shape=(60, 80)), *messages[1:]],
-    )
+    bag(tmp_path / "halved", [of.camera(0.0, square, shape=(60, 80)), *messages[1:]])
     file.write_text(f"{file.read_text()}{camera}".replace("trial#", "halved#"))
     (depth,) = Problem.read(file).experiments[0].depths
     assert depth.camera.matrix[0, 0] == 50
@@ -615,9 +474,7 @@ def test_images_are_rectified_where_a_word_of_their_topic_says_so(
 ) -> None:
     of = Messages()
     camera = of.camera(0.0, **RAYS, shape=PIXELS.shape)
-    log = bag(
-        tmp_path / "trial", [camera, of.image(0.0, "16UC1", PIXELS, topic)]
-    )
+    log = bag(tmp_path / "trial", [camera, of.image(0.0, "16UC1", PIXELS, topic)])
     read = read_depth(Path(f"{log}#{topic}"), None, 1.0)
     assert read.matrix is not None
     assert read.matrix[0, 0] == (90 if rectified else 100)
@@ -630,18 +487,9 @@ def test_images_are_rectified_where_a_word_of_their_topic_says_so(
             {"shape": (2, 3)},
             r"of 3 x 2 pixels, .* the images have 6 x 4 pixels; .* state camera.matrix",
         ),
-        (
-            {"shape": (4, 6), "binned": 2},
-            r"with binning \[2, 2\] .* state camera.matrix",
-        ),
-        (
-            {"shape": (4, 6), "corner": 8},
-            r"the offset \[8, 8\] .* state camera.matrix",
-        ),
-        (
-            {"shape": (4, 6), "distortion": np.ones(8)},
-            "8 coefficients; .* state camera.distortion",
-        ),
+        ({"shape": (4, 6), "binned": 2}, r"with binning \[2, 2\] .* state camera.matrix"),
+        ({"shape": (4, 6), "corner": 8}, r"the offset \[8, 8\] .* state camera.matrix"),
+        ({"shape": (4, 6), "distortion": np.ones(8)}, "8 coefficients; .* state camera.distortion"),
     ],
 )
 def test_a_camera_of_other_images_is_refused_where_its_numbers_are_not_stated(
@@ -650,13 +498,9 @@ def test_a_camera_of_other_images_is_refused_where_its_numbers_are_not_stated(
     of = Messages()
     image = of.image(0.0, "16UC1", PIXELS, "/camera/depth")
     log = bag(tmp_path / "trial", [of.camera(0.0, **RAYS | camera), image])
-    with pytest.raises(
-        InputError, match=f"trial#/camera/camera_info: .*{message}"
-    ):
+    with pytest.raises(InputError, match=f"trial#/camera/camera_info: .*{message}"):
         read_depth(Path(f"{log}#/camera/depth"), None, 1.0)
-    stated = read_depth(
-        Path(f"{log}#/camera/depth"), None, 1.0, {"matrix", "distortion"}
-    )
+    stated = read_depth(Path(f"{log}#/camera/depth"), None, 1.0, {"matrix", "distortion"})
     assert stated.matrix is stated.distortion is None
     np.testing.assert_allclose(stated.images_m[0], 0.4)
 
@@ -682,10 +526,7 @@ def bad_messages(of: Messages) -> dict[str, tuple]:
     ("bad", "message"),
     [
         ("short", "message has 61 bytes; expected 4 rows of 6 times 2"),
-        (
-            "rvl",
-            "'16UC1; compressedDepth rvl' that is not a PNG .*: use the topic of uncompressed",
-        ),
+        ("rvl", "'16UC1; compressedDepth rvl' that is not a PNG .*: use the topic of uncompressed"),
         ("flat", "has the columns u, v, rgb; expected x, y and z among them"),
         (
             "unknown",
@@ -706,22 +547,9 @@ def test_messages_that_are_not_as_expected_are_refused_with_their_log_and_topic(
         _ = read_depth(Path(f"{log}#/bad"), None, 1.0).images_m[0]
 
 
-def test_a_camera_that_does_not_tell_its_lens_is_not_taken(
-    tmp_path: Path,
-) -> None:
-    camera = {
-        "K": np.eye(3).ravel().tolist(),
-        "P": [0.0] * 12,
-        "height": 1,
-        "width": 2,
-    }
-    image = {
-        "encoding": "16UC1",
-        "height": 1,
-        "width": 2,
-        "step": 4,
-        "data": "kAGQAQ==",
-    }
+def test_a_camera_that_does_not_tell_its_lens_is_not_taken(tmp_path: Path) -> None:
+    camera = {"K": np.eye(3).ravel().tolist(), "P": [0.0] * 12, "height": 1, "width": 2}
+    image = {"encoding": "16UC1", "height": 1, "width": 2, "step": 4, "data": "kAGQAQ=="}
     topics = {
         "/camera_info": ("foxglove.CameraCalibration", [(0.0, camera)]),
         "/depth": ("foxglove.RawImage", [(0.0, image)]),
@@ -736,25 +564,14 @@ def test_a_camera_that_does_not_tell_its_lens_is_not_taken(
 
 def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
     of = Messages()
-    images = [
-        of.image(0.0, "16UC1", each * PIXELS, "/depth")
-        for each in np.array([1, 2], "<u2")
-    ]
+    images = [of.image(0.0, "16UC1", each * PIXELS, "/depth") for each in np.array([1, 2], "<u2")]
     log = bag(tmp_path / "trial", images)
     (image,) = read_depth(Path(f"{log}#/depth"), None, 1.0).images_m
     np.testing.assert_allclose(image, 0.4)
     times = (0.0, 0.0, 1.0)
-    moves = [
-        of.transform(t, "base", "tool", (k, 0, 0), STILL)
-        for k, t in enumerate(times)
-    ]
-    log = bag(
-        tmp_path / "moved",
-        [of.tree(t, m) for t, m in zip(times, moves, strict=True)],
-    )
-    np.testing.assert_allclose(
-        read_poses(Path(f"{log}#/tf")).positions_m[:, 0], (0, 2)
-    )
+    moves = [of.transform(t, "base", "tool", (k, 0, 0), STILL) for k, t in enumerate(times)]
+    log = bag(tmp_path / "moved", [of.tree(t, m) for t, m in zip(times, moves, strict=True)])
+    np.testing.assert_allclose(read_poses(Path(f"{log}#/tf")).positions_m[:, 0], (0, 2))
 
 
 @pytest.mark.parametrize(
@@ -764,33 +581,22 @@ def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
             "trial#/wrenhc",
             "there is no topic '/wrenhc'; expected one of the topics of the log: /tf, /wrench; did you mean",
         ),
-        (
-            "trial#/tf",
-            "has the frames base, arm, tool; expected two of them, as in trial#/tf#base",
-        ),
+        ("trial#/tf", "has the frames base, arm, tool; expected two of them, as in trial#/tf#base"),
         (
             "trial#/tf#base>tol",
             "there is no frame 'tol'; expected one of base, arm, tool; did you mean",
         ),
-        (
-            "trial#/tf#base>tool#fast",
-            "found 'fast' after the topic; expected two frames",
-        ),
+        ("trial#/tf#base>tool#fast", "found 'fast' after the topic; expected two frames"),
         ("trial#/wrench", "expected t_s, x_m, y_m"),
         ("broken.mcap#/tf", "is damaged, or a file of another type"),
         ("notes#/tf", "is not a log; expected a ROS bag"),
     ],
 )
-def test_what_a_log_does_not_hold_is_refused(
-    tmp_path: Path, address: str, message: str
-) -> None:
+def test_what_a_log_does_not_hold_is_refused(tmp_path: Path, address: str, message: str) -> None:
     of = Messages()
     arm = of.transform(0.0, "base", "arm", (0, 0, 0), STILL)
     tool = of.transform(0.0, "arm", "tool", (0, 0, 0), STILL)
-    bag(
-        tmp_path / "trial",
-        [of.tree(0.0, arm, tool), of.wrench(0.0, np.ones(6))],
-    )
+    bag(tmp_path / "trial", [of.tree(0.0, arm, tool), of.wrench(0.0, np.ones(6))])
     (tmp_path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(50))
     (tmp_path / "notes").mkdir()
     with pytest.raises(InputError) as raised:
@@ -801,21 +607,13 @@ def test_what_a_log_does_not_hold_is_refused(
 
 def test_joints_beyond_their_limits_are_refused(tmp_path: Path) -> None:
     of = Messages()
-    log = bag(
-        tmp_path / "trial",
-        [of.joints(t, {"turn": 30.0, "slide": 0.1}) for t in T_S],
-    )
+    log = bag(tmp_path / "trial", [of.joints(t, {"turn": 30.0, "slide": 0.1}) for t in T_S])
     (tmp_path / "arm.urdf").write_text(URDF)
-    with pytest.raises(
-        InputError,
-        match=r"turn is at 30, outside its limits -1.5 to 1.5 .*#deg",
-    ):
+    with pytest.raises(InputError, match=r"turn is at 30, outside its limits -1.5 to 1.5 .*#deg"):
         read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
 
 
-ENTITIES = "".join(
-    f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10)
-)
+ENTITIES = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10))
 
 
 @pytest.mark.parametrize(
@@ -824,12 +622,8 @@ ENTITIES = "".join(
      '<!DOCTYPE x [<!ENTITY a9 SYSTEM "file:///etc/passwd">]>'],
     ids=["expanding", "external"],
 )  # fmt: skip
-def test_entities_of_a_robots_description_are_not_expanded(
-    tmp_path: Path, doctype: str
-) -> None:
-    log = bag(
-        tmp_path / "trial", [Messages().joints(t, {"turn": t}) for t in T_S]
-    )
+def test_entities_of_a_robots_description_are_not_expanded(tmp_path: Path, doctype: str) -> None:
+    log = bag(tmp_path / "trial", [Messages().joints(t, {"turn": t}) for t in T_S])
     urdf = f'{doctype}<robot name="arm"><link name="&a9;"/><link name="base"/></robot>'
     (tmp_path / "arm.urdf").write_text(urdf)
     with pytest.raises(InputError) as refused:
@@ -840,9 +634,7 @@ def test_entities_of_a_robots_description_are_not_expanded(
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
 def test_a_pipe_as_a_robots_description_is_refused(tmp_path: Path) -> None:
-    log = bag(
-        tmp_path / "trial", [Messages().joints(t, {"turn": t}) for t in T_S]
-    )
+    log = bag(tmp_path / "trial", [Messages().joints(t, {"turn": t}) for t in T_S])
     os.mkfifo(tmp_path / "arm.urdf")
     with pytest.raises(InputError, match="is a pipe; expected a regular file"):
         read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
@@ -850,16 +642,12 @@ def test_a_pipe_as_a_robots_description_is_refused(tmp_path: Path) -> None:
 
 def test_a_file_whose_name_has_a_mark_is_a_file(tmp_path: Path) -> None:
     file = tmp_path / "run#1.csv"
-    file.write_text(
-        "t_s,x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,0,0,1,0,0,0,1\n"
-    )
+    file.write_text("t_s,x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,0,0,1,0,0,0,1\n")
     assert read_poses(file).positions_m[1, 2] == 1
     assert stored_files(file) == [file]
 
 
-def test_frames_without_a_chain_between_them_are_refused(
-    tmp_path: Path,
-) -> None:
+def test_frames_without_a_chain_between_them_are_refused(tmp_path: Path) -> None:
     of = Messages()
     trees = [
         of.tree(
@@ -870,9 +658,7 @@ def test_frames_without_a_chain_between_them_are_refused(
         for t in T_S
     ]
     log = bag(tmp_path / "trial", trees)
-    with pytest.raises(
-        InputError, match="no chain of frames leads from a to d"
-    ):
+    with pytest.raises(InputError, match="no chain of frames leads from a to d"):
         read_poses(f"{log}#/tf#a>d")
     assert [each.name for each in list_topics(log)] == ["/tf"]
 
@@ -881,22 +667,14 @@ def test_the_node_of_the_pages_makes_frames_that_live_reads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its subscriptions get messages as ROS would hand them over."""
-    page = (
-        Path(__file__).parents[2] / "docs" / "howto" / "live.md"
-    ).read_text()
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "live.md").read_text()
     code = page.partition("```python ros\n")[2].partition("```")[0]
     called: dict[str, Callable] = {}
     subscribe = lambda _, topic, call, __: called.update({topic: call})  # noqa: E731
     node = SimpleNamespace(create_subscription=subscribe)
-    ros = SimpleNamespace(
-        init=lambda: None, create_node=lambda _: node, spin=lambda _: None
-    )
+    ros = SimpleNamespace(init=lambda: None, create_node=lambda _: node, spin=lambda _: None)
     kinds = SimpleNamespace(PoseStamped=None, Markers=None)
-    modules = {
-        "rclpy": ros,
-        "geometry_msgs.msg": kinds,
-        "mocap4r2_msgs.msg": kinds,
-    }
+    modules = {"rclpy": ros, "geometry_msgs.msg": kinds, "mocap4r2_msgs.msg": kinds}
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
     with socket.socket(type=socket.SOCK_DGRAM) as listening:
@@ -905,9 +683,7 @@ def test_the_node_of_the_pages_makes_frames_that_live_reads(
         of = Messages()
         called["/gripper"](of.pose(0.5, (0, 0, 1), about_z(0.3))[-1])
         called["/markers"](of.markers(0.5, {"tip": (1, 2, 3)})[-1])
-        frame = FrameReader([1], ["low", "tip"]).read(
-            listening.recv(10_000).decode()
-        )
+        frame = FrameReader([1], ["low", "tip"]).read(listening.recv(10_000).decode())
     assert frame is not None
     assert frame.t_s == pytest.approx(START_S + 0.5)
     np.testing.assert_allclose(frame.tracks_m, [[np.nan] * 3, [1, 2, 3]])

@@ -26,26 +26,18 @@ def box_body(divisions=(2, 2, 3), edge_m=0.1) -> Any:
         corners = [cubes]
         for axis in axes:
             corners.append(corners[-1] + np.eye(3, dtype=int)[axis])
-        cells.append(
-            np.stack(
-                [np.ravel_multi_index(c.T, counts) for c in corners], axis=1
-            )
-        )
+        cells.append(np.stack([np.ravel_multi_index(c.T, counts) for c in corners], axis=1))
     element = SimpleNamespace(shape_functions=lambda barycentric: barycentric)
     tetrahedra = np.concatenate(cells)
     mesh = TetMesh(nodes, tetrahedra)
-    return SimpleNamespace(
-        nodes_m=nodes, cells=tetrahedra, element=element, mesh=mesh
-    )
+    return SimpleNamespace(nodes_m=nodes, cells=tetrahedra, element=element, mesh=mesh)
 
 
 def quadratic(body) -> Any:
     """The same body with a node on each edge."""
     pairs = list(combinations(range(4), 2))
     edges = np.sort(body.cells[:, pairs], axis=2)
-    unique, number = np.unique(
-        edges.reshape(-1, 2), axis=0, return_inverse=True
-    )
+    unique, number = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
     cells = np.hstack([body.cells, len(body.nodes_m) + number.reshape(-1, 6)])
     nodes = np.vstack([body.nodes_m, body.nodes_m[unique].mean(axis=1)])
 
@@ -54,9 +46,7 @@ def quadratic(body) -> Any:
         return np.column_stack([local * (2 * local - 1), *mid])
 
     element = SimpleNamespace(shape_functions=shape_functions)
-    return SimpleNamespace(
-        nodes_m=nodes, cells=cells, element=element, mesh=body.mesh
-    )
+    return SimpleNamespace(nodes_m=nodes, cells=cells, element=element, mesh=body.mesh)
 
 
 def bend(nodes_m):
@@ -89,11 +79,7 @@ def body(request):
 @pytest.mark.parametrize("deform", [np.asarray, bend])
 def test_inside_points_are_embedded_where_they_are(body, deform):
     nodes = deform(body.nodes_m)
-    points = deform(
-        np.random.default_rng(2).uniform(
-            [0.02] * 3, [0.18, 0.18, 0.28], (20, 3)
-        )
-    )
+    points = deform(np.random.default_rng(2).uniform([0.02] * 3, [0.18, 0.18, 0.28], (20, 3)))
     placement = place_markers(points, nodes, body, attach="embedded")
     np.testing.assert_allclose(located(placement, nodes), points, atol=1e-12)
     np.testing.assert_allclose(placement.weights.sum(axis=1), 1.0)
@@ -102,9 +88,7 @@ def test_inside_points_are_embedded_where_they_are(body, deform):
 
 def test_an_embedded_point_lies_within_its_tetrahedron():
     body = box_body()
-    points = np.random.default_rng(3).uniform(
-        [0, 0, 0], [0.2, 0.2, 0.3], (50, 3)
-    )
+    points = np.random.default_rng(3).uniform([0, 0, 0], [0.2, 0.2, 0.3], (50, 3))
     placement = place_markers(points, body.nodes_m, body, attach="embedded")
     assert placement.weights.min() > -1e-9
     cells = {tuple(cell) for cell in body.cells}
@@ -119,30 +103,22 @@ def test_an_embedded_point_lies_within_its_tetrahedron():
         ([-0.01, -0.02, -0.02], 0.03),  # off a corner
     ],
 )
-def test_outside_points_are_extrapolated_and_the_distance_reported(
-    body, point, distance
-):
+def test_outside_points_are_extrapolated_and_the_distance_reported(body, point, distance):
     placement = place_markers([point], body.nodes_m, body, attach="embedded")
-    np.testing.assert_allclose(
-        located(placement, body.nodes_m), [point], atol=1e-12
-    )
+    np.testing.assert_allclose(located(placement, body.nodes_m), [point], atol=1e-12)
     assert placement.distance_m[0] == pytest.approx(distance)
 
 
 def test_extrapolation_uses_the_element_that_must_stretch_least():
     body = box_body()
-    placement = place_markers(
-        [[0.2, 0.2, 0.33]], body.nodes_m, body, attach="embedded"
-    )
+    placement = place_markers([[0.2, 0.2, 0.33]], body.nodes_m, body, attach="embedded")
     assert placement.weights.min() >= -0.3 - 1e-9
     assert placement.weights.max() <= 1.3 + 1e-9
 
 
 def test_a_point_beyond_the_limit_is_refused_by_name():
     body = box_body()
-    with pytest.raises(
-        InputError, match=r"marker 'tip' .*0\.05 m away.*0\.02 m allowed"
-    ):
+    with pytest.raises(InputError, match=r"marker 'tip' .*0\.05 m away.*0\.02 m allowed"):
         place_markers(
             [[0.1, 0.1, 0.1], [0.1, 0.07, 0.35]],
             body.nodes_m,
@@ -163,13 +139,9 @@ def test_vertex_takes_the_nearest_node(body):
     node = 17
     point = body.nodes_m[node] + [0.01, -0.02, 0.005]
     placement = place_markers([point], body.nodes_m, body, attach="vertex")
-    np.testing.assert_allclose(
-        located(placement, body.nodes_m)[0], body.nodes_m[node]
-    )
+    np.testing.assert_allclose(located(placement, body.nodes_m)[0], body.nodes_m[node])
     assert np.count_nonzero(placement.weights) == 1
-    assert placement.distance_m[0] == pytest.approx(
-        np.linalg.norm([0.01, 0.02, 0.005])
-    )
+    assert placement.distance_m[0] == pytest.approx(np.linalg.norm([0.01, 0.02, 0.005]))
 
 
 def test_auto_snaps_to_near_nodes_only():
@@ -177,9 +149,7 @@ def test_auto_snaps_to_near_nodes_only():
     near = body.nodes_m[17] + [0.004, 0.0, 0.0]
     far = body.nodes_m[17] + [0.02, -0.01, 0.0]
     placement = place_markers([near, far], body.nodes_m, body)
-    np.testing.assert_allclose(
-        located(placement, body.nodes_m), [body.nodes_m[17], far]
-    )
+    np.testing.assert_allclose(located(placement, body.nodes_m), [body.nodes_m[17], far])
 
 
 def test_placing_follows_the_configuration_given():
@@ -194,9 +164,7 @@ def test_placing_follows_the_configuration_given():
 
 def test_a_marker_without_position_is_refused_by_name():
     body = box_body()
-    with pytest.raises(
-        InputError, match=r"marker '1' has no sample .*reference_m"
-    ):
+    with pytest.raises(InputError, match=r"marker '1' has no sample .*reference_m"):
         place_markers([[0.1, 0.1, 0.1], [np.nan, 0.1, 0.1]], body.nodes_m, body)
 
 
@@ -209,9 +177,7 @@ def test_an_unknown_attachment_is_refused():
 
 def as_matrix(markers):
     placement = markers.placement
-    return interpolation_matrix(
-        placement.nodes, placement.weights, placement.node_count
-    )
+    return interpolation_matrix(placement.nodes, placement.weights, placement.node_count)
 
 
 def test_observe_and_operator_agree(body):
@@ -239,10 +205,7 @@ def test_operator_has_one_entry_per_coordinate_of_a_vertex_marker():
 
 def vertex_placement(m=2):
     return Placement(
-        np.arange(4 * m).reshape(m, 4),
-        np.tile([1.0, 0, 0, 0], (m, 1)),
-        np.zeros(m),
-        4 * m,
+        np.arange(4 * m).reshape(m, 4), np.tile([1.0, 0, 0, 0], (m, 1)), np.zeros(m), 4 * m
     )
 
 
@@ -252,8 +215,7 @@ def test_a_sample_needs_all_three_coordinates():
     positions[2:, 1] = np.nan
     markers = track(vertex_placement(), positions_m=positions)
     np.testing.assert_array_equal(
-        markers.is_present,
-        [[True, True], [False, True], [True, False], [True, False]],
+        markers.is_present, [[True, True], [False, True], [True, False], [True, False]]
     )
     np.testing.assert_array_equal(markers.count_missing(), [1, 2])
     assert markers.count_samples() == 5
@@ -261,9 +223,7 @@ def test_a_sample_needs_all_three_coordinates():
 
 
 def test_one_sigma_serves_all_markers():
-    np.testing.assert_array_equal(
-        track(vertex_placement(), sigma_m=0.002).sigma_m, [0.002] * 2
-    )
+    np.testing.assert_array_equal(track(vertex_placement(), sigma_m=0.002).sigma_m, [0.002] * 2)
 
 
 @pytest.mark.parametrize(
@@ -271,18 +231,9 @@ def test_one_sigma_serves_all_markers():
     [
         ({"names": ("a", "a")}, "'a' is given more than once"),
         ({"sigma_m": np.array([1e-3, 0.0])}, "sigma_m of marker 'm1' is 0"),
-        (
-            {"positions_m": np.zeros((3, 2, 3))},
-            r"marker positions has the shape \(3, 2, 3\)",
-        ),
-        (
-            {"placement": vertex_placement(3)},
-            "3 positions on the body for 2 markers",
-        ),
-        (
-            {"places_sigma_m": np.ones(3)},
-            r"places_sigma_m has the shape \(3,\)",
-        ),
+        ({"positions_m": np.zeros((3, 2, 3))}, r"marker positions has the shape \(3, 2, 3\)"),
+        ({"placement": vertex_placement(3)}, "3 positions on the body for 2 markers"),
+        ({"places_sigma_m": np.ones(3)}, r"places_sigma_m has the shape \(3,\)"),
     ],
 )
 def test_inconsistent_markers_are_refused(changes, message):
@@ -291,7 +242,5 @@ def test_inconsistent_markers_are_refused(changes, message):
 
 
 def test_a_placement_beyond_the_last_node_is_refused():
-    with pytest.raises(
-        InputError, match="node 7; expected node indices from 0 to 4"
-    ):
+    with pytest.raises(InputError, match="node 7; expected node indices from 0 to 4"):
         replace(vertex_placement(), node_count=5)

@@ -52,23 +52,15 @@ def refusal(read, path, **options):
 def test_pose_columns_are_told_apart_by_name(file):
     poses = read_poses(file(POSES))
     np.testing.assert_allclose(poses.positions_m, [[0, 0, 1], [0.5, 0, 1]])
-    np.testing.assert_allclose(
-        np.abs(poses.quaternions_xyzw), [[0, 0, 0, 1], [0, 0, 1, 0]]
-    )
-    scalar_first = (
-        "t_s,qw,qx,qy,qz,x_m,y_m,z_m\n0,1,0,0,0,0,0,1\n0.1,0,0,0,1,0.5,0,1\n"
-    )
+    np.testing.assert_allclose(np.abs(poses.quaternions_xyzw), [[0, 0, 0, 1], [0, 0, 1, 0]])
+    scalar_first = "t_s,qw,qx,qy,qz,x_m,y_m,z_m\n0,1,0,0,0,0,0,1\n0.1,0,0,0,1,0.5,0,1\n"
     same = read_poses(file(scalar_first))
     np.testing.assert_allclose(same.quaternions_xyzw, poses.quaternions_xyzw)
     np.testing.assert_allclose(same.positions_m, poses.positions_m)
 
 
 def test_spreadsheet_habits_are_tolerated(file):
-    text = (
-        "\ufeff"
-        + POSES.replace(",", " , ").replace("\n", "\r\n")
-        + "\r\n,,,,,,,\r\n"
-    )
+    text = "\ufeff" + POSES.replace(",", " , ").replace("\n", "\r\n") + "\r\n,,,,,,,\r\n"
     assert len(read_poses(file(text)).t_s) == 2
 
 
@@ -115,8 +107,7 @@ def test_missing_samples_become_nan_as_a_whole(file):
     np.testing.assert_array_equal(table.t_s, [0.0, 0.1, 0.2])
     nan = [np.nan] * 3
     np.testing.assert_array_equal(
-        table.positions_m,
-        [[[1, 2, 3], [4, 5, 6]], [nan, nan], [[2, 2, 3], nan]],
+        table.positions_m, [[[1, 2, 3], [4, 5, 6]], [nan, nan], [[2, 2, 3], nan]]
     )
 
 
@@ -138,16 +129,11 @@ def test_an_unknown_length_unit_is_refused(file):
 
 def test_an_unknown_marker_is_answered_with_a_suggestion(file):
     message = refusal(read_markers, file(MARKERS), names=["tpi"])
-    assert (
-        "no marker 'tpi'; the file has tip, base; did you mean 'tip'?"
-        in message
-    )
+    assert "no marker 'tpi'; the file has tip, base; did you mean 'tip'?" in message
 
 
 def test_a_marker_may_be_asked_for_once(file):
-    assert "more than once" in refusal(
-        read_markers, file(MARKERS), names=["tip", "tip"]
-    )
+    assert "more than once" in refusal(read_markers, file(MARKERS), names=["tip", "tip"])
 
 
 def test_columns_of_markers_not_asked_for_may_hold_anything(file):
@@ -167,25 +153,19 @@ def test_columns_of_markers_not_asked_for_may_hold_anything(file):
         ("t_s", "frame", ["line 1", "unknown frame", "missing t_s"]),
     ],
 )
-def test_a_bad_marker_file_is_named_by_its_line(
-    file, found, replacement, words
-):
+def test_a_bad_marker_file_is_named_by_its_line(file, found, replacement, words):
     assert found in MARKERS
     message = refusal(read_markers, file(MARKERS.replace(found, replacement)))
     assert all(word in message for word in words), message
 
 
 def test_lines_are_counted_over_blank_ones(file):
-    message = refusal(
-        read_markers, file(MARKERS.replace("0.1,1.5", "\n\n0.1,x"))
-    )
+    message = refusal(read_markers, file(MARKERS.replace("0.1,1.5", "\n\n0.1,x")))
     assert "line 5" in message
 
 
 @pytest.mark.parametrize("read", [read_poses, read_markers])
-@pytest.mark.parametrize(
-    "text", ["", "\n\n", "t_s,x_m,y_m,z_m,qx,qy,qz,qw\n", "t_s\n0\n"]
-)
+@pytest.mark.parametrize("text", ["", "\n\n", "t_s,x_m,y_m,z_m,qx,qy,qz,qw\n", "t_s\n0\n"])
 def test_files_without_data_are_refused(file, read, text):
     refusal(read, file(text))
 
@@ -205,16 +185,12 @@ def test_files_that_cannot_be_read_are_refused(tmp_path, read):
 def test_poses_survive_writing_and_reading(tmp_path):
     rng = np.random.default_rng(0)
     t = np.arange(20) / 30.0
-    poses = PoseSequence(
-        t, rng.normal(size=(20, 3)), Rotation.random(20, rng=rng).as_quat()
-    )
+    poses = PoseSequence(t, rng.normal(size=(20, 3)), Rotation.random(20, rng=rng).as_quat())
     write_poses_csv(tmp_path / "poses.csv", poses)
     again = read_poses(tmp_path / "poses.csv")
     np.testing.assert_allclose(again.t_s, poses.t_s, rtol=1e-11)
     np.testing.assert_allclose(again.positions_m, poses.positions_m, rtol=1e-11)
-    np.testing.assert_allclose(
-        again.quaternions_xyzw, poses.quaternions_xyzw, atol=1e-11
-    )
+    np.testing.assert_allclose(again.quaternions_xyzw, poses.quaternions_xyzw, atol=1e-11)
 
 
 def test_markers_survive_writing_and_reading(tmp_path):
@@ -222,9 +198,7 @@ def test_markers_survive_writing_and_reading(tmp_path):
     positions = rng.normal(size=(7, 3, 3))
     positions[2, 1] = np.nan
     names = ["a", "b, with comma", "c"]
-    write_markers_csv(
-        tmp_path / "markers.csv", np.arange(7) / 30.0, names, positions
-    )
+    write_markers_csv(tmp_path / "markers.csv", np.arange(7) / 30.0, names, positions)
     again = read_markers(tmp_path / "markers.csv")
     assert again.names == tuple(names)
     np.testing.assert_allclose(again.positions_m, positions, rtol=1e-11)
@@ -247,9 +221,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr("collocation_sysid.common.files.os.replace", fail)
-    with pytest.raises(
-        InputError, match=r"poses\.csv: this cannot be written: disk full"
-    ):
+    with pytest.raises(InputError, match=r"poses\.csv: this cannot be written: disk full"):
         write_poses_csv(path, PoseSequence.fixed())
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
@@ -259,31 +231,20 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
 
 
 def test_even_times_give_their_interval():
-    assert sample_interval_s(
-        5.0 + 0.01 * np.arange(100), "poses"
-    ) == pytest.approx(0.01)
+    assert sample_interval_s(5.0 + 0.01 * np.arange(100), "poses") == pytest.approx(0.01)
 
 
-@pytest.mark.parametrize(
-    ("rate", "decimals"), [(30, 3), (60, 3), (240, 3), (100, 2), (1000, 3)]
-)
+@pytest.mark.parametrize(("rate", "decimals"), [(30, 3), (60, 3), (240, 3), (100, 2), (1000, 3)])
 def test_rounding_of_printed_times_is_forgiven(rate, decimals):
     times = np.round(np.arange(500) / rate, decimals)
-    assert sample_interval_s(times, "markers") == pytest.approx(
-        1 / rate, rel=1e-2
-    )
+    assert sample_interval_s(times, "markers") == pytest.approx(1 / rate, rel=1e-2)
 
 
 @pytest.mark.parametrize("lost", [1, 7, 48])
-@pytest.mark.parametrize(
-    ("rate", "decimals"), [(1, 0), (30, 3), (100, 2), (240, 3), (100, 12)]
-)
+@pytest.mark.parametrize(("rate", "decimals"), [(1, 0), (30, 3), (100, 2), (240, 3), (100, 12)])
 def test_a_lost_frame_is_named_by_its_row(lost, rate, decimals):
     times = np.delete(np.round(np.arange(50) / rate, decimals), lost)
-    with pytest.raises(
-        InputError,
-        match=rf"swing\.csv: row {lost + 1}: markers: the time jumps",
-    ):
+    with pytest.raises(InputError, match=rf"swing\.csv: row {lost + 1}: markers: the time jumps"):
         sample_interval_s(times, "markers", "swing.csv")
 
 

@@ -7,16 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.recording import (
-    MarkerTable,
-    align_to_template,
-    fit_poses,
-)
+from collocation_sysid.recording import MarkerTable, align_to_template, fit_poses
 from collocation_sysid.recording.rigid_fit import least_rigid_marker
 
-CLUSTER_M = np.array(
-    [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.03, 0.03, 0.06]]
-)
+CLUSTER_M = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.03, 0.03, 0.06]])
 
 
 @pytest.fixture
@@ -25,10 +19,7 @@ def rng():
 
 
 def carried(reference_m, rotations, translations):
-    return (
-        np.einsum("tij,bj->tbi", rotations.as_matrix(), reference_m)
-        + translations[:, None]
-    )
+    return np.einsum("tij,bj->tbi", rotations.as_matrix(), reference_m) + translations[:, None]
 
 
 def motion(rng, frames=20):
@@ -43,9 +34,7 @@ def assert_rotations(quaternions, rotations, atol=1e-7):
 @pytest.mark.parametrize("markers", [3, 4])
 def test_a_rigid_motion_is_recovered_exactly(rng, markers):
     rotations, translations = motion(rng)
-    reference = CLUSTER_M[
-        :markers
-    ]  # three lie in a plane: a reflection would fit as well
+    reference = CLUSTER_M[:markers]  # three lie in a plane: a reflection would fit as well
     fit = fit_poses(reference, carried(reference, rotations, translations))
     assert_rotations(fit.quaternions_xyzw, rotations)
     np.testing.assert_allclose(fit.positions_m, translations, atol=1e-12)
@@ -55,21 +44,15 @@ def test_a_rigid_motion_is_recovered_exactly(rng, markers):
 
 def test_the_fit_is_that_of_scipy(rng):
     rotations, translations = motion(rng)
-    tracks = carried(CLUSTER_M, rotations, translations) + 0.002 * rng.normal(
-        size=(20, 4, 3)
-    )
+    tracks = carried(CLUSTER_M, rotations, translations) + 0.002 * rng.normal(size=(20, 4, 3))
     weights = np.array([1.0, 2.0, 0.5, 3.0])
     fit = fit_poses(CLUSTER_M, tracks, weights)
     centre = weights @ CLUSTER_M / weights.sum()
     for k, points in enumerate(tracks):
         mean = weights @ points / weights.sum()
-        best, root = Rotation.align_vectors(
-            points - mean, CLUSTER_M - centre, weights
-        )
+        best, root = Rotation.align_vectors(points - mean, CLUSTER_M - centre, weights)
         assert_rotations(fit.quaternions_xyzw[[k]], best)
-        np.testing.assert_allclose(
-            fit.residual_m[k], root / np.sqrt(weights.sum()), rtol=1e-6
-        )
+        np.testing.assert_allclose(fit.residual_m[k], root / np.sqrt(weights.sum()), rtol=1e-6)
 
 
 def test_a_weight_of_zero_leaves_a_marker_out(rng):
@@ -101,16 +84,12 @@ def test_frames_with_too_few_markers_are_interpolated_between_others():
     assert np.flatnonzero(fit.missing).tolist() == [0, 1, 5, 10]
     poses = fit.poses(t)
     np.testing.assert_allclose(poses.t_s, t[2:10])
-    np.testing.assert_allclose(
-        poses.positions_m, np.outer(t[2:10], [1.0, 2.0, 3.0]), atol=1e-12
-    )
+    np.testing.assert_allclose(poses.positions_m, np.outer(t[2:10], [1.0, 2.0, 3.0]), atol=1e-12)
     assert_rotations(poses.quaternions_xyzw, turns[2:10])
 
 
 def test_markers_left_on_one_line_count_as_missing(rng):
-    reference = np.array(
-        [[0.0, 0, 0], [0.05, 0, 0], [0.1, 0, 0], [0.0, 0.1, 0]]
-    )
+    reference = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.1, 0, 0], [0.0, 0.1, 0]])
     tracks = carried(reference, *motion(rng))
     tracks[4, 3] = np.nan
     fit = fit_poses(reference, tracks)
@@ -137,14 +116,8 @@ def test_no_frame_with_three_markers_gives_no_poses():
 def test_markers_on_one_line_are_refused(reference):
     with pytest.raises(InputError, match="at least three that do not"):
         fit_poses(reference, np.zeros((5, len(reference), 3)))
-    with pytest.raises(
-        InputError, match="3 markers of a rigid fit lie on one line"
-    ):
-        fit_poses(
-            [[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]],
-            np.zeros((5, 4, 3)),
-            [1, 1, 1, 0],
-        )
+    with pytest.raises(InputError, match="3 markers of a rigid fit lie on one line"):
+        fit_poses([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], np.zeros((5, 4, 3)), [1, 1, 1, 0])
 
 
 def test_negative_weights_and_other_shapes_are_refused():
@@ -176,9 +149,7 @@ def camera_table(rng):
     body = np.repeat(places[None], len(t), axis=0)
     body[t > 0.5] += 0.03
     turn = Rotation.random(rng=rng)
-    return MarkerTable(
-        t, NAMES, body @ turn.as_matrix().T + [1.0, 2.0, 3.0]
-    ), body
+    return MarkerTable(t, NAMES, body @ turn.as_matrix().T + [1.0, 2.0, 3.0]), body
 
 
 def test_tracks_are_moved_to_the_template(rng):
@@ -186,9 +157,7 @@ def test_tracks_are_moved_to_the_template(rng):
     template = dict(zip("abcd", CLUSTER_M.tolist(), strict=True))
     fit = align_to_template(table, template, (0.0, 0.5))
     rotation, translation, residual = fit
-    np.testing.assert_allclose(
-        table.positions_m @ rotation.T + translation, body, atol=1e-12
-    )
+    np.testing.assert_allclose(table.positions_m @ rotation.T + translation, body, atol=1e-12)
     np.testing.assert_allclose(residual, 0.0, atol=1e-12)
     moved = fit.apply(table)
     assert moved.names == NAMES
@@ -201,9 +170,7 @@ def test_a_template_does_without_a_marker_that_is_not_seen(rng):
     tracks[:60, 1] = np.nan
     tracks[:30:2, 0] = np.nan
     gaps = MarkerTable(table.t_s, NAMES, tracks)
-    fit = align_to_template(
-        gaps, dict(zip("abcd", CLUSTER_M.tolist(), strict=True)), (0.0, 0.5)
-    )
+    fit = align_to_template(gaps, dict(zip("abcd", CLUSTER_M.tolist(), strict=True)), (0.0, 0.5))
     assert np.isnan(fit.residual_m).tolist() == [False, True, False, False]
     np.testing.assert_allclose(fit.apply(table).positions_m, body, atol=1e-12)
 
@@ -220,9 +187,7 @@ def test_a_template_does_without_a_marker_that_is_not_seen(rng):
         ("ab", (0.0, 0.5), "at least three"),
     ],
 )
-def test_a_template_that_cannot_be_fitted_is_refused(
-    rng, names, window_s, words
-):
+def test_a_template_that_cannot_be_fitted_is_refused(rng, names, window_s, words):
     table, _ = camera_table(rng)
     template = dict(zip(names, CLUSTER_M.tolist(), strict=False))
     with pytest.raises(InputError, match=words):

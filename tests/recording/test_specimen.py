@@ -28,28 +28,19 @@ LAMBDA_PA = 4e5
 MU_PA = 1e5
 YOUNG_PA = MU_PA * (3 * LAMBDA_PA + 2 * MU_PA) / (LAMBDA_PA + MU_PA)
 POISSON = LAMBDA_PA / 2 / (LAMBDA_PA + MU_PA)
-NEO_HOOKEAN = {
-    "young_pa": YOUNG_PA,
-    "poisson": POISSON,
-    "gamma_r_s": 0.0,
-    "gamma_m_1_s": 0.0,
-}
+NEO_HOOKEAN = {"young_pa": YOUNG_PA, "poisson": POISSON, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 EXACT = {"strain_zero": 0.0, "area_error": 0.0}
 
 
 def nominal_pa(stretches):
     """Principal nominal stresses of ψ = ½ λ (ln J)² − μ ln J + ½ μ (tr C − 3)."""
     stretches = np.asarray(stretches, dtype=float)
-    return (
-        LAMBDA_PA * np.log(stretches.prod()) + MU_PA * (stretches**2 - 1)
-    ) / stretches
+    return (LAMBDA_PA * np.log(stretches.prod()) + MU_PA * (stretches**2 - 1)) / stretches
 
 
 def lateral_stretch(stretches_at):
     """Free stretch at which its own stress, the first one, vanishes."""
-    return brentq(
-        lambda free: nominal_pa(stretches_at(free))[0], 0.2, 3.0, xtol=1e-15
-    )
+    return brentq(lambda free: nominal_pa(stretches_at(free))[0], 0.2, 3.0, xtol=1e-15)
 
 
 def expected(test, strain):
@@ -59,11 +50,7 @@ def expected(test, strain):
         free = lateral_stretch(lambda free: (free, free, stretch))
         return nominal_pa((stretch, free, free))[0], np.nan, free
     if test in ("equibiaxial", "biaxial", "planar"):
-        second = {
-            "equibiaxial": stretch,
-            "planar": 1.0,
-            "biaxial": 1 + strain / 2,
-        }[test]
+        second = {"equibiaxial": stretch, "planar": 1.0, "biaxial": 1 + strain / 2}[test]
         free = lateral_stretch(lambda free: (free, second, stretch))
         first_pa, second_pa, _ = nominal_pa((stretch, second, free))
         return first_pa, second_pa, free
@@ -83,9 +70,7 @@ def specimen(test, strain, **keys):
         keys = {"second_stress_pa": zeros, **keys}
     if test in ("uniaxial", "equibiaxial", "biaxial", "planar"):
         keys = {"lateral_stretch": 1 + zeros, **keys}
-    return cs.Specimen(
-        test, strain, zeros, **{"sigma_pa": 100.0, **EXACT, **keys}
-    )
+    return cs.Specimen(test, strain, zeros, **{"sigma_pa": 100.0, **EXACT, **keys})
 
 
 def simulated(test, strain, values=NEO_HOOKEAN, material="neo-hookean", **keys):
@@ -105,24 +90,14 @@ def test_stresses_are_those_of_the_closed_form(test):
     assert "stress" in read
     assert ("second stress" in read) == (test in ("biaxial", "planar"))
     assert ("lateral stretch" in read) == np.isfinite(rows[2]).all()
-    for name, row in zip(
-        ("stress", "second stress", "lateral stretch"), rows, strict=True
-    ):
+    for name, row in zip(("stress", "second stress", "lateral stretch"), rows, strict=True):
         if name in read:
-            np.testing.assert_allclose(
-                read[name], row, rtol=1e-9, atol=1e-9 * np.abs(row).max()
-            )
+            np.testing.assert_allclose(read[name], row, rtol=1e-9, atol=1e-9 * np.abs(row).max())
 
 
 def test_an_incompressible_solid_has_rivlins_stresses():
     strain = np.linspace(0.1, 2.0, 5)
-    values = {
-        "c10_pa": 8e4,
-        "c01_pa": 2e4,
-        "kappa_pa": 1e12,
-        "gamma_r_s": 0,
-        "gamma_m_1_s": 0,
-    }
+    values = {"c10_pa": 8e4, "c01_pa": 2e4, "kappa_pa": 1e12, "gamma_r_s": 0, "gamma_m_1_s": 0}
     stretch = 1 + strain
     of_test = {
         "uniaxial": 2 * (stretch - stretch**-2) * (8e4 + 2e4 / stretch),
@@ -134,16 +109,10 @@ def test_an_incompressible_solid_has_rivlins_stresses():
         np.testing.assert_allclose(read["stress"], stress_pa, rtol=1e-5)
 
 
-def with_errors(
-    twin, *, strain_zero=0.0, area_error=0.0, noise=0.0, material="neo-hookean"
-):
+def with_errors(twin, *, strain_zero=0.0, area_error=0.0, noise=0.0, material="neo-hookean"):
     """Experiment of a specimen whose measurements have a wrong zero, a wrong area and noise."""
     wrong = cs.Specimen(
-        twin.test,
-        twin.strain + strain_zero,
-        twin.stress_pa,
-        sigma_pa=twin.sigma_pa,
-        **EXACT,
+        twin.test, twin.strain + strain_zero, twin.stress_pa, sigma_pa=twin.sigma_pa, **EXACT
     )
     trajectory = cs.simulate(wrong.experiment(material), NEO_HOOKEAN)
     rng = np.random.default_rng(1)
@@ -158,12 +127,8 @@ def with_errors(
 def test_zero_of_the_strain_and_error_of_the_area_are_estimated():
     strain = np.linspace(0.01, 1.0, 30)
     twins = [
-        cs.Specimen(
-            "uniaxial", strain, 0 * strain, sigma_pa=50.0, area_error=0.01
-        ),
-        cs.Specimen(
-            "equibiaxial", strain, 0 * strain, sigma_pa=50.0, area_error=1e-5
-        ),
+        cs.Specimen("uniaxial", strain, 0 * strain, sigma_pa=50.0, area_error=0.01),
+        cs.Specimen("equibiaxial", strain, 0 * strain, sigma_pa=50.0, area_error=1e-5),
     ]
     recorded = [
         with_errors(twins[0], strain_zero=3e-3, area_error=0.02, noise=50.0),
@@ -174,12 +139,8 @@ def test_zero_of_the_strain_and_error_of_the_area_are_estimated():
     low, high = run.estimates["young_pa"].statistical95
     assert low < YOUNG_PA < high
     assert high - low < 0.02 * YOUNG_PA
-    assert run.nuisance("uniaxial: zero of the strain [1]") == pytest.approx(
-        3e-3, abs=1e-3
-    )
-    assert run.nuisance("uniaxial: area_error of stress [1]") == pytest.approx(
-        0.02, abs=2e-3
-    )
+    assert run.nuisance("uniaxial: zero of the strain [1]") == pytest.approx(3e-3, abs=1e-3)
+    assert run.nuisance("uniaxial: area_error of stress [1]") == pytest.approx(0.02, abs=2e-3)
 
 
 # Problem files ------------------------------------------------------------------------------------
@@ -205,13 +166,8 @@ def written(folder, text=PROBLEM, header="stretch,stress (kPa)", rows=None):
     """Problem file in a folder, with a table of an exact uniaxial test."""
     strain = np.linspace(0.05, 0.8, 12)
     stress_pa = simulated("uniaxial", strain)["stress"]
-    rows = (
-        np.column_stack([1 + strain, stress_pa / 1e3]) if rows is None else rows
-    )
-    lines = [
-        header,
-        *(",".join(f"{cell:.10g}" for cell in row) for row in rows),
-    ]
+    rows = np.column_stack([1 + strain, stress_pa / 1e3]) if rows is None else rows
+    lines = [header, *(",".join(f"{cell:.10g}" for cell in row) for row in rows)]
     (folder / "pull.csv").write_text("\n".join(lines) + "\n")
     (folder / "problem.toml").write_text(text)
     return folder / "problem.toml"
@@ -231,16 +187,8 @@ def test_a_problem_of_specimens_needs_no_mesh_and_no_damping(tmp_path):
     [
         ("strain (%),stress [MPa]", (100.0, 1e-6), ""),
         ("Dehnung in %,Spannung in MPa", (100.0, 1e-6), ""),
-        (
-            "extension (mm),force (N)",
-            (20.0, 4e-6),
-            "length_m = 0.02\narea_m2 = 4e-6\n",
-        ),
-        (
-            "strain (-),stress_pa",
-            (-1.0, -1.0),
-            "strain_sign = -1\nstress_sign = -1\n",
-        ),
+        ("extension (mm),force (N)", (20.0, 4e-6), "length_m = 0.02\narea_m2 = 4e-6\n"),
+        ("strain (-),stress_pa", (-1.0, -1.0), "strain_sign = -1\nstress_sign = -1\n"),
         (
             "Kanal 1,Kanal 2",
             (1.0, 1.0),
@@ -250,10 +198,7 @@ def test_a_problem_of_specimens_needs_no_mesh_and_no_damping(tmp_path):
 )
 def test_tables_of_machines_are_read(tmp_path, header, factors, keys):
     strain = np.linspace(0.05, 0.8, 12)
-    rows = (
-        np.column_stack([strain, simulated("uniaxial", strain)["stress"]])
-        * factors
-    )
+    rows = np.column_stack([strain, simulated("uniaxial", strain)["stress"]]) * factors
     path = written(tmp_path, PROBLEM + keys, header, rows)
     (experiment,) = cs.Problem.read(path).experiments
     assert experiment.readings[0].measured_values[:, 0] == pytest.approx(
@@ -269,9 +214,7 @@ def test_true_stress_is_converted_if_it_is_declared(tmp_path):
     header = "strain (-),true stress (Pa),lateral stretch"
     path = written(tmp_path, PROBLEM + 'stress = "true"\n', header, rows)
     (experiment,) = cs.Problem.read(path).experiments
-    assert experiment.readings[0].measured_values[:, 0] == pytest.approx(
-        read["stress"], rel=1e-8
-    )
+    assert experiment.readings[0].measured_values[:, 0] == pytest.approx(read["stress"], rel=1e-8)
     path = written(tmp_path, PROBLEM, header, rows)
     with pytest.raises(cs.InputError, match="true stress"):
         cs.Problem.read(path)
@@ -287,66 +230,30 @@ STRAIN = np.linspace(0.05, 0.8, 12)
     [
         ("strain (-),stress (kPa)", (100.0, 1e-3), "", "strain.*(%)"),
         ("stretch,stress (kPa)", (100.0, 1e-3), "", "stretch"),
-        (
-            "strain (-),stress (kPa)",
-            (1.0, -1e-3),
-            "",
-            "opposite signs.*stress_sign = -1",
-        ),
+        ("strain (-),stress (kPa)", (1.0, -1e-3), "", "opposite signs.*stress_sign = -1"),
         ("strain (-),stress (GPa)", (1.0, 1.0), "", "Check the unit"),
         ("strain,stress (kPa)", (1.0, 1e-3), "", "names no unit"),
         ("strain (-),force (N)", (1.0, 1.0), "", "area_m2"),
         ("extension (mm),stress (kPa)", (1.0, 1e-3), "", "length_m"),
-        (
-            "extension (mm),stress (kPa)",
-            (-1e3, -1e-3),
-            "length_m = 0.02",
-            "strain_sign",
-        ),
-        (
-            "strain (-),stress (kPa)",
-            (1.0, 1e-3),
-            "skip_cycles = 1",
-            "1 loading cycles",
-        ),
-        (
-            "strain (-),stress (kPa)",
-            (1.0, 1e-3),
-            "skip_cycle = 1",
-            "did you mean 'skip_cycles'",
-        ),
-        (
-            "strain (-),stress (kPa)",
-            (1.0, 1e-3),
-            "window_s = [0.0, 5.0]",
-            "t_s",
-        ),
+        ("extension (mm),stress (kPa)", (-1e3, -1e-3), "length_m = 0.02", "strain_sign"),
+        ("strain (-),stress (kPa)", (1.0, 1e-3), "skip_cycles = 1", "1 loading cycles"),
+        ("strain (-),stress (kPa)", (1.0, 1e-3), "skip_cycle = 1", "did you mean 'skip_cycles'"),
+        ("strain (-),stress (kPa)", (1.0, 1e-3), "window_s = [0.0, 5.0]", "t_s"),
     ],
 )
-def test_mistakes_in_a_table_are_named(
-    tmp_path, header, factors, keys, message
-):
-    rows = (
-        np.column_stack([STRAIN, simulated("uniaxial", STRAIN)["stress"]])
-        * factors
-    )
+def test_mistakes_in_a_table_are_named(tmp_path, header, factors, keys, message):
+    rows = np.column_stack([STRAIN, simulated("uniaxial", STRAIN)["stress"]]) * factors
     path = written(tmp_path, f"{PROBLEM}{keys}\n", header, rows)
     with pytest.raises(cs.InputError, match=message) as raised:
         cs.Problem.read(path)
-    assert "problem.toml" in str(raised.value) or "pull.csv" in str(
-        raised.value
-    )
+    assert "problem.toml" in str(raised.value) or "pull.csv" in str(raised.value)
 
 
 def test_strains_that_begin_at_one_are_stretches(tmp_path):
     strain = np.linspace(0.0, 0.8, 12)
-    rows = np.column_stack(
-        [1 + strain, simulated("uniaxial", strain)["stress"]]
-    )
+    rows = np.column_stack([1 + strain, simulated("uniaxial", strain)["stress"]])
     with pytest.raises(cs.InputError, match="call the column stretch"):
-        cs.Problem.read(
-            written(tmp_path, header="strain (-),stress (Pa)", rows=rows)
-        )
+        cs.Problem.read(written(tmp_path, header="strain (-),stress (Pa)", rows=rows))
 
 
 def test_a_confined_test_with_positive_compression_is_refused(tmp_path):
@@ -357,96 +264,64 @@ def test_a_confined_test_with_positive_compression_is_refused(tmp_path):
     with pytest.raises(cs.InputError, match="strain_sign = -1"):
         cs.Problem.read(path)
     path = written(
-        tmp_path,
-        text + "strain_sign = -1\nstress_sign = -1\n",
-        "strain (-),stress (Pa)",
-        rows,
+        tmp_path, text + "strain_sign = -1\nstress_sign = -1\n", "strain (-),stress (Pa)", rows
     )
-    assert cs.run(cs.Problem.read(path)).parameters[
-        "young_pa"
-    ] == pytest.approx(YOUNG_PA)
+    assert cs.run(cs.Problem.read(path)).parameters["young_pa"] == pytest.approx(YOUNG_PA)
 
 
 def test_a_thousandfold_stress_beside_another_test_is_refused(tmp_path):
     stress_pa = simulated("planar", STRAIN)["stress"]
     rows = np.column_stack([STRAIN, stress_pa / 1e3])
     path = written(tmp_path)
-    lines = [
-        "strain (-),stress (MPa)",
-        *(f"{a:.10g},{b:.10g}" for a, b in rows),
-    ]
+    lines = ["strain (-),stress (MPa)", *(f"{a:.10g},{b:.10g}" for a, b in rows)]
     (tmp_path / "wide.csv").write_text("\n".join(lines))
-    path.write_text(
-        PROBLEM + PROBLEM[PROBLEM.index("[[") :].replace("pull", "wide")
-    )
+    path.write_text(PROBLEM + PROBLEM[PROBLEM.index("[[") :].replace("pull", "wide"))
     with pytest.raises(cs.InputError, match="kPa or MPa"):
         cs.Problem.read(path)
 
 
 def test_rows_out_of_order_are_noted(tmp_path):
-    strain = np.concatenate(
-        [np.linspace(0.05, 0.8, 12), np.linspace(0.05, 0.8, 12)]
-    )
+    strain = np.concatenate([np.linspace(0.05, 0.8, 12), np.linspace(0.05, 0.8, 12)])
     rows = np.column_stack([strain, simulated("uniaxial", strain)["stress"]])
     path = written(tmp_path, header="strain (-),stress (Pa)", rows=rows)
-    (note,) = [
-        each for each in cs.Problem.read(path).notes if "order of time" in each
-    ]
+    (note,) = [each for each in cs.Problem.read(path).notes if "order of time" in each]
     assert "after row 12" in note
     softened = rows.copy()
     softened[12:, 1] *= 0.7
     mixed = softened[np.argsort(softened[:, 0], kind="stable")]
     path = written(tmp_path, header="strain (-),stress (Pa)", rows=mixed)
-    assert any(
-        "loading and unloading" in each for each in cs.Problem.read(path).notes
-    )
+    assert any("loading and unloading" in each for each in cs.Problem.read(path).notes)
 
 
 def test_first_loading_cycles_are_left_out(tmp_path):
-    cycle = np.concatenate(
-        [np.linspace(0.02, 0.8, 10), np.linspace(0.75, 0.0, 10)]
-    )
+    cycle = np.concatenate([np.linspace(0.02, 0.8, 10), np.linspace(0.75, 0.0, 10)])
     strain = np.tile(cycle, 3)
     rows = np.column_stack([strain, simulated("uniaxial", strain)["stress"]])
     rows[:20, 1] *= 1.5  # the virgin material is stiffer
     text = PROBLEM + "skip_cycles = 1\n"
-    problem = cs.Problem.read(
-        written(tmp_path, text, "strain (-),stress (Pa)", rows)
-    )
+    problem = cs.Problem.read(written(tmp_path, text, "strain (-),stress (Pa)", rows))
     assert len(problem.experiments[0].t_s) in (40, 41)
-    assert cs.run(problem).parameters["young_pa"] == pytest.approx(
-        YOUNG_PA, rel=1e-4
-    )
+    assert cs.run(problem).parameters["young_pa"] == pytest.approx(YOUNG_PA, rel=1e-4)
 
 
 def mistaken(mistake):
     """Experiment of a specimen with noise and a mistake in its values."""
     rng = np.random.default_rng(3)
     strain = (
-        np.linspace(-0.02, -0.5, 20)
-        if mistake == "compression"
-        else np.linspace(0.02, 0.8, 20)
+        np.linspace(-0.02, -0.5, 20) if mistake == "compression" else np.linspace(0.02, 0.8, 20)
     )
-    stress_pa = simulated("uniaxial", strain)["stress"] + 500.0 * rng.normal(
-        size=20
-    )
+    stress_pa = simulated("uniaxial", strain)["stress"] + 500.0 * rng.normal(size=20)
     if mistake == "true-stress":
         stress_pa = stress_pa * (1 + strain)
     if mistake == "compression":
         strain, stress_pa = -strain, -stress_pa
-    return cs.Specimen("uniaxial", strain, stress_pa, 500.0).experiment(
-        name="pull"
-    )
+    return cs.Specimen("uniaxial", strain, stress_pa, 500.0).experiment(name="pull")
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("mistake", ["true-stress", "compression", None])
 def test_a_refit_finds_mistakes_that_leave_a_plausible_curve(mistake):
-    run = cs.run(
-        cs.Problem(
-            [mistaken(mistake)], {**NEO_HOOKEAN, "young_pa": cs.Unknown()}
-        )
-    )
+    run = cs.run(cs.Problem([mistaken(mistake)], {**NEO_HOOKEAN, "young_pa": cs.Unknown()}))
     causes = [each.cause for each in run.causes]
     assert causes[:1] == ([f"specimen-{mistake}"] if mistake else [])
 
@@ -455,15 +330,9 @@ def test_a_refit_finds_mistakes_that_leave_a_plausible_curve(mistake):
 def test_a_refit_finds_percent_that_were_taken_for_ratios():
     rng = np.random.default_rng(4)
     strain = np.linspace(0.005, 0.08, 20)
-    stress_pa = simulated("uniaxial", strain)["stress"] + 50.0 * rng.normal(
-        size=20
-    )
-    percent = cs.Specimen("uniaxial", 100 * strain, stress_pa, 50.0).experiment(
-        name="pull"
-    )
-    run = cs.run(
-        cs.Problem([percent], {**NEO_HOOKEAN, "young_pa": cs.Unknown()})
-    )
+    stress_pa = simulated("uniaxial", strain)["stress"] + 50.0 * rng.normal(size=20)
+    percent = cs.Specimen("uniaxial", 100 * strain, stress_pa, 50.0).experiment(name="pull")
+    run = cs.run(cs.Problem([percent], {**NEO_HOOKEAN, "young_pa": cs.Unknown()}))
     assert [each.cause for each in run.causes][:1] == ["specimen-percent"]
 
 
@@ -471,17 +340,11 @@ def test_a_refit_finds_percent_that_were_taken_for_ratios():
 def test_a_refit_finds_kilopascals_beside_pascals():
     """Files are refused already when they are read; arrays in Python are not."""
     specimens = []
-    for test, factor in (
-        ("uniaxial", 1.0),
-        ("planar", 1e-3),
-        ("equibiaxial", 1.0),
-    ):
+    for test, factor in (("uniaxial", 1.0), ("planar", 1e-3), ("equibiaxial", 1.0)):
         stress_pa = factor * simulated(test, STRAIN)["stress"]
         twin = cs.Specimen(test, STRAIN, stress_pa, factor * 500.0)
         specimens.append(twin.experiment(name=test))
-    run = cs.run(
-        cs.Problem(specimens, {**NEO_HOOKEAN, "young_pa": cs.Unknown()})
-    )
+    run = cs.run(cs.Problem(specimens, {**NEO_HOOKEAN, "young_pa": cs.Unknown()}))
     assert [each.cause for each in run.causes][:1] == ["specimen-unit"]
     assert "'planar'" in run.causes[0].message
     assert "multiplied by 1000" in run.causes[0].message
@@ -507,8 +370,7 @@ def test_simulate_writes_the_table_that_the_problem_reads(tmp_path):
         (
             "Kanal 1 (%),Kanal 2 (kPa)",
             (-100.0, 1e-3),
-            "strain_sign = -1\n"
-            'columns = { strain = "Kanal 1 (%)", stress = "Kanal 2 (kPa)" }\n',
+            'strain_sign = -1\ncolumns = { strain = "Kanal 1 (%)", stress = "Kanal 2 (kPa)" }\n',
         ),
         (
             "Kanal 1 (mm),Kanal 2 (N)",
@@ -518,9 +380,7 @@ def test_simulate_writes_the_table_that_the_problem_reads(tmp_path):
         ),
     ],
 )
-def test_a_simulated_table_has_the_columns_that_the_problem_names(
-    tmp_path, header, factors, keys
-):
+def test_a_simulated_table_has_the_columns_that_the_problem_names(tmp_path, header, factors, keys):
     strain = np.linspace(0.05, 0.8, 12)
     stress_pa = simulated("uniaxial", strain)["stress"]
     rows = np.column_stack([strain, stress_pa]) * factors
@@ -531,9 +391,7 @@ def test_a_simulated_table_has_the_columns_that_the_problem_names(
     assert outcome.code == 0, outcome.err
     (twin / "problem.toml").write_text(PROBLEM + keys)
     (experiment,) = cs.Problem.read(twin / "problem.toml").experiments
-    assert experiment.readings[0].measured_values[:, 0] == pytest.approx(
-        2 * stress_pa, rel=1e-8
-    )
+    assert experiment.readings[0].measured_values[:, 0] == pytest.approx(2 * stress_pa, rel=1e-8)
     strains = specimen_strains(experiment)[0]
     assert strains == pytest.approx(strain, rel=1e-8)
 
@@ -555,9 +413,7 @@ def test_columns_of_every_test_are_read_back(tmp_path, test):
         assert table.strain == pytest.approx(strain, rel=1e-8)
         assert table.stress_pa == pytest.approx(stress_pa, rel=1e-8)
         if "second stress" in values:
-            assert table.second_stress_pa == pytest.approx(
-                2 * stress_pa, rel=1e-8
-            )
+            assert table.second_stress_pa == pytest.approx(2 * stress_pa, rel=1e-8)
 
 
 def test_specimens_and_a_motion_share_the_parameters(tmp_path):
@@ -567,14 +423,10 @@ def test_specimens_and_a_motion_share_the_parameters(tmp_path):
     motion = path.read_text()
     written(tmp_path, header="strain (-),stress (Pa)", rows=rows)
     pull = PROBLEM[PROBLEM.index("[[") :].replace("100.0", "0.5")
-    path.write_text(
-        f'{motion}\n{pull}\n[experiment_defaults]\nstart_rule = "standard"\n'
-    )
+    path.write_text(f'{motion}\n{pull}\n[experiment_defaults]\nstart_rule = "standard"\n')
     problem = cs.Problem.read(path, ["solver.method=reduced-space"])
     run = cs.run(problem)
-    assert {name: run.optimum[name].value for name in TRUTH} == pytest.approx(
-        TRUTH, rel=1e-3
-    )
+    assert {name: run.optimum[name].value for name in TRUTH} == pytest.approx(TRUTH, rel=1e-3)
     run.save(tmp_path / "run")
     _, records = read_run(tmp_path / "run")
     assert [len(each.undeformed_m) for each in records] == [
@@ -605,37 +457,21 @@ wrench = { sign = -1, sigma_n = 1e-3 }
 def test_a_motion_a_bench_and_a_specimen_share_the_parameters(tmp_path):
     path = write_problem(tmp_path, {"swing": 8})
     motion = path.read_text()
-    pressed = np.column_stack(
-        [np.arange(6.0), np.linspace(0.0, 12.0, 6), np.zeros(6)]
-    )
+    pressed = np.column_stack([np.arange(6.0), np.linspace(0.0, 12.0, 6), np.zeros(6)])
     header = "Time (s),Displacement (mm),Force (N)"
-    np.savetxt(
-        tmp_path / "press.csv",
-        pressed,
-        delimiter=",",
-        header=header,
-        comments="",
-    )
+    np.savetxt(tmp_path / "press.csv", pressed, delimiter=",", header=header, comments="")
     pulled = np.column_stack([STRAIN, 0 * STRAIN])
     written(tmp_path, header="strain (-),stress (Pa)", rows=pulled)
     pull = PROBLEM[PROBLEM.index("[[") :].replace("100.0", "0.5")
     path.write_text(motion + BENCH + pull)
-    exact = cs.Problem.read(
-        path, [*AT_TRUTH, "transcription.substeps=1"], simulation=True
-    )
+    exact = cs.Problem.read(path, [*AT_TRUTH, "transcription.substeps=1"], simulation=True)
     write_data(exact, tmp_path / "twin", Recipe("midpoint"))
     for name in ("press.csv", "pull.csv"):
         shutil.copy(tmp_path / "twin" / name, tmp_path / name)
     problem = cs.Problem.read(path, ["solver.method=reduced-space"])
-    assert [len(each.t_s) for each in problem.experiments] == [
-        9,
-        6,
-        len(STRAIN),
-    ]
+    assert [len(each.t_s) for each in problem.experiments] == [9, 6, len(STRAIN)]
     run = cs.run(problem)
-    assert {name: run.optimum[name].value for name in TRUTH} == pytest.approx(
-        TRUTH, rel=2e-3
-    )
+    assert {name: run.optimum[name].value for name in TRUTH} == pytest.approx(TRUTH, rel=2e-3)
     assert run.result.fit.experiments["pull"].test == "uniaxial"
     # Each recording alone determines less: only the motion has damping, the specimen no density.
     together = run.estimates["mu_pa"].statistical_std_error
@@ -647,9 +483,7 @@ def test_memory_relaxes_at_the_rate_of_its_branch():
     strain = np.full(12, 0.2)
     strain[0] = 0.0
     t_s = np.concatenate([[0.0], np.linspace(1.0, 40.0, 11)])
-    twin = cs.Specimen(
-        "simple-shear", strain, 0 * strain, 100.0, t_s=t_s, **EXACT
-    )
+    twin = cs.Specimen("simple-shear", strain, 0 * strain, 100.0, t_s=t_s, **EXACT)
     experiment = twin.experiment(prony=("slow",))
     values = {**NEO_HOOKEAN, "slow.share": 0.4, "slow.tau_s": 10.0}
     (read,) = cs.simulate(experiment, values).custom_sensor_values
@@ -661,22 +495,12 @@ def test_memory_relaxes_at_the_rate_of_its_branch():
 
 @pytest.mark.long
 def test_compare_ranks_laws_by_held_out_specimens(tmp_path):
-    stress_pa = {
-        test: simulated(test, STRAIN)["stress"]
-        for test in ("uniaxial", "planar")
-    }
+    stress_pa = {test: simulated(test, STRAIN)["stress"] for test in ("uniaxial", "planar")}
     path = written(tmp_path)
     lines = ["strain (-),stress (Pa)"]
-    lines += [
-        f"{a:.10g},{b:.10g}"
-        for a, b in zip(STRAIN, stress_pa["planar"], strict=True)
-    ]
+    lines += [f"{a:.10g},{b:.10g}" for a, b in zip(STRAIN, stress_pa["planar"], strict=True)]
     (tmp_path / "wide.csv").write_text("\n".join(lines))
-    more = (
-        PROBLEM[PROBLEM.index("[[") :]
-        .replace("pull", "wide")
-        .replace("uniaxial", "planar")
-    )
+    more = PROBLEM[PROBLEM.index("[[") :].replace("pull", "wide").replace("uniaxial", "planar")
     path.write_text(PROBLEM + more)
     outcome = run_command(
         "compare-models",
@@ -697,20 +521,14 @@ def test_refinement_leaves_specimens_as_they_are(tmp_path):
         cs.refine(run)
     problem = cs.Problem.read(write_problem(tmp_path, {"swing": 8}))
     experiment = specimen("uniaxial", STRAIN).experiment(name="pull")
-    finer = finer_mesh(
-        replace(problem, experiments=[*problem.experiments, experiment])
-    )
+    finer = finer_mesh(replace(problem, experiments=[*problem.experiments, experiment]))
     assert finer.experiments[1].body is experiment.body
-    assert len(finer.experiments[0].body.cells) == 8 * len(
-        problem.bodies[0].cells
-    )
+    assert len(finer.experiments[0].body.cells) == 8 * len(problem.bodies[0].cells)
 
 
 @pytest.mark.parametrize("poisson", [0.49, 0.4999, 0.49995])
 def test_a_poissons_ratio_near_one_half_has_a_finite_budget(poisson):
-    twin = cs.Specimen(
-        "uniaxial", STRAIN, simulated("uniaxial", STRAIN)["stress"], 1e3
-    )
+    twin = cs.Specimen("uniaxial", STRAIN, simulated("uniaxial", STRAIN)["stress"], 1e3)
     values = {**NEO_HOOKEAN, "young_pa": cs.Unknown(), "poisson": poisson}
     run = cs.run(cs.Problem([twin.experiment()], values))
     low, high = run.estimates["young_pa"].combined95

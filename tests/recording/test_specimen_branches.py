@@ -10,15 +10,9 @@ import pytest
 from kit.problem_files import run_command
 
 import collocation_sysid as cs
-from collocation_sysid.recording.specimen_hysteresis import (
-    loading_rows,
-    unloading_difference,
-)
+from collocation_sysid.recording.specimen_hysteresis import loading_rows, unloading_difference
 from collocation_sysid.statistics.assessment import probe_concerns
-from collocation_sysid.statistics.probes.relaxed_assumptions import (
-    EstimateChange,
-    Probe,
-)
+from collocation_sysid.statistics.probes.relaxed_assumptions import EstimateChange, Probe
 
 LOADING = np.linspace(0.0, 0.8, 21)
 CYCLE = np.concatenate([LOADING, LOADING[-2:0:-1]])
@@ -50,12 +44,8 @@ def stresses_pa(softening=0.0):
 
 
 def written(folder, softening=0.0, keys="", strain=STRAIN):
-    rows = [
-        f"{a},{b}" for a, b in zip(strain, stresses_pa(softening), strict=True)
-    ]
-    (folder / "pull.csv").write_text(
-        "\n".join(["strain (-),stress (Pa)", *rows]) + "\n"
-    )
+    rows = [f"{a},{b}" for a, b in zip(strain, stresses_pa(softening), strict=True)]
+    (folder / "pull.csv").write_text("\n".join(["strain (-),stress (Pa)", *rows]) + "\n")
     (folder / "problem.toml").write_text(PROBLEM + keys)
     return folder / "problem.toml"
 
@@ -92,9 +82,7 @@ def test_the_difference_of_the_branches_is_measured(tmp_path):
 
 def test_branches_that_agree_or_a_single_one_have_no_difference(tmp_path):
     assert unloading_difference(only_experiment(tmp_path)) is None
-    loading = only_experiment(
-        tmp_path, softening=0.12, keys='branch = "loading"\n'
-    )
+    loading = only_experiment(tmp_path, softening=0.12, keys='branch = "loading"\n')
     assert unloading_difference(loading) is None
 
 
@@ -102,15 +90,7 @@ def drift():
     """Significant and relevant probe of a drift."""
     moves = {"mu_pa": EstimateChange(9e4, 4e2, 1e4, 2.0, 0.5)}
     return Probe(
-        "assumption",
-        "stiffness_drift",
-        20.0,
-        moves,
-        -0.12,
-        0.01,
-        ("stiffness_drift",),
-        True,
-        2.0,
+        "assumption", "stiffness_drift", 20.0, moves, -0.12, 0.01, ("stiffness_drift",), True, 2.0
     )
 
 
@@ -126,15 +106,10 @@ def test_a_drift_is_explained_by_hysteresis_where_the_branches_differ(tmp_path):
 
 
 @pytest.mark.long
-def test_a_solve_of_both_branches_names_hysteresis_and_of_one_does_not(
-    tmp_path,
-):
+def test_a_solve_of_both_branches_names_hysteresis_and_of_one_does_not(tmp_path):
     file = written(tmp_path, softening=0.12, keys="skip_cycles = 2\n")
     head, table = file.read_text().split("[[experiment]]\n")
-    tables = [
-        "[[experiment]]\n" + table.replace('"pull"', f'"pull {k}"')
-        for k in range(3)
-    ]
+    tables = ["[[experiment]]\n" + table.replace('"pull"', f'"pull {k}"') for k in range(3)]
     file.write_text(head + "".join(tables))
     outcome = run_command("solve", file, "--out", tmp_path / "both")
     assert "hysteresis resembles such a drift" in outcome.out
@@ -143,6 +118,4 @@ def test_a_solve_of_both_branches_names_hysteresis_and_of_one_does_not(
     outcome = run_command("solve", file, "--out", tmp_path / "one")
     assert "hysteresis" not in outcome.out
     result = json.loads((tmp_path / "one" / "result.json").read_text())
-    assert result["parameters"]["mu_pa"]["value"] == pytest.approx(
-        1e5, rel=0.02
-    )
+    assert result["parameters"]["mu_pa"]["value"] == pytest.approx(1e5, rel=0.02)

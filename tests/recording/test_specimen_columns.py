@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.recording.specimen_files import (
-    SpecimenLayout,
-    read_specimen,
-)
+from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
 
 VIDEO = "Tensile strain (Video axial) (%)"
 HEADER = f"Time (s),Displacement (mm),Force (N),{VIDEO}"
@@ -35,10 +32,7 @@ def of_test(columns):
 def statements(text):
     """Each statement `columns = { … }` of a message, read as TOML."""
     parts = text.split("columns = {")[1:]
-    return [
-        tomllib.loads(f"columns = {{{part.split('}')[0]}}}")["columns"]
-        for part in parts
-    ]
+    return [tomllib.loads(f"columns = {{{part.split('}')[0]}}}")["columns"] for part in parts]
 
 
 def test_strain_beside_displacement_has_a_statement_for_each(tmp_path):
@@ -72,9 +66,7 @@ def test_two_strains_have_complete_statements(tmp_path):
 def test_a_stated_time_is_kept(tmp_path):
     header = HEADER.replace("Time", "Uhr")
     text = message(tmp_path, header, {"t": "Uhr (s)", "strain": VIDEO})
-    assert statements(text) == [
-        {"strain": VIDEO, "force": "Force (N)", "t": "Uhr (s)"}
-    ]
+    assert statements(text) == [{"strain": VIDEO, "force": "Force (N)", "t": "Uhr (s)"}]
 
 
 def test_a_load_that_is_not_recognised_is_left_open(tmp_path):

@@ -16,9 +16,7 @@ YOUNG_PA = 5e5
 COMPLIANCE_M_N = 5e-6
 CONSTANTS = {"poisson": 0.4, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 # Systematic effects of specimens apart from the compliance.
-OTHERS = dict.fromkeys(
-    ("anisotropy", "stiffness_drift", "poisson", "gauge_length"), "none"
-)
+OTHERS = dict.fromkeys(("anisotropy", "stiffness_drift", "poisson", "gauge_length"), "none")
 STRAIN = np.linspace(0.02, 0.4, 12)
 KEYS = {"sigma_pa": 100.0, "strain_zero": 0.0, "area_error": 0.0}
 
@@ -26,9 +24,7 @@ KEYS = {"sigma_pa": 100.0, "strain_zero": 0.0, "area_error": 0.0}
 def measured(test, **keys):
     """Experiment of a test whose strain contains the displacement of the bench under load."""
     true = cs.Specimen(test, STRAIN, 0 * STRAIN, **KEYS).experiment(name=test)
-    (stress_pa,) = cs.simulate(
-        true, {**CONSTANTS, "young_pa": YOUNG_PA}
-    ).custom_sensor_values
+    (stress_pa,) = cs.simulate(true, {**CONSTANTS, "young_pa": YOUNG_PA}).custom_sensor_values
     bench = COMPLIANCE_M_N * AREA_M2 * stress_pa[:, 0] / LENGTH_M
     twin = cs.Specimen(test, STRAIN + bench, stress_pa[:, 0], **KEYS, **keys)
     return with_readings(twin.experiment(name=test), [stress_pa])
@@ -36,9 +32,7 @@ def measured(test, **keys):
 
 def estimate(test, assumptions, **keys):
     """Estimate of E from a test with assumptions about systematic effects."""
-    problem = cs.Problem(
-        [measured(test, **keys)], {**CONSTANTS, "young_pa": cs.Unknown()}
-    )
+    problem = cs.Problem([measured(test, **keys)], {**CONSTANTS, "young_pa": cs.Unknown()})
     stated = cs.Assumptions(**{**OTHERS, **assumptions})
     options = replace(problem.uncertainty, assumptions=stated)
     return cs.run(replace(problem, uncertainty=options)).estimates["young_pa"]
@@ -47,14 +41,10 @@ def estimate(test, assumptions, **keys):
 SIZE = {"length_m": LENGTH_M, "area_m2": AREA_M2}
 
 
-@pytest.mark.parametrize(
-    "test", ["uniaxial", "equibiaxial", "planar", "simple-shear", "confined"]
-)
+@pytest.mark.parametrize("test", ["uniaxial", "equibiaxial", "planar", "simple-shear", "confined"])
 def test_a_known_compliance_corrects_the_stiffness(test):
     uncorrected = estimate(test, {"machine_compliance_m_n": "none"}, **SIZE)
-    known = {
-        "machine_compliance_m_n": {"mean": COMPLIANCE_M_N, "deviation": 1e-8}
-    }
+    known = {"machine_compliance_m_n": {"mean": COMPLIANCE_M_N, "deviation": 1e-8}}
     corrected = estimate(test, known, **SIZE)
     bias = uncorrected.value / YOUNG_PA - 1
     assert bias < -0.01
@@ -64,9 +54,7 @@ def test_a_known_compliance_corrects_the_stiffness(test):
 def test_an_unknown_compliance_widens_the_interval_to_the_truth():
     exact = estimate("simple-shear", {"machine_compliance_m_n": "none"}, **SIZE)
     assert exact.combined95[1] < YOUNG_PA
-    widened = estimate(
-        "simple-shear", {"machine_compliance_m_n": COMPLIANCE_M_N}, **SIZE
-    )
+    widened = estimate("simple-shear", {"machine_compliance_m_n": COMPLIANCE_M_N}, **SIZE)
     assert widened.combined95[0] < YOUNG_PA < widened.combined95[1]
 
 
@@ -100,28 +88,16 @@ length_m = 0.02
 
 
 @pytest.mark.parametrize("has_area", [True, False])
-def test_the_displacement_of_a_bench_is_told_from_a_measured_strain(
-    tmp_path, has_area
-):
+def test_the_displacement_of_a_bench_is_told_from_a_measured_strain(tmp_path, has_area):
     (gauge,) = measured("uniaxial").readings
     force_n = AREA_M2 * gauge.measured_values[:, 0]
-    rows = np.column_stack(
-        [1e3 * LENGTH_M * STRAIN, force_n if has_area else force_n / AREA_M2]
-    )
-    header = (
-        "extension (mm),force (N)" if has_area else "extension (mm),stress (Pa)"
-    )
-    np.savetxt(
-        tmp_path / "pull.csv", rows, delimiter=",", header=header, comments=""
-    )
+    rows = np.column_stack([1e3 * LENGTH_M * STRAIN, force_n if has_area else force_n / AREA_M2])
+    header = "extension (mm),force (N)" if has_area else "extension (mm),stress (Pa)"
+    np.savetxt(tmp_path / "pull.csv", rows, delimiter=",", header=header, comments="")
     area = f"area_m2 = {AREA_M2}\n" if has_area else ""
     (tmp_path / "problem.toml").write_text(PROBLEM + area)
     problem = cs.Problem.read(tmp_path / "problem.toml")
     (experiment,) = problem.experiments
-    assert experiment.specimen.area_over_length_m == pytest.approx(
-        0.02 if has_area else 0.0
-    )
-    notes = [
-        note for note in problem.notes if "compliance of the test bench" in note
-    ]
+    assert experiment.specimen.area_over_length_m == pytest.approx(0.02 if has_area else 0.0)
+    notes = [note for note in problem.notes if "compliance of the test bench" in note]
     assert len(notes) == (0 if has_area else 1)

@@ -33,17 +33,9 @@ from collocation_sysid.result.animation import (
     film_samples,
 )
 from collocation_sysid.result.figure_style import GREEN
-from collocation_sysid.result.interactive_view import (
-    export_page,
-    frame_files,
-    view_run,
-)
+from collocation_sysid.result.interactive_view import export_page, frame_files, view_run
 from collocation_sysid.result.replay import read_run, run_headline
-from collocation_sysid.result.web_page import (
-    Colouring,
-    surface_strain,
-    write_page,
-)
+from collocation_sysid.result.web_page import Colouring, surface_strain, write_page
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import Concern
 
@@ -55,16 +47,9 @@ def run(tmp_path_factory) -> Path:
     """A run of a fitted experiment and one for validation, solved at the truth."""
     folder = tmp_path_factory.mktemp("seen")
     file = write_problem(folder, {"swing": 8, "nod": 6}, validation="nod")
-    at_truth = settings(
-        *(
-            f"parameters.{name}={{fixed={value}}}"
-            for name, value in TRUTH.items()
-        )
-    )
+    at_truth = settings(*(f"parameters.{name}={{fixed={value}}}" for name, value in TRUTH.items()))
     reduced = settings("solver.method=reduced-space")
-    outcome = run_command(
-        "solve", file, *reduced, *at_truth, "-q", "--out", folder / "run"
-    )
+    outcome = run_command("solve", file, *reduced, *at_truth, "-q", "--out", folder / "run")
     assert outcome.code == 0, outcome.err
     return folder / "run"
 
@@ -84,15 +69,9 @@ def frames_in(file: Path) -> list[np.ndarray]:
 def test_a_run_stores_what_is_needed_to_look_at_it(run):
     _, (swing, nod) = read_run(run)
     assert (swing.name, nod.name) == ("swing", "nod")
-    assert (
-        swing.positions_m.shape
-        == swing.rolled_out_positions_m.shape
-        == (9, NODES, 3)
-    )
+    assert swing.positions_m.shape == swing.rolled_out_positions_m.shape == (9, NODES, 3)
     assert swing.rolled_out_positions_m.dtype == np.float32
-    np.testing.assert_allclose(
-        swing.rolled_out_positions_m, swing.positions_m, atol=1e-6
-    )
+    np.testing.assert_allclose(swing.rolled_out_positions_m, swing.positions_m, atol=1e-6)
     assert nod.positions_m is None
     assert nod.rolled_out_positions_m.shape == (7, NODES, 3)
     assert swing.surface.max() < NODES
@@ -133,31 +112,20 @@ def test_the_simulation_is_drawn_as_edges_over_the_fit(run):
     assert len(fitted.faces.get_facecolor()) > 1
     assert len(simulated.faces.get_facecolor()) == 0
     assert simulated.faces.get_paths()
-    assert (
-        to_hex(simulated.faces.get_edgecolor()[0])
-        == to_hex(title.get_color())
-        == to_hex(GREEN)
-    )
+    assert to_hex(simulated.faces.get_edgecolor()[0]) == to_hex(title.get_color()) == to_hex(GREEN)
     (alone,) = FilmFigure(nod).drawings
     assert alone[0] == "simulated"
     assert alone[3].edge_colour is None
 
 
-def test_a_film_has_the_errors_of_both_beside_the_body_and_a_line_at_its_time(
-    run,
-):
+def test_a_film_has_the_errors_of_both_beside_the_body_and_a_line_at_its_time(run):
     _, (swing, _) = read_run(run)
     film = FilmFigure(swing)
     film.show_sample(4)
     _, errors = film.figure.axes
-    assert [line.get_label() for line in errors.lines[:2]] == [
-        "fitted",
-        "simulated",
-    ]
+    assert [line.get_label() for line in errors.lines[:2]] == ["fitted", "simulated"]
     assert film.cursor is not None
-    assert film.cursor.get_xdata()[0] == pytest.approx(
-        swing.t_s[4] - swing.t_s[0]
-    )
+    assert film.cursor.get_xdata()[0] == pytest.approx(swing.t_s[4] - swing.t_s[0])
     unmarked = replace(swing, measured_m=np.full_like(swing.measured_m, np.nan))
     assert FilmFigure(unmarked).cursor is None
 
@@ -167,9 +135,7 @@ def test_the_body_fills_a_large_part_of_the_frame(run):
     _, (swing, _) = read_run(run)
     film = FilmFigure(swing)
     film.show_sample(3)
-    corners = np.concatenate(
-        [path.vertices for path in film.drawings[0].body.faces.get_paths()]
-    )
+    corners = np.concatenate([path.vertices for path in film.drawings[0].body.faces.get_paths()])
     width, height = np.ptp(corners, axis=0)
     room = film.figure.axes[0].get_ylim()[1] - HEAD_HEIGHT_MM - FOOT_HEIGHT_MM
     assert max(height / room, width / FILM_WIDTH_MM) > 0.6
@@ -191,9 +157,7 @@ def test_frames_show_the_nearest_samples():
     assert film_samples(times, 100.0, 2.0).tolist()[:5] == [0, 0, 1, 2, 2]
 
 
-@pytest.mark.skipif(
-    not find_spec("imageio_ffmpeg"), reason="needs imageio-ffmpeg"
-)
+@pytest.mark.skipif(not find_spec("imageio_ffmpeg"), reason="needs imageio-ffmpeg")
 def test_mp4_is_written_where_ffmpeg_is(run, tmp_path):
     file = animate(run, tmp_path / "film.mp4")
     assert file.read_bytes()[4:8] == b"ftyp"
@@ -202,9 +166,7 @@ def test_mp4_is_written_where_ffmpeg_is(run, tmp_path):
 def test_without_ffmpeg_the_remedy_is_named(run, tmp_path, monkeypatch):
     monkeypatch.setattr(animation.shutil, "which", lambda name: None)
     monkeypatch.setattr(animation, "find_spec", lambda name: None)
-    with pytest.raises(
-        InputError, match=r"pip install 'collocation-sysid\[film\]'.*\.gif"
-    ):
+    with pytest.raises(InputError, match=r"pip install 'collocation-sysid\[film\]'.*\.gif"):
         animate(run, tmp_path / "film.mp4")
     assert not (tmp_path / "film.mp4").exists()
 
@@ -219,9 +181,7 @@ def test_without_ffmpeg_the_remedy_is_named(run, tmp_path, monkeypatch):
         (["--experiment", "jump"], "found 'jump'; expected one of swing, nod"),
     ],
 )
-def test_a_film_that_cannot_be_is_refused(
-    run, arguments, said, tmp_path, monkeypatch
-):
+def test_a_film_that_cannot_be_is_refused(run, arguments, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     outcome = run_command("animate", run, *arguments)
     assert outcome.code == 2
@@ -229,9 +189,7 @@ def test_a_film_that_cannot_be_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "command", [["animate"], ["view", "--html", "a.html"], ["plot"]]
-)
+@pytest.mark.parametrize("command", [["animate"], ["view", "--html", "a.html"], ["plot"]])
 def test_other_folders_are_refused(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     outcome = run_command(command[0], tmp_path, *command[1:])
@@ -242,9 +200,7 @@ def test_other_folders_are_refused(command, tmp_path, monkeypatch):
 
 
 def content(page: Path) -> dict:
-    text = re.search(
-        r"const DATA = (\{.*\});", page.read_text(encoding="utf-8")
-    )
+    text = re.search(r"const DATA = (\{.*\});", page.read_text(encoding="utf-8"))
     assert text is not None
     return json.loads(text[1])
 
@@ -259,15 +215,11 @@ def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
         ("fitted", swing.positions_m),
         ("simulated", swing.rolled_out_positions_m),
     ):
-        shapes = np.frombuffer(b64decode(data["shapes"][name]), "<f4").reshape(
-            9, -1, 3
-        )
+        shapes = np.frombuffer(b64decode(data["shapes"][name]), "<f4").reshape(9, -1, 3)
         np.testing.assert_allclose(shapes, positions[:, outer], atol=1e-6)
     faces = np.frombuffer(b64decode(data["faces"]), "<i4").reshape(-1, 3)
     np.testing.assert_array_equal(outer[faces], swing.surface)
-    strains = np.frombuffer(b64decode(data["shares"]["fitted"]), "u1").reshape(
-        9, -1
-    )
+    strains = np.frombuffer(b64decode(data["shares"]["fitted"]), "u1").reshape(9, -1)
     assert strains.shape[1] == len(faces)
     assert strains.max() == 255
     assert strains[data["opening"]].mean() == strains.mean(axis=1).max() > 0
@@ -276,12 +228,8 @@ def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
 def test_names_are_shown_on_the_page_and_fill_no_place_of_it(run, tmp_path):
     _, (swing, _) = read_run(run)
     name = "@DATA@ @HEADLINE@ </title><script><!-- \x1b"
-    quantity = Colouring.by_field(
-        "<!--<script>", surface_strain(swing, swing.positions_m)
-    )
-    page = write_page(
-        replace(swing, name=name), tmp_path / "a.html", colouring=quantity
-    )
+    quantity = Colouring.by_field("<!--<script>", surface_strain(swing, swing.positions_m))
+    page = write_page(replace(swing, name=name), tmp_path / "a.html", colouring=quantity)
     text = page.read_text(encoding="utf-8")
     assert re.findall(r"<title>(.*)</title>", text) == [escape(name)]
     assert "@DATA@ @HEADLINE@" in text
@@ -293,34 +241,16 @@ def test_names_are_shown_on_the_page_and_fill_no_place_of_it(run, tmp_path):
 
 def test_a_page_is_coloured_by_the_field_asked_for(run, tmp_path):
     page = tmp_path / "page.html"
-    assert (
-        run_command(
-            "view", run, "--html", page, "--field", "displacement_m"
-        ).code
-        == 0
-    )
+    assert run_command("view", run, "--html", page, "--field", "displacement_m").code == 0
     data, swing = content(page), read_run(run)[1][0]
-    assert (data["quantity"], list(data["shapes"])) == (
-        "displacement_m",
-        ["fitted"],
-    )
-    moved_m = (swing.positions_m - swing.undeformed_m)[:, swing.surface].mean(
-        axis=2
-    )
+    assert (data["quantity"], list(data["shapes"])) == ("displacement_m", ["fitted"])
+    moved_m = (swing.positions_m - swing.undeformed_m)[:, swing.surface].mean(axis=2)
     far_m = np.linalg.norm(moved_m, axis=2)
-    shares = np.frombuffer(b64decode(data["shares"]["fitted"]), "u1").reshape(
-        far_m.shape
-    )
+    shares = np.frombuffer(b64decode(data["shares"]["fitted"]), "u1").reshape(far_m.shape)
     expected = (far_m - far_m.min()) / np.ptp(far_m)
     np.testing.assert_allclose(shares / 255, expected, atol=0.003)
-    assert data["ends"] == [
-        f"{far_m.min():.3g}",
-        f"{far_m.max():.3g} displacement_m",
-    ]
-    assert (
-        run_command("view", run, "--html", page, "--field", "von_mises_pa").code
-        == 0
-    )
+    assert data["ends"] == [f"{far_m.min():.3g}", f"{far_m.max():.3g} displacement_m"]
+    assert run_command("view", run, "--html", page, "--field", "von_mises_pa").code == 0
     assert content(page)["quantity"] == "von_mises_pa"
     refused = run_command("view", run, "--html", page, "--field", "stress")
     assert refused.code == 2
@@ -332,19 +262,14 @@ def test_page_and_film_say_what_was_found(run, tmp_path):
     assert run_headline(result).startswith("E = ")
     assert run_headline(result).endswith(f"verdict: {result.trust.verdict}")
     one = a_result(
-        {"core.young_pa": value(1543.21, 123.4)},
-        trust=Assessment((Concern("solve/moves"),)),
+        {"core.young_pa": value(1543.21, 123.4)}, trust=Assessment((Concern("solve/moves"),))
     )
     assert run_headline(one) == "E core = 1543.2 ± 120 Pa; verdict: check"
     run_command("view", run, "--html", tmp_path / "page.html")
-    assert run_headline(result) in (tmp_path / "page.html").read_text(
-        encoding="utf-8"
-    )
+    assert run_headline(result) in (tmp_path / "page.html").read_text(encoding="utf-8")
     texts = [
         text.get_text()
-        for text in FilmFigure(swing, headline=run_headline(result))
-        .figure.axes[0]
-        .texts
+        for text in FilmFigure(swing, headline=run_headline(result)).figure.axes[0].texts
     ]
     assert run_headline(result) in texts
 
@@ -361,11 +286,7 @@ def test_turning_is_no_strain_and_stretching_is(run):
 @pytest.mark.skipif(not shutil.which("node"), reason="needs node")
 def test_the_page_has_no_syntax_error(run, tmp_path):
     run_command("view", run, "--html", tmp_path / "page.html")
-    script = re.search(
-        r"<script>(.*)</script>",
-        (tmp_path / "page.html").read_text(),
-        re.DOTALL,
-    )
+    script = re.search(r"<script>(.*)</script>", (tmp_path / "page.html").read_text(), re.DOTALL)
     assert script is not None
     (tmp_path / "page.js").write_text(script[1], encoding="utf-8")
     subprocess.run(["node", "--check", tmp_path / "page.js"], check=True)
@@ -375,9 +296,7 @@ def test_the_page_has_no_syntax_error(run, tmp_path):
 
 
 def test_without_pyvista_the_remedy_is_named(run, monkeypatch):
-    monkeypatch.setattr(
-        "collocation_sysid.result.interactive_view.find_spec", lambda name: None
-    )
+    monkeypatch.setattr("collocation_sysid.result.interactive_view.find_spec", lambda name: None)
     outcome = run_command("view", run)
     assert outcome.code == 2
     assert "pip install 'collocation-sysid[view]'" in outcome.err
@@ -439,7 +358,5 @@ def test_the_view_colours_the_body_by_a_field(run, tmp_path):
     view_run(run, "det_f", screenshot=tmp_path / "view.png")
     (picture,) = frames_in(tmp_path / "view.png")
     assert picture.std() > 5
-    with pytest.raises(
-        InputError, match="expected one of det_f, energy_density_j_m3"
-    ):
+    with pytest.raises(InputError, match="expected one of det_f, energy_density_j_m3"):
         view_run(run, "colour", screenshot=tmp_path / "view.png")

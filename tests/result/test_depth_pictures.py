@@ -25,42 +25,27 @@ from kit.problem_files import pictures_drawn, run_command
 from kit.results import a_result
 
 import collocation_sysid as cs
-from collocation_sysid.features.camera_misspecifications import (
-    camera_hypotheses,
-)
+from collocation_sysid.features.camera_misspecifications import camera_hypotheses
 from collocation_sysid.pipeline import run
-from collocation_sysid.program.depth.depth_comparison import (
-    SurfaceComparison,
-    depth_residuals,
-)
+from collocation_sysid.program.depth.depth_comparison import SurfaceComparison, depth_residuals
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.result.animation import FilmFigure
-from collocation_sysid.result.camera_overlays import (
-    save_overlays,
-    surface_rows,
-    undeformed_rows,
-)
+from collocation_sysid.result.camera_overlays import save_overlays, surface_rows, undeformed_rows
 from collocation_sysid.result.pictures.album import all_pictures
-from collocation_sysid.result.pictures.camera_pictures import (
-    depth_picture,
-)
+from collocation_sysid.result.pictures.camera_pictures import depth_picture
 from collocation_sysid.result.replay import MotionRecord
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
-AWAY = np.eye(4) + 5 * np.outer(
-    np.eye(4)[2], np.eye(4)[3]
-)  # 5 m above, and looks up
+AWAY = np.eye(4) + 5 * np.outer(np.eye(4)[2], np.eye(4)[3])  # 5 m above, and looks up
 IN_MM = POSE * np.array([[1, 1, 1, 1000]] * 3 + [[1, 1, 1, 1]])
 
 
 def seeing(pose: np.ndarray, factor: float = 1.0) -> cs.Experiment:
     """The bar, seen by a camera that is described by this pose and a factor of its depth."""
     camera = cs.DepthCamera(MATRIX, pose=pose)
-    return hanging(
-        (cs.Depth.of_images("front", factor * image_m(), camera, NOISE_M),)
-    )
+    return hanging((cs.Depth.of_images("front", factor * image_m(), camera, NOISE_M),))
 
 
 @pytest.mark.parametrize(
@@ -100,12 +85,8 @@ def test_frames_that_a_symmetric_body_cannot_tell_apart_are_both_named(sides):
 
 
 def test_a_frame_of_no_convention_is_not_told_as_two_at_once():
-    forward = np.array(
-        [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]]
-    )
-    (mistake,) = camera_hypotheses(
-        seeing(POSE @ forward.T @ np.diag([-1.0, -1, 1, 1]))
-    )
+    forward = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+    (mistake,) = camera_hypotheses(seeing(POSE @ forward.T @ np.diag([-1.0, -1, 1, 1])))
     assert "mistakes" not in mistake.data
     assert "check camera.pose" in mistake.message
 
@@ -117,9 +98,7 @@ def test_a_camera_that_is_somewhere_else_is_told_to_see_nothing():
 
 
 def test_a_camera_that_is_20_mm_and_10_degrees_off_is_none_that_sees_nothing():
-    off = moved(
-        np.radians(10) * np.array([0, 0.6, 0.8]), np.array([0.02, 0, 0])
-    )
+    off = moved(np.radians(10) * np.array([0, 0.6, 0.8]), np.array([0.02, 0, 0]))
     assert not [*camera_hypotheses(seeing(off))]
 
 
@@ -129,16 +108,9 @@ def test_outlines_before_a_fit_are_where_the_stated_camera_sees_the_body():
     assert np.isnan(points[:, 4]).all()
     # The undeformed bar is drawn by hand.
     skin = VisibleSurface.from_body(bar(), seeing(POSE).depths[0])
-    own = (
-        skin.subdivided_triangles(bar().nodes_m[skin.nodes], 1) - POSE[:3, 3]
-    ) @ POSE[:3, :3]
-    silhouette = np.argwhere(
-        np.isfinite(cs.depth_image(cs.DepthCamera(MATRIX), SHAPE, own))
-    )
-    low, high = (
-        np.nanmin(lines[:, 1:3], axis=0),
-        np.nanmax(lines[:, 1:3], axis=0),
-    )
+    own = (skin.subdivided_triangles(bar().nodes_m[skin.nodes], 1) - POSE[:3, 3]) @ POSE[:3, :3]
+    silhouette = np.argwhere(np.isfinite(cs.depth_image(cs.DepthCamera(MATRIX), SHAPE, own)))
+    low, high = (np.nanmin(lines[:, 1:3], axis=0), np.nanmax(lines[:, 1:3], axis=0))
     np.testing.assert_allclose(low[::-1], silhouette.min(axis=0), atol=1.5)
     np.testing.assert_allclose(high[::-1], silhouette.max(axis=0), atol=1.5)
     assert len(depth_picture(rows).axes) == 2
@@ -151,17 +123,10 @@ def test_what_is_not_in_view_is_said_in_the_picture():
 
 
 def test_a_cloud_is_drawn_with_the_body_from_its_broad_side():
-    cloud = (
-        points_from_image(image_m(), cs.DepthCamera(MATRIX)) @ POSE[:3, :3].T
-        + POSE[:3, 3]
-    )
-    (rows,) = undeformed_rows(
-        hanging((cs.Depth("scan", [0.0], [cloud], 1e-3),))
-    ).values()
+    cloud = points_from_image(image_m(), cs.DepthCamera(MATRIX)) @ POSE[:3, :3].T + POSE[:3, 3]
+    (rows,) = undeformed_rows(hanging((cs.Depth("scan", [0.0], [cloud], 1e-3),))).values()
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
-    wide, high = np.nanmax(lines[:, 1:3], axis=0) - np.nanmin(
-        lines[:, 1:3], axis=0
-    )
+    wide, high = np.nanmax(lines[:, 1:3], axis=0) - np.nanmin(lines[:, 1:3], axis=0)
     assert 100 < wide < 135
     assert 20 < high < 60
     # It hangs below the undeformed one, downwards in the picture.
@@ -170,12 +135,7 @@ def test_a_cloud_is_drawn_with_the_body_from_its_broad_side():
 
 def stated(folder: Path, pose: np.ndarray) -> Path:
     bar().mesh.write(folder / "bar.vtu")
-    np.savez(
-        folder / "front.npz",
-        depth_m=image_m(),
-        camera_matrix=MATRIX,
-        camera_pose=pose,
-    )
+    np.savez(folder / "front.npz", depth_m=image_m(), camera_matrix=MATRIX, camera_pose=pose)
     (folder / "problem.toml").write_text(PROBLEM)
     return folder / "problem.toml"
 
@@ -192,12 +152,8 @@ def test_check_draws_the_image_and_the_body_and_names_what_is_wrong(tmp_path):
 
 
 @pytest.mark.long
-def test_check_draws_the_image_of_a_camera_that_looks_away_and_says_that_it_does(
-    tmp_path,
-):
-    checked = run_command(
-        "check", stated(tmp_path, AWAY), "--out", tmp_path / "seen"
-    )
+def test_check_draws_the_image_of_a_camera_that_looks_away_and_says_that_it_does(tmp_path):
+    checked = run_command("check", stated(tmp_path, AWAY), "--out", tmp_path / "seen")
     assert checked.code == 1
     assert (tmp_path / "seen" / "depth_hanging_front.png").is_file()
     assert "points of 'front'" in checked.out
@@ -207,77 +163,47 @@ def test_check_draws_the_image_of_a_camera_that_looks_away_and_says_that_it_does
 
 
 @pytest.mark.long
-def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures(
-    tmp_path,
-):
+def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures(tmp_path):
     tip = np.flatnonzero(bar().nodes_m[:, 0] > 0.12 - 1e-9)[:3]
-    still = cs.Markers(
-        [0.0], np.zeros((1, 3, 3)), 1e-4, places_m=bar().nodes_m[tip]
-    )
+    still = cs.Markers([0.0], np.zeros((1, 3, 3)), 1e-4, places_m=bar().nodes_m[tip])
     marked = replace(seeing(AWAY), markers=still, nuisance=cs.Nuisance.none())
     marked = with_markers(marked, cs.simulate(marked, TRUTH).markers_m)
     unknown = TRUTH | {"young_pa": cs.Unknown(2e5)}
-    solved = run(
-        cs.Problem([marked], cs.Parameters.from_mapping(unknown)),
-        seek_causes=False,
-    )
-    assert solved.parameters["young_pa"] == pytest.approx(
-        TRUTH["young_pa"], rel=1e-3
-    )
-    assert any(
-        "0 points of 'front' are compared" in note
-        for note in solved.solution.notes
-    )
+    solved = run(cs.Problem([marked], cs.Parameters.from_mapping(unknown)), seek_causes=False)
+    assert solved.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=1e-3)
+    assert any("0 points of 'front' are compared" in note for note in solved.solution.notes)
     with pictures_drawn():
         solved.save(tmp_path / "run", frames=False)
     assert (tmp_path / "run" / "depth_experiment_front.png").is_file()
     (text,) = depth_picture(np.zeros((0, 8))).axes[0].texts
-    assert (
-        text.get_text() == "no point is near enough to the body to be compared"
-    )
+    assert text.get_text() == "no point is near enough to the body to be compared"
 
 
-def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(
-    tmp_path,
-):
+def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path):
     (rows,) = undeformed_rows(seeing(POSE)).values()
     named = [("a_b", "c"), ("a", "b_c")]
     twins = [
-        replace(
-            seeing(POSE),
-            name=name,
-            depths=(replace(seeing(POSE).depths[0], name=camera),),
-        )
+        replace(seeing(POSE), name=name, depths=(replace(seeing(POSE).depths[0], name=camera),))
         for name, camera in named
     ]
     drawn = save_overlays(twins, tmp_path)
-    assert [file.name for file in drawn] == [
-        "depth_a_b_c.png",
-        "depth_a_b_c_2.png",
-    ]
+    assert [file.name for file in drawn] == ["depth_a_b_c.png", "depth_a_b_c_2.png"]
     shape_m = bar().nodes_m[None], np.zeros((1, 0, 3))
     shown = [
         replace(
-            MotionRecord.from_experiment(each, shape_m),
-            visible_points={each.depths[0].name: rows},
+            MotionRecord.from_experiment(each, shape_m), visible_points={each.depths[0].name: rows}
         )
         for each in twins
     ]
-    assert {"depth_a_b_c", "depth_a_b_c_2"} <= all_pictures(
-        shown, a_result()
-    ).keys()
+    assert {"depth_a_b_c", "depth_a_b_c_2"} <= all_pictures(shown, a_result()).keys()
 
 
 def test_models_are_not_compared_by_what_only_a_depth_camera_sees(tmp_path):
     file = stated(tmp_path, POSE)
     both = "neo-hookean,st-venant-kirchhoff"
-    compared = run_command(
-        "compare-models", file, "--materials", both, "--out", tmp_path / "both"
-    )
+    compared = run_command("compare-models", file, "--materials", both, "--out", tmp_path / "both")
     assert compared.code == 2
-    assert "'hanging' has neither markers nor a measured force" in " ".join(
-        compared.err.split()
-    )
+    assert "'hanging' has neither markers nor a measured force" in " ".join(compared.err.split())
     assert not (tmp_path / "both").exists()
 
 
@@ -287,37 +213,23 @@ def found():
 
 
 @pytest.mark.long
-def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(
-    found,
-):
+def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(found):
     (part,) = found.collocation.iterates(found.z)
     ((reading, looked),) = depth_residuals(part)
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
-    rows = surface_rows(
-        surface, part.segment.experiment.compute_upward_direction()
-    )
+    rows = surface_rows(surface, part.transcription.experiment.compute_upward_direction())
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     used = np.isfinite(points[:, 4])
     assert used.sum() == reading.correspondences.is_compared.sum()
     assert np.sqrt(np.mean(points[used, 4] ** 2)) < 2e-4
     # What is seen lies within what is drawn of the surface, but for a pixel.
-    low, high = (
-        np.nanmin(lines[:, 1:3], axis=0),
-        np.nanmax(lines[:, 1:3], axis=0),
-    )
+    low, high = (np.nanmin(lines[:, 1:3], axis=0), np.nanmax(lines[:, 1:3], axis=0))
     assert (points[used, 1:3] > low - 1).all()
     assert (points[used, 1:3] < high + 1).all()
     # Where points are in the world they are on the surface, to what they are apart.
-    skin, x = (
-        reading.correspondences.surface,
-        reading.surface_shapes(part.x, part.phi)[0],
-    )
-    _, places = skin.nearest_points(
-        x, points[used, 5:], np.arange(len(skin.plane_triangles))
-    )
-    faces, _ = skin.nearest_points(
-        x, points[used, 5:], np.arange(len(skin.plane_triangles))
-    )
+    skin, x = (reading.correspondences.surface, reading.surface_shapes(part.x, part.phi)[0])
+    _, places = skin.nearest_points(x, points[used, 5:], np.arange(len(skin.plane_triangles)))
+    faces, _ = skin.nearest_points(x, points[used, 5:], np.arange(len(skin.plane_triangles)))
     _, feet, _ = skin.evaluate(x, faces, places)
     away = np.linalg.norm(points[used, 5:] - feet, axis=1)
     assert np.median(np.abs(away - np.abs(points[used, 4]))) < 1e-6
@@ -325,20 +237,14 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(
     assert any("mm RMS, " in title for title in titles)
 
 
-def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
-    found,
-):
+def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found):
     (part,) = found.collocation.iterates(found.z)
     ((reading, looked),) = depth_residuals(part)
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
-    rows = surface_rows(
-        surface, part.segment.experiment.compute_upward_direction()
-    )
-    experiment = part.segment.experiment
+    rows = surface_rows(surface, part.transcription.experiment.compute_upward_direction())
+    experiment = part.transcription.experiment
     x = np.repeat(part.x.reshape(1, -1, 3), 3, axis=0)
-    replay = MotionRecord.from_experiment(
-        experiment, (x[:1], np.zeros((1, 0, 3)))
-    )
+    replay = MotionRecord.from_experiment(experiment, (x[:1], np.zeros((1, 0, 3))))
     # As if the camera had seen it twice, before and after a dropout.
     later = rows + np.eye(8)[0] * 0.2
     replay = replace(
@@ -351,17 +257,9 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(
         visible_points={"front": np.vstack([rows, later])},
     )
     count = reading.correspondences.is_compared.sum()
-    assert [len(replay.camera_points_m(t)) for t in range(3)] == [
-        count,
-        0,
-        count,
-    ]
+    assert [len(replay.camera_points_m(t)) for t in range(3)] == [count, 0, count]
     sparse = replace(replay, visible_points={"front": rows})
-    assert [len(sparse.camera_points_m(t)) > 0 for t in range(3)] == [
-        True,
-        False,
-        False,
-    ]
+    assert [len(sparse.camera_points_m(t)) > 0 for t in range(3)] == [True, False, False]
     film = FilmFigure(sparse)
     ((_, _, _, drawn, _),) = film.drawings
     film.show_sample(0)

@@ -14,10 +14,7 @@ from kit.problems import TRUTH, hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.result import parameter_sliders
-from collocation_sysid.result.parameter_sliders import (
-    ParameterSliders,
-    SliderRange,
-)
+from collocation_sysid.result.parameter_sliders import ParameterSliders, SliderRange
 from collocation_sysid.runs.result_content import ReportedEstimate
 
 pytest.importorskip("ipywidgets")
@@ -31,16 +28,10 @@ def identified(tie: bool = False) -> cs.Run:
     """A swinging cube, whose λ and μ are estimated from noisy tracks; λ may be tied to μ."""
     hung = hung_cube(20)
     tracks = cs.simulate(hung, TRUTH).markers_m
-    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(
-        tracks.shape
-    )
+    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
-    lame = (
-        cs.Tied("mu_pa", TRUTH["lambda_pa"] / TRUTH["mu_pa"])
-        if tie
-        else cs.Unknown(220.0)
-    )
+    lame = cs.Tied("mu_pa", TRUTH["lambda_pa"] / TRUTH["mu_pa"]) if tie else cs.Unknown(220.0)
     stated = {**TRUTH, "lambda_pa": lame, "mu_pa": cs.Unknown(280.0)}
     problem = cs.Problem([replace(hung, markers=seen)], stated, substeps=2)
     return cs.run(problem, "reduced-space", seek_causes=False)
@@ -126,10 +117,7 @@ def test_a_simulation_that_fails_says_why_and_keeps_the_picture(monkeypatch):
 
     monkeypatch.setattr(parameter_sliders, "simulate_with_parameters", fail)
     shown.sliders["mu_pa"].value *= 1.1
-    assert (
-        shown.message.value
-        == "not simulated: an element is inverted (t = 0.1 s)"
-    )
+    assert shown.message.value == "not simulated: an element is inverted (t = 0.1 s)"
     assert shown.simulation is None
     assert shown.picture.value == picture
 
@@ -146,12 +134,8 @@ def test_the_run_returns_the_box_of_widgets():
 
 def test_a_run_without_estimates_has_nothing_to_slide():
     hung = hung_cube(20)
-    markers = replace(
-        hung.markers, positions_m=cs.simulate(hung, TRUTH).markers_m
-    )
-    run = cs.run(
-        cs.Problem([replace(hung, markers=markers)], TRUTH), seek_causes=False
-    )
+    markers = replace(hung.markers, positions_m=cs.simulate(hung, TRUTH).markers_m)
+    run = cs.run(cs.Problem([replace(hung, markers=markers)], TRUTH), seek_causes=False)
     with pytest.raises(cs.InputError, match="no parameter was estimated"):
         run.interactive()
 
@@ -159,13 +143,9 @@ def test_a_run_without_estimates_has_nothing_to_slide():
 def test_without_the_extra_the_error_names_it(monkeypatch):
     find = util.find_spec
     monkeypatch.setattr(
-        parameter_sliders,
-        "find_spec",
-        lambda name: None if name == "ipywidgets" else find(name),
+        parameter_sliders, "find_spec", lambda name: None if name == "ipywidgets" else find(name)
     )
-    with pytest.raises(
-        cs.InputError, match=r"pip install 'collocation-sysid\[interactive\]'"
-    ):
+    with pytest.raises(cs.InputError, match=r"pip install 'collocation-sysid\[interactive\]'"):
         identified().interactive()
 
 
@@ -178,13 +158,7 @@ def test_a_run_needs_no_widgets():
 @pytest.mark.parametrize(
     ("value", "interval", "linear", "bounds", "expected"),
     [
-        (
-            100.0,
-            (80.0, 125.0),
-            False,
-            (1.0, 1e6),
-            (100 / 1.25**3, 100 * 1.25**3, True),
-        ),
+        (100.0, (80.0, 125.0), False, (1.0, 1e6), (100 / 1.25**3, 100 * 1.25**3, True)),
         (100.0, (99.0, 101.0), False, (1.0, 1e6), (100 / 1.5, 150.0, True)),
         (100.0, None, False, (90.0, 1e6), (90.0, 150.0, True)),
         (0.3, (0.2, 0.4), True, (0.0, 0.5), (0.0, 0.5, False)),

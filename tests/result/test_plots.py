@@ -29,12 +29,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.methods.solution import (
-    Iteration,
-    Solution,
-    Status,
-    Timing,
-)
+from collocation_sysid.methods.solution import Iteration, Solution, Status, Timing
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
@@ -61,19 +56,11 @@ from collocation_sysid.result.pictures import (
     shapes_picture,
     spectrum_picture,
 )
-from collocation_sysid.result.pictures.confidence import (
-    GREY,
-    budget_picture,
-    ellipse_outline,
-)
+from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse_outline
 from collocation_sysid.result.pictures.jacobian import RASTER_SIZE, SHOWN_STEPS
 from collocation_sysid.result.pictures.mesh_pictures import spread_levels
 from collocation_sysid.result.pictures.projection import ParallelCamera
-from collocation_sysid.result.pictures.scene import (
-    BodyDrawing,
-    SheetView,
-    sheet,
-)
+from collocation_sysid.result.pictures.scene import BodyDrawing, SheetView, sheet
 from collocation_sysid.result.pictures.shapes import FIELD_COLOURS, SurfaceField
 from collocation_sysid.result.pictures.spectrum import spectral_density
 from collocation_sysid.result.replay import MotionRecord
@@ -108,47 +95,26 @@ def solved(make=hung_cube, scheme="midpoint") -> Solution:
     """A solution found by knowing it."""
     experiment = measured(make(), scheme)
     collocation = Collocation([experiment], GUESS.with_guess(TRUTH), scheme)
-    x = simulate_scheme(
-        experiment,
-        Dynamics.from_experiment(experiment, scheme).with_theta(THETA),
-    )
+    x = simulate_scheme(experiment, Dynamics.from_experiment(experiment, scheme).with_theta(THETA))
     z = collocation.pack(collocation.parameters.guess_q, [x])
     multipliers = np.zeros(collocation.constraint_count)
     return Solution(
-        Status.CONVERGED,
-        "",
-        "known",
-        collocation,
-        z,
-        multipliers,
-        5,
-        history(),
-        Timing(),
+        Status.CONVERGED, "", "known", collocation, z, multipliers, 5, history(), Timing()
     )
 
 
 def rasters(figure):
     """Parameter columns, block band and single block, masked where there is no entry."""
-    return [
-        np.ma.asarray(image.get_array())
-        for a in figure.axes[:3]
-        for image in a.get_images()
-    ]
+    return [np.ma.asarray(image.get_array()) for a in figure.axes[:3] for image in a.get_images()]
 
 
 # Convergence
 
 
-@pytest.mark.parametrize(
-    "option", ["figure.constrained_layout.use", "figure.autolayout"]
-)
-def test_margins_do_not_depend_on_the_layout_that_matplotlib_is_configured_with(
-    option: str,
-):
+@pytest.mark.parametrize("option", ["figure.constrained_layout.use", "figure.autolayout"])
+def test_margins_do_not_depend_on_the_layout_that_matplotlib_is_configured_with(option: str):
     with mpl.rc_context({option: True}):
-        framed = framed_figure(
-            80, 60, left_mm=10, right_mm=5, foot_mm=10, top_mm=5
-        )
+        framed = framed_figure(80, 60, left_mm=10, right_mm=5, foot_mm=10, top_mm=5)
         bare, _ = sheet(80, 60)
     assert framed.get_layout_engine() is None
     assert bare.get_layout_engine() is None
@@ -158,12 +124,8 @@ def test_margins_do_not_depend_on_the_layout_that_matplotlib_is_configured_with(
 def test_convergence_draws_errors_in_millimetres_and_newtons_on_logarithmic_axes():
     rms, loss, violation, _ = convergence(history()).axes
     assert {axes.get_yscale() for axes in (rms, loss, violation)} == {"log"}
-    np.testing.assert_allclose(
-        rms.lines[0].get_ydata(), [10.0 ** (1 - k) for k in range(5)]
-    )
-    np.testing.assert_allclose(
-        loss.lines[0].get_ydata(), [10.0 ** (3 - k) for k in range(5)]
-    )
+    np.testing.assert_allclose(rms.lines[0].get_ydata(), [10.0 ** (1 - k) for k in range(5)])
+    np.testing.assert_allclose(loss.lines[0].get_ydata(), [10.0 ** (3 - k) for k in range(5)])
     assert "mm" in rms.get_ylabel()
     assert "N" in violation.get_ylabel()
 
@@ -189,10 +151,7 @@ def test_parameters_are_drawn_relative_to_the_truth_where_it_is_known():
 @pytest.mark.long
 def test_parameters_to_draw_can_be_chosen_and_are_labelled_with_their_values():
     named = [
-        replace(
-            line,
-            parameters={"young_pa": 720.0, "poisson": 0.2, "core.mu_pa": 450.0},
-        )
+        replace(line, parameters={"young_pa": 720.0, "poisson": 0.2, "core.mu_pa": 450.0})
         for line in history()
     ]
     lines = convergence(named, ("poisson", "core.mu_pa")).axes[3].lines
@@ -204,10 +163,7 @@ def test_parameters_to_draw_can_be_chosen_and_are_labelled_with_their_values():
 
 @pytest.mark.parametrize("names", [(), ("mu_pa",)])
 def test_nothing_to_draw_is_no_error(names, tmp_path):
-    figures = {
-        "none": convergence([], names),
-        "some": convergence(history(), names),
-    }
+    figures = {"none": convergence([], names), "some": convergence(history(), names)}
     save_pictures(tmp_path, figures)
 
 
@@ -216,9 +172,7 @@ def test_nothing_to_draw_is_no_error(names, tmp_path):
 
 def test_tracks_show_each_coordinate_with_its_error_below():
     measured_m, fitted = noisy_tracks()
-    figure = marker_tracks(
-        TIMES, ["tip", "side"], measured_m, fitted, 1.1 * fitted
-    )
+    figure = marker_tracks(TIMES, ["tip", "side"], measured_m, fitted, 1.1 * fitted)
     assert len(figure.axes) == 2 * 3 * 2
     upper, lower = figure.axes[2:4]  # y of the tip
     dots, fit, rolled_out = (line.get_ydata() for line in upper.lines)
@@ -240,19 +194,14 @@ def test_missing_samples_leave_gaps():
 
 def test_tracks_keep_to_a_page_on_which_they_are_legible():
     measured_m, fitted = noisy_tracks(markers=9)
-    figure = marker_tracks(
-        TIMES, [f"m{k}" for k in range(9)], measured_m, fitted
-    )
+    figure = marker_tracks(TIMES, [f"m{k}" for k in range(9)], measured_m, fitted)
     assert len(figure.axes) == 2 * 3 * 3
     assert figure.get_figheight() < 0.75 * figure.get_figwidth()
 
 
 def test_a_budget_has_its_whole_legend_and_colours_that_differ():
     names = [f"a long name of source {k}" for k in range(12)]
-    shares = {
-        "young_pa": dict.fromkeys(names, 1 / 12),
-        "poisson": {names[3]: 1.0},
-    }
+    shares = {"young_pa": dict.fromkeys(names, 1 / 12), "poisson": {names[3]: 1.0}}
     figure = budget_picture(shares)
     figure.draw_without_rendering()
     (legend,) = figure.legends
@@ -260,15 +209,9 @@ def test_a_budget_has_its_whole_legend_and_colours_that_differ():
     assert inside.x0 >= 0
     assert inside.x1 <= whole.width
     assert inside.y0 >= figure.axes[0].get_window_extent().y1
-    drawn = [
-        to_hex(bars[0].get_facecolor()).upper()
-        for bars in figure.axes[0].containers
-    ]
+    drawn = [to_hex(bars[0].get_facecolor()).upper() for bars in figure.axes[0].containers]
     assert drawn == [*COLOUR_CYCLE, GREY]  # for any colour vision, each once
-    ends = [
-        bars[-1].get_x() + bars[-1].get_width()
-        for bars in figure.axes[0].containers
-    ]
+    ends = [bars[-1].get_x() + bars[-1].get_width() for bars in figure.axes[0].containers]
     assert ends[-1] == pytest.approx(1.0)
 
 
@@ -276,44 +219,23 @@ def test_of_many_markers_the_worst_are_shown():
     measured_m, fitted = noisy_tracks(markers=9)
     fitted[:, 4] += 0.1
     fitted[:, 7] += 0.1
-    figure = marker_tracks(
-        TIMES, [f"m{k}" for k in range(9)], measured_m, fitted, max_markers=2
-    )
-    titles = [
-        axes.get_title(loc="left").partition(",")[0] for axes in figure.axes
-    ]
-    assert list(dict.fromkeys(title for title in titles if title)) == [
-        "m4",
-        "m7",
-    ]
+    figure = marker_tracks(TIMES, [f"m{k}" for k in range(9)], measured_m, fitted, max_markers=2)
+    titles = [axes.get_title(loc="left").partition(",")[0] for axes in figure.axes]
+    assert list(dict.fromkeys(title for title in titles if title)) == ["m4", "m7"]
     assert "2 of 9" in figure.legends[0].get_title().get_text()
 
 
 def test_validation_has_no_fitted_track():
     measured_m, fitted = noisy_tracks()
-    assert (
-        len(
-            marker_tracks(TIMES, ["tip", "side"], measured_m, None, fitted)
-            .axes[0]
-            .lines
-        )
-        == 2
-    )
-    assert (
-        len(marker_errors(TIMES, measured_m, None, fitted).axes[0].lines) == 1
-    )
+    assert len(marker_tracks(TIMES, ["tip", "side"], measured_m, None, fitted).axes[0].lines) == 2
+    assert len(marker_errors(TIMES, measured_m, None, fitted).axes[0].lines) == 1
 
 
 def test_error_over_time_is_the_rms_distance_of_the_markers_seen():
-    measured_m, fitted = (
-        np.zeros((len(TIMES), 2, 3)),
-        np.zeros((len(TIMES), 2, 3)),
-    )
+    measured_m, fitted = (np.zeros((len(TIMES), 2, 3)), np.zeros((len(TIMES), 2, 3)))
     fitted[:, 0, 0], fitted[:, 1, 1] = 3e-3, 4e-3
     measured_m[3, 0] = measured_m[4] = np.nan
-    error = (
-        marker_errors(TIMES, measured_m, fitted).axes[0].lines[0].get_ydata()
-    )
+    error = marker_errors(TIMES, measured_m, fitted).axes[0].lines[0].get_ydata()
     assert error[0] == pytest.approx(np.sqrt((9 + 16) / 2))
     assert error[3] == pytest.approx(4.0)
     assert np.isnan(error[4])
@@ -323,10 +245,7 @@ def test_errors_far_apart_get_a_logarithmic_axis():
     measured_m, fitted = noisy_tracks()
     near = marker_errors(TIMES, measured_m, fitted, fitted)
     far = marker_errors(TIMES, measured_m, fitted, fitted + 0.1)
-    assert (near.axes[0].get_yscale(), far.axes[0].get_yscale()) == (
-        "linear",
-        "log",
-    )
+    assert (near.axes[0].get_yscale(), far.axes[0].get_yscale()) == ("linear", "log")
 
 
 # Sparsity
@@ -336,15 +255,10 @@ def test_sparsity_shows_the_first_blocks_below_the_diagonal():
     solution = solved()
     _, band, _ = rasters(jacobian_sparsity(solution.collocation, solution.z))
     filled = ~np.ma.getmaskarray(band)
-    rows, columns = (
-        np.arange(size) * SHOWN_STEPS // size for size in filled.shape
-    )
+    rows, columns = (np.arange(size) * SHOWN_STEPS // size for size in filled.shape)
     blocks = np.array(
         [
-            [
-                filled[np.ix_(rows == i, columns == j)].mean()
-                for j in range(SHOWN_STEPS)
-            ]
+            [filled[np.ix_(rows == i, columns == j)].mean() for j in range(SHOWN_STEPS)]
             for i in range(SHOWN_STEPS)
         ]
     )
@@ -361,13 +275,13 @@ def test_sparsity_needs_few_of_the_timesteps():
 
 def test_sparsity_shows_the_mesh_graph_of_one_block():
     solution = solved()
-    segment = solution.collocation.transcriptions[0]
+    transcription = solution.collocation.transcriptions[0]
     block = rasters(jacobian_sparsity(solution.collocation, solution.z))[2]
-    rows, columns, _ = segment.body.pattern.full
-    expected = np.zeros((segment.dof_count, segment.dof_count), dtype=bool)
+    rows, columns, _ = transcription.body.pattern.full
+    expected = np.zeros((transcription.dof_count, transcription.dof_count), dtype=bool)
     expected[rows, columns] = True
     drawn = ~np.ma.getmaskarray(block)
-    np.testing.assert_array_equal(drawn, expected[segment.free_dofs])
+    np.testing.assert_array_equal(drawn, expected[transcription.free_dofs])
 
 
 def test_parameter_columns_are_dense():
@@ -388,15 +302,10 @@ def test_sparsity_is_drawn_for_every_start_and_scheme(make, scheme):
 
 
 def test_curves_tell_where_the_horizon_grows():
-    lines = [
-        replace(line, share=0.5 if k < 2 else 1.0)
-        for k, line in enumerate(history())
-    ]
+    lines = [replace(line, share=0.5 if k < 2 else 1.0) for k, line in enumerate(history())]
     figure = convergence(lines)
     panel = figure.axes[0]
-    assert (
-        panel.get_title() == "continuation: 50, 100 % of the time steps in turn"
-    )
+    assert panel.get_title() == "continuation: 50, 100 % of the time steps in turn"
     curves = [line for line in panel.lines if line.get_marker() == "o"]
     assert [len(line.get_xdata()) for line in curves] == [2, 3]
     assert not convergence(history()).axes[0].get_title()
@@ -411,19 +320,13 @@ def replay(make=hung_cube) -> MotionRecord:
     experiment = measured(make())
     x = simulate(experiment, TRUTH, "midpoint", substeps=1)
     seen = (x.positions_m, x.markers_m)
-    return MotionRecord.from_experiment(
-        experiment, seen, seen, np.array([3.0, 7.0])
-    )
+    return MotionRecord.from_experiment(experiment, seen, seen, np.array([3.0, 7.0]))
 
 
 def test_a_camera_sees_right_and_up_as_they_are():
     camera = ParallelCamera.from_direction((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
-    np.testing.assert_allclose(
-        camera.project(np.eye(3)), [[1, 0], [0, 0], [0, 1]], atol=1e-15
-    )
-    np.testing.assert_allclose(
-        camera.coordinates_to_viewer_m(np.eye(3)), [0, -1, 0], atol=1e-15
-    )
+    np.testing.assert_allclose(camera.project(np.eye(3)), [[1, 0], [0, 0], [0, 1]], atol=1e-15)
+    np.testing.assert_allclose(camera.coordinates_to_viewer_m(np.eye(3)), [0, -1, 0], atol=1e-15)
 
 
 def test_a_camera_faces_the_plane_of_motion():
@@ -435,14 +338,10 @@ def test_a_camera_faces_the_plane_of_motion():
     assert near[0] > 0.8
 
 
-@pytest.mark.parametrize(
-    "up", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.6, 0.0, -0.8)]
-)
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.6, 0.0, -0.8)])
 def test_up_is_up_in_the_picture(up):
     camera = ParallelCamera.facing_motion(replay().positions_m, up)
-    np.testing.assert_allclose(
-        camera.axes @ camera.axes.T, np.eye(3), atol=1e-12
-    )
+    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
     across, along = camera.project(np.array(up))
     assert across == pytest.approx(0.0, abs=1e-12)
     assert along > 0.9
@@ -451,9 +350,7 @@ def test_up_is_up_in_the_picture(up):
 def test_only_faces_towards_the_viewer_are_drawn_the_nearest_last():
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
     camera = ParallelCamera.from_direction((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
-    polygons, brightness, chosen = camera.visible_faces(
-        mesh.points_m, mesh.surface
-    )
+    polygons, brightness, chosen = camera.visible_faces(mesh.points_m, mesh.surface)
     assert polygons.shape == (2, 3, 2)
     assert (mesh.points_m[mesh.surface[chosen], 2] == 1.0).all()  # of the top
     assert ((brightness > 0.5) & (brightness <= 1.0)).all()
@@ -464,9 +361,7 @@ def test_only_faces_towards_the_viewer_are_drawn_the_nearest_last():
 def test_what_lies_behind_the_body_is_hidden():
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
     camera = ParallelCamera.from_direction((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
-    points = np.array(
-        [[0.4, 0.3, 1.0], [0.4, 0.3, 0.0], [2.0, 0.3, 0.0], [np.nan] * 3]
-    )
+    points = np.array([[0.4, 0.3, 1.0], [0.4, 0.3, 0.0], [2.0, 0.3, 0.0], [np.nan] * 3])
     found = camera.are_hidden(points, mesh.points_m, mesh.surface)
     assert found.tolist() == [False, True, False, False]
 
@@ -476,9 +371,7 @@ def test_every_marker_is_named_once_on_the_mesh():
     names = [f"m{k}" for k in range(len(seen.marker_names))]
     figure = mesh_picture(replace(seen, marker_names=names))
     written = [text.get_text() for text in figure.axes[0].texts]
-    assert sorted(text for text in written if text.startswith("m")) == sorted(
-        names
-    )
+    assert sorted(text for text in written if text.startswith("m")) == sorted(names)
 
 
 def test_names_keep_their_order_and_a_distance():
@@ -492,20 +385,11 @@ def test_names_keep_their_order_and_a_distance():
 def test_shapes_stand_side_by_side_in_one_scale():
     seen = replay()
     figure = shapes_picture(seen, 3)
-    skins = [
-        c for c in figure.axes[0].collections if isinstance(c, PolyCollection)
-    ]
-    boxes = [
-        np.vstack([path.vertices for path in skin.get_paths()])
-        for skin in skins
-    ]
+    skins = [c for c in figure.axes[0].collections if isinstance(c, PolyCollection)]
+    boxes = [np.vstack([path.vertices for path in skin.get_paths()]) for skin in skins]
     assert len(boxes) == 3
     assert boxes[0][:, 0].max() < boxes[1][:, 0].min() < boxes[2][:, 0].min()
-    times = [
-        t.get_text()
-        for t in figure.axes[0].texts
-        if t.get_text().endswith(" s")
-    ]
+    times = [t.get_text() for t in figure.axes[0].texts if t.get_text().endswith(" s")]
     assert times == ["0 s", "0.05 s", "0.1 s"]
 
 
@@ -518,9 +402,7 @@ def test_a_field_colours_each_shape_by_its_values_there():
     seen = replay()
     count = len(seen.surface)
     values = np.arange(1.0, 2 * count + 1).reshape(2, count)
-    pressure = SurfaceField(
-        "pressure [Pa]", lambda samples: values[: len(samples)]
-    )
+    pressure = SurfaceField("pressure [Pa]", lambda samples: values[: len(samples)])
     figure = shapes_picture(seen, 2, pressure)
     sheet_axes = figure.axes[0]
     assert any(text.get_text() == "pressure [Pa]" for text in sheet_axes.texts)
@@ -543,20 +425,14 @@ def test_quadratic_bodies_are_drawn_by_their_corners(tmp_path):
 
 def test_equal_elements_fill_one_bin():
     mesh = box_mesh((0.3, 0.3, 0.3), (1, 1, 1))
-    regular = np.array(
-        [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]
-    ) / np.sqrt(8)
+    regular = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(8)
     size, quality = elements_picture(regular, np.array([[0, 1, 3, 2]])).axes
     (filled,) = [bar for bar in quality.patches if bar.get_height()]
     assert filled.get_x() + filled.get_width() == pytest.approx(1.0)
     (filled,) = [bar for bar in size.patches if bar.get_height()]
-    assert (
-        filled.get_x() <= 1000.0 <= filled.get_x() + filled.get_width() + 1e-9
-    )
+    assert filled.get_x() <= 1000.0 <= filled.get_x() + filled.get_width() + 1e-9
     of_box = elements_picture(mesh.points_m, mesh.tetrahedra).axes[1]
-    assert sum(bar.get_height() for bar in of_box.patches) == len(
-        mesh.tetrahedra
-    )
+    assert sum(bar.get_height() for bar in of_box.patches) == len(mesh.tetrahedra)
     assert not of_box.texts  # the worst is told in the title, not over the bars
 
 
@@ -567,21 +443,14 @@ def two_parameters(rho=0.8) -> Confidence:
     deviation = np.array([0.02, 0.05])
     correlation = np.array([[1.0, rho], [rho, 1.0]])
     covariance = correlation * np.outer(deviation, deviation)
-    return Confidence(
-        ["lambda_pa", "mu_pa"],
-        np.array([5.0, 7.0]),
-        covariance,
-        np.full(2, 1.96),
-    )
+    return Confidence(["lambda_pa", "mu_pa"], np.array([5.0, 7.0]), covariance, np.full(2, 1.96))
 
 
 def told(covariance: np.ndarray | None = None) -> Result:
     """A result of these two parameters, with a history."""
     given = two_parameters()
     pairs = zip(given.names, given.values.tolist(), strict=True)
-    known = uncertainty(
-        given.names, given.covariance if covariance is None else covariance
-    )
+    known = uncertainty(given.names, given.covariance if covariance is None else covariance)
     parameters = {name: value(each) for name, each in pairs}
     return a_result(parameters, uncertainty=known, history=tuple(history()))
 
@@ -597,18 +466,12 @@ def test_an_ellipse_holds_95_per_cent_of_the_pairs(rho):
 
 def test_every_pair_has_a_panel_and_every_correlation_a_number():
     found = Confidence(
-        ["lambda_pa", "mu_pa", "gamma_r_s"],
-        np.ones(3),
-        np.diag([1e-4, 4.0, 1e-2]),
-        np.ones(3),
+        ["lambda_pa", "mu_pa", "gamma_r_s"], np.ones(3), np.diag([1e-4, 4.0, 1e-2]), np.ones(3)
     )
     drawn = [axes for axes in confidence_ellipses(found).axes if axes.patches]
     assert len(drawn) == 3
     matrix = correlation_matrix(two_parameters())
-    assert {text.get_text() for text in matrix.axes[0].texts} == {
-        "1.00",
-        "0.80",
-    }
+    assert {text.get_text() for text in matrix.axes[0].texts} == {"1.00", "0.80"}
 
 
 def test_wide_intervals_are_read_as_factors(tmp_path):
@@ -631,23 +494,15 @@ def test_what_is_not_determined_is_left_out():
 
 def test_a_tone_stands_out_at_its_frequency():
     t = 0.01 * np.arange(200)
-    track = (
-        1e-3
-        * np.sin(2 * np.pi * 8.0 * t)[:, None, None]
-        * np.array([1.0, 0.0, 0.0])
-    )
+    track = 1e-3 * np.sin(2 * np.pi * 8.0 * t)[:, None, None] * np.array([1.0, 0.0, 0.0])
     hertz, density = spectral_density(track, 100.0)
     assert hertz[np.nanargmax(density)] == pytest.approx(8.0, abs=0.2)
-    assert np.nansum(density) * (hertz[1] - hertz[0]) == pytest.approx(
-        0.5, rel=0.02
-    )  # mm²
+    assert np.nansum(density) * (hertz[1] - hertz[0]) == pytest.approx(0.5, rel=0.02)  # mm²
 
 
 def test_gaps_hardly_change_a_spectrum_and_unseen_markers_do_not_count():
     t = 0.01 * np.arange(200)
-    track = np.repeat(
-        1e-3 * np.sin(2 * np.pi * 3.0 * t)[:, None, None], 3, axis=2
-    )
+    track = np.repeat(1e-3 * np.sin(2 * np.pi * 3.0 * t)[:, None, None], 3, axis=2)
     _, whole = spectral_density(track, 100.0)
     gappy = np.concatenate([track, np.full_like(track, np.nan)], axis=1)
     gappy[50:53, 0] = np.nan
@@ -708,9 +563,7 @@ def test_what_went_astray_leaves_gaps(tmp_path, wrong, first):
     seen = replay()
     positions, markers = seen.positions_m.copy(), seen.markers_m.copy()
     positions[first:], markers[first:] = wrong, wrong
-    pictures = all_pictures(
-        [replace(seen, positions_m=positions, markers_m=markers)], a_result()
-    )
+    pictures = all_pictures([replace(seen, positions_m=positions, markers_m=markers)], a_result())
     assert ("shapes_hung_cube" in pictures) == (first > 0)
     save_pictures(tmp_path, pictures)
 
@@ -734,12 +587,7 @@ def test_drawing_needs_no_display_and_leaves_pyplot_alone():
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     here = Path(__file__).parents[1]
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], check=False, cwd=here
-        ).returncode
-        == 0
-    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=here).returncode == 0
 
 
 def test_grasped_nodes_on_the_sides_are_marked():
@@ -749,10 +597,7 @@ def test_grasped_nodes_on_the_sides_are_marked():
         experiment, (np.tile(body.nodes_m, (len(experiment.t_s), 1, 1)), None)
     )
     assert seen.surface_nodes.shape == (len(seen.surface), 6)
-    corners, sides = (
-        body.nodes_m[seen.surface],
-        body.nodes_m[seen.surface_nodes[:, 3:]],
-    )
+    corners, sides = (body.nodes_m[seen.surface], body.nodes_m[seen.surface_nodes[:, 3:]])
     middles = (corners + np.roll(corners, -1, axis=1)) / 2
     for found, expected in zip(sides, middles, strict=True):
         distances = np.linalg.norm(found[:, None] - expected, axis=2)
@@ -761,16 +606,10 @@ def test_grasped_nodes_on_the_sides_are_marked():
     camera = ParallelCamera.facing_motion(body.nodes_m[None], seen.up)
     view = SheetView.fit_points(camera, body.nodes_m, (70, 50), (5, 5))
     drawn = BodyDrawing(axes, view, seen.surface, nodes=seen.surface_nodes)
-    drawn.update(
-        body.nodes_m, np.ones(len(body.nodes_m), bool), np.empty((0, 3))
-    )
+    drawn.update(body.nodes_m, np.ones(len(body.nodes_m), bool), np.empty((0, 3)))
     marked = len(drawn.grasped.get_xdata())
     faces = camera.visible_faces(body.nodes_m, seen.surface).indices
-    assert (
-        marked
-        == len(np.unique(seen.surface_nodes[faces]))
-        > len(np.unique(seen.surface[faces]))
-    )
+    assert marked == len(np.unique(seen.surface_nodes[faces])) > len(np.unique(seen.surface[faces]))
 
 
 def test_letters_that_the_font_lacks_are_no_news(tmp_path):
@@ -791,9 +630,7 @@ def test_commands_say_nothing_of_matplotlibs_own_files(tmp_path):
     }
     (tmp_path / "a_file").touch()
     command = [sys.executable, "-c", code, "plot", str(tmp_path)]
-    done = subprocess.run(
-        command, env=os.environ | beside, capture_output=True, text=True
-    )
+    done = subprocess.run(command, env=os.environ | beside, capture_output=True, text=True)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "not a run folder" in done.stderr

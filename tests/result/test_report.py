@@ -11,13 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from kit.problem_files import (
-    TRUTH,
-    pictures_drawn,
-    run_command,
-    settings,
-    write_problem,
-)
+from kit.problem_files import TRUTH, pictures_drawn, run_command, settings, write_problem
 from kit.results import ROLLOUT, a_result
 
 from collocation_sysid.common.display import plain_text
@@ -41,9 +35,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = folder / "run"
     method = settings("solver.method=reduced-space")
     with pictures_drawn():
-        solved = run_command(
-            "solve", folder / "problem.toml", *method, "--out", out
-        )
+        solved = run_command("solve", folder / "problem.toml", *method, "--out", out)
     assert solved.code == 0
     (folder / "printed.txt").write_text(solved.out)
     return out
@@ -58,22 +50,12 @@ def page(run_folder: Path) -> str:
 
 
 def test_a_report_may_be_markdown(run_folder: Path, page: str):
-    assert (
-        run_command("report", run_folder, "--to", run_folder / "report.md").code
-        == 0
-    )
+    assert run_command("report", run_folder, "--to", run_folder / "report.md").code == 0
     text = (run_folder / "report.md").read_text()
     assert text.count("![") == len(Elements(page).images)
-    for line in (
-        "## Parameters",
-        "## Residuals",
-        "| marker | RMS | samples | diagnosis |",
-    ):
+    for line in ("## Parameters", "## Residuals", "| marker | RMS | samples | diagnosis |"):
         assert line in text.splitlines()
-    assert all(
-        (run_folder / name).is_file()
-        for name in re.findall(r"\]\((.*?\.png)\)", text)
-    )
+    assert all((run_folder / name).is_file() for name in re.findall(r"\]\((.*?\.png)\)", text))
 
 
 class Elements(HTMLParser):
@@ -106,9 +88,7 @@ class Elements(HTMLParser):
 def test_the_page_holds_everything(page: str, run_folder: Path):
     found = Elements(page)
     assert len(found.images) == len(list(run_folder.glob("*.png"))) >= 4
-    assert all(
-        image.startswith("data:image/png;base64,") for image in found.images
-    )
+    assert all(image.startswith("data:image/png;base64,") for image in found.images)
     assert not found.outside
     result = json.loads((run_folder / "result.json").read_text())
     for words in (
@@ -141,15 +121,11 @@ def test_text_is_escaped(run_folder: Path, tmp_path: Path):
 
 
 def test_what_a_terminal_shows_is_on_the_page(page: str, run_folder: Path):
-    shown = plain_text(
-        run_summary(Result.read(run_folder), run_folder)
-    ).splitlines()
+    shown = plain_text(run_summary(Result.read(run_folder), run_folder)).splitlines()
     text = Elements(page).text
     assert sum("forward simulation 'swing': " in line for line in shown) == 1
     for line in shown[:-1]:  # which names the folder
-        if not line.startswith(
-            ("residuals: ", "what to do: ")
-        ):  # a table and a section there
+        if not line.startswith(("residuals: ", "what to do: ")):  # a table and a section there
             assert all(word in text for word in line.split())
 
 
@@ -160,10 +136,7 @@ def test_a_result_read_back_is_shown_as_it_was(run_folder: Path):
     elapsed_s = result.elapsed_s
     before = replace(result, elapsed_s=replace(elapsed_s, pictures=None))
     shown = plain_text(
-        [
-            *run_summary(before, run_folder),
-            f"pictures drawn in {elapsed_s.pictures:.1f} s",
-        ]
+        [*run_summary(before, run_folder), f"pictures drawn in {elapsed_s.pictures:.1f} s"]
     )
     assert shown.split() == printed.split()
 
@@ -190,9 +163,7 @@ def test_folders_without_a_run_are_refused(tmp_path: Path):
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", WIDTHS.values(), ids=WIDTHS)
-def test_a_browser_shows_the_page_whole(
-    page: str, run_folder: Path, tmp_path: Path, width: int
-):
+def test_a_browser_shows_the_page_whole(page: str, run_folder: Path, tmp_path: Path, width: int):
     """No missing picture, no script error, and nothing but tables wider than the window."""
     assert CHROMIUM is not None
     probe = """<script>window.onload = () => {
@@ -227,9 +198,7 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
     truth = ",".join(f"{name}={value}" for name, value in TRUTH.items())
     methods = ("--methods", "reduced-space,shooting", "--truth", truth)
     out = folder / "compare"
-    outcome = run_command(
-        "compare-methods", folder / "problem.toml", *methods, "--out", out
-    )
+    outcome = run_command("compare-methods", folder / "problem.toml", *methods, "--out", out)
     assert outcome.code == 0, outcome.err
     return out
 
@@ -245,9 +214,7 @@ def test_a_comparison_has_a_page_too(comparison: Path):
 
 
 def test_a_damaged_comparison_is_refused(comparison: Path, tmp_path: Path):
-    (tmp_path / "summary.json").write_text(
-        '{"schema": 4, "kind": "compare-methods"}'
-    )
+    (tmp_path / "summary.json").write_text('{"schema": 4, "kind": "compare-methods"}')
     outcome = run_command("report", tmp_path)
     assert outcome.code == 2
     assert "summary.json is damaged" in outcome.err
@@ -268,11 +235,7 @@ def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
     run_command("report", copy)
     page = (copy / "report.html").read_text()
     for topic in ("scheme", "information"):
-        assert (
-            page.count(f'href="#cure-{topic}"')
-            == page.count(f'id="cure-{topic}"')
-            == 1
-        )
+        assert page.count(f'href="#cure-{topic}"') == page.count(f'id="cure-{topic}"') == 1
     assert "<code>collocation-sysid explain scheme</code>" in page
     assert "mu_pa ended at its bound" in page
     assert "usable after checking the reasons below" in page
@@ -280,6 +243,4 @@ def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
 
 def test_every_remedy_names_a_page_that_is_there():
     howto = Path(__file__).parents[2] / "docs" / "howto"
-    assert all(
-        (howto / f"{topic.page}.md").is_file() for topic in TOPICS.values()
-    )
+    assert all((howto / f"{topic.page}.md").is_file() for topic in TOPICS.values())

@@ -33,18 +33,14 @@ def folder(tmp_path):
         for mu, alpha in ((1.5e5, 1.6), (3e3, 4.6))
     ) + 700.0 * rng.normal(size=len(stretch))
     rows = [f"{a},{b}" for a, b in zip(stretch, stress_pa, strict=True)]
-    (tmp_path / "pull.csv").write_text(
-        "\n".join(["stretch,stress (Pa)", *rows]) + "\n"
-    )
+    (tmp_path / "pull.csv").write_text("\n".join(["stretch,stress (Pa)", *rows]) + "\n")
     (tmp_path / "problem.toml").write_text(PROBLEM)
     return tmp_path
 
 
 @pytest.mark.long
 def test_an_undetermined_parameter_is_stated_once(folder):
-    outcome = run_command(
-        "solve", folder / "problem.toml", "--out", folder / "run"
-    )
+    outcome = run_command("solve", folder / "problem.toml", "--out", folder / "run")
     lines = outcome.out.splitlines()
     of_verdict = [line for line in lines if "do not determine" in line]
     assert len(of_verdict) == 1

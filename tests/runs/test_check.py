@@ -41,11 +41,7 @@ from collocation_sysid.result.check_sections import (
     quick_check_tables,
 )
 from collocation_sysid.runs.check import CheckResult, check_problem, quick_check
-from collocation_sysid.runs.check.body_check import (
-    element_concerns,
-    slenderness,
-    worst_elements,
-)
+from collocation_sysid.runs.check.body_check import element_concerns, slenderness, worst_elements
 from collocation_sysid.runs.check.cost import (
     FRICTION_FACTOR,
     STATIC_FACTOR,
@@ -82,27 +78,17 @@ def checked(folder: Path, *overrides: str) -> CheckResult:
 
 def checked_motion(folder: Path, *overrides: str) -> ModesCheck:
     """How the body of the only experiment oscillates at the guess."""
-    (segment,) = (
-        Problem.read(folder / "problem.toml", overrides)
-        .collocation()
-        .transcriptions
-    )
+    (transcription,) = Problem.read(folder / "problem.toml", overrides).collocation().transcriptions
     theta, step_s = (
-        segment.body.theta_from_values(segment.parameters.guesses),
-        segment.dynamics.step_s,
+        transcription.body.theta_from_values(transcription.parameters.guesses),
+        transcription.dynamics.step_s,
     )
-    return check_modes(
-        segment.experiment, as_scheme(segment.scheme), step_s, theta
-    )
+    return check_modes(transcription.experiment, as_scheme(transcription.scheme), step_s, theta)
 
 
 def about(findings: CheckResult, *words: str) -> str:
     """The one warning that has all these words."""
-    found = [
-        warning
-        for warning in findings.warnings
-        if all(word in warning for word in words)
-    ]
+    found = [warning for warning in findings.warnings if all(word in warning for word in words)]
     assert len(found) == 1, findings.warnings
     return found[0]
 
@@ -115,27 +101,18 @@ def sentences(concerns: Iterable[Concern]) -> list[str]:
 
 
 @pytest.mark.long
-def test_where_no_substeps_are_stated_check_says_that_they_are_chosen(
-    tiny: Path,
-):
+def test_where_no_substeps_are_stated_check_says_that_they_are_chosen(tiny: Path):
     assert any("up to 8" in note for note in checked(tiny).notes)
-    assert not any(
-        "up to 8" in note
-        for note in checked(tiny, "transcription.substeps=2").notes
-    )
+    assert not any("up to 8" in note for note in checked(tiny, "transcription.substeps=2").notes)
 
 
-def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_cure_it(
-    tiny: Path,
-):
+def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_cure_it(tiny: Path):
     euler = (*SILICONE, "transcription.scheme=backward-euler")
     findings = checked(tiny, *euler)
     first = findings.motions[0].modes[0]
     assert first.frequency_hz == pytest.approx(7.7, abs=0.2)
     assert first.numerical_damping_ratio == pytest.approx(0.23, abs=0.02)
-    warning = about(
-        findings, "backward-euler at 10 ms", "estimated damping too low"
-    )
+    warning = about(findings, "backward-euler at 10 ms", "estimated damping too low")
     assert 'set transcription.scheme = "midpoint"' in warning
     named = re.search(r"substeps = (\d+)", warning)
     assert named is not None
@@ -144,9 +121,7 @@ def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_
     cured, nearly = (
         [
             concern.message
-            for concern in mode_concerns(
-                checked_motion(tiny, *euler, f"{SUBSTEPS}={count}")
-            )
+            for concern in mode_concerns(checked_motion(tiny, *euler, f"{SUBSTEPS}={count}"))
             if "backward-euler" in concern.message
         ]
         for count in (needed, needed - 1)
@@ -159,23 +134,13 @@ def test_midpoint_at_ten_milliseconds_is_not_warned_of(tiny: Path):
     findings = checked(tiny, *SILICONE)
     first = findings.motions[0].modes[0]
     assert first.numerical_damping_ratio == pytest.approx(0, abs=1e-3)
-    assert (
-        first.samples_per_period
-        == first.steps_per_period
-        == pytest.approx(13, abs=0.5)
-    )
+    assert first.samples_per_period == first.steps_per_period == pytest.approx(13, abs=0.5)
     assert not any("midpoint" in warning for warning in findings.warnings)
-    assert any(
-        "midpoint lengthens" in note and "substeps = 2" in note
-        for note in findings.notes
-    )
+    assert any("midpoint lengthens" in note and "substeps = 2" in note for note in findings.notes)
 
 
 def test_damping_at_the_guess_is_rayleighs(tiny: Path):
-    gammas = (
-        "parameters.gamma_r_s.guess=0.02",
-        "parameters.gamma_m_1_s.guess=0.5",
-    )
+    gammas = ("parameters.gamma_r_s.guess=0.02", "parameters.gamma_m_1_s.guess=0.5")
     modes = checked(tiny, *gammas, 'object.damping="rayleigh"').motions[0].modes
     assert modes
     for mode in modes:
@@ -189,9 +154,7 @@ def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
 
     def added(mode: ModeCheck, scheme: str, damping_ratio: float) -> float:
         omega = 2 * np.pi * mode.frequency_hz
-        return numerical_mode(
-            SCHEMES[scheme], omega, 0.01, damping_ratio
-        ).damping_ratio
+        return numerical_mode(SCHEMES[scheme], omega, 0.01, damping_ratio).damping_ratio
 
     damped = first("parameters.gamma_r_s.guess=0.01")
     assert damped.damping_ratio > 0.2
@@ -200,9 +163,7 @@ def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
     assert damped.numerical_damping_ratio == pytest.approx(expected, rel=1e-9)
     assert expected < -1e-3
     assert damped.period_error == first().period_error
-    creeping = first(
-        "parameters.gamma_r_s.guess=0.1", "transcription.scheme=backward-euler"
-    )
+    creeping = first("parameters.gamma_r_s.guess=0.1", "transcription.scheme=backward-euler")
     assert creeping.damping_ratio > 1
     undamped = added(creeping, "backward-euler", 0.0)
     assert creeping.numerical_damping_ratio == pytest.approx(undamped)
@@ -210,12 +171,8 @@ def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
 
 def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
     motion = checked_motion(tiny, *SILICONE, "parameters.gamma_r_s.guess=0.02")
-    first = replace(
-        motion.modes[0], damping_ratio=0.3, numerical_damping_ratio=-0.05
-    )
-    said = mode_concerns(replace(motion, modes=(first,), duration_s=10.0))[
-        0
-    ].message
+    first = replace(motion.modes[0], damping_ratio=0.3, numerical_damping_ratio=-0.05)
+    said = mode_concerns(replace(motion, modes=(first,), duration_s=10.0))[0].message
     assert "removes a damping ratio of 0.05 from the first mode" in said
     assert "damping too high" in said
     assert f"set transcription.substeps = {motion.substeps_needed}" in said
@@ -223,9 +180,7 @@ def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
 
 def test_too_few_steps_or_samples_a_period_are_warned_of(tiny: Path):
     motion = checked(tiny, *SILICONE).motions[0]
-    first = replace(
-        motion.modes[0], steps_per_period=5.0, samples_per_period=2.5
-    )
+    first = replace(motion.modes[0], steps_per_period=5.0, samples_per_period=2.5)
     found = mode_concerns(replace(motion, modes=(first,), duration_s=10.0))
     assert [each.topic for each in found] == ["scheme", "information"]
     steps, samples = (each.message for each in found)
@@ -248,28 +203,20 @@ def test_nearly_incompressible_linear_elements_are_warned_of(tiny: Path):
     warning = about(checked(tiny, *nearly), "Poisson's ratio is 0.49")
     assert 'set object.element = "tet10-p0"' in warning
     quadratic = checked(tiny, *nearly, "object.element=tet10")
-    assert "tet10 elements lock from 0.45 on" in about(
-        quadratic, "Poisson's ratio is 0.49"
-    )
+    assert "tet10 elements lock from 0.45 on" in about(quadratic, "Poisson's ratio is 0.49")
     averaging = checked(tiny, *nearly, "object.element=tet10-p0")
     assert not any("Poisson" in warning for warning in averaging.warnings)
 
 
 @pytest.mark.parametrize("young_pa", [2e5, 100.0, 1543.0])
 def test_locking_is_warned_of_at_its_very_poisson_ratio(young_pa: float):
-    body = Body(
-        box_mesh((0.1, 0.1, 0.1), (1, 1, 1)),
-        density_kg_m3=30.0,
-        element="tet10",
-    )
+    body = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), density_kg_m3=30.0, element="tet10")
     shape, worst = slenderness(body.mesh), worst_elements(body.mesh)[0]
 
     def warnings(poisson: float) -> list[str]:
         # By way of λ and μ, 0.45 comes back as 0.44999999999999996 for E = 200 kPa.
         shear = young_pa / (2 + 2 * poisson)
-        theta = np.array(
-            [2 * shear * poisson / (1 - 2 * poisson), shear, 0.0, 0.0]
-        )
+        theta = np.array([2 * shear * poisson / (1 - 2 * poisson), shear, 0.0, 0.0])
         return sentences(element_concerns(body, theta, shape, worst))
 
     (warning,) = warnings(0.45)
@@ -305,32 +252,23 @@ def test_the_worst_element_is_named():
         ((0.1, 0.1, 0.1), (2, 2, 2), "tet4", False),
     ],
 )
-def test_slender_bodies_need_several_linear_elements_across(
-    size_m, divisions, element, warned
-):
+def test_slender_bodies_need_several_linear_elements_across(size_m, divisions, element, warned):
     mesh = box_mesh(size_m, divisions)
     shape = slenderness(mesh)
     assert shape.thickness_m == pytest.approx(min(size_m))
     body = Body(mesh, density_kg_m3=30.0, element=element)
-    warnings = sentences(
-        element_concerns(body, COMPRESSIBLE, shape, worst_elements(mesh)[0])
-    )
-    said = [
-        warning for warning in warnings if "too stiff in bending" in warning
-    ]
+    warnings = sentences(element_concerns(body, COMPRESSIBLE, shape, worst_elements(mesh)[0]))
+    said = [warning for warning in warnings if "too stiff in bending" in warning]
     assert bool(said) == warned
     assert all(
-        "of a real body" in each and "not that of data simulated with" in each
-        for each in said
+        "of a real body" in each and "not that of data simulated with" in each for each in said
     )
 
 
 def test_as_many_elements_across_as_are_needed_are_enough():
     mesh = box_mesh((0.005, 0.005, 0.03), (2, 2, 12))
     body = Body(mesh, density_kg_m3=30.0, element="tet10-p0")
-    assert not element_concerns(
-        body, COMPRESSIBLE, slenderness(mesh), worst_elements(mesh)[0]
-    )
+    assert not element_concerns(body, COMPRESSIBLE, slenderness(mesh), worst_elements(mesh)[0])
 
 
 def test_thickness_does_not_depend_on_how_the_body_lies():
@@ -343,9 +281,7 @@ def test_thickness_does_not_depend_on_how_the_body_lies():
 
 # The measurements -------------------------------------------------------------------------------
 
-AWAY = replace_text(
-    REFERENCES, REFERENCES.replace("[0.06, 0.06, 0.03]", "[0.06, 0.085, 0.03]")
-)
+AWAY = replace_text(REFERENCES, REFERENCES.replace("[0.06, 0.06, 0.03]", "[0.06, 0.085, 0.03]"))
 
 
 def test_a_marker_far_from_the_body_is_named(tiny: Path):
@@ -372,10 +308,7 @@ def test_places_that_the_poses_determine_have_no_distance(tiny: Path):
 
 def blank(*samples: tuple[int, int]) -> Edit:
     """Leave out the x of (line, marker)."""
-    edits = [
-        replace_cell("swing_markers.csv", line, 1 + 3 * m, "")
-        for line, m in samples
-    ]
+    edits = [replace_cell("swing_markers.csv", line, 1 + 3 * m, "") for line, m in samples]
     return both(*edits)
 
 
@@ -395,16 +328,13 @@ def test_missing_samples_are_counted_by_marker(tiny: Path):
 
 def test_a_marker_that_is_mostly_missing_is_warned_of(tiny: Path):
     blank(*((line, 1) for line in range(3, 9)))(tiny)
-    assert about(
-        checked(tiny), "marker 'mid' of 'swing' is missing in 6 of 9 samples"
-    )
+    assert about(checked(tiny), "marker 'mid' of 'swing' is missing in 6 of 9 samples")
 
 
 def test_tracks_in_another_unit_are_warned_of(tiny: Path):
-    replace_text(
-        'file = "swing_markers.csv"',
-        'file = "swing_markers.csv"\nlength_unit = "cm"',
-    )(tiny)
+    replace_text('file = "swing_markers.csv"', 'file = "swing_markers.csv"\nlength_unit = "cm"')(
+        tiny
+    )
     assert about(checked(tiny), "is first measured", "check length_unit")
 
 
@@ -412,9 +342,7 @@ def test_tracks_in_another_unit_are_warned_of(tiny: Path):
 
 
 @pytest.mark.parametrize("scheme", ["backward-euler", "midpoint", "bdf2"])
-def test_nonzeros_are_those_of_the_whole_program(
-    tiny: Path, monkeypatch, scheme: str
-):
+def test_nonzeros_are_those_of_the_whole_program(tiny: Path, monkeypatch, scheme: str):
     monkeypatch.setattr("collocation_sysid.runs.check.derivatives.SAMPLES", 5)
     overrides = (f"transcription.scheme={scheme}", "transcription.substeps=2")
     findings = checked(tiny, *overrides)
@@ -439,9 +367,7 @@ def test_every_method_has_a_cost_and_the_chosen_one_counts(tiny: Path):
     findings = checked(tiny)
     by_name = {cost.method: cost for cost in findings.costs}
     assert set(by_name) == {"reduced-space", "interior-point"}
-    assert all(
-        cost.memory_mb > 0 and (cost.time_s or 0) > 0 for cost in findings.costs
-    )
+    assert all(cost.memory_mb > 0 and (cost.time_s or 0) > 0 for cost in findings.costs)
     assert findings.method == "interior-point"
     assert findings.memory_mb == by_name["interior-point"].memory_mb
 
@@ -454,9 +380,9 @@ def test_the_time_of_a_search_counts_equilibria_and_estimated_friction():
     assert search_factor(hung_cube(), {"young_pa"}) == 1.0
     assert alone == STATIC_FACTOR > 1.5
     assert search_factor(touched, {"young_pa"}) == alone
-    assert search_factor(
-        touched, {"young_pa", "ball_friction"}
-    ) == pytest.approx(FRICTION_FACTOR * alone)
+    assert search_factor(touched, {"young_pa", "ball_friction"}) == pytest.approx(
+        FRICTION_FACTOR * alone
+    )
 
 
 def test_times_are_called_estimates_for_the_number_of_samples(tiny: Path):
@@ -467,9 +393,7 @@ def test_times_are_called_estimates_for_the_number_of_samples(tiny: Path):
 
 
 def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):
-    monkeypatch.setattr(
-        "collocation_sysid.runs.check.cost.machine_memory_mb", lambda: 8000.0
-    )
+    monkeypatch.setattr("collocation_sysid.runs.check.cost.machine_memory_mb", lambda: 8000.0)
     small, large = (
         MethodCost("reduced-space", 500.0, 10.0),
         MethodCost("interior-point", 40000.0, 1000.0),
@@ -491,9 +415,7 @@ def no_simulation(*_, **__):
 
 def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
     for name in ("initial_variables", "start_problem"):
-        monkeypatch.setattr(
-            f"collocation_sysid.runs.check.{name}", no_simulation
-        )
+        monkeypatch.setattr(f"collocation_sysid.runs.check.{name}", no_simulation)
     unguessed = ["parameters.mu_pa={}", "parameters.lambda_pa={}"]
     seen = quick_check(Problem.read(tiny / "problem.toml", unguessed))
     assert seen.bodies[0].elements > 0
@@ -502,12 +424,8 @@ def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
     assert seen.recordings[0].markers[0].start_miss_m is None
 
 
-def test_the_command_shows_it_before_anything_is_simulated(
-    tiny: Path, monkeypatch
-):
-    monkeypatch.setattr(
-        "collocation_sysid.runs.check.initial_variables", no_simulation
-    )
+def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypatch):
+    monkeypatch.setattr("collocation_sysid.runs.check.initial_variables", no_simulation)
     shown = []
     show = "collocation_sysid.cli.problem_commands.print_result"
     monkeypatch.setattr(show, lambda content: shown.append(plain_text(content)))
@@ -519,52 +437,31 @@ def test_the_command_shows_it_before_anything_is_simulated(
 
 
 def test_every_grasp_of_an_experiment_is_shown():
-    shown = plain_text(
-        quick_check_tables(quick_check(Problem([bar_in_two_hands()], TRUTH)))
-    )
-    (first,) = re.findall(
-        r"grasp 1 of 'bar in two hands' .* at \((.*?)\) mm", shown
-    )
-    (second,) = re.findall(
-        r"grasp 2 of 'bar in two hands' .* at \((.*?)\) mm", shown
-    )
+    shown = plain_text(quick_check_tables(quick_check(Problem([bar_in_two_hands()], TRUTH))))
+    (first,) = re.findall(r"grasp 1 of 'bar in two hands' .* at \((.*?)\) mm", shown)
+    (second,) = re.findall(r"grasp 2 of 'bar in two hands' .* at \((.*?)\) mm", shown)
     assert (first, second) == ("0, 0, 0", "150, 0, 0")
 
 
-def test_a_long_simulation_is_left_out_and_told_unless_asked_for(
-    tiny: Path, monkeypatch
-):
-    monkeypatch.setattr(
-        "collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0
-    )
+def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, monkeypatch):
+    monkeypatch.setattr("collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0)
     monkeypatch.setattr("collocation_sysid.runs.check.derivatives.SAMPLES", 4)
     problem, told = Problem.read(tiny / "problem.toml"), []
     short = check_problem(problem, told.append)
     assert short.rms_at_guess_m is None
-    assert any(
-        "only the first samples" in n and "check --full" in n
-        for n in short.notes
-    )
-    assert "deviates from the markers by" not in plain_text(
-        full_check_tables(short)
-    )
+    assert any("only the first samples" in n and "check --full" in n for n in short.notes)
+    assert "deviates from the markers by" not in plain_text(full_check_tables(short))
     assert short.derivatives_agree
     assert not any("simulating the recordings" in each for each in told)
     whole = check_problem(problem, told.append, full=True)
     assert (whole.rms_at_guess_m or 0) > 0
-    assert "deviates from the markers by" in plain_text(
-        full_check_tables(whole)
-    )
-    assert any(
-        "simulating the recordings at the guess" in each for each in told
-    )
+    assert "deviates from the markers by" in plain_text(full_check_tables(whole))
+    assert any("simulating the recordings at the guess" in each for each in told)
     assert short.jacobian_nonzeros == whole.jacobian_nonzeros
 
 
 def test_of_equilibria_three_samples_have_all_kinds_of_rows():
-    static = shortened_problem(
-        Problem([block(t_s=np.arange(6.0), z_m=np.zeros(6))], TRUTH)
-    )
+    static = shortened_problem(Problem([block(t_s=np.arange(6.0), z_m=np.zeros(6))], TRUTH))
     assert len(static.experiments[0].t_s) == 3
     moving = shortened_problem(Problem([hung_cube(30)], TRUTH))
     assert len(moving.experiments[0].t_s) == 12
@@ -573,33 +470,19 @@ def test_of_equilibria_three_samples_have_all_kinds_of_rows():
 # The screen and the JSON ------------------------------------------------------------------------
 
 
-def test_the_findings_fit_a_screen_with_the_warnings_last(
-    tiny: Path, monkeypatch
-):
+def test_the_findings_fit_a_screen_with_the_warnings_last(tiny: Path, monkeypatch):
     screen = io.StringIO()
-    console = PlainConsole(
-        file=screen, width=80, force_terminal=True, color_system=None
-    )
+    console = PlainConsole(file=screen, width=80, force_terminal=True, color_system=None)
     monkeypatch.setattr(common, "PlainConsole", lambda: console)
     nearly = ("parameters.mu_pa.guess=200", "parameters.lambda_pa.guess=9800")
     euler = "transcription.scheme=backward-euler"
     meshed = "object.rest_shape=stress_free"
-    outcome = run_command(
-        "check", "problem.toml", *settings(*nearly, euler, meshed)
-    )
-    lines = [
-        line.rstrip() for line in screen.getvalue().rstrip("\n").split("\n")
-    ]
+    outcome = run_command("check", "problem.toml", *settings(*nearly, euler, meshed))
+    lines = [line.rstrip() for line in screen.getvalue().rstrip("\n").split("\n")]
     assert len(lines) <= 41
     assert max(map(len, lines)) <= 80
-    heads = [
-        line.split()[0] for line in lines if line and not line.startswith(" ")
-    ]
-    sections = [
-        head
-        for head in heads
-        if head in ("Body", "Modes", "Measurements", "Solve")
-    ]
+    heads = [line.split()[0] for line in lines if line and not line.startswith(" ")]
+    sections = [head for head in heads if head in ("Body", "Modes", "Measurements", "Solve")]
     assert sections == ["Body", "Measurements", "Modes", "Solve"]
     assert heads[-1] == "The"
     assert heads[-2] == "what"
@@ -609,16 +492,9 @@ def test_the_findings_fit_a_screen_with_the_warnings_last(
 
 def test_the_json_holds_everything(tiny: Path):
     found = json.loads(run_command("check", "problem.toml", "--json").out)
-    assert [m["name"] for m in found["recordings"][0]["markers"]] == [
-        "low",
-        "mid",
-        "side",
-    ]
+    assert [m["name"] for m in found["recordings"][0]["markers"]] == ["low", "mid", "side"]
     assert found["motions"][0]["modes"][0]["frequency_hz"] > 0
-    assert {cost["method"] for cost in found["costs"]} == {
-        "reduced-space",
-        "interior-point",
-    }
+    assert {cost["method"] for cost in found["costs"]} == {"reduced-space", "interior-point"}
     assert isinstance(found["warnings"], list)
     assert found["rms_at_guess_m"] > 0
 
@@ -626,8 +502,7 @@ def test_the_json_holds_everything(tiny: Path):
 def test_point_masses_are_stated_beside_the_mass_of_the_body(tmp_path):
     file = write_problem(tmp_path, {"swing": 4})
     file.write_text(
-        file.read_text()
-        + "\n[[experiment.mass]]\nnodes = { ball_m = [[0.03, 0.03, 0.0], 0.02] }\n"
+        file.read_text() + "\n[[experiment.mass]]\nnodes = { ball_m = [[0.03, 0.03, 0.0], 0.02] }\n"
         "mass_kg = 0.002\n"
     )
     (body,) = check_problem(Problem.read(file)).bodies

@@ -26,17 +26,12 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution, Status
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
-from collocation_sysid.recording.experiment_coarsening import (
-    coarse_experiment,
-    node_sets,
-)
+from collocation_sysid.recording.experiment_coarsening import coarse_experiment, node_sets
 from collocation_sysid.runs.coarse_start import plan_coarse_start
 from collocation_sysid.runs.solving import solve
 
 DIVISIONS = (5, 5, 5)
-NUISANCE = Nuisance.none(
-    time_shift_s=0.003, gravity_rad=0.03, hand_eye_m=0.002, hand_eye_rad=0.02
-)
+NUISANCE = Nuisance.none(time_shift_s=0.003, gravity_rad=0.03, hand_eye_m=0.002, hand_eye_rad=0.02)
 COARSE = ReducedSpace(coarse_start_nodes=100)
 DIRECT = ReducedSpace(coarse_start=False)
 
@@ -50,9 +45,7 @@ def pressed_box() -> Experiment:
     """A cube of 125 nodes that a ball and a plate press."""
     pressed = pressed_cube()
     body = box(divisions=(4, 4, 4))
-    held = replace(
-        pressed.grasps[0], nodes=nodes_where(body, 2, 0.0), selection=None
-    )
+    held = replace(pressed.grasps[0], nodes=nodes_where(body, 2, 0.0), selection=None)
     top = nodes_where(body, 2, 0.1)
     return measured(
         replace(
@@ -99,9 +92,7 @@ def test_the_search_on_the_given_mesh_has_a_tolerance_of_its_own():
     errors = []
     sweeps = []
     for tolerance in (1e-2, 1e-10):
-        solution = solve(
-            problem, replace(COARSE, coarse_start_tolerance=tolerance)
-        )
+        solution = solve(problem, replace(COARSE, coarse_start_tolerance=tolerance))
         assert solution.status is Status.CONVERGED
         errors.append(np.abs(solution.q - direct.q).max())
         sweeps.append(solution.iterations)
@@ -159,24 +150,19 @@ def test_a_mesh_that_cannot_be_coarser_is_noted():
     problem = problem_of(measured(hung_cube(10, divisions=(1, 1, 2))))
     solution = solve(problem, ReducedSpace(coarse_start_nodes=10))
     assert solution.status is Status.CONVERGED
-    assert solution.notes[0].startswith(
-        "the search was not started on a coarser mesh: only "
-    )
+    assert solution.notes[0].startswith("the search was not started on a coarser mesh: only ")
 
 
 def test_small_bodies_and_given_starts_have_no_coarse_start():
     problem = problem_of(measured(hung_cube(10)))
     assert plan_coarse_start(problem, ReducedSpace()) is None
-    assert (
-        plan_coarse_start(problem, replace(COARSE, coarse_start=False)) is None
-    )
+    assert plan_coarse_start(problem, replace(COARSE, coarse_start=False)) is None
 
 
 @pytest.mark.parametrize("value", [True, "on", 1])
 def test_other_values_of_the_option_are_refused(value):
     with pytest.raises(
-        InputError,
-        match=f"coarse_start: found {value!r}; expected 'auto' or false",
+        InputError, match=f"coarse_start: found {value!r}; expected 'auto' or false"
     ):
         ReducedSpace(coarse_start=value)
     with pytest.raises(InputError, match="coarse_start_tolerance: found 0"):
@@ -215,21 +201,15 @@ def test_loads_and_markers_act_on_the_same_places():
 def test_cavities_and_tendons_are_transferred():
     coarse_bar = driven_bar(2)
     whole = box_mesh((0.12, 0.06, 0.06), (12, 6, 6))
-    inside = (
-        np.abs(whole.centres_m - [0.06, 0.03, 0.03]) < [0.02, 0.01, 0.01]
-    ).all(axis=1)
+    inside = (np.abs(whole.centres_m - [0.06, 0.03, 0.03]) < [0.02, 0.01, 0.01]).all(axis=1)
     mesh = TetMesh(whole.points_m, whole.tetrahedra[~inside])
     body = Body(mesh, density_kg_m3=30.0)
-    grasp = replace(
-        coarse_bar.grasps[0], nodes=nodes_where(body, 0, 0.0), selection=None
-    )
+    grasp = replace(coarse_bar.grasps[0], nodes=nodes_where(body, 0, 0.0), selection=None)
     experiment = replace(
         coarse_bar,
         body=body,
         grasps=[grasp],
-        markers=vertex_markers(
-            body, nodes_where(body, 0, 0.12), coarse_bar.t_s
-        ),
+        markers=vertex_markers(body, nodes_where(body, 0, 0.12), coarse_bar.t_s),
         tendons=[replace(t, body_measure=None) for t in coarse_bar.tendons],
         pressures=[replace(p, body_measure=None) for p in coarse_bar.pressures],
     )
@@ -240,11 +220,8 @@ def test_cavities_and_tendons_are_transferred():
         (moved.tendons[0], experiment.tendons[0]),
         (moved.pressures[0], experiment.pressures[0]),
     ):
-        assert mine.require_measure().evaluate(
-            moved.body.nodes_m.reshape(1, -1)
-        ) == pytest.approx(
-            its.require_measure().evaluate(body.nodes_m.reshape(1, -1)),
-            rel=1e-6,
+        assert mine.require_measure().evaluate(moved.body.nodes_m.reshape(1, -1)) == pytest.approx(
+            its.require_measure().evaluate(body.nodes_m.reshape(1, -1)), rel=1e-6
         )
 
 
@@ -256,11 +233,9 @@ def test_frames_of_obstacles_are_copied():
     (coarse,) = start.problem.experiments
     assert len(coarse.body.frames) == len(experiment.body.frames) == 2
     undeformed = [
-        np.tile(e.body.nodes_m.ravel(), (len(segment.dynamics.t_s), 1))
-        for e, segment in zip(
-            start.problem.experiments,
-            start.problem.collocation().transcriptions,
-            strict=True,
+        np.tile(e.body.nodes_m.ravel(), (len(transcription.dynamics.t_s), 1))
+        for e, transcription in zip(
+            start.problem.experiments, start.problem.collocation().transcriptions, strict=True
         )
     ]
     (positions,) = start.interpolated(undeformed)

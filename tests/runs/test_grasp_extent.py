@@ -14,19 +14,14 @@ from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.grasp_extent import (
-    grasp_extent_concerns,
-    grasp_extent_notes,
-)
+from collocation_sysid.runs.check.grasp_extent import grasp_extent_concerns, grasp_extent_notes
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 
 # A cube of 100 mm with layers of nodes every 20 mm.
 CUBE = Body(box_mesh((0.1, 0.1, 0.1), (5, 5, 5)), density_kg_m3=30.0)
 
 
-def held_above(
-    height_m: float, axes: str = "xyz", support: str = ""
-) -> Problem:
+def held_above(height_m: float, axes: str = "xyz", support: str = "") -> Problem:
     """A problem with a cube whose nodes above a height are held along `axes`, and those of the
     lowest layer along the axes of `support`.
     """
@@ -36,22 +31,11 @@ def held_above(
     if support:
         lowest = Box((-1, -1, -1), (1, 1, 0.001))
         grasps.append(Grasp(lowest, PoseSequence.fixed(), axes=support))
-    experiment = Experiment(
-        CUBE,
-        t_s,
-        grasps,
-        vertex_markers(CUBE, [0], t_s),
-        name="cube",
-    )
+    experiment = Experiment(CUBE, t_s, grasps, vertex_markers(CUBE, [0], t_s), name="cube")
     unknown = Unknown(1000.0, 10.0, 1e5)
     return Problem(
         [experiment],
-        {
-            "lambda_pa": unknown,
-            "mu_pa": unknown,
-            "gamma_r_s": 0.01,
-            "gamma_m_1_s": 1.0,
-        },
+        {"lambda_pa": unknown, "mu_pa": unknown, "gamma_r_s": 0.01, "gamma_m_1_s": 1.0},
     )
 
 
@@ -71,9 +55,7 @@ def held_above(
 )
 def test_a_box_that_ends_beyond_its_nodes_is_reported(height_m, gap_mm):
     concerns = grasp_extent_concerns(held_above(height_m))
-    assert [each.code for each in concerns] == (
-        ["description/grasp-extent"] if gap_mm else []
-    )
+    assert [each.code for each in concerns] == (["description/grasp-extent"] if gap_mm else [])
     for concern in concerns:
         assert concern.grade == "check"
         assert f"ends {gap_mm:.3g} mm beyond" in concern.message
@@ -89,10 +71,7 @@ def test_of_recordings_that_are_declared_simulated_it_is_a_note():
     problem = held_above(0.075)
     assert grasp_extent_notes(problem) == []
     simulated = replace(
-        problem,
-        uncertainty=UncertaintyOptions(
-            assumptions=Assumptions(damping_law="none")
-        ),
+        problem, uncertainty=UncertaintyOptions(assumptions=Assumptions(damping_law="none"))
     )
     assert grasp_extent_concerns(simulated) == []
     (note,) = grasp_extent_notes(simulated)
@@ -100,7 +79,5 @@ def test_of_recordings_that_are_declared_simulated_it_is_a_note():
 
 
 def test_check_warns_before_a_solve():
-    messages = [
-        each.message for each in check_problem(held_above(0.075)).concerns
-    ]
+    messages = [each.message for each in check_problem(held_above(0.075)).concerns]
     assert any("ends 5 mm beyond the outermost nodes" in m for m in messages)

@@ -24,10 +24,7 @@ from collocation_sysid.recording import Experiment
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.estimates import Estimate, memory_notes
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import (
-    Uncertainty,
-    uncertainty_from_fit,
-)
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 NOISE_M = 2e-4
 
@@ -41,9 +38,7 @@ def found(experiment: Experiment) -> Uncertainty:
     parameters = guesses(ONE, 1.2)
     collocation = Collocation([noisy], parameters)
     solution = ReducedSpace()(collocation)
-    return uncertainty_from_fit(
-        linearise_fit(collocation, solution.z), parameters, solution.q
-    )
+    return uncertainty_from_fit(linearise_fit(collocation, solution.z), parameters, solution.q)
 
 
 def test_the_instantaneous_modulus_has_an_error_bar():
@@ -51,9 +46,7 @@ def test_the_instantaneous_modulus_has_an_error_bar():
     young = uncertainty.derived["young_pa"]
     at_once = uncertainty.derived["instantaneous_young_pa"]
     share = uncertainty.estimates["prony_1.share"]
-    assert at_once.value == pytest.approx(
-        young.value * (1 + share.value), rel=1e-12
-    )
+    assert at_once.value == pytest.approx(young.value * (1 + share.value), rel=1e-12)
     assert at_once.statistical95 is not None
     assert at_once.statistical95[0] < 720.0 * 1.4 < at_once.statistical95[1]
     assert share.statistical95 is not None
@@ -61,9 +54,7 @@ def test_the_instantaneous_modulus_has_an_error_bar():
 
 
 def test_a_memory_that_is_not_there_is_not_found():
-    forgetful = measured_with(
-        remembering("hung-cube", 40), ONE | {"prony_1.share": 0.0}
-    )
+    forgetful = measured_with(remembering("hung-cube", 40), ONE | {"prony_1.share": 0.0})
     uncertainty = found(forgetful)
     assert any("no memory" in note for note in uncertainty.notes)
     share = uncertainty.estimates["prony_1.share"]
@@ -72,19 +63,12 @@ def test_a_memory_that_is_not_there_is_not_found():
 
 
 def test_a_branch_slower_than_the_recordings_is_told():
-    slow = {
-        "prony_1.share": Estimate(0.3, 0.01, (0.28, 0.32)),
-        "prony_1.tau_s": Estimate(5.0),
-    }
+    slow = {"prony_1.share": Estimate(0.3, 0.01, (0.28, 0.32)), "prony_1.tau_s": Estimate(5.0)}
     (note,) = memory_notes(slow, 2.0)
     assert "slower than the longest recording of 2 s" in note
     assert not memory_notes(slow, 8.0)
-    (note,) = memory_notes(
-        slow | {"prony_1.share": Estimate(0.0, at_bound=True)}, 8.0
-    )
-    assert note.startswith(
-        "no memory was found: the share of prony_1 ended at 0"
-    )
+    (note,) = memory_notes(slow | {"prony_1.share": Estimate(0.0, at_bound=True)}, 8.0)
+    assert note.startswith("no memory was found: the share of prony_1 ended at 0")
 
 
 def test_constants_of_a_branch_have_symbols():
@@ -102,9 +86,7 @@ MEMORY = replace_text(
 
 def test_a_problem_file_describes_a_memory(tiny):
     MEMORY(tiny)
-    replace_text(
-        'nuisance = "none"', 'nuisance = "none"\nloaded_since_s = 2.5'
-    )(tiny)
+    replace_text('nuisance = "none"', 'nuisance = "none"\nloaded_since_s = 2.5')(tiny)
     problem = Problem.read(tiny / "problem.toml")
     (experiment,) = problem.experiments
     assert "prony_1.tau_s" in experiment.body.constants
@@ -120,28 +102,14 @@ GUESSED = "parameters.prony_1.tau_s.guess=0.1"
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        (
-            'name = "prony_1"',
-            'name = "prony_1"\nregion = "core"',
-            "belongs to the region 'core'",
-        ),
-        (
-            "prony_1.share = 0.2",
-            "prony_1.share = -0.2",
-            "expected a number >= 0",
-        ),
-        (
-            "prony_1.share = 0.2",
-            "prony_1.share = { lower = -1.0 }",
-            "expected 0 <= lower < upper",
-        ),
+        ('name = "prony_1"', 'name = "prony_1"\nregion = "core"', "belongs to the region 'core'"),
+        ("prony_1.share = 0.2", "prony_1.share = -0.2", "expected a number >= 0"),
+        ("prony_1.share = 0.2", "prony_1.share = { lower = -1.0 }", "expected 0 <= lower < upper"),
         ("prony_1.share = 0.2", "", "prony_1.share is missing"),
     ],
     ids=["region", "negative", "bound", "missing"],
 )
-def test_a_slip_in_the_memory_is_one_message(
-    tiny, old: str, new: str, expected: str
-):
+def test_a_slip_in_the_memory_is_one_message(tiny, old: str, new: str, expected: str):
     MEMORY(tiny)
     replace_text(old, new)(tiny)
     with pytest.raises(InputError, match=expected):
@@ -157,25 +125,15 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     assert isinstance(program, LiftedCollocation)
     assert findings.overstresses == lifted_count(program, "memory")
     assert findings.variables + findings.overstresses == program.variable_count
-    assert (
-        findings.constraints + findings.overstresses == program.constraint_count
-    )
+    assert findings.constraints + findings.overstresses == program.constraint_count
     assert findings.jacobian_nonzeros == len(program.jacobian_structure[1])
     assert findings.hessian_nonzeros == len(program.hessian_structure[1])
     assert findings.derivatives_agree
     assert findings.hessian_error > 0
-    assert {cost.method for cost in findings.costs} == {
-        "reduced-space",
-        "interior-point",
-    }
-    monkeypatch.setattr(
-        "collocation_sysid.runs.check.derivatives.MOST_LIFTED_NONZEROS", 0
-    )
+    assert {cost.method for cost in findings.costs} == {"reduced-space", "interior-point"}
+    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.MOST_LIFTED_NONZEROS", 0)
     checked = run_command("check", tiny / "problem.toml", *settings(GUESSED))
-    assert (
-        f"{findings.overstresses:,} additional variables and constraints"
-        in checked.out
-    )
+    assert f"{findings.overstresses:,} additional variables and constraints" in checked.out
     assert "τ prony_1" in checked.out
 
 
@@ -183,8 +141,6 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
 def test_a_problem_with_memory_is_solved_from_the_command_line(tiny):
     MEMORY(tiny)
     path, method = tiny / "problem.toml", "solver.method=interior-point"
-    solved = run_command(
-        "solve", path, *settings(GUESSED, method), "--out", tiny / "run"
-    )
+    solved = run_command("solve", path, *settings(GUESSED, method), "--out", tiny / "run")
     assert solved.code == 0, solved.err
     assert "instantaneous" in solved.out

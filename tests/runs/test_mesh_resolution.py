@@ -8,18 +8,10 @@ from pathlib import Path
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.runs.mesh_resolution import (
-    mesh_resolution_concerns,
-    mesh_resolution_notes,
-)
-from collocation_sysid.statistics.budget.discretisation_error import (
-    Refinement,
-    RefinementLevel,
-)
+from collocation_sysid.runs.mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
+from collocation_sysid.statistics.budget.discretisation_error import Refinement, RefinementLevel
 
-FOAM_CYLINDER = (
-    Path(__file__).parents[2] / "problems" / "foam_cylinder" / "problem.toml"
-)
+FOAM_CYLINDER = Path(__file__).parents[2] / "problems" / "foam_cylinder" / "problem.toml"
 LEVEL = RefinementLevel("mesh", 1, 1, 1, 1, 1.0, {})
 
 
@@ -41,10 +33,7 @@ def test_a_coarse_mesh_of_a_real_body_is_to_be_checked():
 def test_a_declared_simulation_has_a_note_instead():
     (concern,) = mesh_resolution_concerns(of_real_body(), None)
     exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
-    for problem in (
-        declared_simulated(),
-        replace(of_real_body(), uncertainty=exact),
-    ):
+    for problem in (declared_simulated(), replace(of_real_body(), uncertainty=exact)):
         assert mesh_resolution_concerns(problem, None) == []
         assert mesh_resolution_notes(problem) == [concern.message]
 
@@ -60,21 +49,15 @@ def test_a_solve_on_a_finer_mesh_answers_the_concern():
 
 def test_averaged_dilatation_has_a_note_only():
     body = cs.Body(
-        cs.box_mesh((0.03, 0.03, 0.12), (1, 1, 4)),
-        density_kg_m3=30.0,
-        element="tet10-p0",
+        cs.box_mesh((0.03, 0.03, 0.12), (1, 1, 4)), density_kg_m3=30.0, element="tet10-p0"
     )
     t_s = 0.01 * np.arange(5)
     poses = np.tile(np.eye(4), (5, 1, 1))
     grasp = cs.Grasp(cs.Box((-1, -1, -1), (1, 1, 1e-3)), poses)
-    markers = cs.Markers(
-        t_s, np.zeros((5, 1, 3)), sigma_m=1e-3, places_m=[(0.0, 0.0, 0.12)]
-    )
+    markers = cs.Markers(t_s, np.zeros((5, 1, 3)), sigma_m=1e-3, places_m=[(0.0, 0.0, 0.12)])
     rebuilt = cs.Experiment(body, t_s, [grasp], markers, name="bar")
     problem = cs.Problem(
-        [rebuilt],
-        {"mu_pa": cs.Unknown(), "poisson": 0.3, "gamma_r_s": 0.0}
-        | {"gamma_m_1_s": 0.0},
+        [rebuilt], {"mu_pa": cs.Unknown(), "poisson": 0.3, "gamma_r_s": 0.0} | {"gamma_m_1_s": 0.0}
     )
     assert mesh_resolution_concerns(problem, None) == []
     (note,) = mesh_resolution_notes(problem)
@@ -84,10 +67,7 @@ def test_averaged_dilatation_has_a_note_only():
 def test_a_mesh_matters_only_to_estimated_moduli_of_fitted_bodies():
     problem = of_real_body()
     known = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_m_1_s": 1.5}
-    damping = cs.Problem(
-        problem.experiments,
-        {**known, "gamma_r_s": cs.Unknown()},
-    )
+    damping = cs.Problem(problem.experiments, {**known, "gamma_r_s": cs.Unknown()})
     assert mesh_resolution_concerns(damping, None) == []
 
 

@@ -25,17 +25,9 @@ from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.result.pictures.mesh_pictures import mesh_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.warm_start import WarmStart
-from collocation_sysid.statistics.uncertainty import (
-    MarkerPlace,
-    marker_places,
-    uncertainty_at,
-)
+from collocation_sysid.statistics.uncertainty import MarkerPlace, marker_places, uncertainty_at
 
-PLACES_M = {
-    "low": [0.0, 0.0, 0.0],
-    "mid": [0.03, 0.02, 0.03],
-    "side": [0.06, 0.06, 0.03],
-}
+PLACES_M = {"low": [0.0, 0.0, 0.0], "mid": [0.03, 0.02, 0.03], "side": [0.06, 0.06, 0.03]}
 # One as it is, one 4 mm off, one not given.
 GIVEN = "{ low = [0.0, 0.0, 0.0], mid = [0.03, 0.024, 0.03] }"
 OPTIONS = settings(
@@ -110,9 +102,7 @@ def test_errors_on_the_surface_lie_in_its_face(folder: Path):
         assert (np.delete(place.std_error_m, across) > 1e-5).all()
 
 
-def places_at_the_guess(
-    folder: Path, overrides: tuple[str, ...]
-) -> dict[str, MarkerPlace]:
+def places_at_the_guess(folder: Path, overrides: tuple[str, ...]) -> dict[str, MarkerPlace]:
     """Places and errors that a solve from the truth would begin with."""
     problem = cs.Problem.read(folder / "problem.toml", [*AT_TRUTH, *overrides])
     collocation = problem.collocation()
@@ -123,17 +113,13 @@ def places_at_the_guess(
 
 def test_a_later_solve_starts_from_the_places_found(folder: Path, result: dict):
     earlier = WarmStart.read(folder / "run")
-    problem = earlier.apply_to_problem(
-        cs.Problem.read(folder / "problem.toml", OPTIONS[1::2])
-    )
+    problem = earlier.apply_to_problem(cs.Problem.read(folder / "problem.toml", OPTIONS[1::2]))
     collocation = earlier.apply_to_places(problem.collocation())
-    (segment,) = collocation.transcriptions
-    found = [
-        place["position_m"] for place in result["places"]["swing"].values()
-    ]
-    assert segment.marker_places_m(
-        segment.compute_guess_phi()
-    ) == pytest.approx(np.array(found), abs=1e-9)
+    (transcription,) = collocation.transcriptions
+    found = [place["position_m"] for place in result["places"]["swing"].values()]
+    assert transcription.marker_places_m(transcription.compute_guess_phi()) == pytest.approx(
+        np.array(found), abs=1e-9
+    )
     z = earlier.simulated_variables(collocation)
     assert z is not None
     again = cs.solve(problem, "reduced-space", start=folder / "run")
@@ -150,26 +136,19 @@ def test_places_travel_to_another_mesh(folder: Path):
     problem = earlier.apply_to_problem(
         cs.Problem.read(folder / "problem.toml", [*OPTIONS, *other][1::2])
     )
-    (segment,) = earlier.apply_to_places(problem.collocation()).transcriptions
-    places_m = segment.marker_places_m(segment.compute_guess_phi())
-    for m, name in enumerate(segment.experiment.markers.names):
-        assert places_m[m] == pytest.approx(
-            earlier.places_m["swing"][name], abs=1e-9
+    (transcription,) = earlier.apply_to_places(problem.collocation()).transcriptions
+    places_m = transcription.marker_places_m(transcription.compute_guess_phi())
+    for m, name in enumerate(transcription.experiment.markers.names):
+        assert places_m[m] == pytest.approx(earlier.places_m["swing"][name], abs=1e-9)
+        of_nodes, reading = transcription.markers.observable.shape_functions(
+            transcription.compute_guess_phi()
         )
-        of_nodes, reading = segment.markers.observable.shape_functions(
-            segment.compute_guess_phi()
-        )
-        there = reading.weights[m] @ segment.body.nodes_m[of_nodes[m]]
+        there = reading.weights[m] @ transcription.body.nodes_m[of_nodes[m]]
         assert there == pytest.approx(places_m[m], abs=1e-9)
 
 
-def test_a_record_without_places_is_no_start(
-    folder: Path, tmp_path: Path, result: dict
-):
-    broken = {
-        **result,
-        "places": {"swing": {"low": {"position_m": [1.0, 2.0]}}},
-    }
+def test_a_record_without_places_is_no_start(folder: Path, tmp_path: Path, result: dict):
+    broken = {**result, "places": {"swing": {"low": {"position_m": [1.0, 2.0]}}}}
     (tmp_path / "result.json").write_text(json.dumps(broken))
     with pytest.raises(cs.InputError, match="damaged"):
         WarmStart.read(tmp_path)
@@ -180,35 +159,20 @@ def test_a_record_without_places_is_no_start(
 
 def test_the_terminal_says_where_markers_are_and_the_priors(folder: Path):
     said = " ".join((folder / "printed.txt").read_text().split())
-    moved = re.search(
-        r"stated positions: up to ([\d.]+) mm \(mid; prior ±3 mm\)", said
-    )
+    moved = re.search(r"stated positions: up to ([\d.]+) mm \(mid; prior ±3 mm\)", said)
     assert moved is not None
     assert float(moved[1]) == pytest.approx(4.0, abs=0.2)
-    assert re.search(
-        r"positions of 1 marker, estimated to ±[\d.]+ mm \(prior ±124 mm\)",
-        said,
-    )
+    assert re.search(r"positions of 1 marker, estimated to ±[\d.]+ mm \(prior ±124 mm\)", said)
     assert re.search(r"tilt of gravity: [\d.e-]+° \(prior ±1°\)", said)
-    assert re.search(
-        r"rotation of the body in the gripper: [\d.e-]+° \(prior ±0.5°\)", said
-    )
-    assert re.search(
-        r"measured [\d.e-]+ ms (later|earlier) than stated \(prior ±5 ms\)",
-        said,
-    )
+    assert re.search(r"rotation of the body in the gripper: [\d.e-]+° \(prior ±0.5°\)", said)
+    assert re.search(r"measured [\d.e-]+ ms (later|earlier) than stated \(prior ±5 ms\)", said)
 
 
-def test_the_page_has_places_and_nuisance_parameters_in_their_units(
-    folder: Path,
-):
+def test_the_page_has_places_and_nuisance_parameters_in_their_units(folder: Path):
     page = folder / "page.html"
     assert run_command("report", folder / "run", "--to", page).code == 0
     text = page.read_text()
-    assert (
-        "Positions of the markers of &#39;swing&#39;" in text
-        or "markers of 'swing'" in text
-    )
+    assert "Positions of the markers of &#39;swing&#39;" in text or "markers of 'swing'" in text
     assert "not given" in text
     assert ">3 mm<" in text
     assert ">5 ms<" in text
@@ -218,15 +182,9 @@ def test_the_page_has_places_and_nuisance_parameters_in_their_units(
 
 def test_pictures_have_what_was_given_and_what_was_found(folder: Path):
     _, (seen,) = read_run(folder / "run")
-    assert np.isnan(seen.declared_places_m).any(axis=1).tolist() == [
-        False,
-        False,
-        True,
-    ]
+    assert np.isnan(seen.declared_places_m).any(axis=1).tolist() == [False, False, True]
     assert seen.marker_places_m[1] == pytest.approx(PLACES_M["mid"], abs=1e-3)
-    assert seen.declared_places_m[1] == pytest.approx(
-        [0.03, 0.024, 0.03], abs=1e-9
-    )
+    assert seen.declared_places_m[1] == pytest.approx([0.03, 0.024, 0.03], abs=1e-9)
     assert legend_of(seen.marker_places_m, seen.declared_places_m, seen) >= {
         "position not given", "position given",
     }  # fmt: skip
@@ -235,14 +193,8 @@ def test_pictures_have_what_was_given_and_what_was_found(folder: Path):
 
 
 def legend_of(places_m: np.ndarray, given_m: np.ndarray, seen) -> set[str]:
-    figure = mesh_picture(
-        replace(seen, marker_places_m=places_m, declared_places_m=given_m)
-    )
-    keys = [
-        child
-        for child in figure.axes[0].get_children()
-        if isinstance(child, Legend)
-    ]
+    figure = mesh_picture(replace(seen, marker_places_m=places_m, declared_places_m=given_m))
+    keys = [child for child in figure.axes[0].get_children() if isinstance(child, Legend)]
     return {text.get_text() for each in keys for text in each.get_texts()}
 
 

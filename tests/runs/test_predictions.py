@@ -45,22 +45,16 @@ def predicted(softer: float) -> cs.Run:
     """A swinging cube whose motion is predicted with stated parameters."""
     hung = hung_cube(30)
     tracks = cs.simulate(hung, TRUTH).markers_m
-    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(
-        tracks.shape
-    )
+    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
-    stated = {
-        n: v * softer if n.endswith("_pa") else v for n, v in TRUTH.items()
-    }
+    stated = {n: v * softer if n.endswith("_pa") else v for n, v in TRUTH.items()}
     problem = cs.Problem([replace(hung, markers=seen)], stated, substeps=4)
     return cs.run(problem, seek_causes=False)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("softer", "verdict"), [(1.0, "good"), (0.75, "check"), (0.3, "doubtful")]
-)
+@pytest.mark.parametrize(("softer", "verdict"), [(1.0, "good"), (0.75, "check"), (0.3, "doubtful")])
 def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
     finished = predicted(softer)
     assert finished.uncertainty is None
@@ -72,20 +66,13 @@ def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
         assert concern.grade == verdict
         assert "deviates from the markers by" in concern.message
         assert f"{rms_mm:.3g} mm RMS" in concern.message
-        assert concern.data["sigmas"] == pytest.approx(
-            rms_mm / np.sqrt(3), rel=0.01
-        )
+        assert concern.data["sigmas"] == pytest.approx(rms_mm / np.sqrt(3), rel=0.01)
 
 
 def test_few_numbers_that_are_off_by_chance_are_no_concern():
-    def grades(
-        sigmas: float, numbers: int, tame: float | None = None
-    ) -> list[str]:
+    def grades(sigmas: float, numbers: int, tame: float | None = None) -> list[str]:
         how = sigmas, tame or sigmas, numbers
-        return [
-            c.grade
-            for c in prediction_concerns("a", "the markers", "sigma_m", *how)
-        ]
+        return [c.grade for c in prediction_concerns("a", "the markers", "sigma_m", *how)]
 
     assert grades(1.4, 1000) == []
     assert grades(2.0, 1000) == ["check"]
@@ -96,16 +83,10 @@ def test_few_numbers_that_are_off_by_chance_are_no_concern():
 
 # Depth --------------------------------------------------------------------------------------------
 
-BAR_TRUTH = {
-    "young_pa": 1.5e5,
-    "poisson": 0.3,
-    "gamma_r_s": 1e-3,
-    "gamma_m_1_s": 0.1,
-}
+BAR_TRUTH = {"young_pa": 1.5e5, "poisson": 0.3, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
 POSE = np.array(  # looks along y at a bar from 0.3 m away
-    [[1, 0, 0, 0.06], [0, 0, 1, -0.3], [0, -1, 0, -0.01], [0, 0, 0, 1]],
-    dtype=float,
+    [[1, 0, 0, 0.06], [0, 0, 1, -0.3], [0, -1, 0, -0.01], [0, 0, 0, 1]], dtype=float
 )
 DEPTH_NOISE_M = 2e-4
 NOTHING = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
@@ -117,43 +98,24 @@ def bar() -> cs.Body:
     return cs.Body(mesh, density_kg_m3=1070.0)
 
 
-def hanging(
-    gravity: tuple[float, float, float], depth: cs.Depth, **changes
-) -> cs.Experiment:
+def hanging(gravity: tuple[float, float, float], depth: cs.Depth, **changes) -> cs.Experiment:
     """The bar held at one end, pulled towards the camera or away from it by gravity."""
-    held = cs.Grasp(
-        np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed()
-    )
-    settings = {
-        "kind": "static",
-        "nuisance": cs.Nuisance.none(),
-        "gravity_m_s2": gravity,
-    }
-    return cs.Experiment(
-        bar(), [0.0], [held], depths=[depth], **settings | changes
-    )
+    held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
+    settings = {"kind": "static", "nuisance": cs.Nuisance.none(), "gravity_m_s2": gravity}
+    return cs.Experiment(bar(), [0.0], [held], depths=[depth], **settings | changes)
 
 
 @cache
 def recorded(gravity: tuple[float, float, float], **changes) -> cs.Experiment:
     """The same with a depth image, taken at the truth."""
     x = cs.simulate(hanging(gravity, NOTHING), BAR_TRUTH).positions_m[0]
-    skin, camera = (
-        VisibleSurface.from_body(bar(), NOTHING),
-        cs.DepthCamera(MATRIX, pose=POSE),
-    )
+    skin, camera = (VisibleSurface.from_body(bar(), NOTHING), cs.DepthCamera(MATRIX, pose=POSE))
     shape_m = x[skin.nodes]
     image_m = cs.depth_image(
-        camera,
-        SHAPE,
-        (skin.subdivided_triangles(shape_m) - POSE[:3, 3]) @ POSE[:3, :3],
+        camera, SHAPE, (skin.subdivided_triangles(shape_m) - POSE[:3, 3]) @ POSE[:3, :3]
     )
-    image_m = image_m + DEPTH_NOISE_M * np.random.default_rng(0).normal(
-        size=SHAPE
-    )
-    depth = cs.Depth.of_images(
-        "front", image_m, camera, DEPTH_NOISE_M, spacing_m=0.004
-    )
+    image_m = image_m + DEPTH_NOISE_M * np.random.default_rng(0).normal(size=SHAPE)
+    depth = cs.Depth.of_images("front", image_m, camera, DEPTH_NOISE_M, spacing_m=0.004)
     return hanging(gravity, depth, **changes)
 
 
@@ -169,10 +131,7 @@ def image_predicted(young_pa: float) -> cs.Run:
 @pytest.mark.long
 def test_predicted_depth_is_compared_with_the_image_and_graded():
     right, wrong = image_predicted(1.5e5), image_predicted(0.3e5)
-    good, bad = (
-        each.rollouts["experiment"].error.depth["front"]
-        for each in (right, wrong)
-    )
+    good, bad = (each.rollouts["experiment"].error.depth["front"] for each in (right, wrong))
     assert right.trust.verdict == "good"
     assert good.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.25)
     assert good.share_beyond_gate == 0.0
@@ -180,14 +139,9 @@ def test_predicted_depth_is_compared_with_the_image_and_graded():
     assert "deviates from the depth of front by" in wrong.trust.reasons[0]
     assert bad.rms_m > 0.008
     found = stored(wrong)
-    assert (
-        found["rollout"]["experiment"]["depth"]["front"]["rms_m"] == bad.rms_m
-    )
+    assert found["rollout"]["experiment"]["depth"]["front"]["rms_m"] == bad.rms_m
     assert found["fit"]["experiment"]["depth"]["front"]["points"] > 100
-    assert (
-        f"depth of front {1e3 * bad.rms_m:.3g} mm RMS of {bad.points} points"
-        in shown(wrong)
-    )
+    assert f"depth of front {1e3 * bad.rms_m:.3g} mm RMS of {bad.points} points" in shown(wrong)
 
 
 def test_gate_and_rms_of_depth_belong_to_the_same_points():
@@ -195,13 +149,10 @@ def test_gate_and_rms_of_depth_belong_to_the_same_points():
     assert bad.gate_m == 0.01 < bad.reach_m
     assert bad.rms_within_gate_m <= bad.gate_m
     assert 0.1 < bad.share_beyond_gate < 0.9
-    beyond = (
-        bad.rms_m**2 - (1 - bad.share_beyond_gate) * bad.rms_within_gate_m**2
-    )
+    beyond = bad.rms_m**2 - (1 - bad.share_beyond_gate) * bad.rms_within_gate_m**2
     assert bad.gate_m < np.sqrt(beyond / bad.share_beyond_gate) <= bad.reach_m
-    assert (
-        f"{bad.share_beyond_gate:.0%} beyond the limit of 10 mm (gate_m)"
-        in shown(image_predicted(0.3e5))
+    assert f"{bad.share_beyond_gate:.0%} beyond the limit of 10 mm (gate_m)" in shown(
+        image_predicted(0.3e5)
     )
 
 
@@ -227,33 +178,23 @@ def test_depth_of_a_validation_recording_is_compared_drawn_and_judged():
     away = recorded((0.0, -9.81, 0.0), name="away", validation=True)
     wrong = replace(away, gravity_m_s2=(0.0, 0.0, -9.81), name="wrong")
     unknown = BAR_TRUTH | {"young_pa": cs.Unknown(1.4e5)}
-    finished = cs.run(
-        cs.Problem([fitted, away, wrong], unknown), seek_causes=False
-    )
+    finished = cs.run(cs.Problem([fitted, away, wrong], unknown), seek_causes=False)
     (predicted,) = finished.rollouts["away"].error.depth.values()
     assert isinstance(predicted, DepthError)
     assert predicted.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.3)
-    drawn = {
-        replay.name: replay.visible_points for replay in replays(finished)
-    }["away"]["front"]
+    drawn = {replay.name: replay.visible_points for replay in replays(finished)}["away"]["front"]
     assert np.isfinite(drawn[:, 4]).sum() == predicted.points
     assert "points of depth cameras cannot be compared" in shown(finished)
-    (concern,) = (
-        c for c in finished.trust.concerns if c.code == "roll-out/predicted"
-    )
+    (concern,) = (c for c in finished.trust.concerns if c.code == "roll-out/predicted")
     assert concern.data["experiment"] == "wrong/front"
 
 
 # Yardsticks of a validation recording -------------------------------------------------------------
 
 
-def swing(
-    name: str, late_s: float, seed: int, steps: int = 16, **changes
-) -> cs.Experiment:
+def swing(name: str, late_s: float, seed: int, steps: int = 16, **changes) -> cs.Experiment:
     """The cube, swung alike every time, seen by cameras that are late."""
-    hung = hung_cube(
-        steps, nuisance=cs.Nuisance.none(time_shift_s=5e-3), **changes
-    )
+    hung = hung_cube(steps, nuisance=cs.Nuisance.none(time_shift_s=5e-3), **changes)
     tracks = CubicSpline(hung.t_s, cs.simulate(hung, TRUTH).markers_m)
     seen = tracks(np.maximum(hung.t_s - late_s, 0.0))
     seen = seen + 2e-4 * np.random.default_rng(seed).standard_normal(seen.shape)
@@ -266,10 +207,7 @@ def swing(
 def validated(late_s: float) -> cs.Run:
     """A recording that is predicted from another, whose cameras are 4 ms late."""
     unknown = {**TRUTH, "mu_pa": cs.Unknown(290.0)}
-    both = [
-        swing("fitted", 4e-3, 0),
-        replace(swing("new", late_s, 1), validation=True),
-    ]
+    both = [swing("fitted", 4e-3, 0), replace(swing("new", late_s, 1), validation=True)]
     finished = cs.run(cs.Problem(both, unknown, substeps=3), seek_causes=False)
     return finished
 
@@ -284,21 +222,12 @@ def test_a_blind_prediction_has_the_nuisance_parameters_of_the_fitted_recordings
     assert alike.rollouts["new"].blind_error.rms_m == pytest.approx(
         alike.rollouts["new"].rms_m, rel=0.05
     )
-    assert (
-        other.rollouts["new"].blind_error.rms_m
-        > 3 * other.rollouts["new"].rms_m
-    )
+    assert other.rollouts["new"].blind_error.rms_m > 3 * other.rollouts["new"].rms_m
     found = stored(other)["rollout"]
-    assert (
-        found["new"]["blind"]["rms_m"]
-        == other.rollouts["new"].blind_error.rms_m
-    )
+    assert found["new"]["blind"]["rms_m"] == other.rollouts["new"].blind_error.rms_m
     assert "blind" not in found["fitted"]
     said = shown(other)
-    assert (
-        "with the nuisance parameters of the fitted recordings (blind): "
-        in said
-    )
+    assert "with the nuisance parameters of the fitted recordings (blind): " in said
     assert f"{1e3 * other.rollouts['new'].blind_error.rms_m:.3f} mm RMS" in said
 
 
@@ -307,9 +236,7 @@ def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
     copied = alike.rollouts["new"].copy_error
     assert isinstance(copied, CopyError)
     assert copied.copied == "fitted"
-    assert copied.error.rms_m == pytest.approx(
-        np.sqrt(6) * 2e-4, rel=0.1
-    )  # the noise of both
+    assert copied.error.rms_m == pytest.approx(np.sqrt(6) * 2e-4, rel=0.1)  # the noise of both
     assert stored(alike)["rollout"]["new"]["copied"]["copied"] == "fitted"
     assert "the measurements of 'fitted' as the prediction: " in shown(alike)
 
@@ -324,15 +251,7 @@ def test_the_nearest_recording_is_copied_or_the_output_says_why_none_is():
     assert nearest_recording_error(new, [swing("long", 0.0, 2, steps=17)]) == (
         "no fitted recording has the same samples (long: 18 samples instead of 17)"
     )
-    faster = replace(
-        near,
-        t_s=0.9 * near.t_s,
-        markers=replace(near.markers, t_s=0.9 * near.t_s),
-    )
+    faster = replace(near, t_s=0.9 * near.t_s, markers=replace(near.markers, t_s=0.9 * near.t_s))
     assert "other times" in nearest_recording_error(new, [faster])
-    renamed = replace(
-        near.markers, names=[f"{name}'" for name in near.markers.names]
-    )
-    assert "other markers" in nearest_recording_error(
-        new, [replace(near, markers=renamed)]
-    )
+    renamed = replace(near.markers, names=[f"{name}'" for name in near.markers.names])
+    assert "other markers" in nearest_recording_error(new, [replace(near, markers=renamed)])

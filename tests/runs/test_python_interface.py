@@ -13,16 +13,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from IPython.core.formatters import DisplayFormatter
-from kit.problems import (
-    EDGE_M,
-    TRUTH,
-    box,
-    hung_cube,
-    measured,
-    noisy,
-    smooth_poses,
-    times,
-)
+from kit.problems import EDGE_M, TRUTH, box, hung_cube, measured, noisy, smooth_poses, times
 from matplotlib.collections import PolyCollection
 
 import collocation_sysid as cs
@@ -51,27 +42,18 @@ def lifted(t_s: np.ndarray) -> np.ndarray:
 
 def seen(t_s: np.ndarray, **changes) -> cs.Markers:
     """Two markers that are not measured yet."""
-    given = {
-        "sigma_m": 1e-3,
-        "places_m": [(0.0, 0.0, 0.0), (0.07, 0.03, 0.02)],
-        **changes,
-    }
+    given = {"sigma_m": 1e-3, "places_m": [(0.0, 0.0, 0.0), (0.07, 0.03, 0.02)], **changes}
     return cs.Markers(t_s, np.zeros((len(t_s), 2, 3)), **given)
 
 
 def swung(body: cs.Body, **changes) -> cs.Experiment:
     t_s = times(10)
-    return cs.Experiment(
-        body, t_s, [cs.Grasp(TOP, lifted(t_s))], seen(t_s), **changes
-    )
+    return cs.Experiment(body, t_s, [cs.Grasp(TOP, lifted(t_s))], seen(t_s), **changes)
 
 
 @cache
 def identified() -> cs.Run:
-    return cs.run(
-        cs.Problem([noisy(hung_cube())], UNKNOWN, title="A cube"),
-        seek_causes=False,
-    )
+    return cs.run(cs.Problem([noisy(hung_cube())], UNKNOWN, title="A cube"), seek_causes=False)
 
 
 # Arrays -------------------------------------------------------------------------------------------
@@ -80,27 +62,17 @@ def identified() -> cs.Run:
 def test_an_experiment_finds_nodes_poses_and_places_on_its_body():
     swing = swung(box())
     (grasp,) = swing.grasps
-    np.testing.assert_array_equal(
-        grasp.nodes, np.flatnonzero(box().nodes_m[:, 2] > 0.09)
-    )
-    np.testing.assert_allclose(
-        grasp.poses.at(swing.t_s)[0], lifted(swing.t_s)[:, :3, :3]
-    )
+    np.testing.assert_array_equal(grasp.nodes, np.flatnonzero(box().nodes_m[:, 2] > 0.09))
+    np.testing.assert_allclose(grasp.poses.at(swing.t_s)[0], lifted(swing.t_s)[:, :3, :3])
     assert swing.markers.names == ("m1", "m2")
     places = swing.markers.predict_positions(box().nodes_m)
-    np.testing.assert_allclose(
-        places, [(0.0, 0.0, 0.0), (0.07, 0.03, 0.02)], atol=1e-12
-    )
+    np.testing.assert_allclose(places, [(0.0, 0.0, 0.0), (0.07, 0.03, 0.02)], atol=1e-12)
     np.testing.assert_array_equal(swing.gravity_m_s2, [0.0, 0.0, -9.81])
 
 
 def test_loads_are_on_selected_nodes_too():
     low = cs.Ball((0.0, 0.0, 0.0), 0.01)
-    swing = swung(
-        box(),
-        masses=[cs.PointMass(low, 0.1)],
-        forces=[cs.Force(low, (0, 0, 1.0))],
-    )
+    swing = swung(box(), masses=[cs.PointMass(low, 0.1)], forces=[cs.Force(low, (0, 0, 1.0))])
     np.testing.assert_array_equal(swing.masses[0].nodes, [0])
     np.testing.assert_array_equal(swing.forces[0].nodes, [0])
 
@@ -125,18 +97,14 @@ def test_markers_without_places_start_where_the_first_samples_are():
 def test_markers_have_places_or_a_placement():
     swing = swung(box())
     places, placement = [(0.0, 0.0, 0.0)] * 2, swing.markers.placement
-    with pytest.raises(
-        cs.InputError, match=r"places_m and a placement; expected one of them"
-    ):
+    with pytest.raises(cs.InputError, match=r"places_m and a placement; expected one of them"):
         seen(times(3), places_m=places, placement=placement)
 
 
 def test_a_marker_far_from_the_body_is_refused():
     t_s = times(10)
     far = seen(t_s, places_m=[(0.0, 0.0, 0.0), (0.5, 0.0, 0.0)])
-    with pytest.raises(
-        cs.InputError, match=r"experiment 'experiment': marker 'm2' at .* away"
-    ):
+    with pytest.raises(cs.InputError, match=r"experiment 'experiment': marker 'm2' at .* away"):
         cs.Experiment(box(), t_s, [cs.Grasp(TOP, lifted(t_s))], far)
 
 
@@ -145,25 +113,18 @@ def test_a_matrix_that_is_no_rigid_motion_is_refused():
     poses = lifted(t_s)
     poses[4, 0, 0] = 2.0
     with pytest.raises(
-        cs.InputError,
-        match=r"matrix 5: the matrix at t_s = 0.04 is not a rotation",
+        cs.InputError, match=r"matrix 5: the matrix at t_s = 0.04 is not a rotation"
     ):
         cs.Experiment(box(), t_s, [cs.Grasp(TOP, poses)], seen(t_s))
 
 
 def test_experiments_of_one_problem_have_different_names():
-    with pytest.raises(
-        cs.InputError, match=r"two experiments are named 'experiment'"
-    ):
+    with pytest.raises(cs.InputError, match=r"two experiments are named 'experiment'"):
         cs.Problem([swung(box()), swung(box())], UNKNOWN)
 
 
 def test_things_say_what_they_are():
-    shown = repr(
-        cs.Problem(
-            [hung_cube()], UNKNOWN | {"gamma_m_1_s": 1.0}, title="A cube"
-        )
-    )
+    shown = repr(cs.Problem([hung_cube()], UNKNOWN | {"gamma_m_1_s": 1.0}, title="A cube"))
     assert shown.startswith(
         "Problem('A cube', experiments 'hung cube'; Parameters(lambda_pa = 200,"
     )
@@ -182,26 +143,18 @@ def test_a_run_tells_its_parameters_with_their_error_bars():
     assert lower < run.parameters["mu_pa"] < upper
     assert lower < TRUTH["mu_pa"] < upper
     assert 0 < run.std_error("mu_pa") < 30
-    assert np.isnan(
-        [*run.interval("lambda_pa"), run.std_error("lambda_pa")]
-    ).all()  # fixed
-    assert np.isfinite(
-        [*run.interval("young_pa"), run.std_error("young_pa")]
-    ).all()
+    assert np.isnan([*run.interval("lambda_pa"), run.std_error("lambda_pa")]).all()  # fixed
+    assert np.isfinite([*run.interval("young_pa"), run.std_error("young_pa")]).all()
     assert run.derived["poisson"] == pytest.approx(0.2, abs=0.05)
     assert "μ Pa" in run.table()
     assert f"mu_pa = {run.parameters['mu_pa']:.5g} ±" in repr(run)
-    with pytest.raises(
-        cs.InputError, match=r"no parameter 'mu'; .* did you mean 'mu_pa'?"
-    ):
+    with pytest.raises(cs.InputError, match=r"no parameter 'mu'; .* did you mean 'mu_pa'?"):
         run.interval("mu")
 
 
 def test_intervals_of_a_run_that_has_not_converged_are_nan():
     method = cs.ReducedSpace(max_iterations=1)
-    run = cs.run(
-        cs.Problem([noisy(hung_cube())], UNKNOWN), method, seek_causes=False
-    )
+    run = cs.run(cs.Problem([noisy(hung_cube())], UNKNOWN), method, seek_causes=False)
     assert not run.solution.status.converged
     low, high = run.interval("mu_pa")
     assert np.isnan([low, high, run.std_error("mu_pa")]).all()
@@ -209,10 +162,7 @@ def test_intervals_of_a_run_that_has_not_converged_are_nan():
 
 def test_a_printed_run_has_all_that_the_terminal_shows():
     noted = cs.run(
-        cs.Problem(
-            [noisy(hung_cube())], UNKNOWN, notes=("seen through glass",)
-        ),
-        seek_causes=False,
+        cs.Problem([noisy(hung_cube())], UNKNOWN, notes=("seen through glass",)), seek_causes=False
     )
     shown = str(noted)
     assert noted.table() in shown
@@ -229,9 +179,7 @@ def test_a_printed_run_has_all_that_the_terminal_shows():
 
 def test_a_run_becomes_a_data_frame(monkeypatch):
     given = {}
-    frame = SimpleNamespace(
-        from_dict=lambda rows, orient: given.update(rows) or orient
-    )
+    frame = SimpleNamespace(from_dict=lambda rows, orient: given.update(rows) or orient)
     monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=frame))
     assert identified().to_frame() == "index"
     numbers = ["std_error", "lower", "upper"]
@@ -240,9 +188,7 @@ def test_a_run_becomes_a_data_frame(monkeypatch):
     columns = ["value", *combined, *statistical, "verdict", "guess", "unit"]
     assert list(given["mu_pa"]) == columns
     assert given["mu_pa"]["verdict"] == "good"
-    assert (
-        given["mu_pa"]["combined_lower"] < given["mu_pa"]["statistical_lower"]
-    )
+    assert given["mu_pa"]["combined_lower"] < given["mu_pa"]["statistical_lower"]
     assert (given["mu_pa"]["guess"], given["mu_pa"]["unit"]) == (150.0, "Pa")
     assert np.isnan(given["lambda_pa"]["combined_std_error"])
 
@@ -267,38 +213,27 @@ def test_a_notebook_shows_the_body_of_a_run_once():
     assert set(shown) == {"image/png", "text/plain"}
 
 
-@pytest.mark.parametrize(
-    "field", ["von_mises_pa", "energy_density_j_m3", "det_f"]
-)
+@pytest.mark.parametrize("field", ["von_mises_pa", "energy_density_j_m3", "det_f"])
 def test_a_drawn_body_is_coloured_by_what_its_material_feels(field):
     run = identified()
     (positions_m,), body = run.solution.positions_m, run.problem.bodies[0]
-    felt = ElementFields.from_body(
-        body, body.theta_from_values(run.parameters)
-    ).evaluate_at(positions_m[[0, -1]])[field]
+    felt = ElementFields.from_body(body, body.theta_from_values(run.parameters)).evaluate_at(
+        positions_m[[0, -1]]
+    )[field]
     (bar,) = run.plot(field=field, count=2).axes[0].child_axes
     low, high = bar.get_ylim()
     outer = felt[:, body.mesh.surface_cells]
     assert high == pytest.approx(outer.max(), rel=1e-6)
-    assert (
-        low == pytest.approx(outer.min(), rel=1e-6)
-        or low == 0 < outer.min() < high / 5
-    )
+    assert low == pytest.approx(outer.min(), rel=1e-6) or low == 0 < outer.min() < high / 5
 
 
 def test_what_cannot_be_drawn_is_told_with_what_can():
-    with pytest.raises(
-        cs.InputError, match=r"'det'; expected .* did you mean 'det_f'\?"
-    ):
+    with pytest.raises(cs.InputError, match=r"'det'; expected .* did you mean 'det_f'\?"):
         identified().plot(field="det")
-    with pytest.raises(
-        cs.InputError, match=r"found 'sway'; expected one of hung cube"
-    ):
+    with pytest.raises(cs.InputError, match=r"found 'sway'; expected one of hung cube"):
         identified().plot("sway")
     for count in (0, 21):
-        with pytest.raises(
-            cs.InputError, match=rf"count is {count}; expected 1 to 20 shapes"
-        ):
+        with pytest.raises(cs.InputError, match=rf"count is {count}; expected 1 to 20 shapes"):
             identified().plot(count=count)
 
 
@@ -309,11 +244,7 @@ def test_what_cannot_be_drawn_is_told_with_what_can():
 def two_specimens() -> cs.Problem:
     """A soft cube and a bar with a core, which share a material's μ."""
     core = cs.Region("core", cs.Box((0.0, 0.0, 0.0), (0.05, 1.0, 1.0)))
-    bar = cs.Body(
-        box_mesh((0.1, 0.05, EDGE_M), (2, 1, 3)),
-        density_kg_m3=40.0,
-        regions=[core],
-    )
+    bar = cs.Body(box_mesh((0.1, 0.05, EDGE_M), (2, 1, 3)), density_kg_m3=40.0, regions=[core])
     truth = {**TRUTH, "core.mu_pa": 500.0}
     shared = {**UNKNOWN, "core.mu_pa": cs.Unknown(guess=300.0)}
     made = []
@@ -335,15 +266,10 @@ def test_two_bodies_share_a_parameter_by_name(tmp_path):
     assert run.solution.status.converged
     assert run.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
     assert run.parameters["core.mu_pa"] == pytest.approx(500.0, rel=1e-4)
-    assert {
-        name: getattr(found, "rms_m", found)
-        for name, found in run.rollouts.items()
-    } == {
+    assert {name: getattr(found, "rms_m", found) for name, found in run.rollouts.items()} == {
         name: pytest.approx(0.0, abs=1e-6) for name in ("cube", "bar", "again")
     }
-    result = json.loads(
-        (run.save(tmp_path / "run", frames=False) / "result.json").read_text()
-    )
+    result = json.loads((run.save(tmp_path / "run", frames=False) / "result.json").read_text())
     nodes = [len(body.nodes_m) for body in two_specimens().bodies]
     assert result["problem"]["nodes"] == sum(nodes)
     assert len(result["provenance"]["mesh_sha256"]) == 2
@@ -354,19 +280,14 @@ def test_a_body_that_was_only_predicted_is_drawn_with_its_regions():
     assert not axes.child_axes
     skins = [c for c in axes.collections if isinstance(c, PolyCollection)]
     assert len(skins) == 2
-    reds_over_blues = {
-        round(r / b, 2) for r, _, b, _ in skins[0].get_facecolor()
-    }
+    reds_over_blues = {round(r / b, 2) for r, _, b, _ in skins[0].get_facecolor()}
     assert len(reds_over_blues) == 2
 
 
 def test_a_check_looks_at_every_body():
     findings = check_problem(two_specimens())
     assert findings.derivatives_agree
-    assert [body.experiments for body in findings.bodies] == [
-        ("cube",),
-        ("bar", "again"),
-    ]
+    assert [body.experiments for body in findings.bodies] == [("cube",), ("bar", "again")]
     whole = two_specimens().collocation()
     assert findings.jacobian_nonzeros == len(whole.jacobian_structure[1])
     assert findings.hessian_nonzeros == len(whole.hessian_structure[1])
@@ -377,54 +298,33 @@ def test_a_check_looks_at_every_body():
 THETA_RULE = cs.Scheme(
     "theta-0.6",
     order=1,
-    regular=cs.Stencil(
-        p=(0.6, 0.4), q=(1.0, -1.0), w=(0.6, 0.4), s=(1.0, -2.0, 1.0)
-    ),
-    start=(
-        cs.Stencil(
-            p=(0.6, 0.4), q=(1.0, -1.0), w=(0.6,), s=(1.0, -1.0), r=-1.0
-        ),
-    ),
+    regular=cs.Stencil(p=(0.6, 0.4), q=(1.0, -1.0), w=(0.6, 0.4), s=(1.0, -2.0, 1.0)),
+    start=(cs.Stencil(p=(0.6, 0.4), q=(1.0, -1.0), w=(0.6,), s=(1.0, -1.0), r=-1.0),),
 )
 
 
 def test_a_scheme_of_ones_own_runs(tmp_path):
     cube = hung_cube()
-    cube = cs.with_markers(
-        cube, cs.simulate(cube, TRUTH, THETA_RULE, substeps=1).markers_m
-    )
+    cube = cs.with_markers(cube, cs.simulate(cube, TRUTH, THETA_RULE, substeps=1).markers_m)
     rollout = cs.RolloutOptions("scheme")
-    run = cs.run(
-        cs.Problem([cube], UNKNOWN, scheme=THETA_RULE, rollout=rollout),
-        seek_causes=False,
-    )
+    run = cs.run(cs.Problem([cube], UNKNOWN, scheme=THETA_RULE, rollout=rollout), seek_causes=False)
     assert run.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
     found = run.rollouts["hung cube"]
     assert getattr(found, "rms_m", 1.0) < 1e-6
-    result = json.loads(
-        (run.save(tmp_path / "run", frames=False) / "result.json").read_text()
-    )
+    result = json.loads((run.save(tmp_path / "run", frames=False) / "result.json").read_text())
     assert result["problem"]["scheme"] == "theta-0.6"
 
 
 def test_a_function_is_a_method():
     def halving(collocation, watch=None, start=None):
-        return replace(
-            cs.ReducedSpace(ladder=(0.5, 1.0))(collocation, watch, start),
-            method="mine",
-        )
+        return replace(cs.ReducedSpace(ladder=(0.5, 1.0))(collocation, watch, start), method="mine")
 
     problem = cs.Problem([measured(hung_cube())], UNKNOWN, substeps=1)
     for asked in ((problem, halving), (replace(problem, method=halving),)):
         run = cs.run(*asked, seek_causes=False)
         assert run.solution.method == "mine"
-        assert run.solution.parameters["mu_pa"] == pytest.approx(
-            300.0, rel=1e-4
-        )
-    assert (
-        cs.solve(replace(problem, methods={"mine": halving}), "mine").method
-        == "mine"
-    )
+        assert run.solution.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
+    assert cs.solve(replace(problem, methods={"mine": halving}), "mine").method == "mine"
 
 
 def test_options_of_ones_own_are_a_method():
@@ -434,19 +334,11 @@ def test_options_of_ones_own_are_a_method():
         tolerance: float = 1e-3
 
         def __call__(self, collocation, watch=None, start=None):
-            rough = cs.ReducedSpace(tolerance=self.tolerance)(
-                collocation, watch, start
-            )
-            return replace(
-                cs.InteriorPoint()(collocation, watch, rough.z),
-                method=self.name,
-            )
+            rough = cs.ReducedSpace(tolerance=self.tolerance)(collocation, watch, start)
+            return replace(cs.InteriorPoint()(collocation, watch, rough.z), method=self.name)
 
     problem = cs.Problem(
-        [measured(hung_cube())],
-        UNKNOWN,
-        substeps=1,
-        method=Polished(tolerance=1e-2),
+        [measured(hung_cube())], UNKNOWN, substeps=1, method=Polished(tolerance=1e-2)
     )
     run = cs.run(problem, seek_causes=False)
     assert run.solution.method == "polished"
@@ -458,31 +350,21 @@ def test_a_function_is_a_material():
     def fung(F, mu_pa, lambda_pa):
         jacobian = ca.det(F)
         strain = ca.trace(F.T @ F) - 3 - 2 * ca.log(jacobian)
-        return (
-            mu_pa / 2 * (ca.exp(0.3 * strain) - 1) / 0.3
-            + lambda_pa / 2 * ca.log(jacobian) ** 2
-        )
+        return mu_pa / 2 * (ca.exp(0.3 * strain) - 1) / 0.3 + lambda_pa / 2 * ca.log(jacobian) ** 2
 
-    body = cs.Body(
-        box_mesh((EDGE_M,) * 3, (1, 1, 2)), material=fung, density_kg_m3=30.0
-    )
+    body = cs.Body(box_mesh((EDGE_M,) * 3, (1, 1, 2)), material=fung, density_kg_m3=30.0)
     swing = swung(body)
-    swing = cs.with_markers(
-        swing, cs.simulate(swing, TRUTH, "midpoint", substeps=1).markers_m
-    )
+    swing = cs.with_markers(swing, cs.simulate(swing, TRUTH, "midpoint", substeps=1).markers_m)
     run = cs.run(cs.Problem([swing], UNKNOWN), seek_causes=False)
     assert run.solution.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
 
 
 def test_wrong_options_name_what_is_possible():
     with pytest.raises(
-        cs.InputError,
-        match=r"integrator: found 'newmrk'; .*did you mean 'newmark'",
+        cs.InputError, match=r"integrator: found 'newmrk'; .*did you mean 'newmark'"
     ):
         cs.RolloutOptions(integrator="newmrk")  # type: ignore[arg-type]
     with pytest.raises(cs.InputError, match=r"no scheme 'midpont'"):
         cs.Problem([hung_cube()], UNKNOWN, scheme="midpont")
-    with pytest.raises(
-        cs.InputError, match=r"method: found 'newton'; expected one of"
-    ):
+    with pytest.raises(cs.InputError, match=r"method: found 'newton'; expected one of"):
         cs.Problem([hung_cube()], UNKNOWN, method="newton")

@@ -17,11 +17,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import Run, run
-from collocation_sysid.problem import (
-    Problem,
-    RolloutOptions,
-    UncertaintyOptions,
-)
+from collocation_sysid.problem import Problem, RolloutOptions, UncertaintyOptions
 from collocation_sysid.result.run_sections import refinement_table
 from collocation_sysid.runs.numerical_error import refine
 from collocation_sysid.statistics.assessment import numerical_concerns
@@ -34,19 +30,12 @@ from collocation_sysid.statistics.estimates import Estimate
 
 FREE = ("mu_pa", "gamma_r_s")
 # Lower bounds of `write_problem`.
-LOWER = {
-    "lambda_pa": 10.0,
-    "mu_pa": 10.0,
-    "gamma_r_s": 1e-5,
-    "gamma_m_1_s": 1e-3,
-}
+LOWER = {"lambda_pa": 10.0, "mu_pa": 10.0, "gamma_r_s": 1e-5, "gamma_m_1_s": 1e-3}
 
 
 def errors_of(x, order, levels=3, **options):
     """Errors of a quantity whose logarithm is x + h^order at h = 1."""
-    values = [
-        float(np.exp(x + 0.1 * 2.0 ** (-order * k))) for k in range(levels)
-    ]
+    values = [float(np.exp(x + 0.1 * 2.0 ** (-order * k))) for k in range(levels)]
     answer = Estimate(values[0], 1.0, (values[0] / 1.01, values[0] * 1.01))
     return discretisation_error("mu_pa", answer, values[1:], [], **options)
 
@@ -63,22 +52,14 @@ def test_two_levels_hold_the_limit_of_any_order_from_one_upwards():
     for order in (1.05, 2.0, 4.0):
         low, high = errors_of(5.0, order, levels=2).interval95 or (0, 0)
         assert low < np.exp(5.0) < high
-    assert errors_of(5.0, 2.0, levels=2).extrapolated == pytest.approx(
-        np.exp(5.0)
-    )
+    assert errors_of(5.0, 2.0, levels=2).extrapolated == pytest.approx(np.exp(5.0))
 
 
 def test_the_mesh_may_converge_more_slowly():
     for order in (0.55, 1.0, 2.0, 4.0):
-        values = [
-            float(np.exp(5.0 - 0.1 * 2.0 ** (-order * k))) for k in range(2)
-        ]
-        answer = Estimate(
-            values[0], 0.01, (values[0] * 0.9999, values[0] * 1.0001)
-        )
-        low, high = discretisation_error(
-            "mu_pa", answer, [], values[1:]
-        ).interval95 or (0, 0)
+        values = [float(np.exp(5.0 - 0.1 * 2.0 ** (-order * k))) for k in range(2)]
+        answer = Estimate(values[0], 0.01, (values[0] * 0.9999, values[0] * 1.0001))
+        low, high = discretisation_error("mu_pa", answer, [], values[1:]).interval95 or (0, 0)
         assert low < np.exp(5.0) < high
 
 
@@ -92,9 +73,7 @@ def test_without_numerical_error_the_interval_is_that_of_the_noise():
 
 
 def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
-    found = discretisation_error(
-        "mu_pa", Estimate(100.0, 1.0, (98, 102)), [110.0, 121.0], []
-    )
+    found = discretisation_error("mu_pa", Estimate(100.0, 1.0, (98, 102)), [110.0, 121.0], [])
     assert found.step_order is None
     assert found.extrapolated == pytest.approx(121.0)
     low, high = found.interval95 or (0, 0)
@@ -105,20 +84,13 @@ def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
 @pytest.mark.parametrize(("value", "half_step"), [(-0.1, -0.11), (0.01, -0.01)])
 def test_a_poisson_ratio_below_zero_has_an_interval(value, half_step):
     estimate = Estimate(value, 0.02, (value - 0.04, value + 0.04))
-    low, high = discretisation_error(
-        "poisson", estimate, [half_step], []
-    ).interval95 or (0, 0)
+    low, high = discretisation_error("poisson", estimate, [half_step], []).interval95 or (0, 0)
     assert low < value + 4 / 3 * (half_step - value) < high
     assert high - low == pytest.approx(0.08, rel=0.1)
 
 
 def test_an_estimate_without_an_interval_gets_none():
-    assert (
-        discretisation_error(
-            "mu_pa", Estimate(100.0), [101.0], [99.0]
-        ).interval95
-        is None
-    )
+    assert discretisation_error("mu_pa", Estimate(100.0), [101.0], [99.0]).interval95 is None
 
 
 # On problems
@@ -127,18 +99,12 @@ def test_an_estimate_without_an_interval_gets_none():
 def coarse() -> Problem:
     """Data of a step four times finer, on the same mesh."""
     guess = GUESS.with_guess(TRUTH)
-    items = [
-        i if i.name in FREE else replace(i, is_fixed=True) for i in guess.items
-    ]
+    items = [i if i.name in FREE else replace(i, is_fixed=True) for i in guess.items]
     experiment = measured(hung_cube(16, divisions=(1, 1, 2)), substeps=4)
     sigma_m = np.full(len(experiment.markers.names), 1e-5)
-    seen = replace(
-        experiment, markers=replace(experiment.markers, sigma_m=sigma_m)
-    )
+    seen = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m))
     exact = UncertaintyOptions(assumptions=Assumptions.exact())
-    return Problem(
-        [seen], Parameters(tuple(items)), substeps=1, uncertainty=exact
-    )
+    return Problem([seen], Parameters(tuple(items)), substeps=1, uncertainty=exact)
 
 
 @pytest.fixture(scope="module")
@@ -164,9 +130,7 @@ def refined(answer, progress) -> Run:
 def test_each_solve_reports_its_name_and_iterations(refined, progress):
     names = [each for each in progress if "halved" in each]
     assert names == [
-        f"solving again: {kind} halved {level}×"
-        for kind in ("step", "mesh")
-        for level in (1, 2)
+        f"solving again: {kind} halved {level}×" for kind in ("step", "mesh") for level in (1, 2)
     ]
     first, second = (progress.index(name) for name in names[:2])
     assert "1" in progress[first:second]
@@ -190,24 +154,18 @@ def test_halving_the_step_leads_to_the_truth(refined):
 
 def test_finer_answers_start_from_the_coarser(refined):
     assert refined.refinement is not None
-    halved = [
-        (level.refined, level.halvings) for level in refined.refinement.levels
-    ]
+    halved = [(level.refined, level.halvings) for level in refined.refinement.levels]
     assert halved == [("step", 1), ("step", 2), ("mesh", 1), ("mesh", 2)]
     assert max(level.iterations for level in refined.refinement.levels) <= 6
     assert set(refined.refinement.errors) == {*FREE, "young_pa", "poisson"}
 
 
-def test_the_estimate_from_the_roll_out_is_that_of_half_the_step(
-    answer, refined
-):
+def test_the_estimate_from_the_roll_out_is_that_of_half_the_step(answer, refined):
     assert answer.refinement is not None
     assert refined.refinement is not None
     for name in FREE:
         measured_change = refined.refinement.errors[name].step
-        assert answer.refinement.errors[name].step == pytest.approx(
-            measured_change, rel=0.3
-        )
+        assert answer.refinement.errors[name].step == pytest.approx(measured_change, rel=0.3)
 
 
 def test_roll_outs_that_are_no_finer_tell_nothing():
@@ -225,12 +183,8 @@ def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
     combined = {"mu_pa": 1.0}
 
     def concerns(half_step_pa: float) -> list:
-        error = discretisation_error(
-            "mu_pa", optimum["mu_pa"], [half_step_pa], []
-        )
-        return numerical_concerns(
-            optimum, combined, Refinement({"mu_pa": error})
-        )
+        error = discretisation_error("mu_pa", optimum["mu_pa"], [half_step_pa], [])
+        return numerical_concerns(optimum, combined, Refinement({"mu_pa": error}))
 
     assert concerns(101.4) == []
     assert numerical_concerns(optimum, combined, None) == []
@@ -246,19 +200,14 @@ def test_other_numbers_of_levels_are_refused(answer):
 
 def test_without_an_estimated_parameter_it_is_refused_with_the_reason(answer):
     fixed = Parameters(
-        tuple(
-            replace(each, is_fixed=True)
-            for each in answer.problem.parameters.items
-        )
+        tuple(replace(each, is_fixed=True) for each in answer.problem.parameters.items)
     )
     alone = replace(answer, problem=replace(answer.problem, parameters=fixed))
     with pytest.raises(InputError, match="no parameter was estimated"):
         refine(alone)
 
 
-def test_estimates_that_do_not_change_are_stated_instead_of_an_empty_table(
-    answer,
-):
+def test_estimates_that_do_not_change_are_stated_instead_of_an_empty_table(answer):
     result = answer.result
     unchanged = replace(
         result,
@@ -286,17 +235,11 @@ def test_a_run_without_tests_of_causes_has_the_error_that_the_problem_asks_for()
 def test_the_command_writes_into_the_run_folder(tmp_path):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
-    precise = settings(
-        "experiment.swing.markers.sigma_m=2e-4", "rollout.integrator=newmark"
-    )
-    ended = run_command(
-        "solve", problem, "--out", folder, "--method", "reduced-space", *precise
-    )
+    precise = settings("experiment.swing.markers.sigma_m=2e-4", "rollout.integrator=newmark")
+    ended = run_command("solve", problem, "--out", folder, "--method", "reduced-space", *precise)
     assert ended.code == 0, ended
     before = json.loads((folder / "result.json").read_text())
-    assert (
-        before["problem"]["substeps"] == 2
-    )  # which the problem does not state
+    assert before["problem"]["substeps"] == 2  # which the problem does not state
     ended = run_command("refine", folder)
     assert ended.code == 0, ended
     after = json.loads((folder / "result.json").read_text())
@@ -309,9 +252,7 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
             assert found["value"] == pytest.approx(corrected)
             low, high = found["combined95"]
             least, most = kept["errors"][name]["interval95"]
-            assert (
-                low <= max(least, LOWER[name]) <= found["value"] < most <= high
-            )
+            assert low <= max(least, LOWER[name]) <= found["value"] < most <= high
             assert sum(after["budget"][name].values()) == pytest.approx(1.0)
             assert found["numerical_error"]["mesh"] is not None
             assert before["parameters"][name]["numerical_error"]["mesh"] is None
@@ -322,17 +263,10 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
 
 
 @pytest.mark.long
-def test_what_is_interrupted_keeps_the_levels_that_it_finished(
-    tmp_path, monkeypatch
-):
+def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeypatch):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
-    assert (
-        run_command(
-            "solve", problem, "--out", folder, "--method", "reduced-space"
-        ).code
-        == 0
-    )
+    assert run_command("solve", problem, "--out", folder, "--method", "reduced-space").code == 0
     from collocation_sysid.runs import numerical_error as refining
 
     solved, whole = [], refining.solve
@@ -340,11 +274,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(
     def interrupted_at_the_mesh(problem, *arguments, **options):
         solved.append(problem)
         found = whole(problem, *arguments, **options)
-        return (
-            replace(found, status=Status.INTERRUPTED)
-            if len(solved) == 2
-            else found
-        )
+        return replace(found, status=Status.INTERRUPTED) if len(solved) == 2 else found
 
     monkeypatch.setattr(refining, "solve", interrupted_at_the_mesh)
     stopped = run_command("refine", folder)
@@ -353,9 +283,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(
     assert "collocation-sysid refine" in stopped.err
     kept = json.loads((folder / "refinement.json").read_text())
     assert [level["refined"] for level in kept["levels"]] == ["step"]
-    part = json.loads((folder / "result.json").read_text())["parameters"][
-        "mu_pa"
-    ]
+    part = json.loads((folder / "result.json").read_text())["parameters"]["mu_pa"]
     assert part["numerical_error"]["step"] is not None
     assert part["numerical_error"]["mesh"] is None
     assert run_command("refine", folder).code == 0
@@ -363,9 +291,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(
     both = json.loads((folder / "refinement.json").read_text())
     assert both["levels"][0] == kept["levels"][0]
     assert [level["refined"] for level in both["levels"]] == ["step", "mesh"]
-    told = json.loads((folder / "result.json").read_text())["parameters"][
-        "mu_pa"
-    ]
+    told = json.loads((folder / "result.json").read_text())["parameters"]["mu_pa"]
     assert told["numerical_error"]["mesh"] is not None
 
 
@@ -373,9 +299,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(
 def test_a_problem_may_ask_for_it(tmp_path):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
-    asked = run_command(
-        "solve", problem, "--out", folder, "--set", "uncertainty.numerical=true"
-    )
+    asked = run_command("solve", problem, "--out", folder, "--set", "uncertainty.numerical=true")
     assert asked.code == 0
     assert "half the step" in asked.out
     assert json.loads((folder / "refinement.json").read_text())["levels"]

@@ -17,9 +17,7 @@ from collocation_sysid.recording import read_markers, write_markers_csv
 from collocation_sysid.runs.forward_simulation import ForwardSimulation
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.probes.profile_likelihood import (
-    profile_of_solution,
-)
+from collocation_sysid.statistics.probes.profile_likelihood import profile_of_solution
 
 NUISANCE = """
 [experiment.nuisance]
@@ -33,9 +31,7 @@ REDUCED = settings("solver.method=reduced-space")
 OFFSET_M = np.array([0.002, -0.001, 0.0015])
 
 
-def spoil(
-    folder: Path, name: str, noise_m: float, offset_m=OFFSET_M, seed: int = 0
-) -> None:
+def spoil(folder: Path, name: str, noise_m: float, offset_m=OFFSET_M, seed: int = 0) -> None:
     """Add noise to an experiment's tracks, and an offset to the first marker."""
     file = folder / f"{name}_markers.csv"
     table = read_markers(file)
@@ -59,22 +55,15 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _with_nuisance(text: str) -> str:
     """Offsets are estimated in both experiments."""
-    head, *experiments = text.replace('nuisance = "none"\n', "").split(
-        "\n[[experiment]]\n"
-    )
-    return "\n[[experiment]]\n".join(
-        [head, *(part + NUISANCE for part in experiments)]
-    )
+    head, *experiments = text.replace('nuisance = "none"\n', "").split("\n[[experiment]]\n")
+    return "\n[[experiment]]\n".join([head, *(part + NUISANCE for part in experiments)])
 
 
 @pytest.fixture(scope="module")
 def finished(two: Path):
     overrides = [
         "solver.method=reduced-space",
-        *(
-            f"experiment.{name}.markers.sigma_m=2e-4"
-            for name in ("swing", "turn")
-        ),
+        *(f"experiment.{name}.markers.sigma_m=2e-4" for name in ("swing", "turn")),
     ]
     return run(Problem.read(two / "problem.toml", overrides))
 
@@ -88,18 +77,11 @@ def test_nuisance_is_reported_with_unit_prior_and_error(finished):
         assert abs(found.value - truth) < 4 * found.std_error
 
 
-def test_a_validation_experiment_gets_its_nuisance_with_the_material_as_found(
-    finished,
-):
+def test_a_validation_experiment_gets_its_nuisance_with_the_material_as_found(finished):
     rollout = finished.rollouts["turn"]
     assert isinstance(rollout, ForwardSimulation)
-    assert (
-        rollout.rms_m < 5e-4
-    )  # the offset alone is 2.7 mm of one in three markers
-    found = [
-        rollout.nuisance[f"turn: camera offset of low, {axis} [m]"]
-        for axis in "xyz"
-    ]
+    assert rollout.rms_m < 5e-4  # the offset alone is 2.7 mm of one in three markers
+    found = [rollout.nuisance[f"turn: camera offset of low, {axis} [m]"] for axis in "xyz"]
     np.testing.assert_allclose(found, OFFSET_M, atol=3e-4)
 
 
@@ -134,10 +116,7 @@ def test_a_result_is_read_as_it_was_written(finished):
         (("converged",), "yes"),
         (("parameters", "mu_pa", "value"), "x"),
         (("parameters", "mu_pa", "statistical95"), [1.0]),
-        (
-            ("trust", "concerns"),
-            [{"code": "noise/larger", "grade": "fine", "data": {}}],
-        ),
+        (("trust", "concerns"), [{"code": "noise/larger", "grade": "fine", "data": {}}]),
         (("history",), [{"iteration": 1}]),
         (("iterations",), 1.5),
         (("iterations",), True),
@@ -164,9 +143,7 @@ def test_a_profile_agrees_with_the_error_bar_where_the_loss_is_round(finished):
     fit = linearise_fit(solution.collocation, solution.z)
     profile = profile_of_solution(solution, fit, uncertainty, "mu_pa")
     np.testing.assert_allclose(
-        profile.interval,
-        uncertainty.estimates["mu_pa"].statistical95,
-        rtol=0.01,
+        profile.interval, uncertainty.estimates["mu_pa"].statistical95, rtol=0.01
     )
     best = profile.values[np.argmin(profile.losses)]
     assert best == pytest.approx(solution.parameters["mu_pa"])
@@ -186,9 +163,7 @@ def test_a_profile_counts_the_prior_of_its_parameter(finished):
     problem = replace(finished.problem, parameters=held)
     again = run(problem, seek_causes=False)
     fit = linearise_fit(again.solution.collocation, again.solution.z)
-    profile = profile_of_solution(
-        again.solution, fit, again.uncertainty, "mu_pa"
-    )
+    profile = profile_of_solution(again.solution, fit, again.uncertainty, "mu_pa")
     lower, upper = profile.interval
     assert upper is not None
     assert lower is not None
@@ -199,20 +174,11 @@ def test_a_profile_counts_the_prior_of_its_parameter(finished):
     )
 
 
-def test_the_terminal_shows_nuisance_verdicts_and_residuals(
-    two, tmp_path, monkeypatch
-):
+def test_the_terminal_shows_nuisance_verdicts_and_residuals(two, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "400")
-    sigma = settings(
-        *(f"experiment.{n}.markers.sigma_m=2e-4" for n in ("swing", "turn"))
-    )
+    sigma = settings(*(f"experiment.{n}.markers.sigma_m=2e-4" for n in ("swing", "turn")))
     outcome = run_command(
-        "solve",
-        two / "problem.toml",
-        *REDUCED,
-        *sigma,
-        "--out",
-        tmp_path / "run",
+        "solve", two / "problem.toml", *REDUCED, *sigma, "--out", tmp_path / "run"
     )
     assert outcome.code == 0
     assert "nuisance parameters of 'swing': " in outcome.out
@@ -229,18 +195,11 @@ def test_noise_may_be_estimated_and_profiles_asked_for(two, tmp_path):
     asked = '\n[uncertainty]\nnoise = "estimated"\nprofile = ["mu_pa"]\n'
     (two / "asked.toml").write_text(text + asked)
     outcome = run_command(
-        "solve",
-        two / "asked.toml",
-        *REDUCED,
-        "--json",
-        "--out",
-        tmp_path / "run",
+        "solve", two / "asked.toml", *REDUCED, "--json", "--out", tmp_path / "run"
     )
     found = json.loads(outcome.out)["uncertainty"]
     assert found["noise"] == "estimated"
-    assert (
-        found["reduced_chi_squared"] < 0.1
-    )  # sigma_m says 1 mm, the noise is 0.2 mm
+    assert found["reduced_chi_squared"] < 0.1  # sigma_m says 1 mm, the noise is 0.2 mm
     low, high = found["profiles"]["mu_pa"]["interval"]
     assert low < TRUTH["mu_pa"] < high
     assert np.log(high / low) < 0.1
@@ -262,18 +221,10 @@ def test_what_the_data_do_not_tell_has_no_error_bar(tmp_path):
         )
     )
     sigma = settings("experiment.swing.markers.sigma_m=3e-3")
-    outcome = run_command(
-        "solve", file, *REDUCED, *sigma, "--json", "--out", folder / "run"
-    )
+    outcome = run_command("solve", file, *REDUCED, *sigma, "--json", "--out", folder / "run")
     found = json.loads(outcome.out)
     poisson = found["parameters"]["poisson"]
     assert poisson["statistical_std_error"] is None
     assert poisson["reason"]
-    said = [
-        sentence
-        for sentence in found["uncertainty"]["verdicts"]
-        if "poisson" in sentence
-    ]
-    assert any(
-        "not identifiable" in s or "ended at its lower bound" in s for s in said
-    )
+    said = [sentence for sentence in found["uncertainty"]["verdicts"] if "poisson" in sentence]
+    assert any("not identifiable" in s or "ended at its lower bound" in s for s in said)

@@ -15,9 +15,7 @@ from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.program.depth.depth_comparison import camera_residuals
-from collocation_sysid.program.depth.surface_correspondences import (
-    SurfaceCorrespondences,
-)
+from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.runs import several_starts, solving, thinned_start
 
 # Finer than the pixels, so that no point is left out.
@@ -28,9 +26,7 @@ UNKNOWN = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown()})
 @cache
 def depth() -> cs.Depth:
     """An image of the bar by a camera whose stated pose is off by some degrees."""
-    pose = moved(
-        np.array([0.05, -0.03, 0.02]), np.array([0.004, 0.002, -0.003])
-    )
+    pose = moved(np.array([0.05, -0.03, 0.02]), np.array([0.004, 0.002, -0.003]))
     return cs.Depth.of_images(
         "front",
         noisy(np.random.default_rng(3)),
@@ -53,8 +49,8 @@ def many(monkeypatch):
 
 def compared(solution: cs.Solution) -> int:
     """Number of points that are compared with the surface, or left out for a stated reason."""
-    (segment,) = solution.collocation.transcriptions
-    (correspondences,) = segment.association.correspondences
+    (transcription,) = solution.collocation.transcriptions
+    (correspondences,) = transcription.association.correspondences
     excluded = sum(correspondences.excluded_counts.values())
     return int(correspondences.is_compared.sum()) + excluded
 
@@ -95,9 +91,7 @@ def test_the_optimum_is_that_of_the_search_with_all_points(monkeypatch):
     assert compared(solution) == compared(direct) == len(given)
     assert solution.status.converged
     assert solution.scan is not None
-    difference = np.log(
-        solution.parameters["young_pa"] / direct.parameters["young_pa"]
-    )
+    difference = np.log(solution.parameters["young_pa"] / direct.parameters["young_pa"])
     error = standard_error(direct)
     # Points that change to other triangles leave some per cent of a standard error open.
     assert abs(difference) < 0.03 * error
@@ -106,37 +100,26 @@ def test_the_optimum_is_that_of_the_search_with_all_points(monkeypatch):
         direct.history[-1].loss, abs=several_starts.SAME_LOSS / 4
     )
     # The note on the fit is that of all points, and the only one.
-    (fit,) = (
-        each for each in solution.notes if "deviate from the surf" in each
-    )
+    (fit,) = (each for each in solution.notes if "deviate from the surf" in each)
     count = solution.collocation.transcriptions[0].association.correspondences
     assert f" {int(count[0].is_compared.sum())} points of" in fit
 
 
-def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(
-    many, monkeypatch
-):
+def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(many, monkeypatch):
     def fail(_):
         raise thinned_start.NoThinnedStartError("300 depth points fail")
 
     monkeypatch.setattr(solving, "require_determined", fail)
     solution = cs.solve(problem())
-    assert (
-        "the search was not started with fewer points: 300 depth points fail"
-        in (solution.notes)
-    )
+    assert "the search was not started with fewer points: 300 depth points fail" in (solution.notes)
     assert solution.status.converged
     assert compared(solution) == len(depth().clouds[0])
 
 
-def test_thinned_points_that_do_not_determine_a_parameter_are_no_start(
-    many, monkeypatch
-):
+def test_thinned_points_that_do_not_determine_a_parameter_are_no_start(many, monkeypatch):
     rough = cs.solve(thinned_start.thinned_problem(problem()))
     thinned_start.require_determined(rough)
-    monkeypatch.setattr(
-        thinned_start, "undetermined_names", lambda _: ("young_pa",)
-    )
+    monkeypatch.setattr(thinned_start, "undetermined_names", lambda _: ("young_pa",))
     with pytest.raises(thinned_start.NoThinnedStartError, match="determine E"):
         thinned_start.require_determined(rough)
 
@@ -150,15 +133,11 @@ def test_an_interrupt_keeps_the_point_and_compares_all_points(many):
             raise KeyboardInterrupt
 
     guess = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(1.6e5)})
-    solution = cs.solve(
-        cs.Problem([hanging((depth(),))], guess), watch=interrupt
-    )
+    solution = cs.solve(cs.Problem([hanging((depth(),))], guess), watch=interrupt)
     assert solution.status is Status.INTERRUPTED
     assert compared(solution) == len(depth().clouds[0])
     assert any("do not fit all points best" in each for each in solution.notes)
-    assert solution.parameters["young_pa"] == pytest.approx(
-        lines[-1].parameters["young_pa"]
-    )
+    assert solution.parameters["young_pa"] == pytest.approx(lines[-1].parameters["young_pa"])
 
 
 def test_unchanged_correspondences_end_the_search_after_one_solve():
@@ -179,9 +158,7 @@ def test_unchanged_correspondences_end_the_search_after_one_solve():
 
 def test_associations_are_kept_with_other_guesses():
     collocation = problem().collocation()
-    other = collocation.with_parameters(
-        collocation.parameters.with_guess({"young_pa": 2e5})
-    )
+    other = collocation.with_parameters(collocation.parameters.with_guess({"young_pa": 2e5}))
     before = collocation.transcriptions[0].association
     assert other.transcriptions[0].association is before
     assert other.parameters.guesses["young_pa"] == pytest.approx(2e5)
@@ -190,10 +167,10 @@ def test_associations_are_kept_with_other_guesses():
 def test_an_alignment_with_the_same_shape_is_not_repeated():
     guess = UNKNOWN.with_guess({"young_pa": 1.6e5})
     collocation = cs.Problem([hanging((depth(),))], guess).collocation()
-    (segment,) = collocation.transcriptions
-    (reading,) = camera_residuals(segment)
-    rest = segment.experiment.rigid_positions([0.0]).reshape(1, -1)
-    phi = np.zeros(segment.nuisance.size)
+    (transcription,) = collocation.transcriptions
+    (reading,) = camera_residuals(transcription)
+    rest = transcription.experiment.rigid_positions([0.0]).reshape(1, -1)
+    phi = np.zeros(transcription.nuisance.size)
     assert reading.aligned_correspondences(rest, phi) is reading.correspondences
     sagging = rest + 0.5 * NOISE_M
     moved_body = reading.aligned_correspondences(sagging, phi)
@@ -210,33 +187,23 @@ def test_an_alignment_with_the_same_shape_is_not_repeated():
 
 
 def test_a_search_at_a_known_minimum_ends():
-    known = cs.solve(
-        cs.Problem(
-            [hanging((depth(),))], UNKNOWN.with_guess({"young_pa": 1.6e5})
-        )
-    )
+    known = cs.solve(cs.Problem([hanging((depth(),))], UNKNOWN.with_guess({"young_pa": 1.6e5})))
     last = known.history[-1]
     is_at = partial(several_starts._is_at, solution=known)
     assert is_at(last)
     assert not is_at(replace(last, share=0.5))
     assert not is_at(replace(last, loss=last.loss + 11.0))
-    assert not is_at(
-        replace(
-            last, parameters={"young_pa": 1.02 * known.parameters["young_pa"]}
-        )
-    )
+    assert not is_at(replace(last, parameters={"young_pa": 1.02 * known.parameters["young_pa"]}))
 
 
 def test_all_points_have_the_correspondences_of_the_thinned_solution(many):
     thinned = cs.solve(thinned_start.thinned_problem(problem()))
     collocation = thinned_start.collocation_with_all_points(problem(), thinned)
-    (segment,) = collocation.transcriptions
-    (found,) = segment.association.correspondences
+    (transcription,) = collocation.transcriptions
+    (found,) = transcription.association.correspondences
     assert isinstance(found, SurfaceCorrespondences)
     assert found.camera.depth is depth()
-    (before,) = thinned.collocation.transcriptions[
-        0
-    ].association.correspondences
+    (before,) = thinned.collocation.transcriptions[0].association.correspondences
     assert found.gate_m == before.gate_m
     assert found.is_compared.sum() > 2 * before.is_compared.sum()
     assert len(thinned.z) == collocation.variable_count

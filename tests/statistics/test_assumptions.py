@@ -31,20 +31,10 @@ from collocation_sysid.fem.air import AIR_KG_M3
 from collocation_sysid.fem.laws.constants import GAMMA_R
 from collocation_sysid.fem.laws.materials import DAMPINGS, DampingLaw
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changed_residuals,
-)
-from collocation_sysid.statistics.budget.systematic_effects import (
-    ASSUMPTIONS,
-    ExperimentAtAnswer,
-)
+from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, ExperimentAtAnswer
 
-VALUES = {
-    "young_pa": 8e3,
-    "poisson": 0.3,
-    "gamma_r_s": 6e-3,
-    "gamma_m_1_s": 0.0,
-}
+VALUES = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 0.0}
 BY_NAME = {row.name: row for row in ASSUMPTIONS}
 # How far off what is assumed is, so that markers follow it linearly.
 OFF = {
@@ -83,29 +73,21 @@ def parameters(**stated: float | Unknown | Tied) -> Parameters:
     )
 
 
-def changed(
-    experiment: Experiment, name: str, scheme: str = "midpoint"
-) -> np.ndarray:
+def changed(experiment: Experiment, name: str, scheme: str = "midpoint") -> np.ndarray:
     """Markers (T, M, 3) where an assumption is off by one of its unit, to first order [m]."""
     row = name.partition(" ")[0]
     collocation = Collocation([experiment], parameters(), scheme)
     positions = simulate(experiment, VALUES, scheme, substeps=1).positions_m
-    z = collocation.pack(
-        collocation.guess_p, [positions.reshape(len(positions), -1)]
-    )
+    z = collocation.pack(collocation.guess_p, [positions.reshape(len(positions), -1)])
     names, found = changed_residuals(collocation, z, [(BY_NAME[row], 1.0)])
-    return (
-        found[0][..., names.index(name)] * experiment.markers.sigma_m[:, None]
-    )
+    return found[0][..., names.index(name)] * experiment.markers.sigma_m[:, None]
 
 
 @pytest.mark.parametrize("name", OFF)
 def test_markers_change_as_where_the_body_is_as_the_assumption_fears(name):
     experiment, off = swung(AIR_KG_M3 * (name in OF_AIR)), OFF[name]
     tracks = [
-        with_wrong_assumptions(
-            experiment, VALUES, {name: way}
-        ).markers.positions_m
+        with_wrong_assumptions(experiment, VALUES, {name: way}).markers.positions_m
         for way in (off, 0.0)
     ]
     simulated = (tracks[0] - tracks[1]) / off
@@ -117,10 +99,7 @@ def test_markers_change_as_where_the_body_is_as_the_assumption_fears(name):
 
 def test_a_grip_that_gives_way_is_a_body_on_springs():
     layer_m, sway_m = 1e-4, np.array([0.02, 0.01, -0.015])
-    mesh, hung = (
-        box().mesh,
-        hung_cube(24, start="undeformed", gravity_m_s2=(0.0, 0.0, 0.0)),
-    )
+    mesh, hung = (box().mesh, hung_cube(24, start="undeformed", gravity_m_s2=(0.0, 0.0, 0.0)))
     nodes, body = hung.grasps[0].nodes, Body(mesh, density_kg_m3=60.0)
     poses = smooth_poses(hung.t_s, tuple(sway_m), turn_rad=(0.0, 0.0, 0.0))
 
@@ -128,23 +107,16 @@ def test_a_grip_that_gives_way_is_a_body_on_springs():
         way = x - at.rest_m - sway_m * (1 - ca.cos(20.0 * at.t_s))
         return -VALUES["young_pa"] * at.volume_m3 ** (2 / 3) / layer_m * way
 
-    loose = Body(
-        mesh,
-        density_kg_m3=60.0,
-        forces=[NodeForce.from_law(spring, nodes=nodes)],
-    )
+    loose = Body(mesh, density_kg_m3=60.0, forces=[NodeForce.from_law(spring, nodes=nodes)])
     gripped = replace(hung, body=body, grasps=(Grasp(nodes, poses),))
     on_springs = replace(hung, body=loose, grasps=())
     # Under the midpoint rule springs as stiff as these would ring.
     tracks = [
-        simulate(each, VALUES, "bdf2", substeps=1).markers_m
-        for each in (on_springs, gripped)
+        simulate(each, VALUES, "bdf2", substeps=1).markers_m for each in (on_springs, gripped)
     ]
     simulated = (tracks[0] - tracks[1]) / layer_m
     expected = changed(gripped, "grip_layer_m", "bdf2")
-    np.testing.assert_allclose(
-        expected, simulated, atol=0.01 * np.abs(simulated).max()
-    )
+    np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
 
 
 @pytest.mark.parametrize("has_stated_places", [True, False])
@@ -156,33 +128,24 @@ def test_markers_with_a_mass_are_point_masses(has_stated_places):
         experiment,
         masses=[
             PointMass([int(node)], mass_kg * weight)
-            for nodes, weights in zip(
-                placement.nodes, placement.weights, strict=True
-            )
+            for nodes, weights in zip(placement.nodes, placement.weights, strict=True)
             for node, weight in zip(nodes, weights, strict=True)
             if weight > 0
         ],
     )
     tracks = [
-        simulate(each, VALUES, "midpoint", substeps=1).markers_m
-        for each in (loaded, experiment)
+        simulate(each, VALUES, "midpoint", substeps=1).markers_m for each in (loaded, experiment)
     ]
     simulated = (tracks[0] - tracks[1]) / mass_kg
     described = experiment
     if not has_stated_places:
         places_m = experiment.markers.predict_positions(experiment.body.nodes_m)
         markers = replace(
-            experiment.markers,
-            placement=None,
-            places_m=places_m,
-            places_sigma_m=1e-3,
-            located=None,
+            experiment.markers, placement=None, places_m=places_m, places_sigma_m=1e-3, located=None
         ).on_body(experiment.body)
         described = replace(experiment, markers=markers)
     np.testing.assert_allclose(
-        changed(described, "marker_mass_kg"),
-        simulated,
-        atol=0.01 * np.abs(simulated).max(),
+        changed(described, "marker_mass_kg"), simulated, atol=0.01 * np.abs(simulated).max()
     )
 
 
@@ -209,10 +172,7 @@ def hanging_bar(layers: int) -> Experiment:
 
 def test_a_gripper_that_holds_less_of_the_body_leaves_a_longer_bar():
     """The row is that of a compliant layer, whose areas are estimated from the volumes of nodes."""
-    sag_m = [
-        simulate(hanging_bar(layers), VALUES).markers_m[0, 0, 2]
-        for layers in (16, 17)
-    ]
+    sag_m = [simulate(hanging_bar(layers), VALUES).markers_m[0, 0, 2] for layers in (16, 17)]
     # The additional layer at the top carries the weight of the bar below it.
     simulated = (sag_m[1] - sag_m[0]) / 0.005
     (expected,) = changed(hanging_bar(16), "grasp_edge_m")[:, 0, 2]
@@ -226,33 +186,20 @@ def test_the_edge_of_a_platen_is_the_face_of_the_specimen():
 
 def platen_forces_n(experiment: Experiment, platen: int) -> np.ndarray:
     """(T, k, 3) what a platen gives each node that it holds, which is what the body gives it."""
-    x = simulate(experiment, VALUES).positions_m.reshape(
-        len(experiment.t_s), -1
-    )
-    inside = experiment.body.force(
-        x, np.zeros_like(x), experiment.body.theta_from_values(VALUES)
-    )
+    x = simulate(experiment, VALUES).positions_m.reshape(len(experiment.t_s), -1)
+    inside = experiment.body.force(x, np.zeros_like(x), experiment.body.theta_from_values(VALUES))
     return -inside.reshape(len(x), -1, 3)[:, experiment.grasps[platen].nodes]
 
 
 def test_a_bench_that_gives_way_presses_less():
     compliance_m_n, pressed_m = 1e-6, PRESSED_M
-    for _ in range(
-        5
-    ):  # what it gives way follows the force, and that what is pressed
-        force_n = platen_forces_n(block("xyz", z_m=pressed_m), 1)[..., 2].sum(
-            axis=1
-        )
+    for _ in range(5):  # what it gives way follows the force, and that what is pressed
+        force_n = platen_forces_n(block("xyz", z_m=pressed_m), 1)[..., 2].sum(axis=1)
         pressed_m = PRESSED_M - compliance_m_n * force_n
-    tracks = [
-        simulate(block("xyz", z_m=z_m), VALUES).markers_m
-        for z_m in (pressed_m, PRESSED_M)
-    ]
+    tracks = [simulate(block("xyz", z_m=z_m), VALUES).markers_m for z_m in (pressed_m, PRESSED_M)]
     simulated = (tracks[0] - tracks[1]) / compliance_m_n
     expected = changed(block("xyz"), "machine_compliance_m_n")
-    np.testing.assert_allclose(
-        expected, simulated, atol=0.01 * np.abs(simulated).max()
-    )
+    np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
     assert simulated[-1, :, 2].max() > 0
 
 
@@ -263,34 +210,19 @@ def test_friction_holds_back_what_slides_on_platens():
         forces = []
         for platen in range(2):
             nodes = sliding.grasps[platen].nodes
-            press = friction * np.abs(
-                platen_forces_n(sliding, platen)[k, :, 2:]
-            )
+            press = friction * np.abs(platen_forces_n(sliding, platen)[k, :, 2:])
             way = (x[k] - start)[nodes] * [1, 1, 0]
-            pull = (
-                -press
-                * way
-                / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
-            )
-            forces += [
-                Force([n], f)
-                for n, f in zip(nodes, pull, strict=True)
-                if f.any()
-            ]
+            pull = -press * way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+            forces += [Force([n], f) for n, f in zip(nodes, pull, strict=True) if f.any()]
         held_back = block(t_s=TIMES[:2], z_m=PRESSED_M[[k, k]], forces=forces)
         tracks.append(simulate(held_back, VALUES).markers_m[-1])
     simulated = (tracks - sliding.markers.predict_positions(x)[1:]) / friction
     expected = changed(sliding, "platen_friction")[1:]
-    np.testing.assert_allclose(
-        expected, simulated, atol=0.01 * np.abs(simulated).max()
-    )
+    np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
 
 
 def test_planes_of_symmetry_have_no_friction_and_are_no_grip():
-    sliding, sticking = (
-        changed(block(), "grip_layer_m"),
-        changed(block("xyz"), "platen_friction"),
-    )
+    sliding, sticking = (changed(block(), "grip_layer_m"), changed(block("xyz"), "platen_friction"))
     assert not sliding.any()
     assert not sticking.any()
 
@@ -300,49 +232,30 @@ def test_in_a_vacuum_nothing_is_assumed_of_the_air(name):
     collocation = Collocation([swung()], parameters(), "midpoint")
     x = np.tile(collocation.experiments[0].body.nodes_m.ravel(), (25, 1))
     (part,) = collocation.iterates(collocation.pack(collocation.guess_p, [x]))
-    assert (
-        BY_NAME[name].effect(
-            ExperimentAtAnswer(part, collocation.parameters), 0
-        )
-        is None
-    )
+    assert BY_NAME[name].effect(ExperimentAtAnswer(part, collocation.parameters), 0) is None
 
 
 def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():
     experiment = swung(AIR_KG_M3)
     collocation = Collocation([experiment], parameters(), "midpoint")
     x = experiment.body.nodes_m.ravel()
-    z = collocation.pack(
-        collocation.guess_p, [np.tile(x, (len(experiment.t_s), 1))]
-    )
+    z = collocation.pack(collocation.guess_p, [np.tile(x, (len(experiment.t_s), 1))])
     at = ExperimentAtAnswer(collocation.iterates(z)[0], collocation.parameters)
     count = len(experiment.t_s)
     sideways = np.tile([0.0, 2.0, 0.0], len(x) // 3)
     vars(at)["states"] = (np.tile(x, (count, 1)), np.tile(sideways, (count, 1)))
-    force = (
-        BY_NAME["air_drag"].effect(at, 0).force_n[0].reshape(-1, 3).sum(axis=0)
-    )
-    np.testing.assert_allclose(
-        force, [0, -0.5 * AIR_KG_M3 * 1.5 * EDGE_M**2 * 4.0, 0], atol=1e-9
-    )
+    force = BY_NAME["air_drag"].effect(at, 0).force_n[0].reshape(-1, 3).sum(axis=0)
+    np.testing.assert_allclose(force, [0, -0.5 * AIR_KG_M3 * 1.5 * EDGE_M**2 * 4.0, 0], atol=1e-9)
 
 
 def test_a_ratio_tied_to_one_that_is_estimated_is_not_stated():
-    estimated = parameters(
-        **{"poisson": Unknown(0.3, 0.1, 0.49), "core.poisson": Tied("poisson")}
-    )
+    estimated = parameters(**{"poisson": Unknown(0.3, 0.1, 0.49), "core.poisson": Tied("poisson")})
     experiment = swung()
     collocation = Collocation([experiment], parameters(), "midpoint")
     x = np.tile(experiment.body.nodes_m.ravel(), (len(experiment.t_s), 1))
     (part,) = collocation.iterates(collocation.pack(collocation.guess_p, [x]))
-    assert (
-        BY_NAME["poisson"].effect(ExperimentAtAnswer(part, estimated), 0)
-        is None
-    )
-    assert (
-        BY_NAME["poisson"].effect(ExperimentAtAnswer(part, parameters()), 0)
-        is not None
-    )
+    assert BY_NAME["poisson"].effect(ExperimentAtAnswer(part, estimated), 0) is None
+    assert BY_NAME["poisson"].effect(ExperimentAtAnswer(part, parameters()), 0) is not None
 
 
 @pytest.mark.parametrize("law", ["material", "kelvin-voigt"])
@@ -360,26 +273,17 @@ def test_without_damping_its_law_is_no_matter(changes):
     experiment = swung()
     values = VALUES
     if "kind" in changes:
-        experiment = replace(
-            experiment, kind="static", nuisance=Nuisance.none()
-        )
+        experiment = replace(experiment, kind="static", nuisance=Nuisance.none())
     else:
         values = VALUES | changes
-    collocation = Collocation(
-        [experiment], Parameters.from_mapping(values), "midpoint"
-    )
+    collocation = Collocation([experiment], Parameters.from_mapping(values), "midpoint")
     rows = len(experiment.t_s)
     rest = np.tile(experiment.body.nodes_m.ravel(), (rows, 1))
     z = collocation.pack(collocation.guess_p, [rest])
-    at = ExperimentAtAnswer(
-        next(iter(collocation.iterates(z))), collocation.parameters
-    )
+    at = ExperimentAtAnswer(next(iter(collocation.iterates(z))), collocation.parameters)
     for name in ("damping_law", "rayleigh_damping"):
         row = BY_NAME[name]
-        assert all(
-            row.effect(at, axis) is None
-            for axis in range(len(row.list_components()))
-        )
+        assert all(row.effect(at, axis) is None for axis in range(len(row.list_components())))
 
 
 def test_a_law_of_a_users_own_stays_as_it_is():
@@ -389,6 +293,4 @@ def test_a_law_of_a_users_own_stays_as_it_is():
     experiment = swung()
     own = DampingLaw("own", (GAMMA_R,), stress=stress)
     body = Body(experiment.body.mesh, density_kg_m3=60.0, damping=own)
-    assert not changed(
-        replace(experiment, body=body), "damping_law kelvin-voigt"
-    ).any()
+    assert not changed(replace(experiment, body=body), "damping_law kelvin-voigt").any()

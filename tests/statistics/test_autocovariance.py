@@ -9,14 +9,8 @@ import pytest
 from kit.fits import Problem, autoregressive, problem
 from scipy.linalg import block_diag, toeplitz
 
-from collocation_sysid.statistics.linearised import (
-    LinearisedFit,
-    factorise_information,
-)
-from collocation_sysid.statistics.residuals.autocorrelation import (
-    error_processes,
-    lagged_products,
-)
+from collocation_sysid.statistics.linearised import LinearisedFit, factorise_information
+from collocation_sysid.statistics.residuals.autocorrelation import error_processes, lagged_products
 
 LAG = 2
 PROBLEMS = {
@@ -28,9 +22,7 @@ PROBLEMS = {
 
 def some_fit(of: Problem, phi: float = 0.9, seed: int = 0) -> LinearisedFit:
     rng = np.random.default_rng(seed)
-    errors = [
-        autoregressive(rng, *present.shape, phi) for present in of.present
-    ]
+    errors = [autoregressive(rng, *present.shape, phi) for present in of.present]
     return of.fit(errors, np.zeros(len(of.names)))[0]
 
 
@@ -39,9 +31,7 @@ def dense(of: Problem, by_experiment: list[np.ndarray]) -> np.ndarray:
     blocks = []
     for matrix, present in zip(by_experiment, of.present, strict=True):
         seen = np.repeat(present, 3, axis=1).ravel()
-        blocks.append(
-            np.kron(matrix, np.eye(3 * present.shape[1])) * np.outer(seen, seen)
-        )
+        blocks.append(np.kron(matrix, np.eye(3 * present.shape[1])) * np.outer(seen, seen))
     return block_diag(*blocks)
 
 
@@ -52,27 +42,16 @@ def test_lags_explain_the_expected_products_of_residuals(name):
     factored = factorise_information(fit)
     lengths = [len(present) for present in of.present]
     found = lagged_products(fit, factored, [LAG] * len(lengths))
-    true = [
-        0.7**k * 0.9 ** np.arange(length) for k, length in enumerate(lengths)
-    ]
-    tails = [
-        np.where(np.arange(len(gamma)) > LAG, gamma, 0.0) for gamma in true
-    ]
-    explained = found.expected @ np.concatenate(
-        [gamma[: LAG + 1] for gamma in true]
-    )
+    true = [0.7**k * 0.9 ** np.arange(length) for k, length in enumerate(lengths)]
+    tails = [np.where(np.arange(len(gamma)) > LAG, gamma, 0.0) for gamma in true]
+    explained = found.expected @ np.concatenate([gamma[: LAG + 1] for gamma in true])
     explained += found.long_lag_products(fit, factored, tails)
 
     slopes = np.concatenate(
-        [
-            slope.reshape(-1, slope.shape[2])
-            for slope in factored.scaled_jacobians
-        ]
+        [slope.reshape(-1, slope.shape[2]) for slope in factored.scaled_jacobians]
     )
     maker = np.eye(len(slopes)) - slopes @ slopes.T
-    of_residuals = (
-        maker @ dense(of, [toeplitz(gamma) for gamma in true]) @ maker
-    )
+    of_residuals = maker @ dense(of, [toeplitz(gamma) for gamma in true]) @ maker
     expected = []
     for k, length in enumerate(lengths):
         for lag in range(LAG + 1):
@@ -92,9 +71,7 @@ def test_products_are_those_of_residuals_so_many_samples_apart(name):
         for lag in range(LAG + 1):
             apart = toeplitz(distance == lag).astype(float)
             expected.append(np.einsum("tc,ts,sc->", residual, apart, residual))
-    found = lagged_products(
-        fit, factorise_information(fit), [LAG] * len(lengths)
-    )
+    found = lagged_products(fit, factorise_information(fit), [LAG] * len(lengths))
     np.testing.assert_allclose(found.products, expected, rtol=1e-9)
 
 
@@ -104,23 +81,13 @@ def test_experiments_have_lags_of_their_own():
     found = lagged_products(fit, factorise_information(fit), lags)
     first, second = found.autocovariances()
     assert (len(first), len(second)) == (2, 4)
-    np.testing.assert_allclose(
-        found.expected @ [*first, *second], found.products, atol=1e-9
-    )
-    np.testing.assert_array_equal(
-        np.concatenate(found.split(np.arange(6.0))), np.arange(6)
-    )
+    np.testing.assert_allclose(found.expected @ [*first, *second], found.products, atol=1e-9)
+    np.testing.assert_array_equal(np.concatenate(found.split(np.arange(6.0))), np.arange(6))
     three = replace(found, lags=(0, 2, 1)).split(np.arange(6.0))
-    assert [part.tolist() for part in three] == [
-        [0.0],
-        [1.0, 2.0, 3.0],
-        [4.0, 5.0],
-    ]
+    assert [part.tolist() for part in three] == [[0.0], [1.0, 2.0, 3.0], [4.0, 5.0]]
     beyond = np.arange(6.0)
     less = np.concatenate(found.autocovariances(beyond))
-    np.testing.assert_allclose(
-        found.expected @ less, found.products - beyond, atol=1e-9
-    )
+    np.testing.assert_allclose(found.expected @ less, found.products - beyond, atol=1e-9)
 
 
 def test_the_size_of_errors_is_found_where_offsets_hide_their_mean():
@@ -130,12 +97,8 @@ def test_the_size_of_errors_is_found_where_offsets_hide_their_mean():
         (process,) = error_processes(fit, factorise_information(fit))
         variances.append(np.diag(process.channel_covariance).mean())
         lag1.append(process.autocorrelation[1])
-    assert np.mean(variances) == pytest.approx(
-        1.0, abs=4 * np.std(variances) / np.sqrt(60)
-    )
-    assert np.mean(lag1) == pytest.approx(
-        0.85, abs=4 * np.std(lag1) / np.sqrt(60)
-    )
+    assert np.mean(variances) == pytest.approx(1.0, abs=4 * np.std(variances) / np.sqrt(60))
+    assert np.mean(lag1) == pytest.approx(0.85, abs=4 * np.std(lag1) / np.sqrt(60))
     assert np.std(variances) < 0.2
 
 
@@ -149,11 +112,7 @@ def test_error_bars_stay_sane_where_errors_hardly_forget():
 
 def test_rounding_is_no_process():
     fit = some_fit(PROBLEMS["one"])
-    silent = tuple(
-        replace(block, residual=0 * block.residual) for block in fit.blocks
-    )
-    (process,) = error_processes(
-        replace(fit, blocks=silent), factorise_information(fit)
-    )
+    silent = tuple(replace(block, residual=0 * block.residual) for block in fit.blocks)
+    (process,) = error_processes(replace(fit, blocks=silent), factorise_information(fit))
     assert process.order == 0
     np.testing.assert_array_equal(process.channel_covariance, 0.0)

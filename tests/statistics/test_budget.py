@@ -38,17 +38,9 @@ from collocation_sysid.statistics.budget.consider_analysis import (
     changes_of_assumptions,
     changes_of_nuisances,
 )
-from collocation_sysid.statistics.budget.discretisation_error import (
-    estimate_changes,
-)
-from collocation_sysid.statistics.budget.systematic_effects import (
-    ASSUMPTIONS,
-    Assumptions,
-)
-from collocation_sysid.statistics.budget.uncertainty_budget import (
-    VarianceSources,
-    source_label,
-)
+from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
+from collocation_sysid.statistics.budget.uncertainty_budget import VarianceSources, source_label
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
@@ -84,19 +76,10 @@ def test_the_combined_interval_contains_the_statistical_one(finished):
 
 
 def test_without_systematic_effects_and_discretisation_error_both_intervals_agree():
-    exact = run(
-        replace(problem(**NOTHING), rollout=RolloutOptions("scheme")),
-        seek_causes=False,
-    )
+    exact = run(replace(problem(**NOTHING), rollout=RolloutOptions("scheme")), seek_causes=False)
     for name, line in exact.budget.items():
-        assert line.combined95 == pytest.approx(
-            exact.estimates[name].statistical95
-        )
-        assert set(line.shares) <= {
-            "noise",
-            "nuisance parameters",
-            "step and mesh",
-        }
+        assert line.combined95 == pytest.approx(exact.estimates[name].statistical95)
+        assert set(line.shares) <= {"noise", "nuisance parameters", "step and mesh"}
 
 
 def assumed_deviation(solved: Run, name: str) -> float:
@@ -108,10 +91,7 @@ def test_one_assumption_alone_has_its_own_variance(finished):
     heavy = run(problem(**NOTHING | {"mass": 0.05}), seek_causes=False)
     # Markers that swing tell moduli over density: E follows the mass.
     assert assumed_deviation(heavy, "mu_pa") == pytest.approx(0.05, rel=1e-3)
-    assert (
-        max(heavy.budget["mu_pa"].shares, key=heavy.budget["mu_pa"].shares.get)
-        == "mass"
-    )
+    assert max(heavy.budget["mu_pa"].shares, key=heavy.budget["mu_pa"].shares.get) == "mass"
 
 
 def test_a_large_systematic_effect_stays_on_the_logarithmic_scale_of_its_parameter():
@@ -136,18 +116,10 @@ def test_a_parameter_with_an_interval_wider_than_its_value_is_not_determined():
 
 def test_intervals_respect_the_bounds_of_their_parameter():
     estimate = Estimate(0.05, 0.1, (0.0, 0.25))
-    combined = combine(
-        "x_friction", estimate, None, 0.1, linear=True, bounds=(0.0, 0.2)
-    )
+    combined = combine("x_friction", estimate, None, 0.1, linear=True, bounds=(0.0, 0.2))
     assert combined.statistical95 == (0.0, 0.2)
     assert combined.combined95 == (0.0, 0.2)
-    ratio = combine(
-        "poisson",
-        Estimate(0.4, 0.02, (0.36, 0.44)),
-        None,
-        2.0,
-        bounds=(0.001, 0.495),
-    )
+    ratio = combine("poisson", Estimate(0.4, 0.02, (0.36, 0.44)), None, 2.0, bounds=(0.001, 0.495))
     assert 0.001 < ratio.combined95[0] < 0.4 < ratio.combined95[1] <= 0.495
 
 
@@ -164,45 +136,28 @@ def test_the_remedy_of_poissons_ratio_names_the_table_of_each_value():
 
 @pytest.mark.long
 @pytest.mark.parametrize("huber", [None, 1.0])
-def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(
-    huber,
-):
+def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(huber):
     experiment = measured(hung_cube(20))
     if huber:  # under which most samples count less than they are
         noise_m = 5e-3 * np.random.default_rng(1).standard_normal((21, 9, 3))
-        experiment = with_markers(
-            experiment, experiment.markers.positions_m + noise_m
-        )
+        experiment = with_markers(experiment, experiment.markers.positions_m + noise_m)
     described = Problem([experiment], GUESS, substeps=1, huber=huber)
     first = solve(described, ReducedSpace(tolerance=1e-9))
     collocation, off = first.collocation, 2e-4
-    changes = changes_of_nuisances(
-        collocation, first.z, {"calibration_scale": off}
-    )
-    assert changes.names == (
-        "calibration_scale",
-        "calibration_distortion_1_m2",
-        "clock_rate",
-    )
-    told = -estimate_changes(
-        linearise_fit(collocation, first.z), changes.blocks
-    )[: len(first.q), 0]
+    changes = changes_of_nuisances(collocation, first.z, {"calibration_scale": off})
+    assert changes.names == ("calibration_scale", "calibration_distortion_1_m2", "clock_rate")
+    told = -estimate_changes(linearise_fit(collocation, first.z), changes.blocks)[: len(first.q), 0]
     pivot = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
     tracks = pivot + (1 + off) * (experiment.markers.positions_m - pivot)
     moved = replace(described, experiments=[with_markers(experiment, tracks)])
     again = solve(moved, ReducedSpace(tolerance=1e-9))
-    atol = (0.3 if huber else 0.03) * np.abs(
-        told
-    ).max()  # weights follow residuals
+    atol = (0.3 if huber else 0.03) * np.abs(told).max()  # weights follow residuals
     np.testing.assert_allclose(again.q - first.q, told, atol=atol)
 
 
 def test_what_is_estimated_is_not_considered():
     experiment = measured(cube_with_nuisance(8))
-    wide = replace(
-        experiment,
-        nuisance=replace(experiment.nuisance, calibration_scale=0.01),
-    )
+    wide = replace(experiment, nuisance=replace(experiment.nuisance, calibration_scale=0.01))
     solution = solve(Problem([wide], GUESS))
     names = changes_of_nuisances(
         solution.collocation, solution.z, Assumptions().collect_deviations()
@@ -221,12 +176,8 @@ def test_a_nuisance_that_moves_the_body_may_be_considered():
 
 
 def test_every_assumption_has_a_key_a_default_and_words():
-    assert set(Assumptions().collect_deviations()) == {
-        row.name for row in (*ASSUMPTIONS, *KINDS)
-    }
-    assert all(
-        row.description and source_label(row.name) for row in ASSUMPTIONS
-    )
+    assert set(Assumptions().collect_deviations()) == {row.name for row in (*ASSUMPTIONS, *KINDS)}
+    assert all(row.description and source_label(row.name) for row in ASSUMPTIONS)
     assert source_label("grip_layer_m") == "grip layer"
 
 
@@ -246,16 +197,10 @@ def swings(*gamma_r_s: float) -> Problem:
     rng, recordings = np.random.default_rng(5), []
     for k, damping in enumerate(gamma_r_s):
         swing = replace(hung_cube(25), name=f"swing {k}")
-        markers = simulate(
-            swing, TRUTH | {"gamma_r_s": damping}, "midpoint", substeps=1
-        ).markers_m
-        noise_m = swing.markers.sigma_m[:, None] * rng.standard_normal(
-            markers.shape
-        )
+        markers = simulate(swing, TRUTH | {"gamma_r_s": damping}, "midpoint", substeps=1).markers_m
+        noise_m = swing.markers.sigma_m[:, None] * rng.standard_normal(markers.shape)
         recordings.append(with_markers(swing, markers + noise_m))
-    options = UncertaintyOptions(
-        assumptions=Assumptions(**NOTHING), numerical=False
-    )
+    options = UncertaintyOptions(assumptions=Assumptions(**NOTHING), numerical=False)
     return Problem(recordings, GUESS, substeps=1, uncertainty=options)
 
 
@@ -283,9 +228,7 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     assert (folder / "budget.png").exists()
     told = Result.read(folder)
     assert set(told.budget["mu_pa"]) == set(finished.budget["mu_pa"].shares)
-    short, whole = (
-        plain_text(run_summary(told, folder, budget=b)) for b in (False, True)
-    )
+    short, whole = (plain_text(run_summary(told, folder, budget=b)) for b in (False, True))
     assert "± syst" in short
     assert "% of the variance" not in short
     assert "% of the variance" in whole
@@ -300,18 +243,12 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     [
         ("mass", "-0.1", "uncertainty.assumptions.mass: found -0.1; expected"),
         ("weight", "0.1", "uncertainty.assumptions.weight: unknown key"),
-        (
-            "air_drag",
-            '"off"',
-            "uncertainty.assumptions.air_drag: found 'off'; expected",
-        ),
+        ("air_drag", '"off"', "uncertainty.assumptions.air_drag: found 'off'; expected"),
     ],
 )
 def test_what_cannot_be_assumed_is_one_message(tmp_path, key, value, said):
     file = write_problem(tmp_path, {"swing": 8})
-    file.write_text(
-        file.read_text() + f"\n[uncertainty.assumptions]\n{key} = {value}\n"
-    )
+    file.write_text(file.read_text() + f"\n[uncertainty.assumptions]\n{key} = {value}\n")
     outcome = run_command("check", file)
     assert outcome.code == 2
     assert said in " ".join(outcome.err.split())
@@ -324,28 +261,15 @@ def fast_block(damping: str, sigma_m: float = 3e-4) -> Experiment:
     """A block of 400 kg/m³ that is swung 12 cm at 2 Hz, so that it is strained by some 10 %."""
     t_s = np.linspace(0.0, 0.5, 26)
     way_m = np.outer(0.06 * (1 - np.cos(4 * np.pi * t_s)), [1, 0, 0.5])
-    body = Body(
-        box_mesh((0.05, 0.05, 0.15), (1, 1, 3)),
-        density_kg_m3=400.0,
-        damping=damping,
-    )
+    body = Body(box_mesh((0.05, 0.05, 0.15), (1, 1, 3)), density_kg_m3=400.0, damping=damping)
     top = np.flatnonzero(body.nodes_m[:, 2] > 0.149)
     low = body.nodes_m[body.nodes_m[:, 2] < 0.06][::4]
     swing = PoseSequence(t_s, way_m, np.tile([0, 0, 0, 1.0], (len(t_s), 1)))
-    markers = Markers(
-        t_s, np.zeros((len(t_s), len(low), 3)), sigma_m, places_m=low
-    )
-    return Experiment(
-        body, t_s, [Grasp(top, swing)], markers, nuisance=Nuisance.none()
-    )
+    markers = Markers(t_s, np.zeros((len(t_s), len(low), 3)), sigma_m, places_m=low)
+    return Experiment(body, t_s, [Grasp(top, swing)], markers, nuisance=Nuisance.none())
 
 
-BLOCK = {
-    "young_pa": 20e3,
-    "poisson": 0.3,
-    "gamma_r_s": 6e-3,
-    "gamma_m_1_s": 0.2,
-}
+BLOCK = {"young_pa": 20e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 0.2}
 
 
 def fitted_block(made_with: str, fitted_with: str, **stated):
@@ -356,9 +280,7 @@ def fitted_block(made_with: str, fitted_with: str, **stated):
     described = Problem(
         [with_markers(fast_block(fitted_with), twin)],
         BLOCK | unknown,
-        uncertainty=UncertaintyOptions(
-            assumptions=Assumptions(**(NOTHING | stated))
-        ),
+        uncertainty=UncertaintyOptions(assumptions=Assumptions(**(NOTHING | stated))),
     )
     return run(described, seek_causes=False)
 
@@ -371,9 +293,7 @@ def fitted_block(made_with: str, fitted_with: str, **stated):
         pytest.param("rayleigh", "kelvin-voigt", marks=pytest.mark.long),
     ],
 )
-def test_a_wrong_law_of_damping_is_covered_by_the_budget_not_by_the_noise(
-    made_with, fitted_with
-):
+def test_a_wrong_law_of_damping_is_covered_by_the_budget_not_by_the_noise(made_with, fitted_with):
     wrong = fitted_block(made_with, fitted_with, damping_law=1.0)
     truth = BLOCK["gamma_r_s"]
     low, high = wrong.estimates["gamma_r_s"].statistical95
@@ -398,10 +318,7 @@ def test_other_laws_of_damping_count_unless_the_law_is_known_and_rayleighs_only_
     default = Assumptions().collect_deviations()
     assert default["damping_law"] == 1.0
     assert default["rayleigh_damping"] is None
-    assert (
-        Assumptions(damping_law="none").collect_deviations()["damping_law"]
-        is None
-    )
+    assert Assumptions(damping_law="none").collect_deviations()["damping_law"] is None
 
 
 @pytest.mark.parametrize("stated", ["none", NOTHING])
@@ -414,7 +331,5 @@ def test_a_problem_file_states_with_one_word_that_all_is_exact(tmp_path):
     file = write_problem(tmp_path, {"swing": 5})
     read = Problem.read(file, ['uncertainty.assumptions="none"'])
     assert read.uncertainty.assumptions == Assumptions.exact()
-    with pytest.raises(
-        InputError, match=r'found "exact"; expected a table, or "none"'
-    ):
+    with pytest.raises(InputError, match=r'found "exact"; expected a table, or "none"'):
         Problem.read(file, ['uncertainty.assumptions="exact"'])

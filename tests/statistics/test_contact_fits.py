@@ -13,10 +13,7 @@ from kit.problems import GUESS, measured, pressed_cube
 import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.features.contact_feature import contact_concerns
-from collocation_sysid.model.contact.contact_summary import (
-    ContactSummary,
-    contact_summaries,
-)
+from collocation_sysid.model.contact.contact_summary import ContactSummary, contact_summaries
 from collocation_sysid.recording import Experiment
 from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.runs.check import check_problem
@@ -29,20 +26,14 @@ THERE_AND_BACK_M = np.concatenate([DEPTHS_M[:7], DEPTHS_M[:7][::-1]])
 def forces_n(seed: int) -> np.ndarray:
     """What the ball measures where it is as stated, with noise."""
     exact = cs.simulate(poked(), TRUTH).wrenches[0][:, :3]
-    return exact + SIGMA_N * np.random.default_rng(seed).normal(
-        size=exact.shape
-    )
+    return exact + SIGMA_N * np.random.default_rng(seed).normal(size=exact.shape)
 
 
-def measured_once(
-    experiment: Experiment, seed: int = 0, **unknown
-) -> cs.Problem:
+def measured_once(experiment: Experiment, seed: int = 0, **unknown) -> cs.Problem:
     """To find E and the place of the ball."""
     held, ball = experiment.grasps
     read = replace(ball, wrench=replace(ball.wrench, values=forces_n(seed)))
-    known = cs.Parameters.from_mapping(
-        {**TRUTH, "young_pa": cs.Unknown(1e4), **unknown}
-    )
+    known = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(1e4), **unknown})
     return cs.Problem([replace(experiment, grasps=[held, read])], known)
 
 
@@ -53,9 +44,7 @@ def answer(experiment: Experiment, seed: int = 0, **unknown) -> cs.Run:
 
 def touch_of(experiment: Experiment) -> ContactSummary:
     """How the ball touches the block."""
-    x = cs.simulate(experiment, TRUTH).positions_m.reshape(
-        len(experiment.t_s), -1
-    )
+    x = cs.simulate(experiment, TRUTH).positions_m.reshape(len(experiment.t_s), -1)
     (touch,) = contact_summaries(experiment, x, experiment.t_s)
     return touch
 
@@ -67,21 +56,14 @@ def told(run: cs.Run) -> set[str]:
 
 def test_a_ball_that_rubs_may_come_deep_into_a_block_from_one_sample_to_the_next():
     at_once, slowly = (
-        cs.simulate(
-            poked(depths_m=depths_m, friction=friction), TRUTH
-        ).wrenches[0][-1, 2]
-        for depths_m, friction in (
-            (np.array([0.0, 4e-3]), 0.5),
-            (np.linspace(0, 4e-3, 9), 0.0),
-        )
+        cs.simulate(poked(depths_m=depths_m, friction=friction), TRUTH).wrenches[0][-1, 2]
+        for depths_m, friction in ((np.array([0.0, 4e-3]), 0.5), (np.linspace(0, 4e-3, 9), 0.0))
     )
     assert at_once == pytest.approx(slowly, rel=0.1)
 
 
 @pytest.mark.parametrize("off_m", [0.0, 3e-4])
-def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(
-    off_m: float,
-):
+def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(off_m: float):
     finished = answer(poked(off_m))
     low, high = finished.result.parameters["young_pa"].statistical95
     assert low < TRUTH["young_pa"] < high
@@ -90,7 +72,7 @@ def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(
     assert lowest < TRUTH["young_pa"] < highest
     assert highest - lowest < 0.5 * TRUTH["young_pa"]
     part = finished.solution.collocation.iterates(finished.solution.z)[0]
-    place_m = float((part.phi * part.segment.nuisance.scales)[0])
+    place_m = float((part.phi * part.transcription.nuisance.scales)[0])
     assert place_m == pytest.approx(-off_m, abs=1e-4)
 
 
@@ -105,8 +87,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 
 
 @pytest.mark.parametrize(
-    ("off_m", "prior_m", "verdict"),
-    [(2.5e-3, 5e-4, "check"), (1e-3, 1e-4, "doubtful")],
+    ("off_m", "prior_m", "verdict"), [(2.5e-3, 5e-4, "check"), (1e-3, 1e-4, "doubtful")]
 )
 def test_an_obstacle_far_from_where_it_is_stated_is_told(
     off_m: float, prior_m: float, verdict: str
@@ -118,9 +99,7 @@ def test_an_obstacle_far_from_where_it_is_stated_is_told(
 
 
 @pytest.mark.parametrize("factor", [30.0, 1 / 30.0])
-def test_a_compressed_block_is_found_from_thirty_times_its_stiffness_and_a_thirtieth(
-    factor: float,
-):
+def test_a_compressed_block_is_found_from_thirty_times_its_stiffness_and_a_thirtieth(factor: float):
     pressed = poked(shape=FLAT)
     held, plate = pressed.grasps
     exact_n = cs.simulate(pressed, TRUTH).wrenches[0][:, :3]
@@ -128,13 +107,9 @@ def test_a_compressed_block_is_found_from_thirty_times_its_stiffness_and_a_thirt
     known = cs.Parameters.from_mapping(
         {**TRUTH, "young_pa": cs.Unknown(factor * TRUTH["young_pa"])}
     )
-    solution = cs.solve(
-        cs.Problem([replace(pressed, grasps=[held, measured])], known)
-    )
+    solution = cs.solve(cs.Problem([replace(pressed, grasps=[held, measured])], known))
     assert solution.status.converged
-    assert solution.parameters["young_pa"] == pytest.approx(
-        TRUTH["young_pa"], rel=1e-4
-    )
+    assert solution.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=1e-4)
 
 
 FORGOTTEN = {
@@ -155,9 +130,7 @@ def test_wrong_friction_and_a_forgotten_obstacle_are_told(fault: str):
     actual = poked(friction=0.0 if others else 0.5)
     actual = replace(actual, grasps=[*actual.grasps, *others])
     exact_n = cs.simulate(actual, TRUTH).wrenches[0][:, :3]
-    read_n = exact_n + SIGMA_N * np.random.default_rng(0).normal(
-        size=exact_n.shape
-    )
+    read_n = exact_n + SIGMA_N * np.random.default_rng(0).normal(size=exact_n.shape)
     held, ball = stated.grasps
     measured = replace(ball, wrench=replace(ball.wrench, values=read_n))
     known = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(1e4)})
@@ -200,37 +173,23 @@ def test_check_compares_derivatives_within_the_gap_and_looks_at_no_grasp_of_an_o
         ({"shape": FLAT, "depths_m": THERE_AND_BACK_M}, {"lost"}),
     ],
 )
-def test_check_says_what_contact_will_spoil_at_the_guess(
-    changes: dict, codes: set[str]
-):
-    concerns = check_problem(
-        measured_once(poked(**changes)), full=True
-    ).concerns
+def test_check_says_what_contact_will_spoil_at_the_guess(changes: dict, codes: set[str]):
+    concerns = check_problem(measured_once(poked(**changes)), full=True).concerns
     of_contact = [each for each in concerns if each.topic == "contact"]
-    assert {each.code for each in of_contact} == {
-        f"contact/{code}" for code in codes
-    }
+    assert {each.code for each in of_contact} == {f"contact/{code}" for code in codes}
     assert all("ball" in each.message for each in of_contact)
     assert all("at the guess" in each.message for each in of_contact)
 
 
 def test_check_says_nothing_of_contact_that_it_has_not_simulated(monkeypatch):
-    monkeypatch.setattr(
-        "collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0
-    )
-    for changes in (
-        {"higher_m": 0.05, "place_sigma_m": None},
-        {"shape": SMALL},
-    ):
+    monkeypatch.setattr("collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0)
+    for changes in ({"higher_m": 0.05, "place_sigma_m": None}, {"shape": SMALL}):
         concerns = check_problem(measured_once(poked(**changes))).concerns
         assert not any(each.topic == "contact" for each in concerns)
 
 
 def test_what_several_recordings_share_is_said_once():
-    often = [
-        touch_of(replace(poked(shape=SMALL), name=name))
-        for name in ("a", "b", "c")
-    ]
+    often = [touch_of(replace(poked(shape=SMALL), name=name)) for name in ("a", "b", "c")]
     (one,) = contact_concerns(often)
     assert "'a' and 2 more" in one.message
 
@@ -238,9 +197,7 @@ def test_what_several_recordings_share_is_said_once():
 def test_what_friction_did_is_told_in_a_line_and_kept_in_the_result(tmp_path):
     run = answer(poked(friction=0.3, place_sigma_m=None))
     said = " ".join(
-        plain_text(
-            run_summary(run.result, run.save(tmp_path / "run", frames=False))
-        ).split()
+        plain_text(run_summary(run.result, run.save(tmp_path / "run", frames=False))).split()
     )
     assert said.count("friction of ball in 'poke': at most") == 1
     (rubbed,) = run.result.fit.experiments["poke"].friction.values()
@@ -256,51 +213,33 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
     run = cs.run(cs.Problem([seen], GUESS), seek_causes=False)
     assert run.refinement is None
     assert run.result.list_discretisation_kinds() == ()
-    free = measured(
-        replace(pressed_cube(6), grasps=pressed_cube(6).body_grasps)
-    )
-    assert (
-        cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement
-        is not None
-    )
+    free = measured(replace(pressed_cube(6), grasps=pressed_cube(6).body_grasps))
+    assert cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement is not None
 
 
-@pytest.mark.parametrize(
-    "unknown", ["obstacle_offset_m", "obstacle_tilt_rad", "obstacle_time_s"]
-)
+@pytest.mark.parametrize("unknown", ["obstacle_offset_m", "obstacle_tilt_rad", "obstacle_time_s"])
 @pytest.mark.parametrize("zero", ["", "y"])
-def test_what_is_found_of_an_obstacle_moves_it_in_a_forward_simulation_as_in_the_fit(
-    unknown, zero
-):
+def test_what_is_found_of_an_obstacle_moves_it_in_a_forward_simulation_as_in_the_fit(unknown, zero):
     pressed = pressed_cube(8, nuisance=cs.Nuisance.none(**{unknown: 1e-4}))
     displaced = [replace(obstacle, zero=zero) for obstacle in pressed.obstacles]
-    (segment,) = (
-        cs.Problem([pressed.with_obstacles(displaced)], GUESS)
-        .collocation()
-        .transcriptions
+    (transcription,) = (
+        cs.Problem([pressed.with_obstacles(displaced)], GUESS).collocation().transcriptions
     )
-    as_stated = segment.prescribed_motion.evaluate_at(
-        np.zeros(segment.nuisance.size)
-    )
-    for phi in np.eye(segment.nuisance.size):
+    as_stated = transcription.prescribed_motion.evaluate_at(np.zeros(transcription.nuisance.size))
+    for phi in np.eye(transcription.nuisance.size):
         change_m = (
-            segment.prescribed_motion.evaluate_at(phi).positions_m
-            - as_stated.positions_m
+            transcription.prescribed_motion.evaluate_at(phi).positions_m - as_stated.positions_m
         )
-        simulated_m = segment.corrected_experiment(phi).prescribed_positions(
-            segment.dynamics.t_s
+        simulated_m = transcription.corrected_experiment(phi).prescribed_positions(
+            transcription.dynamics.t_s
         )
         assert np.abs(change_m).max() > 1e-6
         np.testing.assert_allclose(
-            simulated_m - as_stated.positions_m,
-            change_m,
-            atol=0.01 * np.abs(change_m).max(),
+            simulated_m - as_stated.positions_m, change_m, atol=0.01 * np.abs(change_m).max()
         )
 
 
 def test_a_place_is_off_along_the_displacement_or_else_along_the_normal():
     ball, plate = pressed_cube().obstacles
     assert replace(ball, zero="y").offset_direction.tolist() == [0.0, 1.0, 0.0]
-    np.testing.assert_array_equal(
-        plate.offset_direction, plate.shape.offset_direction
-    )
+    np.testing.assert_array_equal(plate.offset_direction, plate.shape.offset_direction)

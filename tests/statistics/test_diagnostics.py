@@ -27,17 +27,11 @@ def diagnosis(residual: np.ndarray, missing: float = 0.0) -> MarkerDiagnosis:
     both = np.zeros((len(T_S), 2, 3))
     both[:, 1] = np.where(seen[:, 1:], residual, 0.0)
     slope = np.zeros((len(T_S), 2, 3, 2))
-    slope[:, 1, 2, 0] = np.where(
-        seen[:, 1], 50 * MOTION, 0.0
-    )  # of a shared parameter
+    slope[:, 1, 2, 0] = np.where(seen[:, 1], 50 * MOTION, 0.0)  # of a shared parameter
     slope[:, 1, 0, 1] = seen[:, 1]  # of an offset
-    block = ResidualBlock(
-        "gravity", T_S, ("Base", "Tip2"), seen, both, slope, np.full(2, SIGMA_M)
-    )
+    block = ResidualBlock("gravity", T_S, ("Base", "Tip2"), seen, both, slope, np.full(2, SIGMA_M))
     names = ("mu_pa", "gravity: offset of Tip2, x [m]")
-    fit = LinearisedFit(
-        (block,), names, 1, np.zeros(2), np.zeros(2), np.zeros(2, dtype=bool)
-    )
+    fit = LinearisedFit((block,), names, 1, np.zeros(2), np.zeros(2), np.zeros(2, dtype=bool))
     (found,) = diagnose_markers(fit)
     assert (found.experiment, found.marker) == ("gravity", "Tip2")
     assert found.sentence.startswith("gravity/Tip2: ")
@@ -47,29 +41,17 @@ def diagnosis(residual: np.ndarray, missing: float = 0.0) -> MarkerDiagnosis:
 @pytest.mark.parametrize("missing", [0.0, 0.3])
 def test_white_residuals_are_as_they_should_be(missing):
     said = [diagnosis(noise(seed), missing) for seed in range(20)]
-    assert (
-        sum("uncorrelated, consistent with noise" in d.sentence for d in said)
-        >= 18
-    )
-    assert np.mean([d.rms_m for d in said]) == pytest.approx(
-        np.sqrt(3) * SIGMA_M, rel=0.03
-    )
-    assert np.mean([d.early_share for d in said]) == pytest.approx(
-        0.1, abs=0.03
-    )
+    assert sum("uncorrelated, consistent with noise" in d.sentence for d in said) >= 18
+    assert np.mean([d.rms_m for d in said]) == pytest.approx(np.sqrt(3) * SIGMA_M, rel=0.03)
+    assert np.mean([d.early_share for d in said]) == pytest.approx(0.1, abs=0.03)
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.3])
 def test_a_constant_part_is_a_marker_off_its_place(missing):
     found = diagnosis(noise() + np.array([6.0, 0.0, 0.0]), missing)
     assert found.constant_share == pytest.approx(36 / 39, abs=0.03)
-    np.testing.assert_allclose(
-        found.offset_m, [6 * SIGMA_M, 0, 0], atol=0.2 * SIGMA_M
-    )
-    assert (
-        "is a constant part: its position on the body is wrong by 1.2 mm"
-        in found.sentence
-    )
+    np.testing.assert_allclose(found.offset_m, [6 * SIGMA_M, 0, 0], atol=0.2 * SIGMA_M)
+    assert "is a constant part: its position on the body is wrong by 1.2 mm" in found.sentence
     assert "marker_offsets" in found.sentence
 
 
@@ -105,10 +87,7 @@ def test_residuals_at_the_start_tell_of_the_release():
 def test_a_drift_is_not_called_an_oscillation():
     drift = np.zeros((len(T_S), 3))
     drift[:, 2] = np.linspace(-10, 10, len(T_S))
-    assert (
-        "slow drift: the model lacks creep"
-        in diagnosis(noise() + drift).sentence
-    )
+    assert "slow drift: the model lacks creep" in diagnosis(noise() + drift).sentence
 
 
 def test_a_slow_walk_without_a_peak_is_named_too():
@@ -121,10 +100,5 @@ def test_a_slow_walk_without_a_peak_is_named_too():
 def test_an_exact_fit_needs_no_words():
     found = diagnosis(np.zeros((len(T_S), 3)))
     assert found.rms_m == 0
-    assert (
-        found.sentence
-        == "gravity/Tip2: residuals are at the level of rounding errors"
-    )
-    assert np.isfinite(
-        [found.lag1, found.constant_share, found.oscillating_share]
-    ).all()
+    assert found.sentence == "gravity/Tip2: residuals are at the level of rounding errors"
+    assert np.isfinite([found.lag1, found.constant_share, found.oscillating_share]).all()

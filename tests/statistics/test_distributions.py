@@ -17,27 +17,12 @@ VALUES = np.array([0.0, 1e-3, 2.0, 40.0, 1e3])
     ("found", "expected"),
     [
         (distributions.normal_isf(TAILS), stats.norm.isf(TAILS)),
-        (
-            distributions.chi2_isf(TAILS, FREEDOM),
-            stats.chi2.isf(TAILS, FREEDOM),
-        ),
-        (
-            distributions.chi2_sf(VALUES, FREEDOM),
-            stats.chi2.sf(VALUES, FREEDOM),
-        ),
-        (
-            distributions.chi2_cdf(VALUES, FREEDOM),
-            stats.chi2.cdf(VALUES, FREEDOM),
-        ),
-        (
-            distributions.student_ppf(0.975, FREEDOM),
-            stats.t.ppf(0.975, FREEDOM),
-        ),
+        (distributions.chi2_isf(TAILS, FREEDOM), stats.chi2.isf(TAILS, FREEDOM)),
+        (distributions.chi2_sf(VALUES, FREEDOM), stats.chi2.sf(VALUES, FREEDOM)),
+        (distributions.chi2_cdf(VALUES, FREEDOM), stats.chi2.cdf(VALUES, FREEDOM)),
+        (distributions.student_ppf(0.975, FREEDOM), stats.t.ppf(0.975, FREEDOM)),
         (distributions.student_ppf(0.975, np.inf), stats.norm.ppf(0.975)),
-        (
-            distributions.f_sf(VALUES, 3, freedom=FREEDOM),
-            stats.f.sf(VALUES, 3, FREEDOM),
-        ),
+        (distributions.f_sf(VALUES, 3, freedom=FREEDOM), stats.f.sf(VALUES, 3, FREEDOM)),
         (distributions.chi2_sf(np.nan, 3), np.nan),
     ],
 )

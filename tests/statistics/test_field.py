@@ -19,23 +19,12 @@ from collocation_sysid.fem.laws.constants import MU
 from collocation_sysid.fem.meshes.refinement import refine_body
 from collocation_sysid.fem.spatial_field import FieldModes, Laplacian
 from collocation_sysid.result.pictures.field_intervals import field_picture
-from collocation_sysid.result.replay import (
-    ARRAY_LAYOUT,
-    GROUP_PREFIXES,
-    read_run,
-)
+from collocation_sysid.result.replay import ARRAY_LAYOUT, GROUP_PREFIXES, read_run
 from collocation_sysid.runs.check.body_check import check_body
 from collocation_sysid.runs.forward_simulation import simulate_experiment
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changes_of_assumptions,
-)
-from collocation_sysid.statistics.budget.discretisation_error import (
-    estimate_changes,
-)
-from collocation_sysid.statistics.field_estimates import (
-    FieldEstimate,
-    field_estimates,
-)
+from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
+from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
+from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
@@ -43,17 +32,10 @@ SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3
 KNOWN = {"poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
 
 
-def bar(
-    field: cs.Field | None = None, stiff: np.ndarray | None = None, **changes
-) -> Body:
+def bar(field: cs.Field | None = None, stiff: np.ndarray | None = None, **changes) -> Body:
     regions = [] if stiff is None else [cs.Region("stiff", stiff)]
     mesh = cs.box_mesh(SIZE_M, changes.pop("divisions", (2, 2, 6)))
-    return Body(
-        mesh,
-        density_kg_m3=100.0,
-        field=field,
-        **({"regions": regions} | changes),
-    )
+    return Body(mesh, density_kg_m3=100.0, field=field, **({"regions": regions} | changes))
 
 
 def centres(body: Body) -> np.ndarray:
@@ -66,43 +48,30 @@ def swung(body: Body, above_m: float = 0.119, steps: int = 15) -> cs.Experiment:
     outer = np.unique(body.mesh.surface)
     places = x[outer[x[outer, 2] < 0.119]]
     grasp = cs.Grasp(np.flatnonzero(x[:, 2] > above_m), smooth_poses(t_s))
-    markers = replace(
-        point_markers(body, places, t_s), sigma_m=np.full(len(places), SIGMA_M)
-    )
+    markers = replace(point_markers(body, places, t_s), sigma_m=np.full(len(places), SIGMA_M))
     return cs.Experiment(body, t_s, [grasp], markers, nuisance=IDEAL)
 
 
 @cache
-def problem(
-    ratio: float = 1.0, above_m: float = 0.119, steps: int = 15, **stated
-) -> cs.Problem:
+def problem(ratio: float = 1.0, above_m: float = 0.119, steps: int = 15, **stated) -> cs.Problem:
     """A bar whose lower half is stiffer, which no description tells."""
     true = bar(stiff=centres(bar())[:, 2] < 0.06)
     values = {**KNOWN, "young_pa": YOUNG_PA, "stiff.young_pa": ratio * YOUNG_PA}
-    tracks = cs.simulate(
-        swung(true, above_m, steps), values, "midpoint", substeps=1
-    ).markers_m
+    tracks = cs.simulate(swung(true, above_m, steps), values, "midpoint", substeps=1).markers_m
     noise = SIGMA_M * np.random.default_rng(5).normal(size=tracks.shape)
     field = cs.Field(**({"length_m": 0.05, "modes": 20} | stated))
     seen = cs.with_markers(swung(bar(field), above_m, steps), tracks + noise)
-    return cs.Problem(
-        [seen], {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}, substeps=1
-    )
+    return cs.Problem([seen], {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}, substeps=1)
 
 
 @cache
-def found(
-    ratio: float = 1.0, above_m: float = 0.119, **stated
-) -> FieldEstimate:
+def found(ratio: float = 1.0, above_m: float = 0.119, **stated) -> FieldEstimate:
     solution = cs.solve(problem(ratio, above_m, **stated))
     assert solution.status.converged
     collocation = solution.collocation
     known = uncertainty_at(collocation, solution.z)
     (field,) = field_estimates(
-        collocation.transcriptions[0].body,
-        collocation.parameters,
-        solution.q,
-        known,
+        collocation.transcriptions[0].body, collocation.parameters, solution.q, known
     )
     return field
 
@@ -114,9 +83,7 @@ def truth(ratio: float) -> np.ndarray:
 def held_share(field: FieldEstimate, ratio: float) -> float:
     """Of the elements that the data tell, those whose interval holds the truth."""
     low, high = np.log(field.statistical95)
-    return float(
-        ((low < truth(ratio)) & (truth(ratio) < high))[field.is_informed].mean()
-    )
+    return float(((low < truth(ratio)) & (truth(ratio) < high))[field.is_informed].mean())
 
 
 def test_the_prior_falls_off_as_materns_does():
@@ -129,9 +96,7 @@ def test_the_prior_falls_off_as_materns_does():
     correlation = modes.shapes @ modes.shapes[5000] / 0.25
     for away in (0.15, 0.2, 0.3, 0.4):
         here = np.abs(away_m - away) < 0.02
-        assert correlation[here].mean() == pytest.approx(
-            np.exp(-away / 0.15), abs=0.06
-        )
+        assert correlation[here].mean() == pytest.approx(np.exp(-away / 0.15), abs=0.06)
     variance = (modes.shapes**2).sum(axis=1) + modes.omitted_deviation**2
     np.testing.assert_allclose(variance, 0.25)
 
@@ -152,41 +117,27 @@ def test_pieces_that_do_not_touch_have_a_stiffness_each():
     layer = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2] // 0.02
     apart = np.flatnonzero((layer < 1) | (layer > 4))
     first = Laplacian.from_mesh(mesh, apart, 5).vectors[0]
-    lower, upper = (
-        first[part] for part in (layer[apart] < 1, layer[apart] > 4)
-    )
+    lower, upper = (first[part] for part in (layer[apart] < 1, layer[apart] > 4))
     assert np.ptp(lower) < 1e-6 * abs(lower[0])
     assert upper[0] == pytest.approx(-lower[0])
 
 
 REMEMBERING, AVERAGING = {"prony": ["slow"]}, {"element": "tet10-p0"}
-SLOWLY = AVERAGING | {
-    "evaluator": "casadi"
-}  # whose second derivatives take long to compile
+SLOWLY = AVERAGING | {"evaluator": "casadi"}  # whose second derivatives take long to compile
 
 
-def uneven(
-    kind: dict, rng: np.random.Generator
-) -> tuple[Body, list[np.ndarray], np.ndarray]:
+def uneven(kind: dict, rng: np.random.Generator) -> tuple[Body, list[np.ndarray], np.ndarray]:
     """A body, places, velocities and weights of its nodes, and θ with shares at its end."""
     body = bar(cs.Field(0.05, modes=4), divisions=(1, 1, 3), **kind)
     memory = {"slow.share": 0.3, "slow.tau_s": 0.1}
-    shares = dict(
-        zip(
-            body.list_field_coefficient_names(), rng.normal(size=4), strict=True
-        )
-    )
+    shares = dict(zip(body.list_field_coefficient_names(), rng.normal(size=4), strict=True))
     x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
-    theta = body.theta_from_values(
-        {**KNOWN, **memory, "young_pa": YOUNG_PA, **shares}
-    )
+    theta = body.theta_from_values({**KNOWN, **memory, "young_pa": YOUNG_PA, **shares})
     return body, [x, *rng.normal(size=(2, *x.shape))], theta
 
 
 def share_steps(body: Body) -> np.ndarray:
-    return 0.1 * np.isin(
-        np.arange(len(body.constants)), np.r_[body.field_slices[0]]
-    )
+    return 0.1 * np.isin(np.arange(len(body.constants)), np.r_[body.field_slices[0]])
 
 
 @pytest.mark.parametrize("kind", [REMEMBERING, AVERAGING, SLOWLY], ids=str)
@@ -197,9 +148,7 @@ def test_slopes_by_the_shares_are_those_of_differences(kind: dict, rng):
     def force(at: np.ndarray) -> np.ndarray:
         return body.force(x, v, at)[0]
 
-    assert_derivative(
-        force, lambda d: by_theta @ d, theta, rng, scale=share_steps(body)
-    )
+    assert_derivative(force, lambda d: by_theta @ d, theta, rng, scale=share_steps(body))
 
 
 @pytest.mark.parametrize("kind", [REMEMBERING, SLOWLY], ids=str)
@@ -210,34 +159,26 @@ def test_curvature_by_the_shares_is_that_of_differences(kind: dict, rng):
     def slope(at: np.ndarray) -> np.ndarray:
         return body.second_derivatives(x, v, w, at).theta[0]
 
-    assert_derivative(
-        slope, lambda d: by_both @ d, theta, rng, scale=share_steps(body)
-    )
+    assert_derivative(slope, lambda d: by_both @ d, theta, rng, scale=share_steps(body))
 
 
 def test_a_hidden_stiff_half_is_found():
     field = found(2.0)
     z_m = centres(bar())[:, 2]
-    upper, lower = (
-        np.log(field.value[part]).mean() for part in (z_m > 0.08, z_m < 0.04)
-    )
+    upper, lower = (np.log(field.value[part]).mean() for part in (z_m > 0.08, z_m < 0.04))
     assert np.exp(lower - upper) == pytest.approx(2.0, rel=0.15)
     assert held_share(field, 2.0) >= 0.9
     assert field.is_informed.mean() > 0.9
     assert 5 < field.count_identified_modes() <= 20
 
 
-@pytest.mark.parametrize(
-    "method", [cs.InteriorPoint(), cs.Shooting()], ids=type
-)
+@pytest.mark.parametrize("method", [cs.InteriorPoint(), cs.Shooting()], ids=type)
 def test_other_methods_find_the_same_field(method):
     expected = cs.solve(problem(2.0, steps=3, modes=3))
     solution = cs.solve(problem(2.0, steps=3, modes=3), method)
     assert solution.status.converged
     for name, value in expected.parameters.items():
-        assert solution.parameters[name] == pytest.approx(
-            value, rel=1e-4, abs=1e-4
-        )
+        assert solution.parameters[name] == pytest.approx(value, rel=1e-4, abs=1e-4)
 
 
 def test_a_body_of_another_size_moves_a_field_as_its_budget_says():
@@ -245,40 +186,22 @@ def test_a_body_of_another_size_moves_a_field_as_its_budget_says():
     field = cs.Field(0.05, modes=8)
     clamp_m = shape.nodes_m[shape.nodes_m[:, 2] > 0.119].mean(axis=0)
     true = Body(
-        cs.TetMesh(
-            clamp_m + (1 + larger) * (shape.nodes_m - clamp_m),
-            shape.mesh.tetrahedra,
-        ),
+        cs.TetMesh(clamp_m + (1 + larger) * (shape.nodes_m - clamp_m), shape.mesh.tetrahedra),
         density_kg_m3=100.0,
     )
-    values, free = (
-        {**KNOWN, "young_pa": YOUNG_PA},
-        {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)},
-    )
+    values, free = ({**KNOWN, "young_pa": YOUNG_PA}, {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)})
     solutions = [
-        cs.solve(
-            cs.Problem(
-                [cs.with_markers(swung(bar(field)), tracks)], free, substeps=1
-            )
-        )
+        cs.solve(cs.Problem([cs.with_markers(swung(bar(field)), tracks)], free, substeps=1))
         for body in (shape, true)
-        for tracks in [
-            cs.simulate(swung(body), values, "midpoint", substeps=1).markers_m
-        ]
+        for tracks in [cs.simulate(swung(body), values, "midpoint", substeps=1).markers_m]
     ]
     moved = np.subtract(*(solution.q for solution in reversed(solutions)))
     fitted = solutions[0]
-    changes = changes_of_assumptions(
-        fitted.collocation, fitted.z, {"body_scale": larger}
-    )
-    told = estimate_changes(
-        linearise_fit(fitted.collocation, fitted.z), changes.blocks
-    )
+    changes = changes_of_assumptions(fitted.collocation, fitted.z, {"body_scale": larger})
+    told = estimate_changes(linearise_fit(fitted.collocation, fitted.z), changes.blocks)
     size = changes.names.index("body_scale")
     assert np.abs(moved).max() > 0.05
-    np.testing.assert_allclose(
-        moved, -told[: len(moved), size], atol=0.03 * np.abs(moved).max()
-    )
+    np.testing.assert_allclose(moved, -told[: len(moved), size], atol=0.03 * np.abs(moved).max())
 
 
 HEAVY, OF_DENSITY = 1.4, cs.Field(0.05, "density_kg_m3", 20, 0.3)
@@ -313,9 +236,7 @@ def test_a_heavier_half_is_found_beside_the_stiffness():
     told = field.is_informed
     assert told.mean() > 0.5
     assert np.mean((low < truth) & (truth < high)) > 0.9
-    upper, lower = (
-        field.value[part].mean() for part in (z_m > 0.08, z_m < 0.04)
-    )
+    upper, lower = (field.value[part].mean() for part in (z_m > 0.08, z_m < 0.04))
     assert 1.2 < lower / upper < 1.6
     assert solution.parameters["young_pa"] == pytest.approx(YOUNG_PA, rel=0.1)
 
@@ -337,43 +258,31 @@ def test_a_field_of_density_weighs_what_its_shapes_say(rng):
 
 def too_light(solution: cs.Solution, size: float = 30.0) -> cs.Solution:
     """The same where a shape of the density is so large that nodes have no mass."""
-    place = [item.name for item in solution.collocation.parameters.free].index(
-        "field_1"
-    )
-    return replace(
-        solution, z=np.r_[solution.z[:place], size, solution.z[place + 1 :]]
-    )
+    place = [item.name for item in solution.collocation.parameters.free].index("field_1")
+    return replace(solution, z=np.r_[solution.z[:place], size, solution.z[place + 1 :]])
 
 
 def test_a_simulation_refuses_a_density_that_leaves_a_node_without_mass():
     body = bar(OF_DENSITY)
     values = {**KNOWN, "young_pa": YOUNG_PA}
     with pytest.raises(
-        cs.InputError,
-        match=r"because density_kg_m3 is too low near it; .*amplitude",
+        cs.InputError, match=r"because density_kg_m3 is too low near it; .*amplitude"
     ):
         cs.simulate(swung(body), {**values, "field_1": 30.0})
 
 
 def test_an_answer_without_mass_somewhere_is_doubtful_and_says_why_it_cannot_be_simulated():
     solution, field = weighed()
-    assert "field/negative" not in [
-        concern.code for concern in field.list_concerns()
-    ]
+    assert "field/negative" not in [concern.code for concern in field.list_concerns()]
     light = too_light(solution)
     collocation = light.collocation
     (light_field,) = field_estimates(
-        collocation.transcriptions[0].body,
-        collocation.parameters,
-        light.q,
-        np.eye(len(light.q)),
+        collocation.transcriptions[0].body, collocation.parameters, light.q, np.eye(len(light.q))
     )
     concern = light_field.list_concerns()[0]
     assert (concern.code, concern.grade) == ("field/negative", "doubtful")
     assert "density_kg_m3 is zero or negative in" in concern.message
-    problem = cs.Problem(
-        collocation.experiments, collocation.parameters, substeps=1
-    )
+    problem = cs.Problem(collocation.experiments, collocation.parameters, substeps=1)
     said = simulate_experiment(problem, light, problem.experiments[0])
     assert isinstance(said, str)
     assert "expected masses above zero" in said
@@ -384,31 +293,19 @@ def test_a_solve_keeps_clear_of_masses_below_zero():
     heavy = cs.Region("half", lower, density_kg_m3=190.0)
     true = Body(bar().mesh, density_kg_m3=10.0, regions=[heavy])
     values = {**KNOWN, "young_pa": YOUNG_PA}
-    tracks = cs.simulate(
-        swung(true, steps=8), values, "midpoint", substeps=1
-    ).markers_m
+    tracks = cs.simulate(swung(true, steps=8), values, "midpoint", substeps=1).markers_m
     body = bar(cs.Field(0.03, "density_kg_m3", 12, 0.5))
     seen = cs.with_markers(swung(body, steps=8), tracks)
     solution = cs.solve(cs.Problem([seen], values, substeps=1))
     body = solution.collocation.transcriptions[0].body
-    assert (
-        body.mass_of_dofs(body.theta_from_values(solution.parameters)).min() > 0
-    )
+    assert body.mass_of_dofs(body.theta_from_values(solution.parameters)).min() > 0
 
 
 def test_densities_by_the_default_amplitude_have_masses_above_zero(rng):
     body = bar(cs.Field(0.03, "density_kg_m3", 30))
     for _ in range(200):
-        shares = dict(
-            zip(
-                body.list_field_coefficient_names(),
-                rng.normal(size=30),
-                strict=True,
-            )
-        )
-        theta = body.theta_from_values(
-            {**KNOWN, "young_pa": YOUNG_PA, **shares}
-        )
+        shares = dict(zip(body.list_field_coefficient_names(), rng.normal(size=30), strict=True))
+        theta = body.theta_from_values({**KNOWN, "young_pa": YOUNG_PA, **shares})
         assert body.mass_of_dofs(theta).min() > 0
 
 
@@ -421,19 +318,12 @@ def test_an_even_body_is_found_even():
 def test_what_does_not_deform_is_as_the_prior_has_it():
     field = found(1.0, 0.055)
     above = (bar().nodes_m[bar().cells, 2] > 0.055).all(axis=1)
-    assert (
-        field.compute_deviation_over_prior()[
-            above & (centres(bar())[:, 2] > 0.1)
-        ].min()
-        > 0.9
-    )
+    assert field.compute_deviation_over_prior()[above & (centres(bar())[:, 2] > 0.1)].min() > 0.9
     assert field.compute_deviation_over_prior()[~above].max() < 0.5
 
 
 def test_an_amplitude_that_is_too_small_is_told():
-    codes = [
-        concern.code for concern in found(3.0, amplitude=0.05).list_concerns()
-    ]
+    codes = [concern.code for concern in found(3.0, amplitude=0.05).list_concerns()]
     assert "field/amplitude" in codes
     assert not found(3.0, amplitude=1.0).list_concerns()
 
@@ -445,33 +335,19 @@ def test_evidence_is_that_of_a_normal_marginal_likelihood(rng):
     posterior = np.linalg.inv(np.eye(6) + slopes.T @ slopes / noise**2)
     shares = posterior @ slopes.T @ data / noise**2
     many = np.ones(len(modes.shapes))
-    field = FieldEstimate(
-        "young_pa", modes, np.arange(1), many, many, 1.96, shares, posterior
-    )
+    field = FieldEstimate("young_pa", modes, np.arange(1), many, many, 1.96, shares, posterior)
 
     def exact(prior: np.ndarray) -> float:
         total = slopes @ prior @ slopes.T + noise**2 * np.eye(30)
-        return (
-            -float(
-                data @ np.linalg.solve(total, data)
-                + np.linalg.slogdet(total)[1]
-            )
-            / 2
-        )
+        return -float(data @ np.linalg.solve(total, data) + np.linalg.slogdet(total)[1]) / 2
 
-    beyond = replace(
-        field, covariance=2 * np.eye(6)
-    )  # the model misses by more than noise
+    beyond = replace(field, covariance=2 * np.eye(6))  # the model misses by more than noise
     assert beyond.log_evidence_ratio(factor=3.0) == 0.0
     for length_m, factor in ((None, 3.0), (0.02, 1.0), (0.1, 0.5)):
         other = modes if length_m is None else modes.with_length(length_m)
-        turn = (
-            factor * np.linalg.lstsq(modes.shapes, other.shapes, rcond=None)[0]
-        )
+        turn = factor * np.linalg.lstsq(modes.shapes, other.shapes, rcond=None)[0]
         expected = exact(turn @ turn.T) - exact(np.eye(6))
-        assert field.log_evidence_ratio(length_m, factor) == pytest.approx(
-            expected, abs=1e-6
-        )
+        assert field.log_evidence_ratio(length_m, factor) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -481,14 +357,8 @@ def test_evidence_is_that_of_a_normal_marginal_likelihood(rng):
             {"parameter": "E"},
             "expected one of young_pa, lambda_pa, mu_pa, gamma_r_s, density_kg_m3",
         ),
-        (
-            {"modes": 1000},
-            "expected at most 60, because the part of the body .* has 63 nodes",
-        ),
-        (
-            {"length_m": 0.0},
-            "length_m of a field is 0; expected a number above 0",
-        ),
+        ({"modes": 1000}, "expected at most 60, because the part of the body .* has 63 nodes"),
+        ({"length_m": 0.0}, "length_m of a field is 0; expected a number above 0"),
         ({"length_m": []}, "length_m of a field is"),
     ],
 )
@@ -500,14 +370,10 @@ def test_a_field_that_cannot_be_is_refused(stated: dict, message: str):
 def test_bodies_of_other_meshes_do_not_share_a_field():
     (one,) = problem().experiments
     other = Body(
-        cs.box_mesh(SIZE_M, (2, 2, 5)),
-        density_kg_m3=100.0,
-        field=cs.Field(0.05, modes=20),
+        cs.box_mesh(SIZE_M, (2, 2, 5)), density_kg_m3=100.0, field=cs.Field(0.05, modes=20)
     )
     second = replace(swung(other), name="second")
-    with pytest.raises(
-        cs.InputError, match="two bodies have a field of young_pa"
-    ):
+    with pytest.raises(cs.InputError, match="two bodies have a field of young_pa"):
         cs.Problem([one, second], {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)})
 
 
@@ -522,12 +388,7 @@ def test_a_field_is_one_parameter_with_a_slice_of_the_coordinates():
     assert len(parameters.items) == len(KNOWN) + 2
     (field,) = parameters.fields
     assert field.name == "field"
-    assert [each.name for each in field.components] == [
-        "field_1",
-        "field_2",
-        "field_3",
-        "field_4",
-    ]
+    assert [each.name for each in field.components] == ["field_1", "field_2", "field_3", "field_4"]
     assert {each.prior for each in field.components} == {(0.0, 1.0)}
     assert [each.name for each in parameters.free_scalars] == ["young_pa"]
     assert parameters.scalar_coordinates == (0,)
@@ -536,11 +397,7 @@ def test_a_field_is_one_parameter_with_a_slice_of_the_coordinates():
     assert parameters.scalar_values(q) == KNOWN | {"young_pa": np.exp(0.1)}
     assert parameters.values(q)["field_4"] == 0.5
     without = parameters.without({"field_2", "poisson"})
-    assert [each.name for each in without.fields[0].components] == [
-        "field_1",
-        "field_3",
-        "field_4",
-    ]
+    assert [each.name for each in without.fields[0].components] == ["field_1", "field_3", "field_4"]
     assert parameters.without(body_coefficients(known)).fields == ()
 
 
@@ -553,9 +410,7 @@ def test_a_scalar_is_not_tied_to_a_component_of_a_field():
     (seen,) = problem(modes=4).experiments
     tied = {**KNOWN, "field_1": cs.Unknown(0.1)}
     tied["young_pa"] = cs.Tied("field_1", 2.0)
-    with pytest.raises(
-        cs.InputError, match="young_pa: tied to 'field_1', expected a parameter"
-    ):
+    with pytest.raises(cs.InputError, match="young_pa: tied to 'field_1', expected a parameter"):
         cs.Problem([seen], tied)
 
 
@@ -582,9 +437,7 @@ def test_the_likeliest_of_several_lengths_is_taken():
     assert found.shapes.length_m == 0.05
     assert found.likelier["0.05"] == 0.0 > found.likelier["0.005"]
     said = " ".join(str(run).split())
-    assert (
-        "length 0.05 m; relative log evidence of the lengths: 0.005 m -" in said
-    )
+    assert "length 0.05 m; relative log evidence of the lengths: 0.005 m -" in said
 
 
 def _of_lengths(*lengths_m: float) -> cs.Experiment:
@@ -594,15 +447,11 @@ def _of_lengths(*lengths_m: float) -> cs.Experiment:
 
 def test_a_run_folder_has_the_field_in_every_element(tmp_path):
     run = cs.run(problem(2.0), seek_causes=False)
-    assert run.trust.verdict == "good" or not any(
-        "field" in r for r in run.trust.reasons
-    )
+    assert run.trust.verdict == "good" or not any("field" in r for r in run.trust.reasons)
     run.save(tmp_path / "run")
     result, (replay,) = read_run(tmp_path / "run")
     stored, field = replay.fields["young_pa"], run.fields["young_pa"]
-    assert (
-        result.fields["young_pa"].identified == field.count_identified_modes()
-    )
+    assert result.fields["young_pa"].identified == field.count_identified_modes()
     np.testing.assert_array_equal(stored[field.cells, 0], field.value)
     assert (stored[:, 1] < stored[:, 0]).all()
     assert (stored[:, 0] < stored[:, 2]).all()
@@ -611,10 +460,7 @@ def test_a_run_folder_has_the_field_in_every_element(tmp_path):
     with np.load(tmp_path / "run" / "trajectory.npz") as arrays:
         documented = documented_arrays()
         for name in arrays.files:
-            assert (
-                name in documented
-                or f"{name.partition('_')[0]}_NAME" in documented
-            ), name
+            assert name in documented or f"{name.partition('_')[0]}_NAME" in documented, name
         assert "field_young_pa" in arrays.files
         np.testing.assert_array_equal(arrays["field_young_pa"], stored)
     said = str(run)
@@ -622,17 +468,13 @@ def test_a_run_folder_has_the_field_in_every_element(tmp_path):
     assert "E from " in said
     untold = stored.copy()
     untold[:, 3] = 1.0
-    told, pale = (
-        field_picture(replay, "young_pa", values) for values in (stored, untold)
-    )
+    told, pale = (field_picture(replay, "young_pa", values) for values in (stored, untold))
     assert _brightness(pale) > _brightness(told) + 0.1
 
 
 def documented_arrays() -> set[str]:
     """Names of the arrays of trajectory.npz in the table of docs/howto/field.md."""
-    page = (Path(__file__).parents[2] / "docs/howto/field.md").read_text(
-        encoding="utf-8"
-    )
+    page = (Path(__file__).parents[2] / "docs/howto/field.md").read_text(encoding="utf-8")
     rows = page.partition("## Arrays")[2].partition("\n#")[0].splitlines()
     cells = [row.split("|")[1] for row in rows if row.startswith("| `")]
     return {name for cell in cells for name in re.findall("`([^`]+)`", cell)}
@@ -640,17 +482,9 @@ def documented_arrays() -> set[str]:
 
 def test_the_documented_arrays_are_those_that_a_run_may_have():
     documented = documented_arrays()
-    missing = {
-        *ARRAY_LAYOUT,
-        "residuals_m",
-        "part_names",
-        "marker_names",
-        "static",
-    } - documented
+    missing = {*ARRAY_LAYOUT, "residuals_m", "part_names", "marker_names", "static"} - documented
     assert not missing
-    fronts = {f"{front}NAME" for front in GROUP_PREFIXES.values()} | {
-        "wrench_K"
-    }
+    fronts = {f"{front}NAME" for front in GROUP_PREFIXES.values()} | {"wrench_K"}
     assert fronts <= documented
     assert documented <= {
         *ARRAY_LAYOUT,
@@ -669,29 +503,19 @@ def _brightness(figure: Figure) -> float:
 
 
 def test_a_finer_mesh_has_the_same_field():
-    core = cs.Region(
-        "core", np.arange(30), field=cs.Field((0.02, 0.04), "mu_pa", 3)
-    )
+    core = cs.Region("core", np.arange(30), field=cs.Field((0.02, 0.04), "mu_pa", 3))
     body = bar(cs.Field(0.05, modes=4), regions=[core])
-    body = body.with_field_lengths(
-        body.collect_field_lengths_m() | {"core.mu_pa": 0.04}
-    )
+    body = body.with_field_lengths(body.collect_field_lengths_m() | {"core.mu_pa": 0.04})
     finer = refine_body(body)
-    assert finer.collect_field_lengths_m() == {
-        "young_pa": 0.05,
-        "core.mu_pa": 0.04,
-    }
+    assert finer.collect_field_lengths_m() == {"young_pa": 0.05, "core.mu_pa": 0.04}
     for coarse, fine in zip(body.parts, finer.parts, strict=True):
-        np.testing.assert_array_equal(
-            fine.field.shapes, np.repeat(coarse.field.shapes, 8, axis=0)
-        )
+        np.testing.assert_array_equal(fine.field.shapes, np.repeat(coarse.field.shapes, 8, axis=0))
     shares = dict.fromkeys(body.list_field_coefficient_names(), 0.3)
     values = {"poisson": 0.3, **shares, "young_pa": YOUNG_PA}
     stretched = np.diag([1.02, 0.99, 1.05])
     energies = [
         each.energy(
-            each.nodes_m @ stretched,
-            **{n: v for n, v in values.items() if "gamma" not in n},
+            each.nodes_m @ stretched, **{n: v for n, v in values.items() if "gamma" not in n}
         )
         for each in (body, finer)
     ]
@@ -701,61 +525,29 @@ def test_a_finer_mesh_has_the_same_field():
 def test_a_file_states_fields_of_the_body_and_of_a_region(tiny: Path):
     own = ["length_m=0.1", "modes=3", "parameter=gamma_r_s"]
     core = "[{name = 'core', cells = {box_m = [[-1, -1, -1], [1, 1, 0.05]]}}]"
-    stated = [
-        *(f"object.field.{each}" for each in own),
-        f"object.region={core}",
-    ]
-    inside = [
-        "object.region.core.field.length_m=[0.1, 0.2]",
-        "object.region.core.field.modes=2",
-    ]
+    stated = [*(f"object.field.{each}" for each in own), f"object.region={core}"]
+    inside = ["object.region.core.field.length_m=[0.1, 0.2]", "object.region.core.field.modes=2"]
     read = cs.Problem.read(tiny / "problem.toml", [*stated, *inside])
     assert read.collect_lengths_m() == {"gamma_r_s": 0.1, "core.young_pa": 0.1}
     free = [item.name for item in read.parameters.free if "field" in item.name]
-    assert free == [
-        "field_1",
-        "field_2",
-        "field_3",
-        "core.field_1",
-        "core.field_2",
+    assert free == ["field_1", "field_2", "field_3", "core.field_1", "core.field_2"]
+    known = cs.Problem.read(tiny / "problem.toml", [*stated, "parameters.field_2.guess=0.4"])
+    shares = [item for item in known.parameters.free if item.name.startswith("field_")]
+    assert sorted((share.guess, share.prior) for share in shares) == [(0.0, (0.0, 1.0))] * 2 + [
+        (0.4, (0.0, 1.0))
     ]
-    known = cs.Problem.read(
-        tiny / "problem.toml", [*stated, "parameters.field_2.guess=0.4"]
-    )
-    shares = [
-        item for item in known.parameters.free if item.name.startswith("field_")
-    ]
-    assert sorted((share.guess, share.prior) for share in shares) == [
-        (0.0, (0.0, 1.0))
-    ] * 2 + [(0.4, (0.0, 1.0))]
-    assert [item.name for item in read.parameters.fields] == [
-        "field",
-        "core.field",
-    ]
+    assert [item.name for item in read.parameters.fields] == ["field", "core.field"]
     (field,) = known.parameters.fields
     assert [share.guess for share in field.components] == [0.0, 0.4, 0.0]
     wrong = "object.region.core.field.parameter=E"
-    with pytest.raises(
-        cs.InputError,
-        match=r"object.region 'core': parameter of the field is 'E'",
-    ):
+    with pytest.raises(cs.InputError, match=r"object.region 'core': parameter of the field is 'E'"):
         cs.Problem.read(tiny / "problem.toml", [*stated, *inside, wrong])
 
 
-@pytest.mark.parametrize(
-    ("length_m", "codes"), [(0.05, []), (0.003, ["field/shapes"])]
-)
-def test_a_check_tells_what_the_shapes_can_show(
-    length_m: float, codes: list[str]
-):
+@pytest.mark.parametrize(("length_m", "codes"), [(0.05, []), (0.003, ["field/shapes"])])
+def test_a_check_tells_what_the_shapes_can_show(length_m: float, codes: list[str]):
     body = bar(cs.Field(length_m, modes=10))
-    seen = check_body(
-        body,
-        body.theta_from_values({**KNOWN, "young_pa": YOUNG_PA}),
-        ("swing",),
-    )
-    assert [
-        each.code for each in seen.concerns if each.topic == "field"
-    ] == codes
+    seen = check_body(body, body.theta_from_values({**KNOWN, "young_pa": YOUNG_PA}), ("swing",))
+    assert [each.code for each in seen.concerns if each.topic == "field"] == codes
     assert seen.fields["young_pa"].modes == 10
     assert "field_1" not in seen.guess

@@ -23,20 +23,15 @@ def solved(test: str, **assumptions) -> cs.Run:
     """Run of a test whose strains were computed with a gauge length that is too short; other
     assumptions than those stated are exact.
     """
-    true = cs.Specimen(
-        test, STRAIN / (1 + LONGER), 0 * STRAIN, **KEYS
-    ).experiment(name=test)
-    (stress_pa,) = cs.simulate(
-        true, {**CONSTANTS, "young_pa": YOUNG_PA}
-    ).custom_sensor_values
+    true = cs.Specimen(test, STRAIN / (1 + LONGER), 0 * STRAIN, **KEYS).experiment(name=test)
+    (stress_pa,) = cs.simulate(true, {**CONSTANTS, "young_pa": YOUNG_PA}).custom_sensor_values
     stated = cs.Specimen(test, STRAIN, stress_pa[:, 0], **KEYS)
     problem = cs.Problem(
         [with_readings(stated.experiment(name=test), [stress_pa])],
         {**CONSTANTS, "young_pa": cs.Unknown()},
     )
     options = replace(
-        problem.uncertainty,
-        assumptions=replace(cs.Assumptions.exact(), **assumptions),
+        problem.uncertainty, assumptions=replace(cs.Assumptions.exact(), **assumptions)
     )
     return cs.run(replace(problem, uncertainty=options))
 
@@ -60,16 +55,10 @@ def test_the_combined_interval_contains_the_modulus_of_a_wrong_length(test):
 def test_the_row_belongs_to_specimens_by_default_and_not_to_bodies():
     assert cs.Assumptions().gauge_length == 0.01
     swung = hung_cube()
-    values = {
-        "young_pa": 600.0,
-        "poisson": 0.3,
-        "gamma_r_s": 0.01,
-        "gamma_m_1_s": 1.0,
-    }
+    values = {"young_pa": 600.0, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
     tracks_m = cs.simulate(swung, values, "midpoint", substeps=1).markers_m
     problem = cs.Problem(
-        [cs.with_markers(swung, tracks_m)],
-        {**values, "young_pa": cs.Unknown(600.0)},
+        [cs.with_markers(swung, tracks_m)], {**values, "young_pa": cs.Unknown(600.0)}
     )
     budget = cs.run(problem).result.budget["young_pa"]
     assert "gauge_length" not in budget

@@ -10,48 +10,25 @@ from kit.problems import box
 
 from collocation_sysid.fem.laws.moduli import ENGINEERING, LAME
 from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
-from collocation_sysid.statistics.identifiability import (
-    identifiability_sentences,
-)
-from collocation_sysid.statistics.linearised import (
-    DerivedModuli,
-    LinearisedFit,
-    ResidualBlock,
-)
-from collocation_sysid.statistics.uncertainty import (
-    Uncertainty,
-    uncertainty_from_fit,
-)
+from collocation_sysid.statistics.identifiability import identifiability_sentences
+from collocation_sysid.statistics.linearised import DerivedModuli, LinearisedFit, ResidualBlock
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 DAMPING = ("gamma_r_s", "gamma_m_1_s")
-VALUES = {
-    "lambda_pa": 2000.0,
-    "mu_pa": 300.0,
-    "young_pa": 800.0,
-    "poisson": 0.4,
-}
+VALUES = {"lambda_pa": 2000.0, "mu_pa": 300.0, "young_pa": 800.0, "poisson": 0.4}
 VALUES |= {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
 Z95 = 1.96
 
 
 def parameters(elastic: tuple[str, str] = LAME, **changes) -> Parameters:
     items = [
-        Parameter(
-            name,
-            VALUES[name],
-            VALUES[name] / 1e4,
-            0.499 if name == "poisson" else 1e7,
-        )
+        Parameter(name, VALUES[name], VALUES[name] / 1e4, 0.499 if name == "poisson" else 1e7)
         for name in elastic + DAMPING
     ]
-    return Parameters(
-        tuple(replace(item, **changes.get(item.name, {})) for item in items)
-    )
+    return Parameters(tuple(replace(item, **changes.get(item.name, {})) for item in items))
 
 
-def uncertainty(
-    covariance: np.ndarray, of: Parameters | None = None
-) -> Uncertainty:
+def uncertainty(covariance: np.ndarray, of: Parameters | None = None) -> Uncertainty:
     """As of a fit with this covariance of q, whose residuals are exactly zero."""
     of = of or parameters()
     k = len(covariance)
@@ -59,15 +36,7 @@ def uncertainty(
     slope = np.zeros((4, 1, 3, k))
     slope.reshape(-1, k)[:k] = (vectors / np.sqrt(values)).T
     seen, residual = np.ones((4, 1), dtype=bool), np.zeros((4, 1, 3))
-    block = ResidualBlock(
-        "swing",
-        0.01 * np.arange(4),
-        ("tip",),
-        seen,
-        residual,
-        slope,
-        np.ones(1),
-    )
+    block = ResidualBlock("swing", 0.01 * np.arange(4), ("tip",), seen, residual, slope, np.ones(1))
     names = tuple(item.name for item in of.free)
     derived = DerivedModuli.from_bodies([ThetaMap(of, box())], of.guess_q)
     nothing, free = np.zeros(k), np.zeros(k, dtype=bool)
@@ -75,9 +44,7 @@ def uncertainty(
     return uncertainty_from_fit(fit, of, of.guess_q)
 
 
-def spread(
-    deviations, correlations: dict[tuple[int, int], float] | None = None
-) -> np.ndarray:
+def spread(deviations, correlations: dict[tuple[int, int], float] | None = None) -> np.ndarray:
     correlation = np.eye(len(deviations))
     for (i, j), value in (correlations or {}).items():
         correlation[i, j] = correlation[j, i] = value
@@ -85,9 +52,7 @@ def spread(
 
 
 def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
-    (sentence,) = identifiability_sentences(
-        uncertainty(spread([0.2, 0.01, 0.02, 0.05]))
-    )
+    (sentence,) = identifiability_sentences(uncertainty(spread([0.2, 0.01, 0.02, 0.05])))
     assert sentence == (
         "the data determine mu_pa to ±2 %, gamma_r_s to ±4 % and gamma_m_1_s to ±10 %; "
         "lambda_pa only to ±48 % (95 %, statistical)"
@@ -95,13 +60,10 @@ def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
 
 
 @pytest.mark.parametrize(
-    ("deviation", "said"),
-    [(0.2, "±48 %"), (0.23, "within a factor of 1.6"), (0.4, "of 2.2")],
+    ("deviation", "said"), [(0.2, "±48 %"), (0.23, "within a factor of 1.6"), (0.4, "of 2.2")]
 )
 def test_wide_intervals_are_told_by_their_factor(deviation, said):
-    sentence, *_ = identifiability_sentences(
-        uncertainty(spread([deviation, 0.01, 0.02, 0.05]))
-    )
+    sentence, *_ = identifiability_sentences(uncertainty(spread([deviation, 0.01, 0.02, 0.05])))
     assert "lambda_pa only to " in sentence
     assert f"{said} (95 %, statistical)" in sentence
 
@@ -111,13 +73,9 @@ def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
     assert found.estimates["lambda_pa"].statistical_std_error is None
     low, high = found.estimates["lambda_pa"].statistical95 or (0, 0)
     assert np.log(high / low) == pytest.approx(2 * Z95 * 0.9, rel=1e-3)
-    (sentence,) = [
-        s for s in identifiability_sentences(found) if "not identifiable" in s
-    ]
+    (sentence,) = [s for s in identifiability_sentences(found) if "not identifiable" in s]
     assert sentence in found.notes
-    assert sentence.startswith(
-        "lambda_pa is not identifiable from these data: its 95 % interval"
-    )
+    assert sentence.startswith("lambda_pa is not identifiable from these data: its 95 % interval")
     assert "fix it" in sentence
 
 
@@ -126,9 +84,7 @@ def test_a_parameter_the_data_say_nothing_of_is_not_determined():
     assert found.estimates["gamma_m_1_s"].statistical95 is None
     said = identifiability_sentences(found)
     assert "gamma_m_1_s" not in said[0]
-    silent = (
-        "gamma_m_1_s is not determined: no information on damping in these data"
-    )
+    silent = "gamma_m_1_s is not determined: no information on damping in these data"
     assert any(sentence.startswith(silent) for sentence in said)
 
 
@@ -150,9 +106,7 @@ def test_confounded_parameters_are_told_by_the_combination_that_is_fixed():
     for name in ENGINEERING:
         assert found.estimates[name].statistical_std_error is None
         assert "confounded with" in (found.estimates[name].reason or "")
-    unidentifiable = [
-        note for note in found.notes if "not identifiable" in note
-    ]
+    unidentifiable = [note for note in found.notes if "not identifiable" in note]
     assert len(unidentifiable) == 1  # of both
     assert unidentifiable[0].startswith(
         "young_pa and poisson are not identifiable from these data: confounded with each other "
@@ -162,19 +116,14 @@ def test_confounded_parameters_are_told_by_the_combination_that_is_fixed():
 
 def test_the_powers_of_a_combination_are_those_that_cancel():
     found = uncertainty(spread([0.4, 0.1, 0.02, 0.02], {(0, 1): 0.995}))
-    (sentence,) = [
-        s for s in identifiability_sentences(found) if "combination" in s
-    ]
+    (sentence,) = [s for s in identifiability_sentences(found) if "combination" in s]
     assert "lambda_pa^-0.25 · mu_pa " in sentence
 
 
 def test_parameters_known_very_well_keep_their_error_though_confounded():
     found = uncertainty(spread([0.01, 0.01, 0.02, 0.02], {(0, 1): 0.99}))
     assert found.estimates["mu_pa"].statistical_std_error is not None
-    assert any(
-        "confounded" in sentence
-        for sentence in identifiability_sentences(found)
-    )
+    assert any("confounded" in sentence for sentence in identifiability_sentences(found))
 
 
 def three_confounded(deviation: float) -> Uncertainty:
@@ -187,14 +136,8 @@ def three_confounded(deviation: float) -> Uncertainty:
 
 
 def test_three_parameters_can_be_confounded_without_any_two_being_so():
-    (sentence,) = [
-        s
-        for s in identifiability_sentences(three_confounded(0.1))
-        if "confounded" in s
-    ]
-    assert sentence.startswith(
-        "lambda_pa, mu_pa and gamma_r_s are confounded: only"
-    )
+    (sentence,) = [s for s in identifiability_sentences(three_confounded(0.1)) if "confounded" in s]
+    assert sentence.startswith("lambda_pa, mu_pa and gamma_r_s are confounded: only")
 
 
 def test_a_third_with_a_fifth_of_the_others_share_belongs_to_the_combination():
@@ -202,9 +145,7 @@ def test_a_third_with_a_fifth_of_the_others_share_belongs_to_the_combination():
     covariance = np.diag([0, 0, 0, 1e-4])
     covariance[:3, :3] = 0.2**2 * basis @ basis.T
     (sentence,) = [
-        s
-        for s in identifiability_sentences(uncertainty(covariance))
-        if "only their" in s
+        s for s in identifiability_sentences(uncertainty(covariance)) if "only their" in s
     ]
     assert sentence.startswith("lambda_pa, mu_pa and gamma_r_s are confounded")
     assert "lambda_pa · mu_pa · gamma_r_s^0.35 is determined" in sentence
@@ -214,27 +155,17 @@ def test_a_third_with_a_fifth_of_the_others_share_belongs_to_the_combination():
 WELL = np.log(1.25) / (Z95 * np.sqrt(2.01))
 
 
-@pytest.mark.parametrize(
-    ("deviation", "told"), [(0.01, 0), (0.99 * WELL, 0), (1.01 * WELL, 1)]
-)
-def test_of_three_that_are_known_well_each_no_combination_is_told(
-    deviation, told
-):
+@pytest.mark.parametrize(("deviation", "told"), [(0.01, 0), (0.99 * WELL, 0), (1.01 * WELL, 1)])
+def test_of_three_that_are_known_well_each_no_combination_is_told(deviation, told):
     sentences = [
-        s
-        for s in identifiability_sentences(three_confounded(deviation))
-        if "confounded" in s
+        s for s in identifiability_sentences(three_confounded(deviation)) if "confounded" in s
     ]
     assert len(sentences) == told
 
 
 def test_the_other_elastic_pair_is_told_where_it_is_known_better():
     found = uncertainty(spread([0.7, 0.02, 0.02, 0.02]))
-    (sentence,) = [
-        s
-        for s in identifiability_sentences(found)
-        if "other elastic constants" in s
-    ]
+    (sentence,) = [s for s in identifiability_sentences(found) if "other elastic constants" in s]
     assert "young_pa to ±" in sentence
     assert "poisson" in sentence
 
@@ -252,9 +183,7 @@ def test_poisson_that_can_be_anything_is_not_identifiable():
 
 def test_an_interval_beyond_both_bounds_is_no_estimate():
     of = parameters(mu_pa={"lower": 270.0, "upper": 330.0})
-    estimate = uncertainty(spread([0.1, 0.1, 0.02, 0.02]), of).estimates[
-        "mu_pa"
-    ]
+    estimate = uncertainty(spread([0.1, 0.1, 0.02, 0.02]), of).estimates["mu_pa"]
     assert estimate.statistical_std_error is None
     assert "between its bounds" in (estimate.reason or "")
 

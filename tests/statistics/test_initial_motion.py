@@ -11,30 +11,19 @@ import pytest
 import collocation_sysid as cs
 from collocation_sysid.recording import Experiment, Force
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.statistics.misspecification.initial_motion import (
-    initial_motion_hypotheses,
-)
+from collocation_sysid.statistics.misspecification.initial_motion import initial_motion_hypotheses
 
-TRUTH = {
-    "young_pa": 1.5e3,
-    "poisson": 0.3,
-    "gamma_r_s": 0.004,
-    "gamma_m_1_s": 0.5,
-}
+TRUTH = {"young_pa": 1.5e3, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 SIGMA_M = 2e-4
 
 
 def swing(start: str, rests_s: float = 0.15) -> Experiment:
     """A hanging block, whose hand rests at first and then swings."""
-    block = cs.Body(
-        cs.box_mesh((0.04, 0.04, 0.16), (1, 1, 3)), density_kg_m3=40.0
-    )
+    block = cs.Body(cs.box_mesh((0.04, 0.04, 0.16), (1, 1, 3)), density_kg_m3=40.0)
     t_s = 0.01 * np.arange(70)
     then_s = np.maximum(t_s - rests_s, 0)
     poses = np.tile(np.eye(4), (len(t_s), 1, 1))
-    poses[:, 0, 3] = (
-        0.04 * np.sin(14 * then_s) * np.minimum(1, then_s / 0.2) ** 2
-    )
+    poses[:, 0, 3] = 0.04 * np.sin(14 * then_s) * np.minimum(1, then_s / 0.2) ** 2
     hand = cs.Grasp(cs.Box((-1, -1, 0.159), (1, 1, 1)), poses)
     places_m = [(0.0, 0.0, 0.0), (0.04, 0.0, 0.05), (0.0, 0.04, 0.1)]
     empty = np.zeros((len(t_s), len(places_m), 3))
@@ -56,9 +45,7 @@ def recorded(start: str, seed: int = 0, rests_s: float = 0.15) -> Experiment:
 
 
 def test_a_body_that_swings_before_its_grasp_moves_was_not_at_rest():
-    problem = cs.Problem(
-        [recorded("undeformed")], dict.fromkeys(TRUTH, cs.Unknown())
-    )
+    problem = cs.Problem([recorded("undeformed")], dict.fromkeys(TRUTH, cs.Unknown()))
     (cause,) = misspecification_hypotheses(problem)
     assert cause.cause == "not-at-rest"
     assert cause.strength > 2

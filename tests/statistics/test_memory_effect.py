@@ -8,14 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from kit.problems import (
-    EDGE_M,
-    box,
-    nodes_where,
-    smooth_poses,
-    times,
-    vertex_markers,
-)
+from kit.problems import EDGE_M, box, nodes_where, smooth_poses, times, vertex_markers
 from kit.static import block
 
 from collocation_sysid import (
@@ -34,25 +27,12 @@ from collocation_sysid import (
     with_markers,
 )
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changed_residuals,
-)
-from collocation_sysid.statistics.budget.memory_effect import (
-    is_distinguishable,
-    supports_memory,
-)
-from collocation_sysid.statistics.budget.systematic_effects import (
-    ASSUMPTIONS,
-    Assumptions,
-)
+from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
+from collocation_sysid.statistics.budget.memory_effect import is_distinguishable, supports_memory
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
 from collocation_sysid.statistics.budget.uncertainty_budget import source_label
 
-VALUES = {
-    "young_pa": 8e3,
-    "poisson": 0.3,
-    "gamma_r_s": 6e-3,
-    "gamma_m_1_s": 1.0,
-}
+VALUES = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
 TAU_S = 0.1
 NAME = f"memory_share τ={TAU_S:g}s"
 (ROW,) = (row for row in ASSUMPTIONS if row.name == "memory_share")
@@ -68,29 +48,21 @@ def swung(samples: int = 24, **options) -> Experiment:
     t_s = times(samples)
     grasp = Grasp(nodes_where(body, 2, EDGE_M), smooth_poses(t_s))
     markers = vertex_markers(body, nodes_where(body, 2, 0.0), t_s)
-    return Experiment(
-        body, t_s, [grasp], markers, name="cube", nuisance=Nuisance.none()
-    )
+    return Experiment(body, t_s, [grasp], markers, name="cube", nuisance=Nuisance.none())
 
 
-def tracks_m(
-    experiment: Experiment, values: Mapping[str, float], scheme: str
-) -> np.ndarray:
+def tracks_m(experiment: Experiment, values: Mapping[str, float], scheme: str) -> np.ndarray:
     """Simulated markers (T, M, 3) [m]."""
     return simulate(experiment, values, scheme, substeps=1).markers_m
 
 
 def effect_m(
-    experiment: Experiment,
-    values: Mapping[str, float] = VALUES,
-    scheme: str = "midpoint",
+    experiment: Experiment, values: Mapping[str, float] = VALUES, scheme: str = "midpoint"
 ) -> np.ndarray:
     """Change of the markers (T, M, 3) by a branch with the share one, to first order [m]."""
     first = next(iter(values))
     collocation = Collocation(
-        [experiment],
-        Parameters.from_mapping({**values, first: Unknown(values[first])}),
-        scheme,
+        [experiment], Parameters.from_mapping({**values, first: Unknown(values[first])}), scheme
     )
     x = simulate(experiment, values, scheme, substeps=1).positions_m
     z = collocation.pack(collocation.guess_p, [x.reshape(len(x), -1)])
@@ -120,19 +92,14 @@ YEOH = {
     ],
     ids=["cube", "tet10", "yeoh", "undeformed", "loaded-before"],
 )
-def test_the_effect_is_that_of_a_small_share_in_a_simulation(
-    changes, options, values, scheme
-):
+def test_the_effect_is_that_of_a_small_share_in_a_simulation(changes, options, values, scheme):
     plain = replace(swung(**options), **changes)
     remembering = replace(swung(prony=["b"], **options), **changes)
     simulated_m = (
-        tracks_m(remembering, values | SMALL_MEMORY, scheme)
-        - tracks_m(plain, values, scheme)
+        tracks_m(remembering, values | SMALL_MEMORY, scheme) - tracks_m(plain, values, scheme)
     ) / SMALL_SHARE
     np.testing.assert_allclose(
-        effect_m(plain, values, scheme),
-        simulated_m,
-        atol=2e-3 * np.abs(simulated_m).max(),
+        effect_m(plain, values, scheme), simulated_m, atol=2e-3 * np.abs(simulated_m).max()
     )
 
 
@@ -140,8 +107,7 @@ def test_all_regions_of_a_body_have_the_branch():
     def two_halves(**options) -> Experiment:
         mesh = box().mesh
         upper = np.flatnonzero(
-            mesh.points_m[mesh.tetrahedra, 2].mean(axis=1)
-            > mesh.points_m[:, 2].mean()
+            mesh.points_m[mesh.tetrahedra, 2].mean(axis=1) > mesh.points_m[:, 2].mean()
         )
         return swung(regions=[Region("upper", upper)], **options)
 
@@ -150,9 +116,7 @@ def test_all_regions_of_a_body_have_the_branch():
         - tracks_m(two_halves(), VALUES, "midpoint")
     ) / SMALL_SHARE
     np.testing.assert_allclose(
-        effect_m(two_halves()),
-        simulated_m,
-        atol=2e-3 * np.abs(simulated_m).max(),
+        effect_m(two_halves()), simulated_m, atol=2e-3 * np.abs(simulated_m).max()
     )
 
 
@@ -165,12 +129,9 @@ def test_memory_is_not_added_to_statics_to_memory_or_to_averaged_elements():
 
 
 @pytest.mark.parametrize(
-    ("tau_s", "is_shown"),
-    [(0.005, False), (0.01, True), (0.8, True), (1.0, False)],
+    ("tau_s", "is_shown"), [(0.005, False), (0.01, True), (0.8, True), (1.0, False)]
 )
-def test_a_recording_shows_times_between_its_sampling_and_its_duration(
-    tau_s, is_shown
-):
+def test_a_recording_shows_times_between_its_sampling_and_its_duration(tau_s, is_shown):
     assert is_distinguishable(tau_s, 0.01, 0.8) is is_shown
 
 
@@ -191,9 +152,7 @@ def solved(share: float, models_memory: bool = False) -> Run:
     noise_m = np.random.default_rng(1).normal(scale=NOISE_M, size=exact_m.shape)
     described = remembering if models_memory else swung(80)
     sigma_m = np.full(exact_m.shape[1], NOISE_M)
-    described = replace(
-        described, markers=replace(described.markers, sigma_m=sigma_m)
-    )
+    described = replace(described, markers=replace(described.markers, sigma_m=sigma_m))
     names = (*VALUES, *memory) if models_memory else tuple(VALUES)
     problem = Problem(
         [with_markers(described, exact_m + noise_m)],

@@ -13,18 +13,9 @@ from scipy.stats import binom, kstest
 from study_coverage import CASES, reference, truth, twin
 
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.statistics.linearised import (
-    factorise_information,
-    linearise_fit,
-)
-from collocation_sysid.statistics.residuals.noise_level import (
-    estimate_noise_level,
-)
-from collocation_sysid.statistics.uncertainty import (
-    ErrorModel,
-    Uncertainty,
-    uncertainty_from_fit,
-)
+from collocation_sysid.statistics.linearised import factorise_information, linearise_fit
+from collocation_sysid.statistics.residuals.noise_level import estimate_noise_level
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 DRAWS = 100
 # What chance makes of a right share in 998 of 1000 such counts.
@@ -45,13 +36,10 @@ ERRORS = {
 def draws(of: Problem, deviations: tuple[float, ...], count: int = DRAWS):
     """Fits to white errors, with priors that are wrong by their deviation, and their errors."""
     rng = np.random.default_rng(5)
-    prior = np.divide(
-        1, of.prior_slope, where=of.prior_slope > 0, out=0 * of.prior_slope
-    )
+    prior = np.divide(1, of.prior_slope, where=of.prior_slope > 0, out=0 * of.prior_slope)
     for _ in range(count):
         errors = [
-            np.resize(deviations, s.shape[1])[:, None]
-            * rng.normal(size=(*s.shape, 3))
+            np.resize(deviations, s.shape[1])[:, None] * rng.normal(size=(*s.shape, 3))
             for s in of.present
         ]
         yield of.fit(errors, prior * rng.normal(size=len(of.names)))
@@ -60,10 +48,7 @@ def draws(of: Problem, deviations: tuple[float, ...], count: int = DRAWS):
 @cache
 def found(name: str, errors: str) -> list[tuple[Uncertainty, np.ndarray]]:
     fits = draws(PROBLEMS[name], ERRORS[errors])
-    return [
-        (uncertainty_from_fit(fit, PARAMETERS, wrong[:4]), wrong[:4])
-        for fit, wrong in fits
-    ]
+    return [(uncertainty_from_fit(fit, PARAMETERS, wrong[:4]), wrong[:4]) for fit, wrong in fits]
 
 
 def test_a_parameter_that_one_marker_tells_has_its_degrees_of_freedom_in_any_unit():
@@ -78,9 +63,7 @@ def test_a_parameter_that_one_marker_tells_has_its_degrees_of_freedom_in_any_uni
         known_score_covariance=np.zeros((1, 1)),
     )
     for unit in (1e-6, 1.0, 1e6):
-        told = SimpleNamespace(
-            prior=np.zeros((1, 1)), fit=SimpleNamespace(root=unit * np.eye(1))
-        )
+        told = SimpleNamespace(prior=np.zeros((1, 1)), fit=SimpleNamespace(root=unit * np.eye(1)))
         _, freedom = level.score_covariance("by-marker", told, 1)
         assert freedom == pytest.approx(10.0)
 
@@ -101,9 +84,7 @@ def test_the_kind_of_error_bars_follows_the_residuals(name):
     share = {
         errors: np.mean([each.noise == kind for each, _ in found(name, errors)])
         for errors, kind in zip(
-            ERRORS,
-            ("given", "estimated", "estimated", "by-marker"),
-            strict=True,
+            ERRORS, ("given", "estimated", "estimated", "by-marker"), strict=True
         )
     }
     assert share["faultless"] > 0.9  # tests of 5, 1 and 1 %
@@ -120,19 +101,12 @@ def test_p_values_are_uniform_without_a_fault(name):
 
 def test_variances_of_the_markers_are_found_without_bias():
     for name in PROBLEMS:
-        levels = [
-            each.level
-            for each, _ in found(name, "one marker three times as noisy")
-        ]
+        levels = [each.level for each, _ in found(name, "one marker three times as noisy")]
         mean = np.mean([level.variances for level in levels], axis=0)
-        truth = [
-            9.0 if name.endswith("m0") else 1.0 for name in levels[0].names
-        ]
+        truth = [9.0 if name.endswith("m0") else 1.0 for name in levels[0].names]
         np.testing.assert_allclose(mean, truth, rtol=0.08)
         spread = np.std([level.variances for level in levels], axis=0) / truth
-        np.testing.assert_allclose(
-            spread, np.sqrt(2 / levels[0].freedoms), rtol=0.3
-        )
+        np.testing.assert_allclose(spread, np.sqrt(2 / levels[0].freedoms), rtol=0.3)
 
 
 @pytest.mark.long
@@ -145,9 +119,7 @@ def test_a_common_variance_would_not_do_where_markers_differ():
     held = {"auto": [], "estimated": []}
     for fit, wrong in draws(split, (3.0, 0.5), 200):
         for noise, hits in held.items():
-            each = uncertainty_from_fit(
-                fit, PARAMETERS, wrong[:4], ErrorModel(noise)
-            )  # type: ignore[arg-type]
+            each = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(noise))  # type: ignore[arg-type]
             half = each.quantiles * np.sqrt(np.diag(each.covariance))
             hits.append((np.abs(wrong[:4]) < half)[0])
     assert np.mean(held["estimated"]) < 0.9 < np.mean(held["auto"])
@@ -190,16 +162,11 @@ def test_error_bars_for_correlated_errors_hold_what_is_expected_besides(noise):
     samples = np.zeros((201, *of.present[0].shape, 3))
     steps = rng.normal(size=(201, 64, 3))
     samples[:, :, 1] = 1.3 * sum(steps[:, k : k + 60] for k in range(5))
-    fit, wrong = of.fit(
-        [samples[0] + rng.normal(size=samples[0].shape)],
-        np.zeros(len(of.names)),
-    )
+    fit, wrong = of.fit([samples[0] + rng.normal(size=samples[0].shape)], np.zeros(len(of.names)))
     fit = fit.with_disturbances([samples[1:]])
     correlated, independent = (
         np.diag(
-            uncertainty_from_fit(
-                fit, PARAMETERS, wrong[:4], ErrorModel(noise, errors)
-            ).covariance
+            uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(noise, errors)).covariance
         )
         for errors in ("autocorrelated", "independent")
     )
@@ -211,9 +178,7 @@ def test_error_bars_for_correlated_errors_hold_what_is_expected_besides(noise):
 
 def notes(deviations: tuple[float, ...], **options) -> tuple[str, ...]:
     fit, wrong = next(draws(PROBLEMS["three markers"], deviations, 1))
-    return uncertainty_from_fit(
-        fit, PARAMETERS, wrong[:4], ErrorModel(**options)
-    ).notes
+    return uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(**options)).notes
 
 
 def test_a_wrong_sigma_is_told_with_how_much():
@@ -222,9 +187,7 @@ def test_a_wrong_sigma_is_told_with_how_much():
     assert (
         "times as large as expected from sigma_m; the error bars are computed from the residuals"
     ) in large
-    assert any(
-        f"{factor:.2g} times" in large for factor in np.arange(2.2, 2.9, 0.1)
-    )
+    assert any(f"{factor:.2g} times" in large for factor in np.arange(2.2, 2.9, 0.1))
     (small,) = notes((1 / 3,))
     assert "only 0.3" in small
     assert "times too large" in small
@@ -246,23 +209,14 @@ def test_intervals_of_a_whole_identification_follow_the_residuals(claimed):
         deviations[0] = 3.0
     else:
         deviations[:] = 1 / claimed
-    stated = replace(
-        experiment,
-        markers=replace(experiment.markers, sigma_m=sigma_m / deviations),
-    )
+    stated = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m / deviations))
     for seed in range(2):
-        collocation, _ = twin(
-            stated, x, CASES[0], sigma_m, np.random.default_rng(seed)
-        )
+        collocation, _ = twin(stated, x, CASES[0], sigma_m, np.random.default_rng(seed))
         solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation)
         fit = linearise_fit(collocation, solution.z)
         each = uncertainty_from_fit(fit, collocation.parameters, solution.q)
-        assert each.noise == (
-            "by-marker" if claimed == "uneven" else "estimated"
-        )
+        assert each.noise == ("by-marker" if claimed == "uneven" else "estimated")
         for name, value in truth().items():
-            low, high = {**each.estimates, **each.derived}[
-                name
-            ].statistical95 or (0.0, np.inf)
+            low, high = {**each.estimates, **each.derived}[name].statistical95 or (0.0, np.inf)
             held.append(low <= value <= high)
     assert np.mean(held) >= 0.75  # of two twins, whose quantities are related

@@ -51,17 +51,13 @@ def test_a_sample_that_spoils_the_rest_is_named():
     assert rest.count_measurements() == fit.count_measurements() - 3
     trust, _ = judged(with_outlier(RNG(0).normal(size=(60, 3, 3))))
     assert any(
-        "swing 0/m1: the sample at t = 0.2 s deviates by 1.5e+02" in r
-        for r in trust.reasons
+        "swing 0/m1: the sample at t = 0.2 s deviates by 1.5e+02" in r for r in trust.reasons
     )
 
 
 def test_noise_has_no_such_sample_be_it_white_or_not():
     for seed in range(100):
-        for errors in (
-            RNG(seed).normal(size=(60, 3, 3)),
-            autoregressive(RNG(seed), 60, 3, 0.95),
-        ):
+        for errors in (RNG(seed).normal(size=(60, 3, 3)), autoregressive(RNG(seed), 60, 3, 0.95)):
             fit, _ = fit_to(errors)
             assert remove_outliers(fit) == (fit, ())
 
@@ -78,16 +74,10 @@ def test_a_sample_that_does_not_pull_is_only_to_be_checked():
 def test_it_hides_no_correlation_of_the_others():
     for seed in range(5):
         errors = 5 * autoregressive(RNG(seed), 60, 3, 0.9)
-        (_, alone), (trust, beside) = (
-            judged(errors),
-            judged(with_outlier(errors)),
-        )
+        (_, alone), (trust, beside) = (judged(errors), judged(with_outlier(errors)))
         assert beside == pytest.approx(alone, abs=0.15)
         assert trust.verdict == "doubtful"
-        assert any(
-            "consecutive samples are correlated" in reason
-            for reason in trust.reasons
-        )
+        assert any("consecutive samples are correlated" in reason for reason in trust.reasons)
         assert any("swing 0/m1" in reason for reason in trust.reasons)
 
 
@@ -96,34 +86,18 @@ def test_several_are_set_apart_but_no_more_than_exceptions():
     residual = fit.blocks[0].residual.copy()
     residual[:12, 0, 0] += 1e5 / 3.0 ** np.arange(12)
     spoiled = replace(fit, blocks=(replace(fit.blocks[0], residual=residual),))
-    assert [outlier.sample for outlier in remove_outliers(spoiled)[1]] == [
-        0,
-        1,
-        2,
-        3,
-        4,
-        5,
-    ]
+    assert [outlier.sample for outlier in remove_outliers(spoiled)[1]] == [0, 1, 2, 3, 4, 5]
 
 
 def test_the_diagnosis_of_its_marker_names_it_in_place_of_a_pattern():
     fit, _ = fit_to(with_outlier(RNG(0).normal(size=(60, 3, 3))))
-    (said,) = (
-        each.sentence for each in diagnose_markers(fit) if each.marker == "m1"
-    )
-    assert (
-        "mm RMS; the sample at t = 0.2 s deviates by 1.5e+02 sigma and contributes 94 %"
-        in said
-    )
+    (said,) = (each.sentence for each in diagnose_markers(fit) if each.marker == "m1")
+    assert "mm RMS; the sample at t = 0.2 s deviates by 1.5e+02 sigma and contributes 94 %" in said
 
 
 def relaxing_bench() -> tuple[Experiment, dict[str, float]]:
     """A block with memory pressed at once and held; the row before the load has been cut."""
-    body = cs.Body(
-        box_mesh((EDGE_M,) * 3, (1, 1, 1)),
-        density_kg_m3=30.0,
-        prony=["prony_1"],
-    )
+    body = cs.Body(box_mesh((EDGE_M,) * 3, (1, 1, 1)), density_kg_m3=30.0, prony=["prony_1"])
     truth = TRUTH | {"prony_1.share": 0.5, "prony_1.tau_s": 5.0}
     t_s, sigma_n = 0.5 * np.arange(41), 2e-3
     z_m = -0.02 * np.minimum(t_s, 1.0)
@@ -133,17 +107,13 @@ def relaxing_bench() -> tuple[Experiment, dict[str, float]]:
         values = np.full((len(t_s[rows]), 6), np.nan)
         values[:, 2] = force_n[rows]
         grasps = list(pressed.grasps)
-        grasps[1] = replace(
-            grasps[1], wrench=Wrench(t_s[rows], values, sigma_n)
-        )
+        grasps[1] = replace(grasps[1], wrench=Wrench(t_s[rows], values, sigma_n))
         unseen = point_markers(body, np.zeros((0, 3)), t_s[rows])
         return replace(pressed, grasps=grasps, markers=unseen)
 
     whole = bench(slice(None), np.zeros(len(t_s)))
     force_n = simulate(whole, truth).wrenches[0][:, 2]
-    return bench(
-        slice(1, None), force_n + sigma_n * RNG(0).normal(size=len(t_s))
-    ), truth
+    return bench(slice(1, None), force_n + sigma_n * RNG(0).normal(size=len(t_s))), truth
 
 
 @pytest.mark.long
@@ -151,21 +121,10 @@ def test_a_first_sample_that_is_no_rest_is_told():
     experiment, truth = relaxing_bench()
     unknown = {"mu_pa": 250.0, "prony_1.share": 0.3, "prony_1.tau_s": 3.0}
     still = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-    given = (
-        truth
-        | still
-        | {name: cs.Unknown(value) for name, value in unknown.items()}
-    )
+    given = truth | still | {name: cs.Unknown(value) for name, value in unknown.items()}
     trust = cs.run(cs.Problem([experiment], given)).trust
     assert trust.verdict == "doubtful"
-    (named,) = (
-        reason
-        for reason in trust.reasons
-        if "block/force: the sample" in reason
-    )
+    (named,) = (reason for reason in trust.reasons if "block/force: the sample" in reason)
     assert "at t = 0.5 s" in named
     assert "is assumed to be relaxed at the first sample" in named
-    assert any(
-        "consecutive samples are correlated" in reason
-        for reason in trust.reasons
-    )
+    assert any("consecutive samples are correlated" in reason for reason in trust.reasons)

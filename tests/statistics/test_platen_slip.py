@@ -25,13 +25,8 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.problem.problem_options import UncertaintyOptions
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.result.run_sections import run_summary
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changed_residuals,
-)
-from collocation_sysid.statistics.budget.systematic_effects import (
-    ASSUMPTIONS,
-    Assumptions,
-)
+from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
 
 (SLIP,) = (row for row in ASSUMPTIONS if row.name == "platen_slip")
 YOUNG_PA = 8e3
@@ -61,9 +56,7 @@ def with_loads(fitted: Experiment, truth: Experiment) -> Experiment:
 def load_change_n(experiment: Experiment) -> np.ndarray:
     """Change (T,) of the load if the faces slide, to first order [N]."""
     values = {"young_pa": YOUNG_PA, **STATED}
-    parameters = Parameters.from_mapping(
-        values | {"young_pa": Unknown(YOUNG_PA, 10.0, 1e6)}
-    )
+    parameters = Parameters.from_mapping(values | {"young_pa": Unknown(YOUNG_PA, 10.0, 1e6)})
     program = Collocation([experiment], parameters)
     x = simulate(experiment, values).positions_m
     z = program.pack(program.guess_p, [x.reshape(len(x), -1)])
@@ -94,12 +87,7 @@ def whole(platen: str, further: tuple[Grasp, ...] = ()) -> Experiment:
     sensor = Wrench(TIMES[:3], np.zeros((3, 6)), SIGMA_N, 1e-3)
     grasps[1] = replace(grasps[1], wrench=sensor)
     return Experiment(
-        body,
-        TIMES[:3],
-        grasps,
-        gravity_m_s2=(0.0, 0.0, 0.0),
-        nuisance=IDEAL,
-        kind="static",
+        body, TIMES[:3], grasps, gravity_m_s2=(0.0, 0.0, 0.0), nuisance=IDEAL, kind="static"
     )
 
 
@@ -122,9 +110,7 @@ def test_a_body_without_planes_of_symmetry_is_not_moved_as_a_whole():
         Grasp(beside, PoseSequence.fixed(), axes="y"),
     )
     expected_n = loads_n(whole("z", held)) - loads_n(sticking)
-    np.testing.assert_allclose(
-        load_change_n(sticking)[1:], expected_n[1:], rtol=0.02
-    )
+    np.testing.assert_allclose(load_change_n(sticking)[1:], expected_n[1:], rtol=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -142,9 +128,7 @@ def solved(experiment: Experiment, **assumptions):
     return run(problem, seek_causes=False)
 
 
-def test_the_combined_interval_contains_the_modulus_although_the_faces_slid(
-    sliding_test,
-):
+def test_the_combined_interval_contains_the_modulus_although_the_faces_slid(sliding_test):
     fitted = solved(sliding_test)
     assert fitted.estimates["young_pa"].value < 0.9 * YOUNG_PA
     low, high = fitted.interval("young_pa")
@@ -175,19 +159,12 @@ def between_sliding_platens() -> Experiment:
     return bench(block("z"))
 
 
-@pytest.mark.parametrize(
-    "experiment", [pulled, seen_by_markers, between_sliding_platens]
-)
-def test_faces_that_are_pulled_or_slide_or_whose_sides_are_seen_have_no_entry(
-    experiment,
-):
+@pytest.mark.parametrize("experiment", [pulled, seen_by_markers, between_sliding_platens])
+def test_faces_that_are_pulled_or_slide_or_whose_sides_are_seen_have_no_entry(experiment):
     collocation = Collocation(
-        [experiment()],
-        Parameters.from_mapping({"young_pa": Unknown(YOUNG_PA), **STATED}),
+        [experiment()], Parameters.from_mapping({"young_pa": Unknown(YOUNG_PA), **STATED})
     )
-    x = simulate(
-        collocation.experiments[0], {"young_pa": YOUNG_PA, **STATED}
-    ).positions_m
+    x = simulate(collocation.experiments[0], {"young_pa": YOUNG_PA, **STATED}).positions_m
     z = collocation.pack(collocation.guess_p, [x.reshape(len(x), -1)])
     changes = changed_residuals(collocation, z, [(SLIP, 1.0)])
     assert not any(block.any() for block in changes.blocks)

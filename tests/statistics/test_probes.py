@@ -41,36 +41,19 @@ NOISE_M = 1e-4
 def swung(fault: str = "", off: float = 0.0) -> Problem:
     """A cube that was swung, of which something is off, described as if nothing were."""
     hung = hung_cube(80)
-    hung = replace(
-        hung,
-        body=Body(hung.body.mesh, density_kg_m3=60.0),
-        nuisance=Nuisance.none(),
-    )
-    recorded = with_wrong_assumptions(
-        hung, TRUTH, {} if fault == "clock_rate" else {fault: off}
-    )
+    hung = replace(hung, body=Body(hung.body.mesh, density_kg_m3=60.0), nuisance=Nuisance.none())
+    recorded = with_wrong_assumptions(hung, TRUTH, {} if fault == "clock_rate" else {fault: off})
     tracks = recorded.markers.positions_m
     if fault == "clock_rate":  # cameras' times are too large
         tracks = CubicSpline(recorded.t_s, tracks)(recorded.t_s * (1 - off))
-    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(
-        tracks.shape
-    )
+    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(recorded.markers, positions_m=tracks, sigma_m=sigma_m)
-    parameters = Parameters.from_mapping(
-        {name: Unknown(value) for name, value in TRUTH.items()}
-    )
-    exact = {
-        n: "none" for n in Assumptions().collect_deviations() if n not in FREED
-    }
+    parameters = Parameters.from_mapping({name: Unknown(value) for name, value in TRUTH.items()})
+    exact = {n: "none" for n in Assumptions().collect_deviations() if n not in FREED}
     stated = Assumptions(**exact, density_gradient=0.1)
     options = UncertaintyOptions(assumptions=stated)
-    return Problem(
-        [replace(recorded, markers=seen)],
-        parameters,
-        substeps=1,
-        uncertainty=options,
-    )
+    return Problem([replace(recorded, markers=seen)], parameters, substeps=1, uncertainty=options)
 
 
 @cache
@@ -101,9 +84,7 @@ def test_refits_report_the_share_of_significant_assumptions():
     name, off = "stiffness_drift", -0.05
     events: list[str | float | None] = []
     with listen_to_shares(events.append):
-        solved = run(
-            swung(name, off), log=events.append, seek_causes=False, probe=True
-        )
+        solved = run(swung(name, off), log=events.append, seek_causes=False, probe=True)
     refits = [text for text in events if "refitting" in str(text)]
     after = events[events.index(refits[0]) + 1 :]
     tested = after[: after.index(None) + 1]
@@ -116,9 +97,7 @@ def test_refits_report_the_share_of_significant_assumptions():
 @pytest.mark.long
 def test_nothing_is_told_of_what_is_as_described():
     faultless = probed()
-    assert [p.name for p in faultless.probes if p.kind == "window"] == list(
-        WINDOWS
-    )
+    assert [p.name for p in faultless.probes if p.kind == "window"] == list(WINDOWS)
     assert not any(p.sentences for p in faultless.probes)
 
 
@@ -140,20 +119,14 @@ def test_what_is_off_is_told_by_freeing_it(name, off, of):
     if of is not None:  # which is nearer to the truth with it than without
         move = probe.moves[of]
         assert abs(move.value - TRUTH[of]) < 3 * move.std_error
-        assert abs(move.value - TRUTH[of]) < 0.5 * abs(
-            move.value - move.change - TRUTH[of]
-        )
+        assert abs(move.value - TRUTH[of]) < 0.5 * abs(move.value - move.change - TRUTH[of])
 
 
 def test_windows_of_time_have_the_stiffness_of_their_time():
     drifting = probed("stiffness_drift", -0.05)
-    first, _, last = (
-        named(drifting, w).moves["young_pa"].change for w in WINDOWS
-    )
+    first, _, last = (named(drifting, w).moves["young_pa"].change for w in WINDOWS)
     assert first > 0 > last
-    assert (first - last) / TRUTH["young_pa"] == pytest.approx(
-        0.05 * 2 / 3, rel=0.3
-    )
+    assert (first - last) / TRUTH["young_pa"] == pytest.approx(0.05 * 2 / 3, rel=0.3)
 
 
 @pytest.mark.long
@@ -161,29 +134,18 @@ def test_each_of_several_recordings_says_what_it_has_alone():
     rng, swings = np.random.default_rng(2), []
     for k, damping in enumerate((5e-3, 9e-3)):
         swing = replace(hung_cube(25), name=f"swing {k}")
-        tracks = simulate(
-            swing, LAME | {"gamma_r_s": damping}, "midpoint", substeps=1
-        ).markers_m
-        tracks = tracks + swing.markers.sigma_m[:, None] * rng.standard_normal(
-            tracks.shape
-        )
+        tracks = simulate(swing, LAME | {"gamma_r_s": damping}, "midpoint", substeps=1).markers_m
+        tracks = tracks + swing.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
         swings.append(with_markers(swing, tracks))
-    exact = Assumptions(
-        **{name: "none" for name in Assumptions().collect_deviations()}
-    )
+    exact = Assumptions(**{name: "none" for name in Assumptions().collect_deviations()})
     options = UncertaintyOptions(assumptions=exact)
     problem = Problem(swings, GUESS, substeps=1, uncertainty=options)
     solved = run(problem, seek_causes=False, probe=True)
     alone = {p.name: p for p in solved.probes if p.kind == "recording"}
     assert set(alone) == {"swing 0", "swing 1"}
-    less, more = (
-        alone[f"swing {k}"].moves["gamma_r_s"].value for k in range(2)
-    )
+    less, more = (alone[f"swing {k}"].moves["gamma_r_s"].value for k in range(2))
     assert less < solved.parameters["gamma_r_s"] < more
-    assert all(
-        "gamma_r_s" in p.sentences and p.chi_squared > 10
-        for p in alone.values()
-    )
+    assert all("gamma_r_s" in p.sentences and p.chi_squared > 10 for p in alone.values())
 
 
 def test_shares_of_both_intervals_stand_beside_every_change():
@@ -191,9 +153,7 @@ def test_shares_of_both_intervals_stand_beside_every_change():
     low, high = solved.optimum["young_pa"].statistical95
     least, most = solved.estimates["young_pa"].combined95
     move = named(solved, "density_gradient z").moves["young_pa"]
-    assert move.of_statistical95 == pytest.approx(
-        2 * move.change / (high - low)
-    )
+    assert move.of_statistical95 == pytest.approx(2 * move.change / (high - low))
     assert move.of_combined95 == pytest.approx(2 * move.change / (most - least))
 
 
@@ -206,30 +166,19 @@ def test_terminal_page_and_file_have_the_probes(tmp_path):
     assert "the data determine density gradient z: with -0.1" in said
     assert "−Δχ²" in said
     assert run_command("report", folder).code == 0
-    assert (
-        "the data determine density gradient z"
-        in next(folder.glob("*.html")).read_text()
-    )
+    assert "the data determine density gradient z" in next(folder.glob("*.html")).read_text()
 
 
 @pytest.mark.long
-def test_a_solve_makes_the_routine_probes_and_all_of_them_where_asked_to(
-    tmp_path,
-):
+def test_a_solve_makes_the_routine_probes_and_all_of_them_where_asked_to(tmp_path):
     file = write_problem(tmp_path, {"swing": 12})
     plain = run_command("solve", file, "--out", tmp_path / "plain", "--quiet")
     routine = Result.read(tmp_path / "plain").probes
     names = [p.name.partition(" ")[0] for p in routine]
-    assert [*dict.fromkeys(names)] == [
-        "stiffness_drift",
-        "memory_share",
-        "clock_rate",
-    ]
+    assert [*dict.fromkeys(names)] == ["stiffness_drift", "memory_share", "clock_rate"]
     assert all(p.routine for p in routine)
     assert "no significant stiffness drift (" in plain.out
-    probing = run_command(
-        "solve", file, "--out", tmp_path / "probed", "--quiet", "--probe"
-    )
+    probing = run_command("solve", file, "--out", tmp_path / "probed", "--quiet", "--probe")
     deep = Result.read(tmp_path / "probed").probes
     assert not any(p.routine for p in deep)
     assert {p.kind for p in deep} == {"window", "assumption"}
@@ -242,9 +191,7 @@ def test_a_solve_makes_the_routine_probes_and_all_of_them_where_asked_to(
 
 def test_an_assumption_that_a_deep_probe_contradicts_means_check():
     wrong_density = probed("density_gradient z", -0.1)
-    (concern,) = (
-        c for c in wrong_density.trust.concerns if c.topic == "assumption"
-    )
+    (concern,) = (c for c in wrong_density.trust.concerns if c.topic == "assumption")
     assert concern.grade == "check"
     assert concern.data["name"] == "density gradient z"
     assert not [c for c in probed().trust.concerns if c.topic == "assumption"]

@@ -9,15 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from assumed_twins import with_wrong_assumptions
-from kit.problems import (
-    EDGE_M,
-    IDEAL,
-    box,
-    hung_cube,
-    nodes_where,
-    smooth_poses,
-    vertex_markers,
-)
+from kit.problems import EDGE_M, IDEAL, box, hung_cube, nodes_where, smooth_poses, vertex_markers
 from scipy.interpolate import CubicSpline
 
 from collocation_sysid import (
@@ -44,10 +36,7 @@ from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.statistics.assessment import Assessment, probe_concerns
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS
-from collocation_sysid.statistics.linearised import (
-    gauss_newton_step,
-    linearise_fit,
-)
+from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
 from collocation_sysid.statistics.probes.relaxed_assumptions import (
     EstimateChange,
     Probe,
@@ -82,36 +71,23 @@ def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
     fine = replace(
         hung,
         t_s=fine_s,
-        markers=vertex_markers(
-            hung.body, nodes_where(hung.body, 2, 0.0), fine_s
-        ),
+        markers=vertex_markers(hung.body, nodes_where(hung.body, 2, 0.0), fine_s),
         grasps=(Grasp(hung.grasps[0].nodes, smooth_poses(fine_s)),),
     )
-    recorded = with_wrong_assumptions(
-        fine, TRUTH, {fault: off} if fault == DRIFT else {}
-    )
+    recorded = with_wrong_assumptions(fine, TRUTH, {fault: off} if fault == DRIFT else {})
     tracks = recorded.markers.positions_m[::FINER]
     if fault == CLOCK:  # the times of the cameras are too large
         tracks = CubicSpline(hung.t_s, tracks)(hung.t_s * (1 - off))
-    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(
-        tracks.shape
-    )
+    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
-    estimated = {
-        name: Unknown(TRUTH[name])
-        for name in ("young_pa", "poisson", "gamma_r_s")
-    }
+    estimated = {name: Unknown(TRUTH[name]) for name in ("young_pa", "poisson", "gamma_r_s")}
     parameters = Parameters.from_mapping(TRUTH | estimated)
     # Nothing but the probes is to give concern: all assumptions are stated as exact.
-    exact = Assumptions(
-        **dict.fromkeys(Assumptions().collect_deviations(), "none")
-    )
+    exact = Assumptions(**dict.fromkeys(Assumptions().collect_deviations(), "none"))
     options = UncertaintyOptions(assumptions=exact)
     recorded = replace(hung, markers=seen)
-    return Problem(
-        [recorded], parameters, substeps=SUBSTEPS, uncertainty=options
-    )
+    return Problem([recorded], parameters, substeps=SUBSTEPS, uncertainty=options)
 
 
 @cache
@@ -130,26 +106,16 @@ def named(finished: Run, name: str) -> Probe:
 @pytest.mark.long
 def test_a_faultless_solve_has_all_routine_probes_and_no_alarm():
     faultless = solved()
-    assert [probe.name for probe in faultless.probes] == [
-        DRIFT,
-        *MEMORY_PROBES,
-        CLOCK,
-    ]
+    assert [probe.name for probe in faultless.probes] == [DRIFT, *MEMORY_PROBES, CLOCK]
     assert not any(probe.sentences for probe in faultless.probes)
     assert faultless.trust.verdict == "good"
     assert not is_deeper_check_worthwhile(faultless.result)
-    assert "solve --probe" not in plain_text(
-        run_summary(faultless.result, Path("runs"))
-    )
+    assert "solve --probe" not in plain_text(run_summary(faultless.result, Path("runs")))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("fault", "off", "size"), [(DRIFT, -0.15, -0.15), (CLOCK, 7e-4, -7e-4)]
-)
-def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(
-    fault, off, size
-):
+@pytest.mark.parametrize(("fault", "off", "size"), [(DRIFT, -0.15, -0.15), (CLOCK, 7e-4, -7e-4)])
+def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(fault, off, size):
     wrongly = solved(fault, off)
     probe = named(wrongly, fault)
     assert probe.sentences
@@ -165,9 +131,7 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(
         if name in TRUTH:  # the corrected estimates are right
             assert abs(move.value - TRUTH[name]) < 3.5 * move.std_error
     assert is_deeper_check_worthwhile(wrongly.result)
-    assert DEEPER_CHECK_ADVICE in plain_text(
-        run_summary(wrongly.result, Path("runs"))
-    )
+    assert DEEPER_CHECK_ADVICE in plain_text(run_summary(wrongly.result, Path("runs")))
 
 
 # Level of significance ----------------------------------------------------------------------------
@@ -180,8 +144,7 @@ def answered(problem: Problem) -> SolvedFit:
     fit = linearise_fit(collocation, z)
     deviations = probed_deviations(Assumptions().collect_deviations())
     kept = {
-        name: deviations[name] if name in (DRIFT, MEMORY, CLOCK) else None
-        for name in deviations
+        name: deviations[name] if name in (DRIFT, MEMORY, CLOCK) else None for name in deviations
     }
     return SolvedFit(
         collocation=collocation,
@@ -200,11 +163,7 @@ def test_faultless_fits_have_no_significant_probe():
     rng, draws, alarms = np.random.default_rng(3), 60, 0
     for _ in range(draws):
         noisy = [
-            replace(
-                b,
-                residual=rng.standard_normal(b.residual.shape) * b.is_measured,
-                misfit=None,
-            )
+            replace(b, residual=rng.standard_normal(b.residual.shape) * b.is_measured, misfit=None)
             for b in at.fit.blocks
         ]
         fit = replace(at.fit, blocks=tuple(noisy))
@@ -231,16 +190,11 @@ def test_what_is_stated_as_exact_is_tested_too():
 
 
 def probe(
-    relevance: float,
-    is_significant: bool = True,
-    name: str = DRIFT,
-    fall: float = 20.0,
+    relevance: float, is_significant: bool = True, name: str = DRIFT, fall: float = 20.0
 ) -> Probe:
     moves = {"young_pa": EstimateChange(8100.0, 40.0, 100.0, 2.0, 0.5)}
     own = (name,) if is_significant else ()
-    return Probe(
-        "assumption", name, fall, moves, -0.05, 0.01, own, True, relevance
-    )
+    return Probe("assumption", name, fall, moves, -0.05, 0.01, own, True, relevance)
 
 
 def test_a_probe_alarms_if_it_is_significant_and_relevant():
@@ -272,40 +226,27 @@ def pressed(heights_m: list[float]) -> Experiment:
     """A cube on the floor under a platen at some heights, one after the other."""
     body, t_s = box(), np.arange(float(len(heights_m)))
     positions = np.outer(heights_m, [0.0, 0.0, 1.0])
-    platen = PoseSequence(
-        t_s, positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)), "linear"
-    )
+    platen = PoseSequence(t_s, positions, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)), "linear")
     grasps = [
         Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed()),
         Grasp(nodes_where(body, 2, EDGE_M), platen),
     ]
     markers = vertex_markers(body, nodes_where(body, 0, EDGE_M), t_s)
-    still = {
-        "gravity_m_s2": (0.0, 0.0, 0.0),
-        "nuisance": IDEAL,
-        "kind": "static",
-    }
+    still = {"gravity_m_s2": (0.0, 0.0, 0.0), "nuisance": IDEAL, "kind": "static"}
     return Experiment(body, t_s, grasps, markers, **still)
 
 
 @pytest.mark.parametrize(
     ("heights_m", "drifts"),
     [
-        (
-            [0.0, -0.005, -0.01, -0.015],
-            False,
-        ),  # as a wrong law of the material would look
+        ([0.0, -0.005, -0.01, -0.015], False),  # as a wrong law of the material would look
         ([0.0, -0.01], False),
         ([0.0, -0.01, 0.0, -0.01, -0.005], True),
     ],
 )
-def test_a_static_recording_shows_a_drift_only_where_its_load_returns(
-    heights_m, drifts
-):
+def test_a_static_recording_shows_a_drift_only_where_its_load_returns(heights_m, drifts):
     stiffness = {"lambda_pa": Unknown(800.0), "mu_pa": Unknown(600.0)}
-    guess = Parameters.from_mapping(
-        {**stiffness, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-    )
+    guess = Parameters.from_mapping({**stiffness, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
     collocation = Collocation([pressed(heights_m)], guess)
     z, _ = initial_variables(collocation)
     (part,) = collocation.iterates(z)

@@ -91,9 +91,7 @@ def test_one_of_two_recordings_with_a_known_mass_is_enough():
     assert parameters_of_open_scale([cube, loaded], parameters) == ()
     only_validated = replace(loaded, validation=True)
     assert (
-        parameters_of_open_scale(
-            Problem([cube, only_validated], OPEN).experiments, parameters
-        )
+        parameters_of_open_scale(Problem([cube, only_validated], OPEN).experiments, parameters)
         == NAMES
     )
 
@@ -107,28 +105,21 @@ def test_it_is_said_before_the_solve_and_in_the_verdict():
     finished = run(found, seek_causes=False)
     assert finished.trust.verdict == "doubtful"
     assert any(said in reason for reason in finished.trust.reasons)
-    assert all(
-        finished.estimates[name].statistical_std_error is None for name in NAMES
-    )
+    assert all(finished.estimates[name].statistical_std_error is None for name in NAMES)
 
 
 def test_where_a_mass_sets_the_scale_the_density_is_found_and_nothing_said():
     cube = hung_cube()
     found = problem(OPEN, masses=[PointMass(tip(cube), 0.01)])
     finished = run(found, seek_causes=False)
-    assert not any(
-        "ratios" in said for said in (*found.notes, *finished.trust.reasons)
-    )
+    assert not any("ratios" in said for said in (*found.notes, *finished.trust.reasons))
     assert finished.parameters["density_kg_m3"] == pytest.approx(30.0, rel=0.05)
     assert np.isfinite(finished.std_error("density_kg_m3"))
 
 
 def test_moduli_relative_to_a_density_as_stated_are_called_so():
     found = problem(STIFF | DAMPED)
-    assert relative_moduli(found.experiments, found.parameters) == (
-        "lambda_pa",
-        "mu_pa",
-    )
+    assert relative_moduli(found.experiments, found.parameters) == ("lambda_pa", "mu_pa")
     said = relative_scale_note(found.experiments, found.parameters)
     assert said == (
         "no known force sets the scale: the data determine λ and μ only relative to "
@@ -137,10 +128,7 @@ def test_moduli_relative_to_a_density_as_stated_are_called_so():
     cube = hung_cube()
     loaded = problem(STIFF | DAMPED, masses=[PointMass(tip(cube), 0.01)])
     assert relative_scale_note(loaded.experiments, loaded.parameters) is None
-    assert (
-        relative_scale_note(problem(OPEN).experiments, problem(OPEN).parameters)
-        is None
-    )
+    assert relative_scale_note(problem(OPEN).experiments, problem(OPEN).parameters) is None
 
 
 # In a problem file ----------------------------------------------------------------------------
@@ -164,9 +152,7 @@ def test_a_density_may_be_a_parameter_instead_of_stated(tiny):
 
 
 def test_a_density_without_a_guess_starts_where_it_is_stated(tiny):
-    found = read(
-        tiny, ("\n[parameters]\n", "\n[parameters]\ndensity_kg_m3 = {}\n")
-    )
+    found = read(tiny, ("\n[parameters]\n", "\n[parameters]\ndensity_kg_m3 = {}\n"))
     assert found.parameters.guesses["density_kg_m3"] == pytest.approx(30.0)
 
 
@@ -186,42 +172,24 @@ def test_a_density_stated_for_a_region_stays(tiny):
     cells = "{ box_m = [[-1, -1, -1], [1, 1, 0.045]] }"
     region = f'\n[[object.region]]\nname = "core"\ncells = {cells}\ndensity_kg_m3 = 60.0\n'
     found = read(tiny, ("\n[parameters]\n", region + FREE))
-    assert [part.has_free_density for part in found.bodies[0].parts] == [
-        True,
-        False,
-    ]
+    assert [part.has_free_density for part in found.bodies[0].parts] == [True, False]
     assert names_of(found) == ()
 
 
 @pytest.mark.parametrize(
     ("edits", "words"),
     [
+        ([("density_kg_m3 = 30.0", "")], ["no mass_kg or density_kg_m3", "[parameters]"]),
         (
-            [("density_kg_m3 = 30.0", "")],
-            ["no mass_kg or density_kg_m3", "[parameters]"],
-        ),
-        (
-            [
-                (
-                    "\n[parameters]\n",
-                    "\n[parameters]\n'core.density_kg_m3' = {}\n",
-                )
-            ],
+            [("\n[parameters]\n", "\n[parameters]\n'core.density_kg_m3' = {}\n")],
             ["core.density_kg_m3", "did you mean 'density_kg_m3'?"],
         ),
         (
             [("\n[parameters]\n", f"{FREE}mass_kg = {{ guess = 0.1 }}\n")],
-            [
-                "found density_kg_m3 and mass_kg, which both determine the density of the body"
-            ],
+            ["found density_kg_m3 and mass_kg, which both determine the density of the body"],
         ),
         (
-            [
-                (
-                    "\n[parameters]\n",
-                    "\n[parameters]\ndensity_kg_m3 = { guess = -3.0 }\n",
-                )
-            ],
+            [("\n[parameters]\n", "\n[parameters]\ndensity_kg_m3 = { guess = -3.0 }\n")],
             ["density_kg_m3", "guess = -3"],
         ),
         (

@@ -13,11 +13,7 @@ from collocation_sysid.statistics.residuals.recording_scatter import (
     RecordingComparison,
     single_fits,
 )
-from collocation_sysid.statistics.uncertainty import (
-    ErrorModel,
-    Uncertainty,
-    uncertainty_from_fit,
-)
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 MADE = problem((80, 80, 80, 80), 3, offsets=False)
 RECORDINGS = len(MADE.slopes)
@@ -29,9 +25,7 @@ SEEDS = 30
 def fitted(seed: int, spread: float = 0.0) -> tuple[LinearisedFit, np.ndarray]:
     """A fit, and its error; each recording has a second parameter of its own, by the spread."""
     rng = np.random.default_rng(seed)
-    local = rng.normal(size=len(MADE.names)) / np.maximum(
-        MADE.prior_slope, 1e-300
-    )
+    local = rng.normal(size=len(MADE.names)) / np.maximum(MADE.prior_slope, 1e-300)
     truth = np.where(MADE.prior_slope > 0, local, 0.0)
     errors = []
     for slope in MADE.slopes:
@@ -42,9 +36,7 @@ def fitted(seed: int, spread: float = 0.0) -> tuple[LinearisedFit, np.ndarray]:
 
 def judged(seed: int, spread: float = 0.0) -> Uncertainty:
     fit, wrong = fitted(seed, spread)
-    return uncertainty_from_fit(
-        fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent")
-    )
+    return uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
 
 
 def scatter(found: Uncertainty) -> RecordingComparison:
@@ -55,43 +47,26 @@ def scatter(found: Uncertainty) -> RecordingComparison:
 def test_a_step_from_the_joint_answer_is_the_fit_to_one_recording():
     fit, wrong = fitted(3)
     rng = np.random.default_rng(3)
-    local = rng.normal(size=len(MADE.names)) / np.maximum(
-        MADE.prior_slope, 1e-300
-    )
+    local = rng.normal(size=len(MADE.names)) / np.maximum(MADE.prior_slope, 1e-300)
     truth = np.where(MADE.prior_slope > 0, local, 0.0)
-    for k, ((alone, step), slope) in enumerate(
-        zip(single_fits(fit), MADE.slopes, strict=True)
-    ):
+    for k, ((alone, step), slope) in enumerate(zip(single_fits(fit), MADE.slopes, strict=True)):
         errors = rng.normal(size=slope.shape[:3])
         rng.normal()
         columns = [0, 1, 2, 3, 4 + k]
         prior = MADE.prior_slope[columns]
-        rows = np.concatenate(
-            [slope[..., columns].reshape(-1, 5), np.diag(prior)]
-        )
-        expected = np.linalg.lstsq(
-            rows, np.concatenate([errors.ravel(), prior * truth[columns]])
-        )[0]
-        np.testing.assert_allclose(
-            wrong[:4] + step[:4], expected[:4], atol=1e-8
-        )
+        rows = np.concatenate([slope[..., columns].reshape(-1, 5), np.diag(prior)])
+        expected = np.linalg.lstsq(rows, np.concatenate([errors.ravel(), prior * truth[columns]]))[
+            0
+        ]
+        np.testing.assert_allclose(wrong[:4] + step[:4], expected[:4], atol=1e-8)
         assert alone.names == tuple(MADE.names[c] for c in columns)
 
 
 def test_recordings_that_agree_have_the_chi_squared_of_chance():
     found = [scatter(judged(seed)) for seed in range(SEEDS)]
-    values = np.array([each.compute_chi_squared() for each in found]) / (
-        RECORDINGS - 1
-    )
-    assert all(
-        (each.count_degrees_of_freedom() == RECORDINGS - 1).all()
-        for each in found
-    )
-    low, high = (
-        chi2.ppf([1e-4, 1 - 1e-4], SEEDS * (RECORDINGS - 1))
-        / SEEDS
-        / (RECORDINGS - 1)
-    )
+    values = np.array([each.compute_chi_squared() for each in found]) / (RECORDINGS - 1)
+    assert all((each.count_degrees_of_freedom() == RECORDINGS - 1).all() for each in found)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], SEEDS * (RECORDINGS - 1)) / SEEDS / (RECORDINGS - 1)
     assert (low < values.mean(axis=0)).all()
     assert (values.mean(axis=0) < high).all()
     assert sum(each.find_disagreements().any() for each in found) <= 3
@@ -101,25 +76,17 @@ def test_recordings_that_agree_have_the_chi_squared_of_chance():
 
 def test_recordings_that_disagree_widen_the_interval_of_what_they_disagree_on():
     calm, found = judged(1), judged(1, spread=SPREAD)
-    assert scatter(found).find_disagreements().tolist() == [
-        False,
-        True,
-        False,
-        False,
-    ]
+    assert scatter(found).find_disagreements().tolist() == [False, True, False, False]
     ratio = np.sqrt(np.diag(found.covariance) / np.diag(calm.covariance))
     birge = np.sqrt(
-        scatter(found).compute_chi_squared()[1]
-        / scatter(found).count_degrees_of_freedom()[1]
+        scatter(found).compute_chi_squared()[1] / scatter(found).count_degrees_of_freedom()[1]
     )
     assert ratio[1] == pytest.approx(birge, rel=0.3)
     assert found.quantiles[1] == pytest.approx(t.ppf(0.975, RECORDINGS - 1))
     assert (ratio[[0, 2, 3]] < 1.3).all()
     (note,) = [note for note in found.notes if "disagree on mu_pa" in note]
     assert "model errors exceed the noise" in note
-    assert any(
-        "disagree on mu_pa" in each.message for each in fit_concerns(found)
-    )
+    assert any("disagree on mu_pa" in each.message for each in fit_concerns(found))
     assert not any("disagree" in note for note in calm.notes)
 
 

@@ -22,7 +22,8 @@ LAWS = {
 }
 SIGMA_PA = 500.0
 STRAIN = np.linspace(0.02, 0.5, 25)
-# Stretch and engineering stress [MPa] of rubber in uniaxial tension, every second row (Treloar 1944).
+# Stretch and engineering stress [MPa] of rubber in uniaxial tension, every second row (Treloar
+# 1944).
 TRELOAR = np.array(
     [
         (1.1267, 0.126771),
@@ -57,9 +58,7 @@ def causes_of(strain, stress_pa, sigma_pa, law):
 
 @pytest.mark.parametrize("law", ["neo-hookean", "yeoh"])
 def test_a_law_that_is_too_simple_is_no_mistake_of_the_description(law):
-    run, causes = causes_of(
-        TRELOAR[:, 0] - 1, 1e6 * TRELOAR[:, 1], sigma_pa=1e4, law=law
-    )
+    run, causes = causes_of(TRELOAR[:, 0] - 1, 1e6 * TRELOAR[:, 1], sigma_pa=1e4, law=law)
     assert run.solution.status is Status.CONVERGED
     assert causes == []
 
@@ -85,9 +84,7 @@ def test_unloading_is_no_mistake_of_the_description(law):
 
 
 def test_nothing_is_named_after_a_search_that_did_not_converge():
-    test = cs.Specimen(
-        "uniaxial", STRAIN, neo_hookean_pa(STRAIN) * (1 + STRAIN), SIGMA_PA
-    )
+    test = cs.Specimen("uniaxial", STRAIN, neo_hookean_pa(STRAIN) * (1 + STRAIN), SIGMA_PA)
     problem = cs.Problem(
         [test.experiment("neo-hookean", "pull")],
         {"mu_pa": cs.Unknown(3e4)} | FIXED,
@@ -102,9 +99,7 @@ def test_nothing_is_named_after_a_search_that_did_not_converge():
 
 
 def test_residuals_of_a_simple_law_name_the_law_first():
-    run, _ = causes_of(
-        TRELOAR[:, 0] - 1, 1e6 * TRELOAR[:, 1], sigma_pa=1e4, law="neo-hookean"
-    )
+    run, _ = causes_of(TRELOAR[:, 0] - 1, 1e6 * TRELOAR[:, 1], sigma_pa=1e4, law="neo-hookean")
     first = run.trust.concerns[0]
     assert first.code == "specimen/law"
     assert "the law neo-hookean may be too simple" in first.message

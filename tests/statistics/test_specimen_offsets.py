@@ -12,28 +12,18 @@ STRETCH = np.linspace(1.0, 2.0, 40)
 
 
 def notes(offset_pa, scale=1.0, **keys):
-    """Notes on offsets of a fit of a rubber whose load cell has an offset, and noise `scale` times as
-    large as stated.
+    """Notes on offsets of a fit of a rubber whose load cell has an offset, and noise `scale` times
+    as large as stated.
     """
     rng = np.random.default_rng(2)
     noise_pa = scale * SIGMA_PA * rng.normal(size=len(STRETCH))
     stress_pa = 1e5 * (STRETCH - STRETCH**-2) + noise_pa + offset_pa
     specimen = cs.Specimen(
-        "uniaxial",
-        STRETCH - 1,
-        stress_pa,
-        sigma_pa=SIGMA_PA,
-        strain_zero=0.0,
-        **keys,
+        "uniaxial", STRETCH - 1, stress_pa, sigma_pa=SIGMA_PA, strain_zero=0.0, **keys
     )
     problem = cs.Problem(
         [specimen.experiment("neo-hookean", "pull")],
-        {
-            "mu_pa": cs.Unknown(8e4),
-            "kappa_pa": 1e9,
-            "gamma_r_s": 0.0,
-            "gamma_m_1_s": 0.0,
-        },
+        {"mu_pa": cs.Unknown(8e4), "kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0},
     )
     answer = cs.run(problem, seek_causes=False)
     return [each for each in answer.notes if "constant offset" in each]

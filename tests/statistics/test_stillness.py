@@ -6,14 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kit.problems import (
-    GUESS,
-    bar_let_go,
-    hung_cube,
-    measured,
-    nodes_where,
-    released_cube,
-)
+from kit.problems import GUESS, bar_let_go, hung_cube, measured, nodes_where, released_cube
 
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import run
@@ -27,12 +20,7 @@ from collocation_sysid.statistics.scale_identifiability import is_motionless
 def hanging(noise_m: float = 5e-4) -> Experiment:
     """The cube hung still from its top face."""
     moving = hung_cube(8, divisions=(1, 1, 2))
-    still = measured(
-        replace(
-            moving,
-            grasps=(Grasp(moving.grasps[0].nodes, PoseSequence.fixed()),),
-        )
-    )
+    still = measured(replace(moving, grasps=(Grasp(moving.grasps[0].nodes, PoseSequence.fixed()),)))
     tracks = still.markers.positions_m
     noise = noise_m * np.random.default_rng(0).normal(size=tracks.shape)
     return with_markers(replace(still, name="hanging"), tracks + noise)
@@ -43,27 +31,17 @@ def test_only_what_neither_moves_nor_changes_is_motionless():
     assert is_motionless(hanging(noise_m=1e-3))
     swaying = measured(released_cube(30))  # by half a millimetre
     assert is_motionless(swaying)
-    finely = replace(
-        swaying.markers, sigma_m=1e-4 * np.ones(len(swaying.markers.names))
-    )
-    for moving in (
-        hung_cube(8),
-        replace(swaying, markers=finely),
-        bar_let_go(8),
-    ):
+    finely = replace(swaying.markers, sigma_m=1e-4 * np.ones(len(swaying.markers.names)))
+    for moving in (hung_cube(8), replace(swaying, markers=finely), bar_let_go(8)):
         assert not is_motionless(measured(moving))
     body = hanging().body
-    pull = Force(
-        nodes_where(body, 2, 0.0), [[0, 0, 0], [0, 0, 0.01]], [0.0, 0.08]
-    )
+    pull = Force(nodes_where(body, 2, 0.0), [[0, 0, 0], [0, 0, 0.01]], [0.0, 0.08])
     assert not is_motionless(replace(hanging(), forces=(pull,)))
 
 
 def test_it_is_said_before_solving():
     problem = Problem([hanging()], GUESS)
-    (note,) = [
-        note for note in problem.notes if "no information on damping" in note
-    ]
+    (note,) = [note for note in problem.notes if "no information on damping" in note]
     assert "fix gamma_r_s and gamma_m_1_s" in note
     found = check_problem(problem)
     assert note in found.warnings
@@ -90,8 +68,5 @@ def test_a_damping_of_which_nothing_is_known_did_not_end_at_its_bound(guess):
         n.startswith("gamma_r_s is not determined: no information on damping")
         for n in found.all_notes
     )
-    assert not any(
-        "ended at its" in said
-        for said in (*found.all_notes, *found.trust.reasons)
-    )
+    assert not any("ended at its" in said for said in (*found.all_notes, *found.trust.reasons))
     assert found.estimates["mu_pa"].statistical_std_error is not None

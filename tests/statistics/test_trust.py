@@ -36,18 +36,14 @@ from collocation_sysid.statistics.assessment import (
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS, Concern, topics_of
 from collocation_sysid.statistics.estimates import correlation_notes
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-)
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
 from collocation_sysid.statistics.residuals.autocorrelation import Dependence
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 RNG = np.random.default_rng
 PACKAGE = Path(__file__).parents[2] / "collocation_sysid"
 VERDICT_PAGE = Path(__file__).parents[2] / "docs" / "howto" / "verdict.md"
-FOAM_CYLINDER = (
-    Path(__file__).parents[2] / "problems" / "foam_cylinder" / "problem.toml"
-)
+FOAM_CYLINDER = Path(__file__).parents[2] / "problems" / "foam_cylinder" / "problem.toml"
 # Of λ = 800 Pa and μ = 600 Pa, with which its tracks were made.
 EXACT = UncertaintyOptions(assumptions=Assumptions.exact())
 FOAM_YOUNG_PA = 600 * (3 * 800 + 2 * 600) / (800 + 600)
@@ -62,37 +58,25 @@ def slow(*values):
 def verdict_of_fit(errors: np.ndarray) -> Assessment:
     fit, wrong = OF.fit([errors], np.zeros(len(OF.names)))
     found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4])
-    return Assessment.from_concerns(
-        fit_concerns(found) + parameter_concerns(found)
-    )
+    return Assessment.from_concerns(fit_concerns(found) + parameter_concerns(found))
 
 
 # The verdict of single findings
 
 
 def test_the_gravest_concern_gives_the_verdict():
-    light, grave = (
-        Concern("solve/acceptable"),
-        Concern("solve/no-error-bars", "doubtful"),
-    )
+    light, grave = (Concern("solve/acceptable"), Concern("solve/no-error-bars", "doubtful"))
     assert Assessment.from_concerns([]).verdict == "good"
     assert Assessment.from_concerns([light, light]) == Assessment((light,))
-    assert Assessment.from_concerns([light, grave]) == Assessment(
-        (grave, light)
-    )
-    assert (
-        Assessment((light,)).verdict,
-        Assessment((grave, light)).verdict,
-    ) == (
+    assert Assessment.from_concerns([light, grave]) == Assessment((grave, light))
+    assert (Assessment((light,)).verdict, Assessment((grave, light)).verdict) == (
         "check",
         "doubtful",
     )
 
 
 def test_a_concern_keeps_its_code_and_its_numbers_in_files():
-    found = Assessment.from_concerns(
-        nuisance_concerns(["time"], [4.0], [-9.0], [9.0])
-    )
+    found = Assessment.from_concerns(nuisance_concerns(["time"], [4.0], [-9.0], [9.0]))
     stored = json.loads(as_json(found))
     (reason,) = stored["reasons"]
     assert reason.startswith(
@@ -115,10 +99,7 @@ def test_every_code_that_gives_concern_has_a_sentence_and_a_remedy():
 
 
 def test_white_residuals_of_the_stated_size_are_good():
-    found = [
-        verdict_of_fit(RNG(seed).normal(size=(80, 3, 3))).verdict
-        for seed in range(80)
-    ]
+    found = [verdict_of_fit(RNG(seed).normal(size=(80, 3, 3))).verdict for seed in range(80)]
     assert found.count("good") >= 79
 
 
@@ -154,17 +135,11 @@ def test_the_page_states_the_threshold_of_doubtful_residuals_that_the_code_uses(
     assert (float(check), float(doubtful)) == (MISFIT, GROSS_MISFIT)
     for seed in range(3):
         errors = autoregressive(RNG(seed), 80, 3, 0.97)
-        (larger,) = (
-            c
-            for c in verdict_of_fit(20 * errors).concerns
-            if c.code == "noise/larger"
-        )
+        (larger,) = (c for c in verdict_of_fit(20 * errors).concerns if c.code == "noise/larger")
         unit = float(doubtful) / (larger.data["factor"] / 20)
         below, above = (verdict_of_fit(f * unit * errors) for f in (0.9, 1.1))
         assert (below.verdict, above.verdict) == ("check", "doubtful")
-        (persistent,) = (
-            c for c in below.concerns if c.code == "residuals/persist"
-        )
+        (persistent,) = (c for c in below.concerns if c.code == "residuals/persist")
         assert persistent.data["autocorrelation"] > 0.9
 
 
@@ -179,16 +154,10 @@ def test_gross_residuals_of_single_samples_are_doubtful():
         assert Assessment.from_concerns(fit_concerns(found)).verdict == verdict
 
 
-@pytest.mark.parametrize(
-    ("lag1", "grade"), [(0.95, "doubtful"), (0.5, "check"), (-0.2, "check")]
-)
-def test_gross_residuals_of_few_samples_are_doubtful_if_clearly_correlated(
-    lag1, grade
-):
+@pytest.mark.parametrize(("lag1", "grade"), [(0.95, "doubtful"), (0.5, "check"), (-0.2, "check")])
+def test_gross_residuals_of_few_samples_are_doubtful_if_clearly_correlated(lag1, grade):
     """A test at the level of the others cannot find a correlation of so few samples."""
-    fit, _ = OF.fit(
-        [6 * RNG(0).normal(size=(80, 3, 3))], np.zeros(len(OF.names))
-    )
+    fit, _ = OF.fit([6 * RNG(0).normal(size=(80, 3, 3))], np.zeros(len(OF.names)))
     found = uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
     few_samples = Dependence(lag1, lag1_deviation=0.4, shared_p=1.0)
     (larger,) = (
@@ -200,10 +169,7 @@ def test_gross_residuals_of_few_samples_are_doubtful_if_clearly_correlated(
 
 
 def test_the_note_on_a_slight_correlation_does_not_contradict_a_good_verdict():
-    slight, strong = (
-        Dependence(lag1, lag1_deviation=0.01, shared_p=1.0)
-        for lag1 in (0.08, 0.4)
-    )
+    slight, strong = (Dependence(lag1, lag1_deviation=0.01, shared_p=1.0) for lag1 in (0.08, 0.4))
     (note,) = correlation_notes("auto", "autocorrelated", slight)
     assert "slightly correlated" in note
     assert "may lack a small effect" in note
@@ -215,9 +181,7 @@ def test_the_note_on_a_slight_correlation_does_not_contradict_a_good_verdict():
 
 
 def test_the_remedy_of_an_unknown_of_a_specimen_is_on_the_page_of_specimens():
-    (found,) = nuisance_concerns(
-        ["offset of the strain"], [4.0], [-9.0], [9.0], is_specimen=True
-    )
+    (found,) = nuisance_concerns(["offset of the strain"], [4.0], [-9.0], [9.0], is_specimen=True)
     assert (found.code, found.grade) == ("specimen/far", "check")
     (topic,) = topics_of([found]).values()
     assert topic.page == "specimen"
@@ -227,18 +191,13 @@ def test_the_remedy_of_an_unknown_of_a_specimen_is_on_the_page_of_specimens():
 def test_a_specimen_whose_strain_is_off_is_explained_on_its_page():
     stretch = np.linspace(1.02, 1.5, 25)
     stress_pa = 1e5 * (stretch - stretch**-2)
-    pull = cs.Specimen(
-        "uniaxial", stretch - 1 + 0.02, stress_pa, sigma_pa=200.0
-    ).experiment("neo-hookean", "pull")
+    pull = cs.Specimen("uniaxial", stretch - 1 + 0.02, stress_pa, sigma_pa=200.0).experiment(
+        "neo-hookean", "pull"
+    )
     known = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-    found = cs.run(
-        cs.Problem([pull], {"mu_pa": cs.Unknown(1e5), **known}),
-        seek_causes=False,
-    )
+    found = cs.run(cs.Problem([pull], {"mu_pa": cs.Unknown(1e5), **known}), seek_causes=False)
     assert found.trust.verdict != "good"
-    assert "explain specimen" in plain_text(
-        remedy_command(found.trust.concerns)
-    )
+    assert "explain specimen" in plain_text(remedy_command(found.trust.concerns))
 
 
 def test_nuisance_parameters_far_from_their_prior():
@@ -251,11 +210,7 @@ def test_nuisance_parameters_far_from_their_prior():
     assert not nuisance_concerns(["time"], [3.8], [-9.0], [9.0])
     (found,) = nuisance_concerns(["time"], [4.0], [-9.0], [9.0])
     assert (found.code, found.grade) == ("nuisance/far", "check")
-    for phi, low, high in (
-        (-7.0, -9.0, 9.0),
-        (2.0, -2.0, 2.0),
-        (2.0, 2.0, 6.0),
-    ):
+    for phi, low, high in ((-7.0, -9.0, 9.0), (2.0, -2.0, 2.0), (2.0, 2.0, 6.0)):
         (found,) = nuisance_concerns(["time"], [phi], [low], [high])
         assert found.grade == "doubtful"
 
@@ -272,9 +227,7 @@ def test_a_roll_out_is_measured_by_the_fit_and_the_noise():
     assert strengths == ["check", "doubtful"]
     assert not forward_simulation_concerns("a", 2.0, 1.0, 1.0, is_fitted=False)
     strengths = [
-        forward_simulation_concerns("a", rms, 1.0, 1.0, is_fitted=False)[
-            0
-        ].grade
+        forward_simulation_concerns("a", rms, 1.0, 1.0, is_fitted=False)[0].grade
         for rms in (4.0, 20.0)
     ]
     assert strengths == ["check", "doubtful"]
@@ -290,12 +243,10 @@ def test_a_scheme_that_damps_or_slows_is_a_concern():
 
 
 def test_what_noise_alone_would_leave():
-    assert rms_expected_from_noise_m(
-        np.array([1e-3]), np.array([100.0]), 0
-    ) == pytest.approx(1e-3 * np.sqrt(3))
-    fewer = rms_expected_from_noise_m(
-        np.array([1e-3, 2e-3]), np.array([50.0, 50.0]), 30.0
+    assert rms_expected_from_noise_m(np.array([1e-3]), np.array([100.0]), 0) == pytest.approx(
+        1e-3 * np.sqrt(3)
     )
+    fewer = rms_expected_from_noise_m(np.array([1e-3, 2e-3]), np.array([50.0, 50.0]), 30.0)
     assert fewer == pytest.approx(1e-3 * np.sqrt(3 * 2.5 * 0.9))
 
 
@@ -317,15 +268,11 @@ def judged(fault: str, seed: int = 100) -> Run:
 def test_faultless_twins_are_good(seed):
     found = judged("none", seed)
     assert found.trust == Assessment(())
-    assert found.compute_noise_rms_m() == pytest.approx(
-        found.solution.rms_m, rel=0.1
-    )
+    assert found.compute_noise_rms_m() == pytest.approx(found.solution.rms_m, rel=0.1)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "fault", ["gravity", slow("clock 100 ms late"), slow("markers exchanged")]
-)
+@pytest.mark.parametrize("fault", ["gravity", slow("clock 100 ms late"), slow("markers exchanged")])
 def test_faults_that_spoil_the_answer_are_doubtful(fault):
     found = judged(fault)
     assert found.trust.verdict == "doubtful"
@@ -333,23 +280,17 @@ def test_faults_that_spoil_the_answer_are_doubtful(fault):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "fault", ["clock 30 ms late", "grasp one layer deeper"]
-)
+@pytest.mark.parametrize("fault", ["clock 30 ms late", "grasp one layer deeper"])
 def test_no_hidden_fault_is_good(fault):
     assert judged(fault).trust.verdict != "good"
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("factor", "words"), [slow(0.3, "as large as"), (3.0, "too large")]
-)
+@pytest.mark.parametrize(("factor", "words"), [slow(0.3, "as large as"), (3.0, "too large")])
 def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
     problem = twin("block", SOFT, 100)
     (experiment,) = problem.experiments
-    claimed = replace(
-        experiment.markers, sigma_m=factor * experiment.markers.sigma_m
-    )
+    claimed = replace(experiment.markers, sigma_m=factor * experiment.markers.sigma_m)
     stated = replace(experiment, markers=claimed)
     stated = replace(problem, experiments=[stated], substeps=2)
     found = run(stated, "reduced-space")
@@ -361,15 +302,9 @@ def test_a_wrong_sigma_of_a_whole_run_is_to_be_checked(factor, words):
     assert not any("consistent with noise" in sentence for sentence in said)
 
 
-@pytest.mark.parametrize(
-    ("substeps", "verdict"), [(1, "check"), slow(2, "good")]
-)
-def test_a_step_that_dominates_the_error_bars_is_corrected_and_to_be_checked(
-    substeps, verdict
-):
-    problem = replace(
-        Problem.read(FOAM_CYLINDER), substeps=substeps, uncertainty=EXACT
-    )
+@pytest.mark.parametrize(("substeps", "verdict"), [(1, "check"), slow(2, "good")])
+def test_a_step_that_dominates_the_error_bars_is_corrected_and_to_be_checked(substeps, verdict):
+    problem = replace(Problem.read(FOAM_CYLINDER), substeps=substeps, uncertainty=EXACT)
     found = run(problem, "reduced-space")
     low, high = found.interval("young_pa")
     assert low < FOAM_YOUNG_PA < high
@@ -382,24 +317,15 @@ def test_a_step_that_dominates_the_error_bars_is_corrected_and_to_be_checked(
 def test_the_verdict_is_shown_stored_and_fed():
     found = judged("none")
     assert ", good: " in repr(found)
-    assert content(found.result)["trust"] == {
-        "verdict": "good",
-        "reasons": [],
-        "concerns": [],
-    }
+    assert content(found.result)["trust"] == {"verdict": "good", "reasons": [], "concerns": []}
     lines = plain_text(run_summary(found.result, Path("runs"))).splitlines()
     assert lines[1] == "Verdict: good"
-    assert (
-        "γ_r refers to the damping law rayleigh, which also damps rigid rotation"
-        in lines
-    )
+    assert "γ_r refers to the damping law rayleigh, which also damps rigid rotation" in lines
     (markers,) = [line for line in lines if line.startswith("markers: ")]
     assert "mm expected from noise alone" in markers
     noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])
     assert noise_mm == pytest.approx(1e3 * np.sqrt(3) * NOISE_M, rel=0.1)
-    caused = replace(
-        found, causes=(Hypothesis("wrench-tare", "the wrench", strength=9.0),)
-    )
+    caused = replace(found, causes=(Hypothesis("wrench-tare", "the wrench", strength=9.0),))
     assert caused.trust.verdict == "doubtful"
     assert caused.trust.reasons[0].startswith(
         "likely: the wrench: the sensor was probably zeroed while it carried the body"
@@ -408,9 +334,7 @@ def test_the_verdict_is_shown_stored_and_fed():
 
 def test_an_answer_that_did_not_converge_is_doubtful():
     found = judged("none")
-    lost = replace(
-        found, solution=replace(found.solution, status=Status.STALLED)
-    )
+    lost = replace(found, solution=replace(found.solution, status=Status.STALLED))
     assert lost.trust.verdict == "doubtful"
     assert "did not converge" in lost.trust.reasons[0]
 
@@ -419,9 +343,7 @@ def test_an_answer_that_did_not_converge_is_doubtful():
 def test_strict_fails_where_the_verdict_is_doubtful(tmp_path):
     file = write_problem(tmp_path, {"swing": 25})
     precise = "experiment.swing.markers.sigma_m=2e-4"
-    method = settings(
-        "solver.method=reduced-space", "transcription.scheme=midpoint", precise
-    )
+    method = settings("solver.method=reduced-space", "transcription.scheme=midpoint", precise)
     wrong = settings("experiment.swing.gravity_m_s2=[0.0, -9.81, 0.0]")
     out = ("--out", tmp_path / "run")
     assert run_command("solve", file, *method, "--strict", *out).code == 0

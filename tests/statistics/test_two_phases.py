@@ -15,15 +15,8 @@ import collocation_sysid as cs
 from collocation_sysid.extras.live.estimator import LiveEstimator
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.refinement import refine_body
-from collocation_sysid.fem.two_phase import (
-    ElementLogarithms,
-    PhaseSummary,
-    TwoPhaseModes,
-)
-from collocation_sysid.runs.phase_posterior import (
-    ContrastPrior,
-    ElementSurrogate,
-)
+from collocation_sysid.fem.two_phase import ElementLogarithms, PhaseSummary, TwoPhaseModes
+from collocation_sysid.runs.phase_posterior import ContrastPrior, ElementSurrogate
 from collocation_sysid.runs.two_phases import (
     _linearise_at,
     _representative_phases,
@@ -43,10 +36,7 @@ from collocation_sysid.statistics.phase_sampling import (
     initial_phases,
     sample_phases,
 )
-from collocation_sysid.statistics.potts_prior import (
-    PottsConstants,
-    PottsHyperprior,
-)
+from collocation_sysid.statistics.potts_prior import PottsConstants, PottsHyperprior
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3
@@ -71,9 +61,7 @@ def swung(body: Body, steps: int = 12) -> cs.Experiment:
     x = body.nodes_m
     places = x[x[:, 2] < 0.119]
     grasp = cs.Grasp(np.flatnonzero(x[:, 2] > 0.119), smooth_poses(t_s))
-    markers = replace(
-        point_markers(body, places, t_s), sigma_m=np.full(len(places), SIGMA_M)
-    )
+    markers = replace(point_markers(body, places, t_s), sigma_m=np.full(len(places), SIGMA_M))
     return cs.Experiment(body, t_s, [grasp], markers, nuisance=IDEAL)
 
 
@@ -81,16 +69,10 @@ def swung(body: Body, steps: int = 12) -> cs.Experiment:
 def problem(ratio: float, seed: int = 5) -> cs.Problem:
     """A bar whose lower half is stiffer, which no description tells; noise by its seed."""
     values = {**KNOWN, "young_pa": YOUNG_PA, "stiff.young_pa": ratio * YOUNG_PA}
-    tracks = cs.simulate(
-        swung(bar(stiff=lower_half())), values, "midpoint", substeps=1
-    ).markers_m
+    tracks = cs.simulate(swung(bar(stiff=lower_half())), values, "midpoint", substeps=1).markers_m
     noise = SIGMA_M * np.random.default_rng(seed).normal(size=tracks.shape)
     measured = cs.with_markers(swung(bar(TWO_PHASES)), tracks + noise)
-    return cs.Problem(
-        [measured],
-        {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)},
-        substeps=1,
-    )
+    return cs.Problem([measured], {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}, substeps=1)
 
 
 @cache
@@ -103,9 +85,7 @@ def answer(ratio: float) -> cs.Solution:
 def field_of(solution: cs.Solution) -> FieldEstimate:
     known = uncertainty_at(solution.collocation, solution.z)
     body = solution.collocation.transcriptions[0].body
-    (field,) = field_estimates(
-        body, solution.collocation.parameters, solution.q, known
-    )
+    (field,) = field_estimates(body, solution.collocation.parameters, solution.q, known)
     return field
 
 
@@ -114,9 +94,7 @@ def test_a_stiff_half_has_its_boundary_and_its_contrast():
     solution = answer(3.0)
     field = field_of(solution)
     assert isinstance(field.modes, TwoPhaseModes)
-    estimate = uncertainty_at(solution.collocation, solution.z).estimates[
-        "contrast"
-    ]
+    estimate = uncertainty_at(solution.collocation, solution.z).estimates["contrast"]
     low, high = estimate.statistical95
     assert low < 3.0 < high
     assert high / low < 2.0
@@ -128,10 +106,7 @@ def test_a_stiff_half_has_its_boundary_and_its_contrast():
     # The half of a coarse mesh has too few elements to rely on intervals.
     codes = [concern.code for concern in field.list_concerns()]
     assert codes == ["field/few"]
-    assert any(
-        "two phases of young_pa: started from a smooth field" in n
-        for n in solution.notes
-    )
+    assert any("two phases of young_pa: started from a smooth field" in n for n in solution.notes)
 
 
 @pytest.mark.long
@@ -175,9 +150,7 @@ def test_a_given_contrast_determines_the_phases():
 @pytest.mark.long
 def test_an_even_body_shows_no_second_material():
     field = field_of(answer(1.0))
-    assert "field/one-phase" in [
-        concern.code for concern in field.list_concerns()
-    ]
+    assert "field/one-phase" in [concern.code for concern in field.list_concerns()]
     low, high = np.log(field.statistical95)
     assert np.mean((low < np.log(YOUNG_PA)) & (np.log(YOUNG_PA) < high)) >= 0.9
 
@@ -197,38 +170,24 @@ def test_unknown_phases_widen_the_interval_of_the_contrast():
     solution = answer(3.0)
     body = solution.collocation.transcriptions[0].body
     (samples,) = body.list_phase_samples()
-    more = replace(
-        samples,
-        deviations=samples.deviations + 0.04 * np.eye(len(samples.names)),
-    )
+    more = replace(samples, deviations=samples.deviations + 0.04 * np.eye(len(samples.names)))
     (field,) = (part.field for part in body.parts)
     wider = body.with_fields({"young_pa": replace(field, samples=more)})
-    experiments = [
-        replace(e, body=wider) for e in solution.collocation.experiments
-    ]
+    experiments = [replace(e, body=wider) for e in solution.collocation.experiments]
     collocation = replace(solution.collocation, experiments=experiments)
     before, after = (
-        uncertainty_at(each, solution.z).covariance
-        for each in (solution.collocation, collocation)
+        uncertainty_at(each, solution.z).covariance for each in (solution.collocation, collocation)
     )
-    place = [item.name for item in collocation.parameters.free].index(
-        "contrast"
-    )
-    assert after[place, place] - before[place, place] == pytest.approx(
-        0.04, rel=1e-6
-    )
+    place = [item.name for item in collocation.parameters.free].index("contrast")
+    assert after[place, place] - before[place, place] == pytest.approx(0.04, rel=1e-6)
 
 
 @pytest.mark.parametrize("by_elements", [False, True])
-def test_slopes_by_the_contrast_and_by_elements_are_those_of_differences(
-    by_elements: bool, rng
-):
+def test_slopes_by_the_contrast_and_by_elements_are_those_of_differences(by_elements: bool, rng):
     body = bar(TWO_PHASES)
     field = replace(body.parts[0].field, phase=lower_half().astype(float))
     if by_elements:
-        field = ElementLogarithms.relative_to(
-            field, rng.normal(size=len(field.phase))
-        )
+        field = ElementLogarithms.relative_to(field, rng.normal(size=len(field.phase)))
     own = body.with_fields({"young_pa": field})
     count = len(field.constants)
     x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
@@ -289,40 +248,30 @@ def test_samples_are_of_the_posterior_that_enumeration_gives(rng):
         h = np.array(label)
         coupling = data.mixed.T @ h
         own = h @ data.of_z @ h + 1 / data.deviation**2
-        information = np.block(
-            [[data.of_p, coupling[:, None]], [coupling, np.array([[own]])]]
-        )
+        information = np.block([[data.of_p, coupling[:, None]], [coupling, np.array([[own]])]])
         of_s = h @ constant - data.mean / data.deviation**2
         score = np.r_[data.score_p - data.mixed.T @ data.base, of_s]
         mean = -np.linalg.solve(information, score)
         jumps = np.abs(np.diff(h)).sum()
         logarithms.append(
-            -(score @ mean + np.linalg.slogdet(information)[1]) / 2
-            - 0.5 * jumps
-            + 0.2 * h.sum()
+            -(score @ mean + np.linalg.slogdet(information)[1]) / 2 - 0.5 * jumps + 0.2 * h.sum()
         )
         means.append(mean[-1])
         labels.append(h)
     weights = np.exp(np.array(logarithms) - max(logarithms))
     weights /= weights.sum()
-    np.testing.assert_allclose(
-        draws.compute_probability(), weights @ np.array(labels), atol=0.03
-    )
+    np.testing.assert_allclose(draws.compute_probability(), weights @ np.array(labels), atol=0.03)
     expected = weights @ np.array(means)
     assert draws.means.mean() == pytest.approx(expected, abs=0.05)
     assert draws.contrasts.mean() == pytest.approx(expected, abs=0.08)
     assert draws.compute_scale_reduction() < 1.1
 
 
-def surrogate_at(
-    ratio: float, phase: np.ndarray, exponent: float
-) -> ElementSurrogate:
+def surrogate_at(ratio: float, phase: np.ndarray, exponent: float) -> ElementSurrogate:
     """The bar's residuals, linearised at given phases and the true parameters."""
     modes = problem(3.0).find_two_phase_fields()["young_pa"]
     base = np.log(ratio) * phase
-    known = problem(3.0).with_fields(
-        {"young_pa": ElementLogarithms.relative_to(modes, base)}
-    )
+    known = problem(3.0).with_fields({"young_pa": ElementLogarithms.relative_to(modes, base)})
     collocation = known.collocation()
     values = {"young_pa": np.log(YOUNG_PA)}
     p = [values.get(item.name, 0.0) for item in collocation.parameters.free]
@@ -341,16 +290,12 @@ def surrogate_at(
 def test_simulated_samples_correct_the_linearised_residuals():
     truth = lower_half().astype(float)
     surrogate = surrogate_at(2.0, truth, exponent=0.0)
-    at_base = surrogate.simulate_errors(
-        surrogate.base[None], changes=np.zeros((1, 1))
-    )
+    at_base = surrogate.simulate_errors(surrogate.base[None], changes=np.zeros((1, 1)))
     assert np.abs(at_base.errors(0.5)).max() < 1e-6
     assert at_base.corrected_surrogate() is surrogate
     phases = np.tile(truth, (5, 1))
     phases[np.arange(5), np.flatnonzero(truth)[:5]] = 0.0
-    samples = surrogate.simulate_errors(
-        np.log(3.5) * phases, changes=np.zeros((5, 1))
-    )
+    samples = surrogate.simulate_errors(np.log(3.5) * phases, changes=np.zeros((5, 1)))
     corrected = samples.corrected_surrogate()
     before = (samples.errors(0.0) ** 2).sum()
     errors = samples.errors(corrected.exponent)
@@ -390,14 +335,10 @@ def test_normal_equations_by_a_power_are_those_of_differences():
 
 def test_elements_are_linearised_at_the_smooth_field():
     search = _two_phase_search(problem(3.0))
-    smooth = cs.solve(
-        problem(3.0).with_fields({search.name: search.modes.to_smooth_field()})
-    )
+    smooth = cs.solve(problem(3.0).with_fields({search.name: search.modes.to_smooth_field()}))
     surrogate = _linearise_at(problem(3.0), search, solution=smooth)
     fit = linearise_fit(smooth.collocation, smooth.z)
-    assert surrogate.fit.compute_chi_squared() == pytest.approx(
-        fit.compute_chi_squared(), rel=1e-6
-    )
+    assert surrogate.fit.compute_chi_squared() == pytest.approx(fit.compute_chi_squared(), rel=1e-6)
     assert np.abs(surrogate.base).max() > 0.1
 
 
@@ -437,9 +378,7 @@ def test_constants_of_the_potts_prior_follow_from_the_phases(rng):
     face_nats = np.array([1.2, 0.4])
     element_nats = np.array([-0.7, 0.5])
     logits = face_nats[:, None] * balance + element_nats[:, None]
-    phases = (rng.random(balance.shape) < 1 / (1 + np.exp(-logits))).astype(
-        float
-    )
+    phases = (rng.random(balance.shape) < 1 / (1 + np.exp(-logits))).astype(float)
     start = PottsConstants(np.full(2, 1.5), element_nats=np.zeros(2))
     drawn = PottsHyperprior().draw(phases, balance, start, rng=rng)
     np.testing.assert_allclose(drawn.face_nats, face_nats, atol=0.12)
@@ -472,9 +411,7 @@ def test_two_phases_that_are_found_are_no_concern():
         ({"contrast": (0.8, 1.2, 1.6)}, "field/one-phase", "contains 1"),
     ],
 )
-def test_doubts_about_two_phases_are_concerns(
-    changes: dict, code: str, message: str
-):
+def test_doubts_about_two_phases_are_concerns(changes: dict, code: str, message: str):
     (concern,) = phase_concerns(summary(**changes), "young_pa")
     assert concern.code == code
     assert message in concern.message
@@ -489,43 +426,22 @@ def test_an_inclusion_of_few_elements_is_a_concern():
 @pytest.mark.parametrize(
     ("stated", "message"),
     [
-        (
-            {"parameter": "density_kg_m3"},
-            "expected prior = 'smooth', or regions with densities",
-        ),
-        (
-            {"length_m": (0.02, 0.05)},
-            "length_m of a two-phase field has 2 values; expected one",
-        ),
+        ({"parameter": "density_kg_m3"}, "expected prior = 'smooth', or regions with densities"),
+        ({"length_m": (0.02, 0.05)}, "length_m of a two-phase field has 2 values; expected one"),
         ({"prior": "three-phase"}, "prior of a field is 'three-phase'"),
     ],
 )
-def test_a_two_phase_field_that_cannot_be_is_refused(
-    stated: dict, message: str
-):
+def test_a_two_phase_field_that_cannot_be_is_refused(stated: dict, message: str):
     with pytest.raises(cs.InputError, match=message):
-        bar(
-            cs.Field(
-                **(
-                    {"length_m": 0.05, "modes": 4, "prior": "two-phase"}
-                    | stated
-                )
-            )
-        )
+        bar(cs.Field(**({"length_m": 0.05, "modes": 4, "prior": "two-phase"} | stated)))
 
 
 def test_two_fields_of_two_phases_are_refused():
     few = cs.Field(0.05, modes=3, prior="two-phase")
     core = cs.Region("core", np.arange(12), field=few)
-    body = Body(
-        bar().mesh, density_kg_m3=100.0, field=TWO_PHASES, regions=[core]
-    )
-    both = cs.Problem(
-        [swung(body)], {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)}, substeps=1
-    )
-    with pytest.raises(
-        cs.InputError, match=r"2 two-phase fields \(young_pa, core.young_pa\)"
-    ):
+    body = Body(bar().mesh, density_kg_m3=100.0, field=TWO_PHASES, regions=[core])
+    both = cs.Problem([swung(body)], {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)}, substeps=1)
+    with pytest.raises(cs.InputError, match=r"2 two-phase fields \(young_pa, core.young_pa\)"):
         solve_two_phases(both, None, lambda *_, **__: pytest.fail("solved"))
 
 
@@ -535,28 +451,18 @@ def test_live_refuses_phases_that_nobody_knows_yet():
 
 
 def test_a_contrast_that_is_not_stated_has_the_prior_of_its_field():
-    (contrast,) = (
-        i for i in problem(3.0).parameters.free if i.name == "contrast"
-    )
+    (contrast,) = (i for i in problem(3.0).parameters.free if i.name == "contrast")
     assert contrast.prior == (1.0, 1.0)
     stated = {**KNOWN, "young_pa": 1e4, "contrast": cs.Unknown(2.0, lower=1.0)}
     given = cs.Problem([swung(bar(TWO_PHASES))], stated, substeps=1).parameters
     (contrast,) = (i for i in given.free if i.name == "contrast")
-    assert (contrast.guess, contrast.lower, contrast.prior) == (
-        2.0,
-        1.0,
-        (1.0, 1.0),
-    )
+    assert (contrast.guess, contrast.lower, contrast.prior) == (2.0, 1.0, (1.0, 1.0))
 
 
 def test_a_finer_mesh_has_the_same_phases():
-    field = replace(
-        bar(TWO_PHASES).parts[0].field, phase=lower_half().astype(float)
-    )
+    field = replace(bar(TWO_PHASES).parts[0].field, phase=lower_half().astype(float))
     finer = refine_body(bar(TWO_PHASES).with_fields({"young_pa": field}))
-    np.testing.assert_array_equal(
-        finer.parts[0].field.phase, np.repeat(field.phase, 8)
-    )
+    np.testing.assert_array_equal(finer.parts[0].field.phase, np.repeat(field.phase, 8))
 
 
 @pytest.mark.long

@@ -27,10 +27,7 @@ from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.statistics.linearised import (
-    marker_sensitivities,
-    sensitivities,
-)
+from collocation_sysid.statistics.linearised import marker_sensitivities, sensitivities
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 AT_TRUTH = GUESS.with_guess(TRUTH)
@@ -39,16 +36,12 @@ NAMES = tuple(TRUTH)
 
 def positions(collocation: Collocation, q):
     return [
-        simulate_scheme(
-            s.experiment, s.dynamics.with_theta(s.constants.theta(q))
-        )
+        simulate_scheme(s.experiment, s.dynamics.with_theta(s.constants.theta(q)))
         for s in collocation.transcriptions
     ]
 
 
-def simulated(
-    experiments, parameters=AT_TRUTH, **options
-) -> tuple[Collocation, np.ndarray]:
+def simulated(experiments, parameters=AT_TRUTH, **options) -> tuple[Collocation, np.ndarray]:
     """A problem, and variables that satisfy its equations of motion at the guess."""
     collocation = Collocation(experiments, parameters, **options)
     x = positions(collocation, parameters.guess_q)
@@ -57,36 +50,26 @@ def simulated(
 
 def with_sigma(experiment: Experiment, sigma_m: float) -> Experiment:
     sigma = np.full(len(experiment.markers.names), sigma_m)
-    return replace(
-        experiment, markers=replace(experiment.markers, sigma_m=sigma)
-    )
+    return replace(experiment, markers=replace(experiment.markers, sigma_m=sigma))
 
 
 def noisy(experiment: Experiment, sigma_m: float, seed: int) -> Experiment:
     rng = np.random.default_rng(seed)
     tracks = experiment.markers.positions_m
     return with_sigma(
-        with_markers(
-            experiment, tracks + sigma_m * rng.normal(size=tracks.shape)
-        ),
-        sigma_m,
+        with_markers(experiment, tracks + sigma_m * rng.normal(size=tracks.shape)), sigma_m
     )
 
 
 def changed(parameters: Parameters, **changes: dict) -> Parameters:
     return Parameters(
-        tuple(
-            replace(item, **changes.get(item.name, {}))
-            for item in parameters.items
-        )
+        tuple(replace(item, **changes.get(item.name, {})) for item in parameters.items)
     )
 
 
 def in_engineering_moduli() -> Parameters:
     """The truth by (E, ν)."""
-    young_pa, poisson = engineering_constants(
-        TRUTH["lambda_pa"], TRUTH["mu_pa"]
-    )
+    young_pa, poisson = engineering_constants(TRUTH["lambda_pa"], TRUTH["mu_pa"])
     elastic = (
         Parameter("young_pa", young_pa, 1e-6, 1e6),
         Parameter("poisson", poisson, 1e-6, 0.49),
@@ -103,9 +86,7 @@ def test_sensitivities_keep_the_linearised_constraints(name, scheme):
     assert_constraints_are_kept(collocation, z)
 
 
-@pytest.mark.parametrize(
-    "options", [{"has_grasp_constraints": True}, {"substeps": 3}]
-)
+@pytest.mark.parametrize("options", [{"has_grasp_constraints": True}, {"substeps": 3}])
 def test_sensitivities_fit_every_layout_and_several_experiments(options):
     collocation, z = simulated([hung_cube(4), released_cube(5)], **options)
     assert_constraints_are_kept(collocation, z)
@@ -114,8 +95,8 @@ def test_sensitivities_fit_every_layout_and_several_experiments(options):
 def assert_constraints_are_kept(collocation, z):
     found = sensitivities(collocation, z)
     moving = [
-        segment.list_parameter_indices()[segment.dynamic_parameters]
-        for segment in collocation.transcriptions
+        transcription.list_parameter_indices()[transcription.dynamic_parameters]
+        for transcription in collocation.transcriptions
     ]
     assert [b.shape for b in found] == [
         (s.grid_times, s.dof_count, len(m))
@@ -140,15 +121,10 @@ def test_sensitivities_agree_with_simulations_at_other_parameters(scheme):
     step = 1e-4
     for k, direction in enumerate(step * np.eye(4)):
         q = AT_TRUTH.guess_q
-        (ahead,), (behind,) = (
-            positions(collocation, q + s * direction) for s in (1, -1)
-        )
+        (ahead,), (behind,) = (positions(collocation, q + s * direction) for s in (1, -1))
         difference = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(
-            by_q[..., k],
-            difference,
-            rtol=0,
-            atol=1e-5 * np.abs(difference).max(),
+            by_q[..., k], difference, rtol=0, atol=1e-5 * np.abs(difference).max()
         )
 
 
@@ -161,36 +137,27 @@ def test_what_is_given_does_not_depend_on_the_parameters():
 
 
 def test_marker_sensitivities_are_those_of_the_nodes_at_the_samples():
-    collocation, z = simulated(
-        [cube_with_gaps(4), released_cube(3)], substeps=2
-    )
-    nodes, markers = (
-        sensitivities(collocation, z),
-        marker_sensitivities(collocation, z),
-    )
-    for segment, of_nodes, of_markers in zip(
+    collocation, z = simulated([cube_with_gaps(4), released_cube(3)], substeps=2)
+    nodes, markers = (sensitivities(collocation, z), marker_sensitivities(collocation, z))
+    for transcription, of_nodes, of_markers in zip(
         collocation.transcriptions, nodes, markers, strict=True
     ):
-        observe = segment.experiment.markers.predict_positions
+        observe = transcription.experiment.markers.predict_positions
         for k in range(collocation.nq):
-            expected = observe(
-                of_nodes[::2, :, k].reshape(-1, segment.dof_count // 3, 3)
-            )
+            expected = observe(of_nodes[::2, :, k].reshape(-1, transcription.dof_count // 3, 3))
             np.testing.assert_allclose(
-                of_markers[..., k],
-                expected.reshape(len(expected), -1),
-                atol=1e-15,
+                of_markers[..., k], expected.reshape(len(expected), -1), atol=1e-15
             )
 
 
 # Covariance
 
 
-def residuals(segment: Transcription, x: np.ndarray) -> np.ndarray:
+def residuals(transcription: Transcription, x: np.ndarray) -> np.ndarray:
     """Of its markers (T, M, 3), without nuisance parameters."""
     phi = np.zeros(0)
-    return segment.markers.residuals(
-        segment.markers.observable.evaluate_positions(x, phi), phi
+    return transcription.markers.residuals(
+        transcription.markers.observable.evaluate_positions(x, phi), phi
     )
 
 
@@ -202,12 +169,10 @@ def test_covariance_is_that_of_the_weighted_least_squares_problem():
         ahead, behind = (
             np.concatenate(
                 [
-                    residuals(segment, x).ravel()
-                    for segment, x in zip(
+                    residuals(transcription, x).ravel()
+                    for transcription, x in zip(
                         collocation.transcriptions,
-                        positions(
-                            collocation, AT_TRUTH.guess_q + sign * direction
-                        ),
+                        positions(collocation, AT_TRUTH.guess_q + sign * direction),
                         strict=True,
                     )
                 ]
@@ -217,9 +182,7 @@ def test_covariance_is_that_of_the_weighted_least_squares_problem():
         columns.append((ahead - behind) / (2 * step))
     matrix = np.stack(columns, axis=1)
     expected = np.linalg.inv(matrix.T @ matrix)
-    found = uncertainty_at(
-        collocation, z, ErrorModel("given", "independent")
-    ).covariance
+    found = uncertainty_at(collocation, z, ErrorModel("given", "independent")).covariance
     deviations = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found / np.outer(deviations, deviations),
                                expected / np.outer(deviations, deviations), atol=1e-4)  # fmt: skip
@@ -233,9 +196,7 @@ def test_normalised_errors_of_noisy_twins_follow_their_distribution():
     for seed in range(twins):
         collocation = Collocation([noisy(experiment, sigma_m, seed)], AT_TRUTH)
         q = fitted(collocation, AT_TRUTH.guess_q)
-        uncertainty = uncertainty_at(
-            collocation, collocation.pack(q, positions(collocation, q))
-        )
+        uncertainty = uncertainty_at(collocation, collocation.pack(q, positions(collocation, q)))
         error = q - AT_TRUTH.guess_q
         squares.append(error @ np.linalg.solve(uncertainty.covariance, error))
         chi_squared.append(uncertainty.reduced_chi_squared)
@@ -248,13 +209,13 @@ def test_normalised_errors_of_noisy_twins_follow_their_distribution():
 
 def fitted(collocation: Collocation, q, steps=2):
     """Gauss–Newton on the simulation."""
-    (segment,) = collocation.transcriptions
-    weight = 1 / segment.experiment.markers.sigma_m[0]
+    (transcription,) = collocation.transcriptions
+    weight = 1 / transcription.experiment.markers.sigma_m[0]
     for _ in range(steps):
         (x,) = positions(collocation, q)
         (by_q,) = marker_sensitivities(collocation, collocation.pack(q, [x]))
         matrix = weight * by_q.reshape(-1, 4)
-        q = q - np.linalg.lstsq(matrix, residuals(segment, x).ravel())[0]
+        q = q - np.linalg.lstsq(matrix, residuals(transcription, x).ravel())[0]
     return q
 
 
@@ -262,23 +223,16 @@ def test_error_bars_are_relative_in_the_logarithm():
     collocation, z = simulated([with_sigma(measured(hung_cube()), 1e-4)])
     uncertainty = uncertainty_at(collocation, z)
     assert uncertainty.names == NAMES
-    for name, variance in zip(
-        NAMES, np.diag(uncertainty.covariance), strict=True
-    ):
+    for name, variance in zip(NAMES, np.diag(uncertainty.covariance), strict=True):
         estimate = uncertainty.estimates[name]
         assert estimate.value == pytest.approx(TRUTH[name])
-        assert estimate.statistical_std_error == pytest.approx(
-            TRUTH[name] * np.sqrt(variance)
-        )
-        assert np.log(estimate.statistical95) - np.log(
-            TRUTH[name]
-        ) == pytest.approx(
+        assert estimate.statistical_std_error == pytest.approx(TRUTH[name] * np.sqrt(variance))
+        assert np.log(estimate.statistical95) - np.log(TRUTH[name]) == pytest.approx(
             1.96 * np.sqrt(variance) * np.array([-1, 1]), rel=1e-4
         )
     deviations = np.sqrt(np.diag(uncertainty.covariance))
     np.testing.assert_allclose(
-        uncertainty.correlation * np.outer(deviations, deviations),
-        uncertainty.covariance,
+        uncertainty.correlation * np.outer(deviations, deviations), uncertainty.covariance
     )
     np.testing.assert_allclose(np.diag(uncertainty.correlation), 1.0)
     assert uncertainty.errors == "independent"
@@ -288,9 +242,7 @@ def test_error_bars_are_relative_in_the_logarithm():
 def test_noise_is_estimated_from_the_residuals():
     experiment = measured(hung_cube())
     for sigma_m in (1e-4, 1e-2):  # what is claimed; the noise has 1 mm
-        collocation, z = simulated(
-            [with_sigma(noisy(experiment, 1e-3, seed=1), sigma_m)]
-        )
+        collocation, z = simulated([with_sigma(noisy(experiment, 1e-3, seed=1), sigma_m)])
         truth, z_truth = simulated([with_sigma(experiment, 1e-3)])
         estimated = uncertainty_at(collocation, z, ErrorModel("estimated"))
         ratio = estimated.covariance / uncertainty_at(truth, z_truth).covariance
@@ -312,8 +264,7 @@ def test_noise_needs_more_measurements_than_parameters():
     tracks[2, 0] = experiment.markers.positions_m[2, 0]
     collocation, z = simulated([with_markers(experiment, tracks)])
     with pytest.raises(
-        InputError,
-        match="from 3 measurements, which are not more than the parameters",
+        InputError, match="from 3 measurements, which are not more than the parameters"
     ):
         uncertainty_at(collocation, z, ErrorModel("estimated"))
 
@@ -331,8 +282,7 @@ def test_a_prior_adds_its_information():
     experiment = measured(hung_cube())
     without, with_prior = (
         uncertainty_at(
-            *simulated([experiment], parameters),
-            ErrorModel(errors="independent"),
+            *simulated([experiment], parameters), ErrorModel(errors="independent")
         ).covariance
         for parameters in (AT_TRUTH, prior)
     )
@@ -352,9 +302,7 @@ def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs(
     assert at_bound.at_bound
     assert at_bound.statistical_std_error is None
     assert at_bound.statistical95 is None
-    np.testing.assert_allclose(
-        uncertainty.covariance[1:, 1:], expected.covariance[1:, 1:]
-    )
+    np.testing.assert_allclose(uncertainty.covariance[1:, 1:], expected.covariance[1:, 1:])
     assert np.isnan(uncertainty.covariance[0]).all()
     assert np.isnan(uncertainty.correlation[0]).all()
     assert not uncertainty.estimates["mu_pa"].at_bound
@@ -362,10 +310,7 @@ def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs(
     assert uncertainty.derived["poisson"].at_bound
     assert uncertainty.derived["poisson"].statistical_std_error is None
     assert uncertainty.derived["poisson"].reason
-    assert any(
-        "lambda_pa ended at its upper bound 200" in note
-        for note in uncertainty.notes
-    )
+    assert any("lambda_pa ended at its upper bound 200" in note for note in uncertainty.notes)
 
 
 def test_fixed_parameters_have_no_error_bar():
@@ -375,9 +320,7 @@ def test_fixed_parameters_have_no_error_bar():
     assert uncertainty.names == NAMES[:3]
     assert uncertainty.estimates["gamma_m_1_s"].value == 1.0
     assert uncertainty.estimates["gamma_m_1_s"].statistical_std_error is None
-    everything = changed(
-        AT_TRUTH, **{name: {"is_fixed": True} for name in NAMES}
-    )
+    everything = changed(AT_TRUTH, **{name: {"is_fixed": True} for name in NAMES})
     known = uncertainty_at(*simulated([experiment], everything))
     assert known.derived["young_pa"].statistical_std_error is None
     assert known.derived["young_pa"].value == pytest.approx(720.0)
@@ -385,24 +328,13 @@ def test_fixed_parameters_have_no_error_bar():
 
 def test_damping_of_a_body_at_rest_is_reported_as_undetermined():
     moving = hung_cube(4)
-    still = replace(
-        moving, grasps=(Grasp(moving.grasps[0].nodes, PoseSequence.fixed()),)
-    )
+    still = replace(moving, grasps=(Grasp(moving.grasps[0].nodes, PoseSequence.fixed()),))
     uncertainty = uncertainty_at(*simulated([measured(still)]))
-    assert np.isinf(np.diag(uncertainty.covariance)).tolist() == [
-        False,
-        False,
-        True,
-        True,
-    ]
+    assert np.isinf(np.diag(uncertainty.covariance)).tolist() == [False, False, True, True]
     assert uncertainty.estimates["gamma_r_s"].statistical_std_error is None
     assert uncertainty.estimates["mu_pa"].statistical_std_error is not None
     assert uncertainty.derived["young_pa"].statistical_std_error is not None
-    silent = [
-        note
-        for note in uncertainty.notes
-        if "no information on damping" in note
-    ]
+    silent = [note for note in uncertainty.notes if "no information on damping" in note]
     assert [note.split()[0] for note in silent] == ["gamma_r_s", "gamma_m_1_s"]
 
 
@@ -429,24 +361,17 @@ def test_derived_error_bars_are_those_of_a_fit_in_the_other_convention():
 
 def test_the_interval_of_poisson_stays_physical():
     collocation, z = simulated([with_sigma(measured(hung_cube()), 0.03)])
-    low, high = uncertainty_at(collocation, z).derived[
-        "poisson"
-    ].statistical95 or (0.0, 0.0)
+    low, high = uncertainty_at(collocation, z).derived["poisson"].statistical95 or (0.0, 0.0)
     assert 0 < low < 0.2 < high < 0.5
 
 
 def test_an_interval_too_wide_to_be_of_use_has_no_standard_error():
-    collocation, z = simulated(
-        [measured(hung_cube())]
-    )  # sigma of 1 mm: too much for γ_m
+    collocation, z = simulated([measured(hung_cube())])  # sigma of 1 mm: too much for γ_m
     uncertainty = uncertainty_at(collocation, z)
     estimate = uncertainty.estimates["gamma_m_1_s"]
     assert estimate.statistical_std_error is None
     assert estimate.statistical95 is not None
     assert estimate.statistical95[1] > 10 * estimate.statistical95[0]
     assert "factor of 10" in (estimate.reason or "")
-    assert any(
-        n.startswith("gamma_m_1_s is not identifiable")
-        for n in uncertainty.notes
-    )
+    assert any(n.startswith("gamma_m_1_s is not identifiable") for n in uncertainty.notes)
     assert uncertainty.estimates["mu_pa"].statistical_std_error is not None

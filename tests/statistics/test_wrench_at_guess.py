@@ -20,9 +20,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Experiment, Wrench
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-)
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
 
 OFFSET_N = 0.8
 
@@ -95,9 +93,7 @@ def test_the_deviation_has_the_offset_of_the_sensor() -> None:
     right = deviation(lambda wrench: wrench)
     wrong = deviation(shift)
     np.testing.assert_allclose(
-        (wrong.compute_offset() - right.compute_offset())[:3],
-        [0, OFFSET_N, 0],
-        atol=1e-12,
+        (wrong.compute_offset() - right.compute_offset())[:3], [0, OFFSET_N, 0], atol=1e-12
     )
     assert wrong.compute_rms_n() > right.compute_rms_n()
     assert f"fy {wrong.compute_offset()[1]:+.3g} N" in wrong.note()
@@ -113,11 +109,7 @@ def test_check_compares_a_wrench_whose_markers_no_fit_explains() -> None:
     )
     markers = replace(experiment.markers, positions_m=shaken)
     # Complete, since a short check omits the fit on a machine that is busy.
-    findings = check_problem(
-        Problem([replace(experiment, markers=markers)], UNKNOWN), full=True
-    )
+    findings = check_problem(Problem([replace(experiment, markers=markers)], UNKNOWN), full=True)
     assert any("set sign = -1" in warning for warning in findings.warnings)
     assert any("no fit explains the markers" in each for each in findings.notes)
-    assert any(
-        "the wrench of" in each and "N RMS" in each for each in findings.notes
-    )
+    assert any("the wrench of" in each and "N RMS" in each for each in findings.notes)

@@ -11,24 +11,16 @@ from kit.problems import GUESS
 from kit.wrench_fits import UNKNOWN, swung
 from wrong_twins import WRENCH_FAULTS
 
-from collocation_sysid.features.wrench_causes import (
-    wrench_causes,
-    wrench_mistakes,
-)
+from collocation_sysid.features.wrench_causes import wrench_causes, wrench_mistakes
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.collocation import (
-    Collocation,
-    ExperimentIterate,
-)
+from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.recording import Nuisance, Wrench
 from collocation_sysid.recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
-    rank,
-)
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import rank
 
 
 def changed(change: Callable[[Wrench], Wrench]) -> Collocation:
@@ -51,17 +43,13 @@ MISTAKES = {
     "wrench-unit": in_kilograms,
     "wrench-clock": lambda w: replace(w, t_s=w.t_s + 0.04),
     "wrench-axes": lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]]),
-    "wrench-sign/part": lambda w: replace(
-        w, values=w.values * [-1, -1, -1, 1, 1, 1]
-    ),
+    "wrench-sign/part": lambda w: replace(w, values=w.values * [-1, -1, -1, 1, 1, 1]),
 }
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("cause", "change"), MISTAKES.items(), ids=MISTAKES)
-def test_a_mistake_is_the_likeliest_cause(
-    cause: str, change: Callable[[Wrench], Wrench]
-):
+def test_a_mistake_is_the_likeliest_cause(cause: str, change: Callable[[Wrench], Wrench]):
     collocation = changed(change)
     found = find_misspecifications(ReducedSpace()(collocation), budget=0)
     assert found[0].code == cause
@@ -69,9 +57,7 @@ def test_a_mistake_is_the_likeliest_cause(
 
 
 def test_a_wrench_that_fits_has_no_cause():
-    assert not find_misspecifications(
-        ReducedSpace()(changed(lambda w: w)), budget=0
-    )
+    assert not find_misspecifications(ReducedSpace()(changed(lambda w: w)), budget=0)
 
 
 # Mass of the tool, more than that of the cube [kg], and its place beyond the grasp [m].
@@ -87,17 +73,17 @@ def with_tool() -> Collocation:
     allowed = replace(Nuisance.none(), tool_kg=1.0, tool_m=0.1)
     given = replace(experiment, nuisance=allowed)
     collocation = Collocation([given], GUESS)
-    (segment,) = collocation.transcriptions
-    (sensor,) = segment.sensors
+    (transcription,) = collocation.transcriptions
+    (sensor,) = transcription.sensors
     solution = ReducedSpace()(Collocation([experiment], GUESS))
     (part,) = solution.parts
-    phi = np.zeros(segment.nuisance.size)
-    tool = segment.nuisance.indices_of_rows(TOOL_MASS, TOOL_CENTRE)
-    phi[tool] = [TOOL_KG, *TOOL_M] / segment.nuisance.scales[tool]
-    iterate = ExperimentIterate(segment, part.q, phi=phi, x=part.x)
-    added = sensor.predict_reactions(
-        iterate.reactions, phi
-    ) - sensor.predict_reactions(iterate.reactions, 0 * phi)
+    phi = np.zeros(transcription.nuisance.size)
+    tool = transcription.nuisance.indices_of_rows(TOOL_MASS, TOOL_CENTRE)
+    phi[tool] = [TOOL_KG, *TOOL_M] / transcription.nuisance.scales[tool]
+    iterate = ExperimentIterate(transcription, part.q, phi=phi, x=part.x)
+    added = sensor.predict_reactions(iterate.reactions, phi) - sensor.predict_reactions(
+        iterate.reactions, 0 * phi
+    )
     (grasp,) = given.grasps
     assert grasp.wrench is not None
     carried = replace(
@@ -106,16 +92,14 @@ def with_tool() -> Collocation:
         sigma_n=grasp.wrench.sigma_n / UNDERSTATED,
         sigma_nm=grasp.wrench.sigma_nm / UNDERSTATED,
     )
-    return Collocation(
-        [replace(given, grasps=[replace(grasp, wrench=carried)])], GUESS
-    )
+    return Collocation([replace(given, grasps=[replace(grasp, wrench=carried)])], GUESS)
 
 
 def test_a_wrench_with_an_estimated_tool_is_compared_with_the_tool():
     solution = ReducedSpace()(with_tool())
     (part,) = solution.parts
-    (mass,) = part.segment.nuisance.indices_of_rows(TOOL_MASS)
-    found_kg = part.phi[mass] * part.segment.nuisance.scales[mass]
+    (mass,) = part.transcription.nuisance.indices_of_rows(TOOL_MASS)
+    found_kg = part.phi[mass] * part.transcription.nuisance.scales[mass]
     assert found_kg == pytest.approx(TOOL_KG, rel=0.05)
     assert not wrench_causes(solution)
 
@@ -132,11 +116,7 @@ def test_nothing_is_concluded_from_a_wrench_with_an_unknown_tool_before_a_solve(
 def sensed(fault: str | None, seed: int = 0) -> Problem:
     """The swung cube with a sensor and a mistake of its wrench."""
     right = Problem([swung(seed)], UNKNOWN)
-    return (
-        right
-        if fault is None
-        else WRENCH_FAULTS[fault](right, np.random.default_rng(0))
-    )
+    return right if fault is None else WRENCH_FAULTS[fault](right, np.random.default_rng(0))
 
 
 @pytest.mark.long
@@ -160,10 +140,7 @@ def test_a_large_tare_is_named_although_its_prior_can_follow_it():
     experiment = swung(nuisance=Nuisance())
     (grasp,) = experiment.grasps
     assert grasp.wrench is not None
-    offset = replace(
-        grasp.wrench,
-        values=grasp.wrench.values + 40 * grasp.wrench.stack_sigmas(),
-    )
+    offset = replace(grasp.wrench, values=grasp.wrench.values + 40 * grasp.wrench.stack_sigmas())
     given = replace(experiment, grasps=[replace(grasp, wrench=offset)])
     (cause,) = wrench_mistakes(Collocation([given], GUESS)).hypotheses
     assert cause.cause == "wrench-tare"

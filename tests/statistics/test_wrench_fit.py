@@ -21,20 +21,11 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.lifted.lifted_collocation import (
-    with_lifted_variables,
-)
-from collocation_sysid.program.simulation import (
-    simulate,
-    with_markers,
-    with_wrenches,
-)
+from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
+from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.recording import Experiment, Nuisance
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.derivatives import (
-    derivative_errors,
-    shortened_problem,
-)
+from collocation_sysid.runs.check.derivatives import derivative_errors, shortened_problem
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import (
     ErrorModel,
@@ -45,9 +36,7 @@ from collocation_sysid.statistics.uncertainty import (
 
 def blind(experiment: Experiment) -> Experiment:
     """The experiment without its sensors."""
-    return replace(
-        experiment, grasps=[replace(g, wrench=None) for g in experiment.grasps]
-    )
+    return replace(experiment, grasps=[replace(g, wrench=None) for g in experiment.grasps])
 
 
 @pytest.mark.long
@@ -69,9 +58,7 @@ def test_a_sensor_improves_what_is_known_of_the_stiffness():
         collocation = Collocation([experiment], GUESS)
         solution = ReducedSpace()(collocation)
         found = uncertainty_at(collocation, solution.z)
-        (young,) = (
-            found.derived[n] for n in found.derived if n.startswith("young")
-        )
+        (young,) = (found.derived[n] for n in found.derived if n.startswith("young"))
         deviations[name] = young.statistical_std_error
     assert deviations["felt"] < 0.8 * deviations["only seen"]
 
@@ -82,19 +69,11 @@ def test_error_bars_are_those_of_the_slopes():
     markers, sensor = linearise_fit(collocation, solution.z).blocks
     assert (sensor.sigma_key, markers.sigma_key) == ("sigma_n", "sigma_m")
     assert sensor.count_measurements() == int(
-        collocation.transcriptions[0]
-        .sensors[0]
-        .is_compared.reshape(-1, 6)
-        .sum()
+        collocation.transcriptions[0].sensors[0].is_compared.reshape(-1, 6).sum()
     )
-    rows = [
-        b.jacobian.reshape(-1, 4)[b.is_measured.ravel()]
-        for b in (markers, sensor)
-    ]
+    rows = [b.jacobian.reshape(-1, 4)[b.is_measured.ravel()] for b in (markers, sensor)]
     of_both = np.linalg.inv(sum(r.T @ r for r in rows))
-    found = uncertainty_at(
-        collocation, solution.z, ErrorModel(noise="given", errors="independent")
-    )
+    found = uncertainty_at(collocation, solution.z, ErrorModel(noise="given", errors="independent"))
     np.testing.assert_allclose(found.covariance, of_both, rtol=1e-6)
     assert {"hung cube/force", "hung cube/torque"} <= set(found.level.names)
 
@@ -105,9 +84,7 @@ def test_the_noise_of_a_sensor_is_judged_by_itself():
     (grasp,) = loud.grasps
     assert grasp.wrench is not None
     quiet = replace(grasp.wrench, sigma_n=grasp.wrench.sigma_n / 4)
-    collocation = Collocation(
-        [replace(loud, grasps=[replace(grasp, wrench=quiet)])], GUESS
-    )
+    collocation = Collocation([replace(loud, grasps=[replace(grasp, wrench=quiet)])], GUESS)
     found = uncertainty_at(collocation, ReducedSpace()(collocation).z)
     assert found.noise == "by-marker"
     assert found.level.factors["hung cube/force"] == pytest.approx(4, rel=0.15)
@@ -117,28 +94,20 @@ def test_the_noise_of_a_sensor_is_judged_by_itself():
 
 def test_tare_clock_lag_and_tool_are_found():
     wanted = Nuisance.none(
-        tare=20.0,
-        sensor_time_s=0.004,
-        sensor_lag_s=0.01,
-        tool_kg=0.02,
-        tool_m=0.02,
+        tare=20.0, sensor_time_s=0.004, sensor_lag_s=0.01, tool_kg=0.02, tool_m=0.02
     )
     collocation = Collocation([swung(0, wanted, 60)], GUESS)
-    (segment,) = collocation.transcriptions
-    names, scales = segment.nuisance.names, segment.nuisance.scales
+    (transcription,) = collocation.transcriptions
+    names, scales = transcription.nuisance.names, transcription.nuisance.scales
     true = np.zeros(len(names))
-    for part, value in (
-        ("tare", 0.005),
-        ("shift of the sensor", 0.003),
-        ("lag", 0.008),
-    ):
+    for part, value in (("tare", 0.005), ("shift of the sensor", 0.003), ("lag", 0.008)):
         true[[part in name for name in names]] = value
     true[["mass of the tool" in name for name in names]] = 0.012
     true[["centre of the tool" in name for name in names]] = (0.0, 0.01, -0.005)
     phi = true / scales
     made = simulate(swung(0, wanted, 60), TRUTH, "midpoint", substeps=1)
     grid, forced = made.reactions
-    (sensor,) = segment.sensors
+    (sensor,) = transcription.sensors
     read = sensor.on_grid(grid).predict_reactions(forced, phi)
     measured = with_wrenches(swung(0, wanted, 60), [read])
     collocation = Collocation([with_markers(measured, made.markers_m)], GUESS)
@@ -183,9 +152,7 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
 
 def test_methods_that_need_second_derivatives_in_the_parameters_refuse_wrenches():
     exact = ReducedSpace(hessian="exact")
-    with pytest.raises(
-        cs.InputError, match="not available for measured forces"
-    ):
+    with pytest.raises(cs.InputError, match="not available for measured forces"):
         exact(Collocation([swung(steps=12)], GUESS))
 
 
@@ -200,22 +167,13 @@ def test_check_compares_the_slopes_of_wrenches():
 def test_check_tells_the_variables_that_a_wrench_brings():
     problem = Problem([swung(steps=12)], UNKNOWN)
     collocation = problem.collocation()
-    findings, program = (
-        check_problem(problem),
-        with_lifted_variables(collocation),
-    )
-    assert (
-        findings.wrenches
-        == program.variable_count - collocation.variable_count
-        > 0
-    )
+    findings, program = (check_problem(problem), with_lifted_variables(collocation))
+    assert findings.wrenches == program.variable_count - collocation.variable_count > 0
     assert findings.hessian_nonzeros == len(program.hessian_structure[1])
 
 
 def test_interior_point_finds_the_body_in_its_grasp_too():
-    nuisance = Nuisance.none(
-        tare=10.0, gravity_rad=0.02, hand_eye_m=1e-3, sensor_time_s=0.001
-    )
+    nuisance = Nuisance.none(tare=10.0, gravity_rad=0.02, hand_eye_m=1e-3, sensor_time_s=0.001)
     collocation = Collocation([swung(nuisance=nuisance, steps=12)], GUESS)
     reduced = ReducedSpace()(collocation)
     found = InteriorPoint()(collocation)
@@ -232,23 +190,14 @@ def test_a_sensor_tells_stiffness_and_density_apart():
     fit = linearise_fit(collocation, solution.z)
     found = uncertainty_from_fit(fit, felt.parameters, solution.q).estimates
     for name, true in {**TRUTH, "density_kg_m3": 30.0}.items():
-        assert (
-            abs(found[name].value - true)
-            < 4 * found[name].statistical_std_error
-        ), name
+        assert abs(found[name].value - true) < 4 * found[name].statistical_std_error, name
     # The error bars are those of the slopes that the search has.
     p, x = collocation.unpack(solution.z)
     point = Horizon(collocation, [len(x[0])]).evaluate(p, x)
-    rows = np.concatenate(
-        [block.jacobian.reshape(-1, 5) for block in fit.blocks]
-    )
-    np.testing.assert_allclose(
-        rows.T @ rows, point.fit.compute_information(), rtol=1e-6
-    )
+    rows = np.concatenate([block.jacobian.reshape(-1, 5) for block in fit.blocks])
+    np.testing.assert_allclose(rows.T @ rows, point.fit.compute_information(), rtol=1e-6)
     seen = Problem([blind(swung())], unknown)
-    told = uncertainty_at(
-        seen.collocation(), seen.collocation().pack(p, x)
-    ).estimates
+    told = uncertainty_at(seen.collocation(), seen.collocation().pack(p, x)).estimates
     assert told["density_kg_m3"].statistical_std_error is None
 
 
@@ -262,7 +211,5 @@ def test_equilibria_under_gravity_tell_the_density_too():
     found = ReducedSpace()(Problem([felt], unknown).collocation()).parameters
     for name, true in {"mu_pa": TRUTH["mu_pa"], "density_kg_m3": 30.0}.items():
         assert found[name] == pytest.approx(true, rel=1e-6)
-    with pytest.raises(
-        cs.InputError, match="density_kg_m3: this parameter has no guess"
-    ):
+    with pytest.raises(cs.InputError, match="density_kg_m3: this parameter has no guess"):
         cs.run(Problem([felt], unknown | {"density_kg_m3": cs.Unknown()}))

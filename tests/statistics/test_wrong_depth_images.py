@@ -13,9 +13,7 @@ import pytest
 from depth_twins import TRUTH, hanging_twin, swinging_twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 
-from collocation_sysid.features.camera_clock_misspecifications import (
-    camera_clock_hypotheses,
-)
+from collocation_sysid.features.camera_clock_misspecifications import camera_clock_hypotheses
 from collocation_sysid.features.camera_feature import depth_image_hypotheses
 from collocation_sysid.features.camera_image_misspecifications import (
     camera_image_hypotheses,
@@ -23,10 +21,7 @@ from collocation_sysid.features.camera_image_misspecifications import (
 )
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
-from collocation_sysid.runs.check import (
-    check_problem,
-    misspecification_hypotheses,
-)
+from collocation_sysid.runs.check import check_problem, misspecification_hypotheses
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.solving import solve
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
@@ -71,9 +66,7 @@ def from_shape(problem: Problem) -> tuple[Hypothesis, ...]:
 
 
 @cache
-def from_motion(
-    fault: str | None, seed: int = 1, guess_pa: float = 2e5
-) -> tuple[Hypothesis, ...]:
+def from_motion(fault: str | None, seed: int = 1, guess_pa: float = 2e5) -> tuple[Hypothesis, ...]:
     """Return the hypotheses of a motion that is simulated at the guess."""
     problem = swinging_twin(seed)
     if fault is not None:
@@ -126,10 +119,7 @@ def test_shapes_go_from_undeformed_to_soft_in_small_steps():
     assert len(shapes_m) > 3
     assert (np.diff(lowest_m) < 0).all()
     size_m = np.linalg.norm(np.ptp(experiment.body.nodes_m, axis=0))
-    steps_m = [
-        np.linalg.norm(after - before, axis=1).max()
-        for before, after in pairwise(shapes_m)
-    ]
+    steps_m = [np.linalg.norm(after - before, axis=1).max() for before, after in pairwise(shapes_m)]
     assert max(steps_m) < 0.17 * size_m
 
 
@@ -141,9 +131,7 @@ def test_large_bodies_are_left_to_a_full_check():
 
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("guess_pa", [5e4, 2e5, 1e6])
-def test_times_that_are_right_are_not_doubted_far_from_the_truth(
-    seed: int, guess_pa: float
-):
+def test_times_that_are_right_are_not_doubted_far_from_the_truth(seed: int, guess_pa: float):
     assert from_motion(None, seed, guess_pa) == ()
 
 

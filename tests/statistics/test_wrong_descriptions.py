@@ -81,9 +81,7 @@ def test_a_right_description_is_not_doubted(name: str, kind: str, seed: int):
 @pytest.mark.long
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("fault", BEFORE)
-def test_a_wrong_description_is_named_before_solving(
-    name: str, fault: str, rng
-):
+def test_a_wrong_description_is_named_before_solving(name: str, fault: str, rng):
     causes = misspecification_hypotheses(FAULTS[fault](soft(name), rng))
     assert causes, fault
     assert causes[0].cause in FAULTS[fault].causes
@@ -91,12 +89,7 @@ def test_a_wrong_description_is_named_before_solving(
 
 
 BODY_IN_GRIPPER = np.array(
-    [
-        [1.0, 0.0, 0.0, -0.03],
-        [0.0, 0.0, 1.0, 0.02],
-        [0.0, -1.0, 0.0, 0.12],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
+    [[1.0, 0.0, 0.0, -0.03], [0.0, 0.0, 1.0, 0.02], [0.0, -1.0, 0.0, 0.12], [0.0, 0.0, 0.0, 1.0]]
 )
 
 
@@ -107,25 +100,17 @@ def gripped(problem: Problem, reading: Callable[[PoseSequence], PoseSequence]):
     (grasp,) = experiment.grasps
     of_gripper = grasp.poses.after(np.linalg.inv(BODY_IN_GRIPPER))
     of_file = PoseSequence(
-        of_gripper.t_s,
-        of_gripper.positions_m,
-        quaternions_xyzw=of_gripper.quaternions_xyzw,
+        of_gripper.t_s, of_gripper.positions_m, quaternions_xyzw=of_gripper.quaternions_xyzw
     )
     poses = reading(of_file).after(BODY_IN_GRIPPER)
-    markers = replace(
-        experiment.markers, placement=None, located=None, places_m=None
-    )
-    changed = replace(
-        experiment, grasps=[Grasp(grasp.nodes, poses)], markers=markers
-    )
+    markers = replace(experiment.markers, placement=None, located=None, places_m=None)
+    changed = replace(experiment, grasps=[Grasp(grasp.nodes, poses)], markers=markers)
     return replace(problem, experiments=[changed])
 
 
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("turn", [1, -1])
-def test_a_quaternion_order_is_named_behind_a_gripper_and_without_places(
-    name: str, turn: int
-):
+def test_a_quaternion_order_is_named_behind_a_gripper_and_without_places(name: str, turn: int):
     """Wrong poses place the markers at wrong points of the body, unless their places are stated."""
     wrong = gripped(soft(name), reordered(turn))
     causes = misspecification_hypotheses(wrong)
@@ -135,18 +120,14 @@ def test_a_quaternion_order_is_named_behind_a_gripper_and_without_places(
 
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_poses_of_a_gripper_without_stated_places_are_not_doubted(
-    name: str, seed: int
-):
+def test_poses_of_a_gripper_without_stated_places_are_not_doubted(name: str, seed: int):
     right = gripped(soft(name, seed), lambda poses: poses)
     assert misspecification_hypotheses(right) == ()
 
 
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("fault", TRACK_FAULTS)
-def test_tracks_that_no_grasped_body_has_are_named_before_solving(
-    name: str, fault: str, rng
-):
+def test_tracks_that_no_grasped_body_has_are_named_before_solving(name: str, fault: str, rng):
     causes = misspecification_hypotheses(TRACK_FAULTS[fault](soft(name), rng))
     assert causes, fault
     assert causes[0].cause in TRACK_FAULTS[fault].causes
@@ -195,9 +176,7 @@ def test_an_unstable_simulation_is_named_after_solving(rng):
 
 
 def shipped(name: str) -> Problem:
-    return Problem.read(
-        Path(__file__).parents[2] / "problems" / name / "problem.toml"
-    )
+    return Problem.read(Path(__file__).parents[2] / "problems" / name / "problem.toml")
 
 
 @pytest.mark.parametrize("name", ["laid_block", "poked_block"])
@@ -206,13 +185,8 @@ def test_obstacles_that_are_right_are_not_doubted(name: str):
 
 
 def test_an_obstacle_that_contains_the_body_has_its_normal_reversed(rng):
-    reversed_plate = PLATE_FAULTS["obstacle: normal reversed"](
-        shipped("laid_block"), rng
-    )
-    assert (
-        misspecification_hypotheses(reversed_plate)[0].cause
-        == "obstacle-normal"
-    )
+    reversed_plate = PLATE_FAULTS["obstacle: normal reversed"](shipped("laid_block"), rng)
+    assert misspecification_hypotheses(reversed_plate)[0].cause == "obstacle-normal"
 
 
 @pytest.mark.parametrize("zero", ["z", ""])
@@ -228,29 +202,20 @@ def test_the_load_of_an_indentation_that_pulls_is_named(zero: str, rng):
 
 
 def with_zero(experiment: Experiment, zero: str) -> Experiment:
-    return experiment.with_obstacles(
-        [replace(each, zero=zero) for each in experiment.obstacles]
-    )
+    return experiment.with_obstacles([replace(each, zero=zero) for each in experiment.obstacles])
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", BODIES)
 def test_a_late_clock_comes_with_its_lag_and_sign(name: str, rng):
-    for fault, said in (
-        ("clock 100 ms late", "late"),
-        ("clock 30 ms early", "early"),
-    ):
-        (first, *_) = misspecification_hypotheses(
-            FAULTS[fault](_twin(name, "stiff", 1), rng)
-        )
+    for fault, said in (("clock 100 ms late", "late"), ("clock 30 ms early", "early")):
+        (first, *_) = misspecification_hypotheses(FAULTS[fault](_twin(name, "stiff", 1), rng))
         assert first.cause == "clock"
         assert f"{said} by about {fault.split()[1]} ms" in first.message
 
 
 def test_the_sentence_says_by_how_much_and_which_key(rng):
-    (first, *_) = misspecification_hypotheses(
-        FAULTS["poses in mm"](soft("block"), rng)
-    )
+    (first, *_) = misspecification_hypotheses(FAULTS["poses in mm"](soft("block"), rng))
     assert "0.001 times as large" in first.message
     assert 'grasp.length_unit = "mm"' in first.message
 
@@ -273,15 +238,10 @@ def test_names_exchanged_midway_are_told_with_their_time(name: str, gap: int):
     given = soft(name)
     (experiment,) = given.experiments
     half, names = len(experiment.t_s) // 2, experiment.markers.names
-    (first, *_) = misspecification_hypotheses(
-        exchanged(given, slice(half, None), gap)
-    )
+    (first, *_) = misspecification_hypotheses(exchanged(given, slice(half, None), gap))
     assert first.cause == "markers-exchanged"
     assert f"from t = {experiment.t_s[half]:.4g} s on" in first.message
-    assert (
-        f": {names[0]} is {names[1]}, {names[1]} is {names[0]};"
-        in first.message
-    )
+    assert f": {names[0]} is {names[1]}, {names[1]} is {names[0]};" in first.message
 
 
 def test_names_exchanged_and_back_are_told_with_both_times():
@@ -300,20 +260,12 @@ def test_a_short_exchange_is_left_to_hubers_loss():
 @pytest.mark.long
 def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
     solution = solve(exchanged(soft("bar"), slice(20, None)))
-    monkeypatch.setattr(
-        fit_misspecifications,
-        "ReducedSpace",
-        None,
-    )
-    assert [cause.cause for cause in find_misspecifications(solution)] == [
-        "markers-exchanged"
-    ]
+    monkeypatch.setattr(fit_misspecifications, "ReducedSpace", None)
+    assert [cause.cause for cause in find_misspecifications(solution)] == ["markers-exchanged"]
 
 
 @pytest.mark.long
-def test_the_search_for_causes_is_bounded_by_what_the_fit_took(
-    monkeypatch, rng
-):
+def test_the_search_for_causes_is_bounded_by_what_the_fit_took(monkeypatch, rng):
     solution, sweeps = solve(FAULTS["marker slips"](soft("block"), rng)), []
 
     class Counted(ReducedSpace):
@@ -322,21 +274,13 @@ def test_the_search_for_causes_is_bounded_by_what_the_fit_took(
             sweeps.append(found.iterations)
             return found
 
+    monkeypatch.setattr(fit_misspecifications, "ReducedSpace", Counted)
     monkeypatch.setattr(
-        fit_misspecifications,
-        "ReducedSpace",
-        Counted,
-    )
-    monkeypatch.setattr(
-        fit_misspecifications,
-        "find_misspecifications_by_modes",
-        lambda *_, **__: (),
+        fit_misspecifications, "find_misspecifications_by_modes", lambda *_, **__: ()
     )
     assert find_misspecifications(solution)[0].cause == "marker-slip"
     assert len(sweeps) > 1
-    assert (
-        max(sweeps) <= max(15, solution.iterations) + 2
-    )  # simulations count when they are done
+    assert max(sweeps) <= max(15, solution.iterations) + 2  # simulations count when they are done
     assert sum(sweeps) <= 3 * max(15, solution.iterations) + 2
 
 
@@ -365,9 +309,7 @@ def test_markers_that_are_hardly_ever_seen_are_nothing_sudden(count: int):
 )
 def test_odd_sizes_and_densities_are_told(edge_m, density_kg_m3, expected):
     body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
-    assert [
-        oddity.cause for oddity in size_and_density_hypotheses(body)
-    ] == expected
+    assert [oddity.cause for oddity in size_and_density_hypotheses(body)] == expected
 
 
 def test_an_odd_size_leads_to_what_states_it():
@@ -377,27 +319,16 @@ def test_an_odd_size_leads_to_what_states_it():
         (generated, "check its lengths, which"),
         (read, "check object.length_unit, "),
     ):
-        (oddity,) = size_and_density_hypotheses(
-            Body(mesh, density_kg_m3=1100.0)
-        )
+        (oddity,) = size_and_density_hypotheses(Body(mesh, density_kg_m3=1100.0))
         assert words in oddity.message
 
 
 def test_a_metal_as_soft_as_rubber_is_odd():
-    theta = {
-        "young_pa": 5e5,
-        "poisson": 0.4,
-        "gamma_r_s": 0.01,
-        "gamma_m_1_s": 0.0,
-    }
+    theta = {"young_pa": 5e5, "poisson": 0.4, "gamma_r_s": 0.01, "gamma_m_1_s": 0.0}
 
     def found(density_kg_m3: float, young_pa: float) -> str | None:
-        body = Body(
-            box_mesh((0.1,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3
-        )
-        odd = material_hypothesis(
-            body, body.theta_from_values(theta | {"young_pa": young_pa})
-        )
+        body = Body(box_mesh((0.1,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
+        odd = material_hypothesis(body, body.theta_from_values(theta | {"young_pa": young_pa}))
         return odd and odd.message
 
     assert found(1100.0, 5e5) is None
@@ -405,30 +336,21 @@ def test_a_metal_as_soft_as_rubber_is_odd():
     assert "if the mass was stated in g" in (found(2e4, 5e5) or "")
 
 
-@pytest.mark.parametrize(
-    ("edge_m", "density_kg_m3"), [(2e3, 1e3), (0.1, 0.03), (0.1, 1e7)]
-)
+@pytest.mark.parametrize(("edge_m", "density_kg_m3"), [(2e3, 1e3), (0.1, 0.03), (0.1, 1e7)])
 def test_impossible_ones_are_refused(edge_m, density_kg_m3):
     body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
     with pytest.raises(InputError, match="expected"):
         size_and_density_hypotheses(body)
 
 
-@pytest.mark.parametrize(
-    "fault", ["density in g/cm3", "mass in g", "mesh in mm"]
-)
+@pytest.mark.parametrize("fault", ["density in g/cm3", "mass in g", "mesh in mm"])
 def test_they_come_first(fault, rng):
     heavy = Body(box_mesh(*BODIES["block"]), density_kg_m3=1000.0)
     given = soft("block")
-    silicone = replace(
-        given, experiments=[replace(given.experiments[0], body=heavy)]
-    )
+    silicone = replace(given, experiments=[replace(given.experiments[0], body=heavy)])
     wrong = FAULTS[fault](silicone, rng)
     assert misspecification_hypotheses(wrong)[0].cause in FAULTS[fault].causes
-    assert any(
-        "expected 10 to" in note or "expected 0.0001" in note
-        for note in wrong.notes
-    )
+    assert any("expected 10 to" in note or "expected 0.0001" in note for note in wrong.notes)
 
 
 # The nodes of a grasp -----------------------------------------------------------------------------
@@ -438,15 +360,11 @@ def held_of(points_m: np.ndarray, below_m: float) -> Problem:
     experiment = soft("block").experiments[0]
     mesh = replace_points(experiment.body, points_m)
     nodes = np.flatnonzero(mesh.nodes_m[:, 2] > below_m)
-    return replace(
-        experiment, body=mesh, grasps=[Grasp(nodes, experiment.grasps[0].poses)]
-    )
+    return replace(experiment, body=mesh, grasps=[Grasp(nodes, experiment.grasps[0].poses)])
 
 
 def replace_points(body: Body, points_m: np.ndarray) -> Body:
-    return Body(
-        type(body.mesh)(points_m, body.mesh.tetrahedra), density_kg_m3=30.0
-    )
+    return Body(type(body.mesh)(points_m, body.mesh.tetrahedra), density_kg_m3=30.0)
 
 
 def test_a_layer_is_held_for_sure():
@@ -463,10 +381,7 @@ def test_nodes_at_the_edge_of_the_box_are_warned_of():
     missed = held_of(points_m, 0.0895)
     (hold,) = check_grasps(missed, 0.03)
     assert (hold.nodes, hold.nearly_grasped) == (6, 3)
-    assert (
-        "enlarged by a tenth of an element's edge"
-        in grasp_concerns(hold)[0].message
-    )
+    assert "enlarged by a tenth of an element's edge" in grasp_concerns(hold)[0].message
 
 
 # After solving ------------------------------------------------------------------------------------
@@ -481,18 +396,13 @@ def test_a_good_fit_has_no_cause(name: str):
 def test_a_clock_that_is_estimated_is_told(rng):
     problem = FAULTS["clock 10 ms late"](soft("bar"), rng)
     reasons = run(problem).trust.reasons
-    assert any(
-        "ms" in said and "than their times state" in said for said in reasons
-    ), reasons
+    assert any("ms" in said and "than their times state" in said for said in reasons), reasons
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
     "fault",  # of gravity `test_trust` asks for the verdict and the cause
-    [
-        pytest.param(f, marks=pytest.mark.slow) if f == "gravity" else f
-        for f in AFTER
-    ],
+    [pytest.param(f, marks=pytest.mark.slow) if f == "gravity" else f for f in AFTER],
 )
 def test_a_wrong_description_is_named_after_solving(fault: str, rng):
     causes = find_misspecifications(solve(FAULTS[fault](soft("bar"), rng)))
@@ -508,9 +418,7 @@ def test_check_does_not_call_a_doubtful_problem_valid(tiny: Path):
     late = 'start = "equilibrium"\ngravity_m_s2 = [0.0, 0.0, -9.81]\n'
     replace_text('name = "swing"\n', f'name = "swing"\n{late}')(tiny)
     low, mid = "low = [0.0, 0.0, 0.0]", "mid = [0.03, 0.02, 0.03]"
-    both(
-        replace_text(low, "LOW"), replace_text(mid, mid.replace("mid", "low"))
-    )(tiny)
+    both(replace_text(low, "LOW"), replace_text(mid, mid.replace("mid", "low")))(tiny)
     replace_text("LOW", low.replace("low", "mid"))(tiny)
     outcome = run_command("check", "problem.toml")
     assert outcome.code == 1
@@ -540,7 +448,4 @@ def test_a_refusal_names_the_likeliest_cause(tiny: Path):
     assert outcome.code == 2
     said = " ".join(outcome.err.split())
     assert "from the pose of the grasp" in said
-    assert (
-        "likely 'swing': the poses would fit if they were 0.001 times as large"
-        in said
-    )
+    assert "likely 'swing': the poses would fit if they were 0.001 times as large" in said

@@ -20,10 +20,7 @@ from collocation_sysid.statistics.misspecification.obstacle_misspecifications im
 
 NAMED = {
     name: (twin, fault)
-    for twin, faults in (
-        (poked_twin, POKING_FAULTS),
-        (sheared_twin, PLATE_FAULTS),
-    )
+    for twin, faults in ((poked_twin, POKING_FAULTS), (sheared_twin, PLATE_FAULTS))
     for name, fault in faults.items()
     if fault.causes
 }
@@ -32,18 +29,14 @@ SILENT = [name for name, fault in POKING_FAULTS.items() if not fault.causes]
 
 @pytest.mark.parametrize("twin", [poked_twin, sheared_twin])
 @pytest.mark.parametrize("seed", range(1, 9))
-def test_a_right_obstacle_is_not_doubted(
-    twin: Callable[[int], Problem], seed: int
-):
+def test_a_right_obstacle_is_not_doubted(twin: Callable[[int], Problem], seed: int):
     assert misspecification_hypotheses(twin(seed)) == ()
 
 
 @pytest.mark.parametrize("name", NAMED)
 def test_a_mistake_is_the_likeliest_cause(name: str):
     twin, fault = NAMED[name]
-    causes = misspecification_hypotheses(
-        fault(twin(1), np.random.default_rng(0))
-    )
+    causes = misspecification_hypotheses(fault(twin(1), np.random.default_rng(0)))
     assert causes[0].cause in fault.causes
     assert "{" not in causes[0].message
 
@@ -65,24 +58,14 @@ def test_a_load_in_the_frame_of_a_turned_plate_is_not_doubted():
     poses = plate.poses
     same = replace(
         plate,
-        poses=replace(
-            poses,
-            quaternions_xyzw=np.tile(half_turn_xyzw, (len(poses.t_s), 1)),
-        ),
+        poses=replace(poses, quaternions_xyzw=np.tile(half_turn_xyzw, (len(poses.t_s), 1))),
         shape=Plane(turned @ plate.shape.normal, turned @ plate.shape.point_m),
-        wrench=replace(
-            plate.wrench,
-            values=plate.wrench.values[:, :3] @ turned,
-            frame="grasp",
-        ),
+        wrench=replace(plate.wrench, values=plate.wrench.values[:, :3] @ turned, frame="grasp"),
     )
     given = experiment.with_obstacles([same])
     assert [*obstacle_hypotheses(given)] == []
     wrong = replace(same, wrench=replace(same.wrench, frame="world"))
-    causes = {
-        each.cause
-        for each in obstacle_hypotheses(experiment.with_obstacles([wrong]))
-    }
+    causes = {each.cause for each in obstacle_hypotheses(experiment.with_obstacles([wrong]))}
     assert "obstacle-pull" in causes
 
 
@@ -92,13 +75,9 @@ def test_a_pull_within_the_tare_is_not_doubted():
     small = wrong(experiment, np.random.default_rng(0))
     assert [*obstacle_hypotheses(small)] == []
     (plate,) = sheared_twin(1).experiments
-    tared = replace(
-        plate, nuisance=replace(Nuisance.none(), tare=4 / DRAGGED_NOISE_N)
-    )
+    tared = replace(plate, nuisance=replace(Nuisance.none(), tare=4 / DRAGGED_NOISE_N))
     pulled = wrench_times(-1, 1)(tared, np.random.default_rng(0))
-    assert "obstacle-pull" not in {
-        each.cause for each in obstacle_hypotheses(pulled)
-    }
+    assert "obstacle-pull" not in {each.cause for each in obstacle_hypotheses(pulled)}
 
 
 def test_friction_that_is_estimated_is_not_doubted():
@@ -115,7 +94,5 @@ def test_a_body_that_hangs_may_touch_what_it_would_not_undeformed():
         experiment, np.random.default_rng(0)
     )
     heavy = replace(away, gravity_m_s2=(0.0, 0.0, -9.81))
-    assert [each.cause for each in obstacle_hypotheses(away)] == [
-        "obstacle-load"
-    ]
+    assert [each.cause for each in obstacle_hypotheses(away)] == ["obstacle-load"]
     assert [*obstacle_hypotheses(heavy)] == []

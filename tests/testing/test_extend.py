@@ -8,14 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from kit.problem_files import (
-    AT_TRUTH,
-    both,
-    replace_text,
-    run_command,
-    settings,
-    write,
-)
+from kit.problem_files import AT_TRUTH, both, replace_text, run_command, settings, write
 from kit.problems import GUESS, TRUTH, hung_cube
 
 import collocation_sysid as cs
@@ -31,19 +24,13 @@ DRAG = 40.0
 
 def drag(x, v, at, drag_coefficient):
     """Of a thick fluid, so that it is felt: half its density, the share of the surface, speed."""
-    return (
-        -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
-    )
+    return -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
 
 
 def in_fluid(steps: int = 10, law=drag, **changes) -> Experiment:
     """A hung cube in a fluid, without what is unknown by default."""
     old = hung_cube(steps, nuisance=Nuisance.none())
-    forces = [
-        cs.NodeForce.from_law(
-            law, cs.Constant("drag_coefficient", "c", usual=1.0)
-        )
-    ]
+    forces = [cs.NodeForce.from_law(law, cs.Constant("drag_coefficient", "c", usual=1.0))]
     body = cs.Body(old.body.mesh, density_kg_m3=30.0, forces=forces, **changes)
     return replace(old, body=body)
 
@@ -53,9 +40,7 @@ def parameters(guess: float) -> cs.Parameters:
     return cs.Parameters((*GUESS.items, *own.items))
 
 
-def seen(
-    experiment: Experiment, integrator: str = "midpoint", sigma: float = 0.0
-) -> Experiment:
+def seen(experiment: Experiment, integrator: str = "midpoint", sigma: float = 0.0) -> Experiment:
     values = {**TRUTH, "drag_coefficient": DRAG}
     tracks = simulate(experiment, values, integrator, substeps=1).markers_m
     noise = sigma * np.random.default_rng(4).normal(size=tracks.shape)
@@ -63,15 +48,9 @@ def seen(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "method", [m for m in METHODS if not m.startswith("casadi:")]
-)
+@pytest.mark.parametrize("method", [m for m in METHODS if not m.startswith("casadi:")])
 def test_every_method_finds_the_constant_of_a_users_force(method):
-    problem = cs.Problem(
-        [seen(in_fluid())],
-        parameters=parameters(25.0),
-        method=METHODS[method](),
-    )
+    problem = cs.Problem([seen(in_fluid())], parameters=parameters(25.0), method=METHODS[method]())
     found = cs.solve(problem)
     assert found.parameters["drag_coefficient"] == pytest.approx(DRAG, rel=5e-3)
 
@@ -89,26 +68,16 @@ def test_a_users_pressure_on_faces_is_found(element, method):
     mesh = hung_cube(2, (1, 1, 2)).body.mesh
     body = cs.Body(mesh, density_kg_m3=30.0, element=element, forces=[force])
     old = hung_cube(12)
-    markers = cs.Markers(
-        old.t_s, np.zeros((13, 2, 3)), 1e-4, places_m=[[0, 0, 0], [0.1, 0.1, 0]]
-    )
+    markers = cs.Markers(old.t_s, np.zeros((13, 2, 3)), 1e-4, places_m=[[0, 0, 0], [0.1, 0.1, 0]])
     top = cs.Box((-1, -1, 0.099), (1, 1, 1))
     made = cs.Experiment(
-        body,
-        old.t_s,
-        [cs.Grasp(top, old.grasps[0].poses)],
-        markers,
-        nuisance=Nuisance.none(),
+        body, old.t_s, [cs.Grasp(top, old.grasps[0].poses)], markers, nuisance=Nuisance.none()
     )
     truth = {**TRUTH, "squeeze_pa": 8.0}
-    made = with_markers(
-        made, simulate(made, truth, "midpoint", substeps=1).markers_m
-    )
+    made = with_markers(made, simulate(made, truth, "midpoint", substeps=1).markers_m)
     unknown = {"mu_pa": cs.Unknown(200.0), "squeeze_pa": cs.Unknown(5.0)}
     problem = cs.Problem(
-        [made],
-        cs.Parameters.from_mapping({**truth, **unknown}),
-        method=METHODS[method](),
+        [made], cs.Parameters.from_mapping({**truth, **unknown}), method=METHODS[method]()
     )
     found = cs.solve(problem).parameters
     assert found["squeeze_pa"] == pytest.approx(8.0, rel=1e-3)
@@ -120,9 +89,7 @@ def test_newmarks_rule_moves_it_alike():
     experiment = in_fluid()
     fine = simulate(experiment, at, "newmark", timestep_s=1e-3).markers_m
     ours = simulate(experiment, at, "midpoint", substeps=10).markers_m
-    without = simulate(
-        experiment, {**at, "drag_coefficient": 1e-6}, "midpoint", substeps=10
-    )
+    without = simulate(experiment, {**at, "drag_coefficient": 1e-6}, "midpoint", substeps=10)
     moved = np.abs(ours - without.markers_m).max()
     assert np.abs(ours - fine).max() < 2e-4 * moved
     assert moved > 2e-4
@@ -130,9 +97,7 @@ def test_newmarks_rule_moves_it_alike():
 
 @pytest.mark.long
 def test_its_interval_holds_the_truth_and_the_report_names_it():
-    problem = cs.Problem(
-        [seen(in_fluid(20), sigma=1e-4)], parameters=parameters(25.0)
-    )
+    problem = cs.Problem([seen(in_fluid(20), sigma=1e-4)], parameters=parameters(25.0))
     run = cs.run(problem, seek_causes=False)
     low, high = run.interval("drag_coefficient")
     assert low < DRAG < high
@@ -149,12 +114,7 @@ def test_left_out_the_verdict_doubts_the_answer():
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 def test_on_a_finer_mesh_it_is_the_same_force(element):
     mesh = hung_cube().body.mesh
-    body = cs.Body(
-        mesh,
-        density_kg_m3=30.0,
-        element=element,
-        forces=[cs.NodeForce.from_law(drag)],
-    )
+    body = cs.Body(mesh, density_kg_m3=30.0, element=element, forces=[cs.NodeForce.from_law(drag)])
     wind = np.array([0.3, -0.2, 0.5])
     theta = np.array([1e-9, 1e-9, 0.0, 0.0, DRAG])
     of_both = []
@@ -196,9 +156,7 @@ PARAMETER = "gamma_m_1_s = {"
 def with_force(function: str = "drag"):
     return both(
         replace_text("density_kg_m3 = 30.0\n", FORCE.format(function)),
-        replace_text(
-            PARAMETER, f"drag_coefficient = {{ guess = 25.0 }}\n{PARAMETER}"
-        ),
+        replace_text(PARAMETER, f"drag_coefficient = {{ guess = 25.0 }}\n{PARAMETER}"),
     )
 
 
@@ -208,9 +166,7 @@ def test_a_force_in_a_file_is_simulated_and_identified(tiny):
     write("mine.py", MINE)(tiny)
     truth = settings(*AT_TRUTH, "parameters.drag_coefficient.guess=40")
     code = ("problem.toml", "--allow-code", "--quiet")
-    done = run_command(
-        "simulate", *code, *truth, "--integrator", "midpoint", "--out", "data"
-    )
+    done = run_command("simulate", *code, *truth, "--integrator", "midpoint", "--out", "data")
     assert done.code == 0, done.err
     recorded = settings("experiment.0.markers.file=data/swing_markers.csv")
     assert run_command("solve", *code, *recorded, "--out", "found").code == 0
@@ -226,49 +182,27 @@ def lift(x, v, at, spin_n_s_m4):
 
 @pytest.mark.parametrize("method", ["reduced-space", "interior-point"])
 def test_a_force_across_the_velocity_is_found(method: str):
-    old, truth = (
-        hung_cube(12, nuisance=Nuisance.none()),
-        {**TRUTH, "spin_n_s_m4": 400.0},
-    )
-    body = cs.Body(
-        old.body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.from_law(lift)]
-    )
+    old, truth = (hung_cube(12, nuisance=Nuisance.none()), {**TRUTH, "spin_n_s_m4": 400.0})
+    body = cs.Body(old.body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.from_law(lift)])
     made = replace(old, body=body)
-    seen = with_markers(
-        made, simulate(made, truth, "midpoint", substeps=1).markers_m
-    )
-    unknown = {
-        "spin_n_s_m4": cs.Unknown(150.0),
-        "mu_pa": cs.Unknown(GUESS.items[0].guess),
-    }
+    seen = with_markers(made, simulate(made, truth, "midpoint", substeps=1).markers_m)
+    unknown = {"spin_n_s_m4": cs.Unknown(150.0), "mu_pa": cs.Unknown(GUESS.items[0].guess)}
     problem = cs.Problem(
-        [seen],
-        cs.Parameters.from_mapping({**truth, **unknown}),
-        method=METHODS[method](),
+        [seen], cs.Parameters.from_mapping({**truth, **unknown}), method=METHODS[method]()
     )
     found = cs.solve(problem).parameters
     assert found["spin_n_s_m4"] == pytest.approx(400.0, rel=1e-3)
-    fine = simulate(
-        made, truth, "newmark", timestep_s=made.timestep_s / 8
-    ).markers_m
+    fine = simulate(made, truth, "newmark", timestep_s=made.timestep_s / 8).markers_m
     coarse = simulate(made, truth, "midpoint", substeps=8).markers_m
-    without = simulate(
-        made, {**truth, "spin_n_s_m4": 0.0}, "midpoint", substeps=8
-    ).markers_m
+    without = simulate(made, {**truth, "spin_n_s_m4": 0.0}, "midpoint", substeps=8).markers_m
     assert np.abs(fine - coarse).max() < 0.02 * np.abs(without - coarse).max()
 
 
 @pytest.mark.parametrize(
     ("function", "said"),
     [
-        (
-            "wild",
-            r"force 'wild' returns an expression of the shape \(2, 1\); expected \(3, 1\)",
-        ),
-        (
-            "gone",
-            "there is no function 'gone'; expected one of drag, lift, wild",
-        ),
+        ("wild", r"force 'wild' returns an expression of the shape \(2, 1\); expected \(3, 1\)"),
+        ("gone", "there is no function 'gone'; expected one of drag, lift, wild"),
     ],
 )
 def test_what_is_no_force_is_one_message(tiny, function, said):
@@ -281,18 +215,15 @@ def test_what_is_no_force_is_one_message(tiny, function, said):
 def test_a_force_on_faces_in_a_file_that_no_face_has_is_one_message(tiny):
     both(
         replace_text("density_kg_m3 = 30.0\n", FORCE.format("drag") + FACES),
-        replace_text(
-            PARAMETER, f"drag_coefficient = {{ guess = 25.0 }}\n{PARAMETER}"
-        ),
+        replace_text(PARAMETER, f"drag_coefficient = {{ guess = 25.0 }}\n{PARAMETER}"),
     )(tiny)
     write("mine.py", MINE)(tiny)
     assert run_command("check", "problem.toml", "--allow-code").code == 0
     replace_text("[-1, -1, -1]", "[0.05, 0.05, -1]")(tiny)
     done = run_command("check", "problem.toml", "--allow-code")
     assert done.code == 2
-    assert (
-        "force 'drag' acts on faces of the surface, but no face has all"
-        in " ".join(done.err.split())
+    assert "force 'drag' acts on faces of the surface, but no face has all" in " ".join(
+        done.err.split()
     )
 
 
@@ -310,14 +241,9 @@ def test_a_constant_that_the_body_has_is_refused():
         return -mu_pa * v
 
     with pytest.raises(
-        InputError,
-        match="'mu_pa', but another constant of the body has the same name",
+        InputError, match="'mu_pa', but another constant of the body has the same name"
     ):
-        cs.Body(
-            hung_cube().body.mesh,
-            density_kg_m3=30.0,
-            forces=[cs.NodeForce.from_law(mine)],
-        )
+        cs.Body(hung_cube().body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.from_law(mine)])
 
 
 def test_a_law_that_is_not_finite_at_rest_is_refused():

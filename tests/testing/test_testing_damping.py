@@ -7,12 +7,7 @@ import pytest
 from kit.materials import CONSTANTS, ELASTIC
 
 from collocation_sysid.fem.laws.constants import GAMMA_R, Constant
-from collocation_sysid.fem.laws.materials import (
-    DAMPINGS,
-    MATERIALS,
-    DampingLaw,
-    material_form,
-)
+from collocation_sysid.fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, material_form
 from collocation_sysid.testing import check_damping
 from collocation_sysid.testing.internal_force_check import check_internal_forces
 from collocation_sysid.testing.property_check import PropertyCheck
@@ -20,26 +15,13 @@ from collocation_sysid.testing.property_check import PropertyCheck
 # Every law with linear and averaging elements, and with a linear material, which does not
 # distinguish the shapes. Rayleigh's law contains more of the energy than its stiffness at rest;
 # `check_material` combines the default law with every material.
-CASES = [
-    (law, "neo-hookean", element)
-    for law in DAMPINGS
-    for element in ("tet4", "tet10-p0")
-]
+CASES = [(law, "neo-hookean", element) for law in DAMPINGS for element in ("tet4", "tet10-p0")]
 CASES += [("kelvin-voigt", "neo-hookean", "tet10")]
 CASES += [(law, "linear", "tet4") for law in DAMPINGS]
-CASES += [
-    ("rayleigh", name, "tet4")
-    for name in ("gent", "yeoh", "st-venant-kirchhoff")
-]
+CASES += [("rayleigh", name, "tet4") for name in ("gent", "yeoh", "st-venant-kirchhoff")]
 # Energies that are differentiated by the chain rule.
-CASES += [
-    (law, name, "tet4")
-    for law in DAMPINGS
-    for name in ("ogden-2", "hyperfoam-1")
-]
-AVERAGED = [
-    (law, "ogden-2", "tet10-p0") for law in ("kelvin-voigt", "rayleigh")
-]
+CASES += [(law, name, "tet4") for law in DAMPINGS for name in ("ogden-2", "hyperfoam-1")]
+AVERAGED = [(law, "ogden-2", "tet10-p0") for law in ("kelvin-voigt", "rayleigh")]
 CASES += [pytest.param(*each, marks=pytest.mark.long) for each in AVERAGED]
 
 
@@ -64,15 +46,9 @@ def test_objective_laws_take_energy_out_at_large_strain(law: str):
 
 
 def test_rayleighs_law_is_neither_objective_nor_dissipative():
-    with pytest.raises(
-        AssertionError,
-        match="'rayleigh': a spinning rotation changes the stress",
-    ):
+    with pytest.raises(AssertionError, match="'rayleigh': a spinning rotation changes the stress"):
         check_damping("rayleigh", is_dissipative=False)
-    with pytest.raises(
-        AssertionError,
-        match=r"'rayleigh': it adds energy .*expected at least 0 W",
-    ):
+    with pytest.raises(AssertionError, match=r"'rayleigh': it adds energy .*expected at least 0 W"):
         check_damping("rayleigh", is_objective=False)
 
 
@@ -104,26 +80,11 @@ def curved_potential(psi, F, rate, gamma_r_s):
 @pytest.mark.parametrize(
     ("law", "sentence"),
     [
-        (
-            {"stress": wrong_sign},
-            r"the stated ∂P_v/∂F is not the automatic derivative .* entry \(",
-        ),
-        (
-            {"stress": negative},
-            r"it adds energy at random deformation 0 .*; found -.*, expected",
-        ),
-        (
-            {"stress": quadratic},
-            "P_v is not linear in the rate|∂P_v/∂Ḟ is not symmetric",
-        ),
-        (
-            {"stress": gyroscopic},
-            "∂P_v/∂Ḟ is not symmetric at random deformation 0",
-        ),
-        (
-            {"potential": curved_potential},
-            "P_v is not linear in the rate|∂P_v/∂Ḟ is not symmetric",
-        ),
+        ({"stress": wrong_sign}, r"the stated ∂P_v/∂F is not the automatic derivative .* entry \("),
+        ({"stress": negative}, r"it adds energy at random deformation 0 .*; found -.*, expected"),
+        ({"stress": quadratic}, "P_v is not linear in the rate|∂P_v/∂Ḟ is not symmetric"),
+        ({"stress": gyroscopic}, "∂P_v/∂Ḟ is not symmetric at random deformation 0"),
+        ({"potential": curved_potential}, "P_v is not linear in the rate|∂P_v/∂Ḟ is not symmetric"),
         (
             {"stress": negative, "potential": curved_potential},
             "it has both a stress and a potential",
@@ -139,9 +100,7 @@ def curved_potential(psi, F, rate, gamma_r_s):
     ],
 )
 def test_a_fault_is_one_sentence(law: dict, sentence: str):
-    with pytest.raises(
-        AssertionError, match=f"damping law 'mine': ({sentence})"
-    ):
+    with pytest.raises(AssertionError, match=f"damping law 'mine': ({sentence})"):
         check_damping(DampingLaw("mine", (GAMMA_R,), **law))
 
 
@@ -150,9 +109,7 @@ def test_compiled_forces_that_differ_from_the_plain_formula_fail():
     check = PropertyCheck("damping law 'mine'")
     sentence = "compiled first derivative of the force of tet4 elements differs from the plain"
     with pytest.raises(AssertionError, match=sentence):
-        check_internal_forces(
-            check, MATERIALS["stable-neo-hookean"], law, {}, "tet4"
-        )
+        check_internal_forces(check, MATERIALS["stable-neo-hookean"], law, {}, "tet4")
 
 
 def test_constants_of_an_own_law_have_stated_values():

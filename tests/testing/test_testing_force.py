@@ -12,9 +12,7 @@ from collocation_sysid.testing import check_force
 
 
 def drag(x, v, at, drag_coefficient):
-    return (
-        -0.6 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-4) * v
-    )
+    return -0.6 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-4) * v
 
 
 def bed(x, v, at, bed_n_m3):
@@ -41,35 +39,24 @@ def creeping(x, v, before, at, creep_n_m):
 
 def quadratic_body() -> cs.Body:
     """A body with quadratic faces, on some of which a force acts."""
-    force = cs.NodeForce.from_law(
-        breath, nodes=cs.Box((-1, -1, -1), (1, 1, 0.051)), on="faces"
-    )
+    force = cs.NodeForce.from_law(breath, nodes=cs.Box((-1, -1, -1), (1, 1, 0.051)), on="faces")
     mesh = cs.box_mesh((0.1, 0.1, 0.1), (1, 1, 2))
     return cs.Body(mesh, density_kg_m3=30.0, element="tet10", forces=[force])
 
 
 FORCES = {
     "foundation": (foundation, {"constants": {"whirl_n_m3": 4e4}}),
-    "breath": (
-        cs.NodeForce.from_law(breath, on="faces"),
-        {"is_dissipative": True},
-    ),
+    "breath": (cs.NodeForce.from_law(breath, on="faces"), {"is_dissipative": True}),
     "breath, quadratic": (
         cs.NodeForce.from_law(breath, on="faces"),
         {"is_dissipative": True, "body": quadratic_body()},
     ),
     "drag": (drag, {"is_dissipative": True, "is_zero_at_rest": True}),
-    "bed": (
-        bed,
-        {"energy": bed_energy, "is_zero_at_rest": True, "is_dissipative": True},
-    ),
+    "bed": (bed, {"energy": bed_energy, "is_zero_at_rest": True, "is_dissipative": True}),
     "lift": (lift, {"is_dissipative": True, "is_zero_at_rest": True}),
     "suction": (cs.NodeForce.from_law(suction, on="faces"), {}),
     "air": (unit_drag(), {"is_dissipative": True, "is_zero_at_rest": True}),
-    "creeping": (
-        cs.NodeForce.from_law(creeping, carries=3),
-        {"is_zero_at_rest": True},
-    ),
+    "creeping": (cs.NodeForce.from_law(creeping, carries=3), {"is_zero_at_rest": True}),
 }
 
 
@@ -98,21 +85,13 @@ class WrongSign(cs.NodeForce):
             {"energy": lambda x, at, bed_n_m3: 2 * bed_energy(x, at, bed_n_m3)},
             r"'bed': the force is not −∂energy/∂x at random state 0, entry \(\d,\); found .*, exp",
         ),
-        (
-            pushed,
-            {"is_dissipative": True},
-            r"'pushed': it adds energy .* expected at most 0 W",
-        ),
+        (pushed, {"is_dissipative": True}, r"'pushed': it adds energy .* expected at most 0 W"),
         (
             lambda x, v, at, push_n: ca.vertcat(push_n, 0, 0),
             {"is_zero_at_rest": True},
             r"the force at rest is not zero, entry \(0,\); found 1, expected 0",
         ),
-        (
-            WrongSign.from_law(bed),
-            {},
-            r"'bed': the generated force is not the law at random state",
-        ),
+        (WrongSign.from_law(bed), {}, r"'bed': the generated force is not the law at random state"),
     ],
 )
 def test_a_fault_is_one_sentence(force, options: dict, sentence: str):
@@ -122,12 +101,9 @@ def test_a_fault_is_one_sentence(force, options: dict, sentence: str):
 
 def test_an_energy_of_a_force_on_faces_is_refused():
     with pytest.raises(
-        cs.InputError,
-        match="'suction' is on faces, where an energy cannot be checked",
+        cs.InputError, match="'suction' is on faces, where an energy cannot be checked"
     ):
-        check_force(
-            cs.NodeForce.from_law(suction, on="faces"), energy=bed_energy
-        )
+        check_force(cs.NodeForce.from_law(suction, on="faces"), energy=bed_energy)
 
 
 MINE = """
@@ -144,15 +120,11 @@ def test_a_problem_file_gives_the_same_force_or_the_check_fails(tmp_path):
     check_force(drag, file=file)
     file.write_text(MINE.replace("-0.6", "-0.5"))
     with pytest.raises(
-        AssertionError,
-        match=r"'drag': the one that a problem file reads from mine.py has other",
+        AssertionError, match=r"'drag': the one that a problem file reads from mine.py has other"
     ):
         check_force(drag, file=file)
     file.write_text(MINE.replace("def drag", "def drags"))
-    with pytest.raises(
-        cs.InputError,
-        match="there is no function 'drag'; expected one of drags",
-    ):
+    with pytest.raises(cs.InputError, match="there is no function 'drag'; expected one of drags"):
         check_force(drag, file=file)
 
 
@@ -163,8 +135,5 @@ def test_a_force_that_no_cluster_can_evaluate_fails():
     def symbolic(x, v, at, push_n_m):
         return -factor * push_n_m * (x - at.rest_m)
 
-    with pytest.raises(
-        AssertionError,
-        match="pickling fails, so that no cluster can evaluate it;",
-    ):
+    with pytest.raises(AssertionError, match="pickling fails, so that no cluster can evaluate it;"):
         check_force(symbolic)

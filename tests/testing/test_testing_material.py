@@ -11,9 +11,7 @@ from collocation_sysid.fem.laws.materials import MATERIALS, Material
 from collocation_sysid.testing import check_material
 
 # Materials with elements: each kind of energy with linear elements, each element with one material.
-CASES = [(name, "tet4") for name in COMPILED] + [
-    ("neo-hookean", name) for name in ELEMENTS
-]
+CASES = [(name, "tet4") for name in COMPILED] + [("neo-hookean", name) for name in ELEMENTS]
 CASES += [("gent", "tet10-p0"), ("yeoh", "tet10")]
 # Laws with other numbers of terms: the compiled forces contain no more than their energy.
 OTHERS = [name for name in MATERIALS if name not in COMPILED]
@@ -25,12 +23,7 @@ LIMITS = [("ogden-2", {"alpha_2": 0.0}), ("hyperfoam-1", {"beta_1": 0.0})]
 @pytest.mark.parametrize(("name", "element"), dict.fromkeys(CASES))
 def test_every_material_passes(name: str, element: str):
     constants = CONSTANTS.get(name, ELASTIC)
-    check_material(
-        name,
-        constants=constants,
-        is_objective=name != "linear",
-        elements=[element],
-    )
+    check_material(name, constants=constants, is_objective=name != "linear", elements=[element])
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -45,13 +38,7 @@ def test_limits_of_exponents_pass(name: str, limit: dict):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "neo-hookean",
-        *(
-            pytest.param(n, marks=pytest.mark.long)
-            for n in ("ogden-1", "hyperfoam-1")
-        ),
-    ],
+    ["neo-hookean", *(pytest.param(n, marks=pytest.mark.long) for n in ("ogden-1", "hyperfoam-1"))],
 )
 def test_a_material_with_memory_passes(name: str):
     constants = CONSTANTS.get(name, ELASTIC)
@@ -64,18 +51,10 @@ def test_the_message_of_a_principal_stretch_that_is_not_smooth():
     def kinked(F, mu_pa):
         strain = (F.T @ F - ca.SX.eye(3)) / 2
         difference = F[0, 0] ** 2 - F[1, 1] ** 2
-        return mu_pa * (
-            ca.sumsqr(strain)
-            + ca.trace(strain) ** 2 * (1 + ca.fabs(difference))
-        )
+        return mu_pa * (ca.sumsqr(strain) + ca.trace(strain) ** 2 * (1 + ca.fabs(difference)))
 
-    with pytest.raises(
-        AssertionError,
-        match=r"∂P/∂F is wrong at a uniaxial stretch of 1\.2, by",
-    ):
-        check_material(
-            Material.from_energy(kinked), is_objective=False, elements=[]
-        )
+    with pytest.raises(AssertionError, match=r"∂P/∂F is wrong at a uniaxial stretch of 1\.2, by"):
+        check_material(Material.from_energy(kinked), is_objective=False, elements=[])
 
 
 def resists_rotation(F, mu_pa):
@@ -84,9 +63,7 @@ def resists_rotation(F, mu_pa):
 
 def falls_under_shear(F, lambda_pa, mu_pa):
     strain = (F.T @ F - ca.SX.eye(3)) / 2
-    return (
-        lambda_pa / 2 * ca.trace(strain) ** 2 - mu_pa * ca.sumsqr(strain) / 10
-    )
+    return lambda_pa / 2 * ca.trace(strain) ** 2 - mu_pa * ca.sumsqr(strain) / 10
 
 
 def limited(F, mu_pa, limit):
@@ -104,21 +81,9 @@ class Stiffened(Material):
 @pytest.mark.parametrize(
     ("energy", "options", "sentence"),
     [
-        (
-            resists_rotation,
-            {},
-            r"'resists-rotation': a rotation changes the energy at random def",
-        ),
-        (
-            falls_under_shear,
-            {},
-            r"does not resist every strain; found -.*, expected above 0 Pa",
-        ),
-        (
-            limited,
-            {"constants": {"limit": 0.01}},
-            r"the energy is not finite .* smaller largest_",
-        ),
+        (resists_rotation, {}, r"'resists-rotation': a rotation changes the energy at random def"),
+        (falls_under_shear, {}, r"does not resist every strain; found -.*, expected above 0 Pa"),
+        (limited, {"constants": {"limit": 0.01}}, r"the energy is not finite .* smaller largest_"),
     ],
 )
 def test_a_fault_is_one_sentence(energy, options: dict, sentence: str):
@@ -127,10 +92,7 @@ def test_a_fault_is_one_sentence(energy, options: dict, sentence: str):
 
 
 def test_another_energy_in_programs_than_in_the_function_fails():
-    with pytest.raises(
-        AssertionError,
-        match="'rubber': the energy differs from its function at r",
-    ):
+    with pytest.raises(AssertionError, match="'rubber': the energy differs from its function at r"):
         check_material(Stiffened.from_energy(rubber))
 
 
@@ -173,8 +135,5 @@ def test_a_material_that_no_cluster_can_evaluate_fails():
     def symbolic(F, mu_pa):
         return factor * rubber(F, mu_pa)
 
-    with pytest.raises(
-        AssertionError,
-        match="'symbolic': pickling fails, so that no cluster can",
-    ):
+    with pytest.raises(AssertionError, match="'symbolic': pickling fails, so that no cluster can"):
         check_material(symbolic)

@@ -53,11 +53,7 @@ def off_the_motion(collocation, watch=None, start=None):
     solution = REDUCED(collocation, watch, start)
     z = solution.z.copy()
     (transcription,) = solution.collocation.transcriptions
-    z[
-        solution.collocation.nq
-        + transcription.dof_count
-        + transcription.free_dofs[0]
-    ] += 0.1
+    z[solution.collocation.nq + transcription.dof_count + transcription.free_dofs[0]] += 0.1
     return replace(solution, z=z)
 
 
@@ -94,42 +90,15 @@ def partial(collocation, watch=None, start=None):
 @pytest.mark.parametrize(
     ("method", "sentence"),
     [
-        (
-            stopped,
-            "'stopped': it does not converge; found iteration-limit, expected converged",
-        ),
-        (
-            silent,
-            r"watch did not get every line of the history; found 0, expected \d",
-        ),
-        (
-            biased,
-            "the estimate of young_pa is wrong; found 80[0-9.]+, expected 800",
-        ),
-        (
-            off_the_motion,
-            "the equations of motion do not hold: residual over the largest force; f",
-        ),
-        (
-            forgetful,
-            "it does not converge from its own answer; found iteration-limit",
-        ),
-        (
-            ascending,
-            "the loss of the last line of the history is above that of the first",
-        ),
-        (
-            partial,
-            "no line of the history is about the complete recording; found 0.5",
-        ),
-        (
-            meddling,
-            "'meddling': it changes the collocation that it solves, entry",
-        ),
-        (
-            lambda *a, **k: None,
-            "it does not return a Solution; found NoneType, expected Solution",
-        ),
+        (stopped, "'stopped': it does not converge; found iteration-limit, expected converged"),
+        (silent, r"watch did not get every line of the history; found 0, expected \d"),
+        (biased, "the estimate of young_pa is wrong; found 80[0-9.]+, expected 800"),
+        (off_the_motion, "the equations of motion do not hold: residual over the largest force; f"),
+        (forgetful, "it does not converge from its own answer; found iteration-limit"),
+        (ascending, "the loss of the last line of the history is above that of the first"),
+        (partial, "no line of the history is about the complete recording; found 0.5"),
+        (meddling, "'meddling': it changes the collocation that it solves, entry"),
+        (lambda *a, **k: None, "it does not return a Solution; found NoneType, expected Solution"),
     ],
 )
 def test_a_fault_is_one_sentence(method, sentence: str):
@@ -149,8 +118,5 @@ class Careless:
 
 
 def test_an_option_that_may_be_anything_fails():
-    with pytest.raises(
-        AssertionError,
-        match="'careless': the text 'text' as the option sweeps is",
-    ):
+    with pytest.raises(AssertionError, match="'careless': the text 'text' as the option sweeps is"):
         check_method(Careless())

@@ -25,16 +25,10 @@ from collocation_sysid.testing import check_nuisance
 def cube_with_camera() -> cs.Experiment:
     """A cube that a depth camera sees between its samples."""
     cube = hung_cube(5, (1, 1, 2))
-    pose = np.array(
-        [[1, 0, 0, 0.05], [0, 0, 1, -0.4], [0, -1, 0, 0.05], [0, 0, 0, 1.0]]
-    )
+    pose = np.array([[1, 0, 0, 0.05], [0, 0, 1, -0.4], [0, -1, 0, 0.05], [0, 0, 0, 1.0]])
     camera = cs.DepthCamera([[100, 0, 0], [0, 100, 0], [0, 0, 1]], pose=pose)
-    places = np.random.default_rng(0).uniform(
-        [-0.04, -0.04, 0.395], [0.04, 0.04, 0.405], (9, 3)
-    )
-    depth = cs.Depth(
-        "front", cube.t_s[1:4] + 0.003, [places] * 3, 0.05, camera, gate_m=0.1
-    )
+    places = np.random.default_rng(0).uniform([-0.04, -0.04, 0.395], [0.04, 0.04, 0.405], (9, 3))
+    depth = cs.Depth("front", cube.t_s[1:4] + 0.003, [places] * 3, 0.05, camera, gate_m=0.1)
     return replace(cube, depths=[depth])
 
 
@@ -55,9 +49,7 @@ def bar_with_loads() -> cs.Experiment:
 def pulled_specimen() -> cs.Experiment:
     """A specimen without a mesh, whose strain has an unknown zero."""
     strain = np.linspace(0.0, 0.2, 5)
-    return cs.Specimen("uniaxial", strain, 1e3 * strain, 10.0).experiment(
-        name="pull"
-    )
+    return cs.Specimen("uniaxial", strain, 1e3 * strain, 10.0).experiment(name="pull")
 
 
 # Recordings that have the parameters of a component; the others are those of every recording.
@@ -81,9 +73,7 @@ def test_every_parameter_of_the_package_passes(row: NuisanceRow):
         experiment = replace(pulled_specimen(), nuisance=cs.Nuisance.none())
     if row == TOOL_CENTRE:  # there is none without the mass of a tool
         assert experiment is not None
-        experiment = replace(
-            experiment, nuisance=cs.Nuisance.none(tool_kg=0.01)
-        )
+        experiment = replace(experiment, nuisance=cs.Nuisance.none(tool_kg=0.01))
     check_nuisance(row, experiment=experiment)
 
 
@@ -93,18 +83,14 @@ def scaled(y, values, t_s, data):
 
 ROWS = {
     "scale": cs.NuisanceRow("camera_scale", "1", 0.02, reading=scaled),
-    "drift": cs.NuisanceRow(
-        "drift", "1", 0.05, clock=lambda values, t_s, data: values * t_s
-    ),
+    "drift": cs.NuisanceRow("drift", "1", 0.05, clock=lambda values, t_s, data: values * t_s),
     "sag": cs.NuisanceRow(
         "sag",
         "m",
         0.003,
         of="marker",
         axes="x y z",
-        reading=lambda y, values, t_s, data: (
-            y + values * (1 - ca.exp(-t_s / data.duration_s))
-        ),
+        reading=lambda y, values, t_s, data: y + values * (1 - ca.exp(-t_s / data.duration_s)),
     ),
 }
 
@@ -122,11 +108,7 @@ def test_parameters_of_a_user_pass(name: str):
             r"'mine': the value zero changes the reading of a marker, entry \(\d,\); found .*, expected",
         ),
         (
-            {
-                "reading": lambda y, values, t_s, data: (
-                    y + values + ca.floor(1e4 * y) / 1e2
-                )
-            },
+            {"reading": lambda y, values, t_s, data: y + values + ca.floor(1e4 * y) / 1e2},
             "zero changes the reading of a marker|the first derivative of the reading is wrong",
         ),
         (

@@ -17,52 +17,32 @@ def cubes(x: np.ndarray) -> np.ndarray:
 
 
 def test_equal_values_pass_and_the_worst_entry_is_named():
-    CHECK.require_equal(
-        [[1.0, 2.0]], [[1.0, 2.0 + 1e-12]], statement="it is off"
-    )
-    with pytest.raises(
-        AssertionError, match=r"gel 'a': it is off, entry \(0, 1\); found 2, e"
-    ):
+    CHECK.require_equal([[1.0, 2.0]], [[1.0, 2.0 + 1e-12]], statement="it is off")
+    with pytest.raises(AssertionError, match=r"gel 'a': it is off, entry \(0, 1\); found 2, e"):
         CHECK.require_equal([[1.0, 2.0]], [[1.01, 2.1]], statement="it is off")
-    with pytest.raises(
-        AssertionError, match=r"it is off, entry \(0,\); found nan, expected 1"
-    ):
+    with pytest.raises(AssertionError, match=r"it is off, entry \(0,\); found nan, expected 1"):
         CHECK.require_equal([np.nan], [1.0], statement="it is off")
     with pytest.raises(
-        AssertionError,
-        match=r"it is off \(shapes\); found \(2,\), expected \(1,\)",
+        AssertionError, match=r"it is off \(shapes\); found \(2,\), expected \(1,\)"
     ):
         CHECK.require_equal([1.0, 1.0], [1.0], statement="it is off")
 
 
 def test_a_derivative_with_a_wrong_sign_entry_or_missing_fails():
     right = np.diag(3 * POINT**2)
-    CHECK.require_derivative(
-        cubes, right, POINT, statement="the slope is wrong"
-    )
+    CHECK.require_derivative(cubes, right, POINT, statement="the slope is wrong")
     small = np.array([[0, 1e-4], [0, 0]])
     for wrong in (-right, right + small, np.zeros((2, 2))):
-        with pytest.raises(
-            AssertionError, match="the slope is wrong, by central diff"
-        ):
-            CHECK.require_derivative(
-                cubes, wrong, POINT, statement="the slope is wrong"
-            )
+        with pytest.raises(AssertionError, match="the slope is wrong, by central diff"):
+            CHECK.require_derivative(cubes, wrong, POINT, statement="the slope is wrong")
 
 
 def test_a_product_with_a_wrong_sign_fails():
     direction = np.array([1.0, 2.0])
     product = 3 * POINT**2 * direction
-    CHECK.require_product(
-        cubes, product, POINT, direction, statement="the slope is wrong"
-    )
-    with pytest.raises(
-        AssertionError,
-        match="the slope is wrong, by central differences, entry",
-    ):
-        CHECK.require_product(
-            cubes, -product, POINT, direction, statement="the slope is wrong"
-        )
+    CHECK.require_product(cubes, product, POINT, direction, statement="the slope is wrong")
+    with pytest.raises(AssertionError, match="the slope is wrong, by central differences, entry"):
+        CHECK.require_product(cubes, -product, POINT, direction, statement="the slope is wrong")
 
 
 def refuse(message: str):
@@ -70,22 +50,10 @@ def refuse(message: str):
 
 
 def test_a_refusal_names_the_key_or_the_check_fails():
-    CHECK.require_refusal(
-        lambda: refuse("no key 'size'"), naming="size", statement="a key"
-    )
-    with pytest.raises(
-        AssertionError, match="the message for a key lacks the name; found no k"
-    ):
-        CHECK.require_refusal(
-            lambda: refuse("no key"), naming="size", statement="a key"
-        )
-    with pytest.raises(
-        AssertionError,
-        match="a key is not refused; found KeyError: 'x', expected",
-    ):
+    CHECK.require_refusal(lambda: refuse("no key 'size'"), naming="size", statement="a key")
+    with pytest.raises(AssertionError, match="the message for a key lacks the name; found no k"):
+        CHECK.require_refusal(lambda: refuse("no key"), naming="size", statement="a key")
+    with pytest.raises(AssertionError, match="a key is not refused; found KeyError: 'x', expected"):
         CHECK.require_refusal(lambda: {}["x"], naming="size", statement="a key")
-    with pytest.raises(
-        AssertionError,
-        match="a key is not refused; found no error, expected an",
-    ):
+    with pytest.raises(AssertionError, match="a key is not refused; found no error, expected an"):
         CHECK.require_refusal(lambda: None, naming="size", statement="a key")

@@ -23,9 +23,7 @@ def test_every_scheme_passes(name: str):
 def test_a_scheme_of_a_user_passes():
     """Backward Euler whose first rows are those of a body that is pushed for two steps."""
     euler = SCHEMES["backward-euler"]
-    check_scheme(
-        Scheme("mine", 1, euler.regular, (*euler.start, euler.regular))
-    )
+    check_scheme(Scheme("mine", 1, euler.regular, (*euler.start, euler.regular)))
 
 
 @pytest.mark.parametrize(
@@ -48,12 +46,7 @@ def test_a_scheme_of_a_user_passes():
             "the stencil of row 1 uses points before the start; found 5 points, expected at most 2",
         ),
         (
-            replace(
-                MIDPOINT,
-                regular=Stencil(
-                    (0.5, 0.5), (1.0, -1.0), (0.0, 1.0), (1, -2, 1)
-                ),
-            ),
+            replace(MIDPOINT, regular=Stencil((0.5, 0.5), (1.0, -1.0), (0.0, 1.0), (1, -2, 1))),
             "it adds energy: per step, an undamped oscillation with ωΔt = .* grows by; found 1",
         ),
     ],

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.program.custom_sensor_residual import (
-    CustomSensorResidual,
-)
+from collocation_sysid.program.custom_sensor_residual import CustomSensorResidual
 from collocation_sysid.testing import check_sensor
 
 TIMES_S = np.linspace(0.0, 0.1, 11)
@@ -38,30 +36,13 @@ TIP_M = [[0.05, 0.05, 0.01]]
 ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]
 SENSORS = {
     "accelerometer": cs.Gauge(
-        "accelerometer",
-        specific_force,
-        TIMES_S,
-        None,
-        0.05,
-        TIP_M,
-        {"bias_m_s2": 0.5},
+        "accelerometer", specific_force, TIMES_S, None, 0.05, TIP_M, {"bias_m_s2": 0.5}
     ),
-    "foil": cs.Gauge(
-        "foil", strain, TIMES_S, None, 1e-4, ENDS_M, {"scale": 0.05}
-    ),
+    "foil": cs.Gauge("foil", strain, TIMES_S, None, 1e-4, ENDS_M, {"scale": 0.05}),
     "speed": cs.Gauge("speed", speed, TIMES_S, None, 1e-3, TIP_M),
-    "load cell": cs.Gauge(
-        "cell", pull, TIMES_S, None, 1e-3, unknowns={"gain": 0.1}, grasp=1
-    ),
+    "load cell": cs.Gauge("cell", pull, TIMES_S, None, 1e-3, unknowns={"gain": 0.1}, grasp=1),
     "load cell, world": cs.Gauge(
-        "cell",
-        pull,
-        TIMES_S,
-        None,
-        1e-3,
-        unknowns={"gain": 0.1},
-        grasp=1,
-        frame="world",
+        "cell", pull, TIMES_S, None, 1e-3, unknowns={"gain": 0.1}, grasp=1, frame="world"
     ),
 }
 
@@ -78,9 +59,7 @@ def one_sided(at, scale):
 
 
 def test_a_reading_with_another_sign_in_programs_fails():
-    with pytest.raises(
-        AssertionError, match=r"'foil': the expression differs from its functi"
-    ):
+    with pytest.raises(AssertionError, match=r"'foil': the expression differs from its functi"):
         check_sensor(replace(SENSORS["foil"], expression=one_sided))
 
 
@@ -88,10 +67,7 @@ def test_an_expression_that_takes_any_unknown_fails():
     def careless(at, **unknowns):
         return at.position_m[2, 1]
 
-    with pytest.raises(
-        AssertionError,
-        match="an unknown that the expression does not have is not",
-    ):
+    with pytest.raises(AssertionError, match="an unknown that the expression does not have is not"):
         check_sensor(replace(SENSORS["foil"], expression=careless))
 
 
@@ -103,10 +79,7 @@ def test_a_prediction_with_wrong_rates_fails(monkeypatch):
 
     original = CustomSensorResidual.expression
     monkeypatch.setattr(CustomSensorResidual, "expression", backward)
-    with pytest.raises(
-        AssertionError,
-        match="the prediction for a known motion is wrong at t = 0",
-    ):
+    with pytest.raises(AssertionError, match="the prediction for a known motion is wrong at t = 0"):
         check_sensor(SENSORS["speed"])
 
 
@@ -125,7 +98,6 @@ def test_a_problem_file_gives_the_same_reading_or_the_check_fails(tmp_path):
     check_sensor(SENSORS["foil"], file=file)
     file.write_text(MINE.replace("0.06", "0.05"))
     with pytest.raises(
-        AssertionError,
-        match=r"'foil': the one that a problem file reads from mine.py has other",
+        AssertionError, match=r"'foil': the one that a problem file reads from mine.py has other"
     ):
         check_sensor(SENSORS["foil"], file=file)

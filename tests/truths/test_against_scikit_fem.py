@@ -31,20 +31,13 @@ def kinematics(w):
 
 def energy_density(w):
     F, _, log_j = kinematics(w)
-    return (
-        0.5 * LAMBDA_PA * log_j**2
-        - MU_PA * log_j
-        + 0.5 * MU_PA * ((F**2).sum((0, 1)) - 3)
-    )
+    return 0.5 * LAMBDA_PA * log_j**2 - MU_PA * log_j + 0.5 * MU_PA * ((F**2).sum((0, 1)) - 3)
 
 
 def virtual_work(v, w):
     """P : ∇v with P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ."""
     F, inverse_transposed, log_j = kinematics(w)
-    stress = (
-        MU_PA * (F - inverse_transposed)
-        + LAMBDA_PA * log_j * inverse_transposed
-    )
+    stress = MU_PA * (F - inverse_transposed) + LAMBDA_PA * log_j * inverse_transposed
     return (stress * v.grad).sum((0, 1))
 
 
@@ -53,11 +46,7 @@ def tangent_work(u, v, w):
     _, G, log_j = kinematics(w)
     turned = np.einsum("ij...,kj...,kl...->il...", G, u.grad, G)
     volumetric = (G * u.grad).sum((0, 1)) * G
-    rate = (
-        MU_PA * u.grad
-        + (MU_PA - LAMBDA_PA * log_j) * turned
-        + LAMBDA_PA * volumetric
-    )
+    rate = MU_PA * u.grad + (MU_PA - LAMBDA_PA * log_j) * turned + LAMBDA_PA * volumetric
     return (rate * v.grad).sum((0, 1))
 
 
@@ -80,9 +69,7 @@ def quadratic(small_mesh) -> tuple[Library, Callable[..., Body]]:
 
 @pytest.fixture
 def positions(small_mesh, rng) -> np.ndarray:
-    return small_mesh.points_m + rng.uniform(
-        -0.006, 0.006, small_mesh.points_m.shape
-    )
+    return small_mesh.points_m + rng.uniform(-0.006, 0.006, small_mesh.points_m.shape)
 
 
 def test_neo_hookean_energy(make_body, library, positions):
@@ -116,9 +103,7 @@ def test_neo_hookean_damping(make_body, library, positions, rng):
 
 @pytest.mark.parametrize("material", COMPILED)
 def test_stiffness_at_rest_is_linear_elasticity(make_body, library, material):
-    expected = library.matrix(
-        linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m
-    )
+    expected = library.matrix(linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m)
     body = make_body(material)
     found = body.stiffness(library.points_m, **elastic(body))
     assert relative_error(found.toarray(), expected) < rounding(material)
@@ -137,32 +122,23 @@ def test_quadratic_neo_hookean_energy_force_and_stiffness(quadratic, rng):
     force = -library.vector(virtual_work, x)
     assert relative_error(body.elastic_force(x, **ELASTIC), force) < 1e-10
     stiffness = library.matrix(tangent_work, x)
-    assert (
-        relative_error(body.stiffness(x, **ELASTIC).toarray(), stiffness)
-        < 1e-10
-    )
+    assert relative_error(body.stiffness(x, **ELASTIC).toarray(), stiffness) < 1e-10
 
 
 @pytest.mark.parametrize("intorder", [2, 6])
 def test_quadratic_stiffness_at_rest_is_exact(quadratic, small_mesh, intorder):
     library = Library(small_mesh, skfem.ElementTetP2(), intorder)
     body = quadratic[1]("linear")
-    expected = library.matrix(
-        linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m
-    )
+    expected = library.matrix(linear_elasticity(LAMBDA_PA, MU_PA).form, library.points_m)
     found = body.stiffness(library.points_m, **ELASTIC)
     assert relative_error(found.toarray(), expected) < 1e-10
 
 
-def test_quadratic_consistent_mass_has_the_lumped_ones_proportions(
-    quadratic, small_mesh
-):
+def test_quadratic_consistent_mass_has_the_lumped_ones_proportions(quadratic, small_mesh):
     """Of a single element; of many, each is scaled to its own mass."""
     one = TetMesh(small_mesh.points_m, small_mesh.tetrahedra[:1])
     library = Library(one, skfem.ElementTetP2(), intorder=4)
-    consistent = library.matrix(
-        lambda u, v, w: 30.0 * (u * v).sum(0), library.points_m
-    )
+    consistent = library.matrix(lambda u, v, w: 30.0 * (u * v).sum(0), library.points_m)
     body = Body(one, density_kg_m3=30.0, element="tet10")
     diagonal = np.diag(consistent)
     expected = 3 * body.mass_kg * diagonal / diagonal.sum()

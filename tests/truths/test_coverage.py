@@ -34,13 +34,7 @@ def outcomes(noise: str, twins: int = TWINS) -> list[CoverageOutcome]:
 
 def held(noise: str, kind: int, twins: int = TWINS) -> np.ndarray:
     """Share of the intervals that hold the truth, by parameter."""
-    return np.mean(
-        [
-            outcome.contains_truth[kind, :4]
-            for outcome in outcomes(noise, twins)
-        ],
-        axis=0,
-    )
+    return np.mean([outcome.contains_truth[kind, :4] for outcome in outcomes(noise, twins)], axis=0)
 
 
 def fewest(twins: int) -> float:
@@ -50,9 +44,7 @@ def fewest(twins: int) -> float:
 
 def scores(noise: str, kind: int, twins: int = TWINS) -> np.ndarray:
     """(twins, 4) errors over their standard deviations."""
-    return np.array(
-        [outcome.scores[kind] for outcome in outcomes(noise, twins)]
-    )
+    return np.array([outcome.scores[kind] for outcome in outcomes(noise, twins)])
 
 
 def limits_of_spread(twins: int) -> tuple[float, float]:
@@ -75,9 +67,7 @@ def test_intervals_hold_the_truth(noise, kind):
 @pytest.mark.parametrize("noise", NOISES)
 def test_errors_are_as_large_as_their_standard_deviations(noise):
     found, (low, high) = scores(noise, ROBUST), limits_of_spread(TWINS)
-    assert (
-        np.abs(found.mean(axis=0)) < norm.isf(RARE / 2) / np.sqrt(2 * TWINS)
-    ).all()
+    assert (np.abs(found.mean(axis=0)) < norm.isf(RARE / 2) / np.sqrt(2 * TWINS)).all()
     assert ((low < found.std(axis=0)) & (found.std(axis=0) < high)).all()
 
 
@@ -89,8 +79,6 @@ def test_textbook_intervals_fail_where_errors_persist():
 
 
 def test_the_kind_of_error_bars_is_chosen_by_the_residuals():
-    assert all(
-        outcome.correlated[ROBUST] for outcome in outcomes("autoregressive")
-    )
+    assert all(outcome.correlated[ROBUST] for outcome in outcomes("autoregressive"))
     chosen = sum(outcome.correlated[ROBUST] for outcome in outcomes("white"))
     assert chosen <= binom.isf(RARE, 2 * TWINS, 0.02)  # 1 % of two tests

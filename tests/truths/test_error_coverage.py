@@ -11,19 +11,12 @@ from kit.fits import PARAMETERS, Problem, autoregressive, problem
 from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
-from collocation_sysid.statistics.linearised import (
-    LinearisedFit,
-    factorise_information,
-)
+from collocation_sysid.statistics.linearised import LinearisedFit, factorise_information
 from collocation_sysid.statistics.residuals.autocorrelation import (
     analyse_dependence,
     error_processes,
 )
-from collocation_sysid.statistics.uncertainty import (
-    ErrorModel,
-    Uncertainty,
-    uncertainty_from_fit,
-)
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 DRAWS = 60
 PROBLEMS = {
@@ -37,13 +30,9 @@ PROBLEMS = {
 def draws(of: Problem, phi: float, shared: float = 0.0, count: int = DRAWS):
     """Fits to random errors, with priors that are wrong by their deviation, and their errors."""
     rng = np.random.default_rng(3)
-    deviation = np.divide(
-        1, of.prior_slope, where=of.prior_slope > 0, out=0 * of.prior_slope
-    )
+    deviation = np.divide(1, of.prior_slope, where=of.prior_slope > 0, out=0 * of.prior_slope)
     for _ in range(count):
-        errors = [
-            autoregressive(rng, *s.shape[:2], phi, shared) for s in of.present
-        ]
+        errors = [autoregressive(rng, *s.shape[:2], phi, shared) for s in of.present]
         yield of.fit(errors, deviation * rng.normal(size=len(of.names)))
 
 
@@ -53,16 +42,9 @@ def held(uncertainty: Uncertainty, wrong: np.ndarray) -> np.ndarray:
     return np.abs(wrong[:4]) < half
 
 
-def coverage(
-    of: Problem, phi: float, shared: float = 0.0, count: int = DRAWS, **options
-) -> float:
+def coverage(of: Problem, phi: float, shared: float = 0.0, count: int = DRAWS, **options) -> float:
     hits = [
-        held(
-            uncertainty_from_fit(
-                fit, PARAMETERS, wrong[:4], ErrorModel(**options)
-            ),
-            wrong,
-        )
+        held(uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(**options)), wrong)
         for fit, wrong in draws(of, phi, shared, count)
     ]
     return float(np.mean(hits))
@@ -70,17 +52,13 @@ def coverage(
 
 def assert_covers(share: float) -> None:
     """Within 91–98 %, and what chance does to it (as if one parameter were counted)."""
-    low, high = (
-        binom.ppf(0.001, DRAWS, 0.93) / DRAWS,
-        binom.ppf(0.999, DRAWS, 0.965) / DRAWS,
-    )
+    low, high = (binom.ppf(0.001, DRAWS, 0.93) / DRAWS, binom.ppf(0.999, DRAWS, 0.965) / DRAWS)
     assert low <= share <= high
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "phi"),
-    [*product(PROBLEMS, (0.0, 0.85)), ("one marker, 40 samples", 0.5)],
+    ("name", "phi"), [*product(PROBLEMS, (0.0, 0.85)), ("one marker, 40 samples", 0.5)]
 )
 def test_intervals_hold_the_truth_as_often_as_they_say(name, phi):
     assert_covers(coverage(PROBLEMS[name], phi, noise="estimated"))
@@ -88,9 +66,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(name, phi):
 
 @pytest.mark.parametrize("phi", [0.0, 0.5])
 def test_intervals_hold_the_truth_with_the_sigma_given(phi):
-    assert_covers(
-        coverage(PROBLEMS["one marker, 40 samples"], phi, noise="given")
-    )
+    assert_covers(coverage(PROBLEMS["one marker, 40 samples"], phi, noise="given"))
 
 
 @pytest.mark.long
@@ -98,21 +74,14 @@ def test_intervals_hold_the_truth_with_the_sigma_given(phi):
 def test_intervals_allow_for_errors_that_markers_share(phi):
     of = problem((100,), markers=3)
     assert_covers(coverage(of, phi, shared=0.6, noise="estimated"))
-    assert (
-        coverage(of, phi, shared=0.6, noise="estimated", errors="independent")
-        < 0.85
-    )
+    assert coverage(of, phi, shared=0.6, noise="estimated", errors="independent") < 0.85
 
 
 @pytest.mark.long
 def test_textbook_intervals_fail_where_errors_persist():
     count = 150
     for name in ("one marker, 40 samples", "no offsets"):
-        textbook = {
-            "noise": "estimated",
-            "errors": "independent",
-            "count": count,
-        }
+        textbook = {"noise": "estimated", "errors": "independent", "count": count}
         share = coverage(PROBLEMS[name], 0.85, **textbook)
         assert share < binom.ppf(0.001, count, 0.93) / count
 
@@ -120,14 +89,10 @@ def test_textbook_intervals_fail_where_errors_persist():
 def test_intervals_rarely_change_for_white_errors():
     of = PROBLEMS["one marker, 40 samples"]
     chosen = [
-        uncertainty_from_fit(
-            fit, PARAMETERS, wrong[:4], ErrorModel(noise="estimated")
-        ).errors
+        uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(noise="estimated")).errors
         for fit, wrong in draws(of, 0.0)
     ]
-    assert (
-        np.mean([errors == "autocorrelated" for errors in chosen]) < 0.06
-    )  # 1 % of two tests
+    assert np.mean([errors == "autocorrelated" for errors in chosen]) < 0.06  # 1 % of two tests
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -159,9 +124,7 @@ def test_autocorrelation_is_that_of_the_errors_not_of_the_residuals():
     of = PROBLEMS["one marker, 40 samples"]
     corrected, raw = [], []
     for fit, _ in draws(of, 0.85):
-        corrected.append(
-            analyse_dependence(fit, factorise_information(fit)).lag1
-        )
+        corrected.append(analyse_dependence(fit, factorise_information(fit)).lag1)
         residual = fit.blocks[0].channels[0]
         raw.append(np.sum(residual[1:] * residual[:-1]) / np.sum(residual**2))
     assert np.median(raw) < 0.75
@@ -173,15 +136,8 @@ def test_processes_of_the_errors_are_found():
     of = problem((400, 300), markers=2)
     mix = np.eye(6) + 0.5
     resonance = [1, -2 * 0.9 * np.cos(0.5), 0.81]
-    first = (
-        0.1
-        * lfilter([1], resonance, rng.normal(size=(700, 6)), axis=0)[300:]
-        @ mix
-    )
-    fit, _ = of.fit(
-        [first.reshape(400, 2, 3), autoregressive(rng, 300, 2, 0.0)],
-        np.zeros(18),
-    )
+    first = 0.1 * lfilter([1], resonance, rng.normal(size=(700, 6)), axis=0)[300:] @ mix
+    fit, _ = of.fit([first.reshape(400, 2, 3), autoregressive(rng, 300, 2, 0.0)], np.zeros(18))
     resonant, white = error_processes(fit, factorise_information(fit))
     impulse = 0.1 * lfilter([1], resonance, np.eye(1, 500)[0])
     expected = np.correlate(impulse, impulse, "full")[499:]
@@ -191,9 +147,7 @@ def test_processes_of_the_errors_are_found():
     )
     scale = np.trace(mix @ mix) * expected[0]
     np.testing.assert_allclose(
-        resonant.channel_covariance / scale,
-        mix @ mix * expected[0] / scale,
-        atol=0.05,
+        resonant.channel_covariance / scale, mix @ mix * expected[0] / scale, atol=0.05
     )
     assert white.order == 0
     np.testing.assert_allclose(white.channel_covariance, np.eye(6), atol=0.3)
@@ -202,9 +156,7 @@ def test_processes_of_the_errors_are_found():
 # NuisanceMap parameters
 
 
-def sample(
-    seed: int = 0, phi: float = 0.0, **options
-) -> tuple[LinearisedFit, np.ndarray]:
+def sample(seed: int = 0, phi: float = 0.0, **options) -> tuple[LinearisedFit, np.ndarray]:
     of = problem(**({"samples": (50, 60), "markers": 2} | options))
     rng = np.random.default_rng(seed)
     errors = [autoregressive(rng, *s.shape[:2], phi) for s in of.present]
@@ -212,21 +164,15 @@ def sample(
 
 
 def plain_information(fit: LinearisedFit) -> np.ndarray:
-    rows = np.concatenate(
-        [b.jacobian.reshape(-1, len(fit.names)) for b in fit.blocks]
-    )
+    rows = np.concatenate([b.jacobian.reshape(-1, len(fit.names)) for b in fit.blocks])
     return rows.T @ rows + np.diag(fit.prior_jacobian**2)
 
 
 def test_shared_covariance_is_the_inverse_of_the_schur_complement_over_local_parameters():
     fit, wrong = sample()
     full, k = plain_information(fit), fit.shared_count
-    schur = full[:k, :k] - full[:k, k:] @ np.linalg.solve(
-        full[k:, k:], full[k:, :k]
-    )
-    found = uncertainty_from_fit(
-        fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent")
-    )
+    schur = full[:k, :k] - full[:k, k:] @ np.linalg.solve(full[k:, k:], full[k:, :k])
+    found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     scale = np.sqrt(np.diag(found.covariance))
     np.testing.assert_allclose(
         found.covariance / np.outer(scale, scale),
@@ -240,33 +186,23 @@ def test_shared_covariance_is_the_inverse_of_the_schur_complement_over_local_par
 
 def test_local_parameters_have_standard_deviations():
     fit, wrong = sample()
-    found = uncertainty_from_fit(
-        fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent")
-    )
+    found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert tuple(found.nuisance) == fit.names[4:]
     expected = np.sqrt(np.diag(np.linalg.inv(plain_information(fit))))[4:]
-    np.testing.assert_allclose(
-        list(found.nuisance.values()), expected, rtol=1e-6
-    )
+    np.testing.assert_allclose(list(found.nuisance.values()), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("bounded", [1, 4])
-def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free(
-    bounded,
-):
+def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free(bounded):
     fit, wrong = sample()
     at_bound = replace(fit, at_bound=np.arange(len(fit.names)) == bounded)
     found, free = (
-        uncertainty_from_fit(
-            each, PARAMETERS, wrong[:4], ErrorModel(errors="independent")
-        )
+        uncertainty_from_fit(each, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
         for each in (at_bound, fit)
     )
     shown = np.arange(4) != bounded
     both = np.ix_(shown, shown)
-    np.testing.assert_allclose(
-        found.covariance[both], free.covariance[both], rtol=1e-9
-    )
+    np.testing.assert_allclose(found.covariance[both], free.covariance[both], rtol=1e-9)
     assert np.isnan([*found.nuisance.values()]).tolist() == [
         *(np.arange(4, len(fit.names)) == bounded)
     ]
@@ -275,13 +211,9 @@ def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free
 
 def test_a_parameter_that_a_prior_determines_costs_no_degree_of_freedom():
     fit, wrong = sample()
-    tight = replace(
-        fit, prior_jacobian=np.where(np.arange(len(fit.names)) < 4, 0.0, 1e6)
-    )
+    tight = replace(fit, prior_jacobian=np.where(np.arange(len(fit.names)) < 4, 0.0, 1e6))
     found = uncertainty_from_fit(tight, PARAMETERS, wrong[:4])
-    assert found.degrees_of_freedom == pytest.approx(
-        fit.count_measurements() - 4, abs=1e-3
-    )
+    assert found.degrees_of_freedom == pytest.approx(fit.count_measurements() - 4, abs=1e-3)
 
 
 # What is said of the residuals
@@ -291,45 +223,28 @@ def test_errors_that_persist_are_told_once():
     fit, wrong = sample(phi=0.9)
     found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4])
     assert found.errors == "autocorrelated"
-    (note,) = [
-        note for note in found.notes if "between consecutive samples" in note
-    ]
+    (note,) = [note for note in found.notes if "between consecutive samples" in note]
     assert "0.8" in note or "0.9" in note
-    forced = uncertainty_from_fit(
-        fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent")
-    )
+    forced = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert forced.errors == "independent"
     assert any("too small" in note for note in forced.notes)
 
 
 def test_persistent_errors_far_below_the_sigma_given_change_nothing():
     fit, wrong = sample(phi=0.9)
-    small = replace(
-        fit,
-        blocks=tuple(
-            replace(b, residual=0.01 * b.residual) for b in fit.blocks
-        ),
-    )
+    small = replace(fit, blocks=tuple(replace(b, residual=0.01 * b.residual) for b in fit.blocks))
     found = uncertainty_from_fit(small, PARAMETERS, wrong[:4])
     assert found.errors == "independent"
     np.testing.assert_allclose(
-        found.covariance,
-        np.linalg.inv(plain_information(fit))[:4, :4],
-        rtol=1e-6,
+        found.covariance, np.linalg.inv(plain_information(fit))[:4, :4], rtol=1e-6
     )
 
 
 def test_error_bars_never_fall_below_those_of_the_sigma_given():
     fit, wrong = sample(phi=0.9)
-    given = uncertainty_from_fit(
-        fit, PARAMETERS, wrong[:4], ErrorModel(errors="autocorrelated")
-    )
-    independent = uncertainty_from_fit(
-        fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent")
-    )
-    assert (
-        np.diag(given.covariance) >= 0.999999 * np.diag(independent.covariance)
-    ).all()
+    given = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="autocorrelated"))
+    independent = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
+    assert (np.diag(given.covariance) >= 0.999999 * np.diag(independent.covariance)).all()
 
 
 def test_error_bars_follow_the_units_of_the_residuals():
@@ -337,8 +252,7 @@ def test_error_bars_follow_the_units_of_the_residuals():
     scaled = replace(
         fit,
         blocks=tuple(
-            replace(b, residual=7 * b.residual, jacobian=7 * b.jacobian)
-            for b in fit.blocks
+            replace(b, residual=7 * b.residual, jacobian=7 * b.jacobian) for b in fit.blocks
         ),
         prior_jacobian=7 * fit.prior_jacobian,
     )
@@ -358,7 +272,5 @@ def test_error_bars_follow_the_units_of_the_residuals():
 def test_a_record_of_two_samples_is_no_error():
     fit, wrong = sample(samples=(2, 3), markers=2, offsets=False)
     for errors in ("auto", "independent", "autocorrelated"):
-        found = uncertainty_from_fit(
-            fit, PARAMETERS, wrong[:4], ErrorModel(errors=errors)
-        )
+        found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors=errors))
         assert np.isfinite(found.degrees_of_freedom)

@@ -26,9 +26,7 @@ def measured_problem() -> Problem:
 def require_recordings() -> None:
     """Skip the test if the recordings have not been fetched."""
     if not (arm.FOLDER / "100mbar.csv").is_file():
-        pytest.skip(
-            "needs the measured data: python scripts/get_pneumatic_arm.py"
-        )
+        pytest.skip("needs the measured data: python scripts/get_pneumatic_arm.py")
 
 
 def test_the_shipped_mesh_and_fibres_are_those_of_the_script():
@@ -65,15 +63,11 @@ def test_every_sector_of_the_outer_wall_has_one_region():
 def test_tracks_begin_at_the_stated_positions_and_the_onset_is_where_it_is_said():
     require_recordings()
     for mbar in arm.PRESSURES_MBAR:
-        rows = np.loadtxt(
-            arm.FOLDER / f"{mbar}mbar.csv", delimiter=",", skiprows=1
-        )
+        rows = np.loadtxt(arm.FOLDER / f"{mbar}mbar.csv", delimiter=",", skiprows=1)
         positions_m = rows[:, 1:].reshape(len(rows), 3, 3)
         stated_m = np.abs(arm.TIP_M) * [-1, 1, 1]
         np.testing.assert_allclose(positions_m[0], stated_m, atol=1e-3)
-        moved_m = np.linalg.norm(
-            (positions_m - positions_m[0]).mean(axis=1), axis=1
-        )
+        moved_m = np.linalg.norm((positions_m - positions_m[0]).mean(axis=1), axis=1)
         assert moved_m[: arm.SAMPLES_BEFORE].max() < 1.2 * arm.ONSET_M
         assert moved_m[arm.SAMPLES_BEFORE + 2] > arm.ONSET_M
 
@@ -82,9 +76,7 @@ def test_a_rigid_transform_is_recovered(rng):
     points_m = rng.normal(size=(4, 3))
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation *= np.sign(np.linalg.det(rotation))
-    found, shift_m = arm.rigid_transform(
-        points_m, points_m @ rotation.T + [1.0, 2.0, 3.0]
-    )
+    found, shift_m = arm.rigid_transform(points_m, points_m @ rotation.T + [1.0, 2.0, 3.0])
     np.testing.assert_allclose(found, rotation, atol=1e-12)
     np.testing.assert_allclose(shift_m, [1.0, 2.0, 3.0], atol=1e-12)
 
@@ -93,27 +85,20 @@ def test_the_polynomial_passes_through_the_recordings_that_it_knows():
     experiments = measured_problem().experiments[:3]
     for each in experiments:
         known_m = study.final_position(study.measured_tip(each))
-        found_m = study.polynomial_position(
-            experiments, study.pressure_mbar(each)
-        )
+        found_m = study.polynomial_position(experiments, study.pressure_mbar(each))
         np.testing.assert_allclose(found_m, known_m, atol=1e-9)
 
 
 def test_the_reinforced_arm_bends_as_far_as_measured_with_the_stated_modulus():
     problem = measured_problem()
     measured_m = study.final_travel(study.measured_tip(problem.experiments[0]))
-    assert study.static_travel_m(problem, 1e6, 100) == pytest.approx(
-        measured_m, rel=0.2
-    )
+    assert study.static_travel_m(problem, 1e6, 100) == pytest.approx(measured_m, rel=0.2)
 
 
 def test_without_threads_the_chamber_balloons_and_the_arm_hardly_bends():
     problem = measured_problem()
     reinforced_m = study.static_travel_m(problem, 1e6, 100)
-    assert (
-        study.static_travel_m(problem, study.NO_THREADS_PA, 100)
-        < 0.6 * reinforced_m
-    )
+    assert study.static_travel_m(problem, study.NO_THREADS_PA, 100) < 0.6 * reinforced_m
     with pytest.raises(SimulationError):
         study.static_travel_m(problem, study.NO_THREADS_PA, 450)
 
@@ -129,7 +114,5 @@ def test_two_pressures_are_predicted_from_three():
     delays_s, log_lags = study.pressure_timing(solution)
     for experiment in problem.experiments:
         if experiment.name in ("150mbar", "350mbar"):
-            error = study.travel_error(
-                experiment, solution, delays_s.mean(), log_lags.mean()
-            )
+            error = study.travel_error(experiment, solution, delays_s.mean(), log_lags.mean())
             assert error.final_m < 0.1 * error.measured_m, experiment.name

@@ -26,10 +26,7 @@ def test_scikit_fem_and_mujoco_move_a_swung_cylinder_as_this_package_does():
     flex = simulate_flex(mesh, TRUTH)
     experiment = recording(mesh, flex, seed=0)
     ours_m = cs.simulate(
-        experiment,
-        {**TRUTH, "gamma_m_1_s": 0.0},
-        "midpoint",
-        substeps=STEPS_PER_SAMPLE,
+        experiment, {**TRUTH, "gamma_m_1_s": 0.0}, "midpoint", substeps=STEPS_PER_SAMPLE
     ).positions_m
     theirs_m = ScikitFemCylinder(experiment).simulate(TRUTH)
     np.testing.assert_allclose(theirs_m, ours_m, atol=1e-8)

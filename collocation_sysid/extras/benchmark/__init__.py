@@ -11,10 +11,4 @@ from .benchmark_bodies import BODIES, BenchmarkBody
 from .benchmark_folder import write_benchmark
 from .scores import Score, score_benchmark
 
-__all__ = [
-    "BODIES",
-    "BenchmarkBody",
-    "Score",
-    "score_benchmark",
-    "write_benchmark",
-]
+__all__ = ["BODIES", "BenchmarkBody", "Score", "score_benchmark", "write_benchmark"]

@@ -180,10 +180,6 @@ def chosen_bodies(name: str | None) -> tuple[BenchmarkBody, ...]:
         If there is no body of this name.
     """
     if name is None:
-        return tuple(
-            body
-            for body in BODIES.values()
-            if body.find_data_folder() is not None
-        )
+        return tuple(body for body in BODIES.values() if body.find_data_folder() is not None)
     require_among(name, BODIES, where="--body")
     return (BODIES[name],)

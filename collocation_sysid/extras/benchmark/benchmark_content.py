@@ -69,27 +69,17 @@ class BenchmarkContent:
         InputError
             If it is no benchmark folder, is damaged, or one of its files was changed.
         """
-        content = read_json(
-            _unchanged(folder, CONTENT_FILE), "a benchmark folder"
-        )
+        content = read_json(_unchanged(folder, CONTENT_FILE), "a benchmark folder")
         with damage_refused(folder, CONTENT_FILE, REMEDY):
             bodies = tuple(str(name) for name in content["bodies"])
         recordings = tuple(
-            recording
-            for body in bodies
-            for recording in _read_recordings(folder, body)
+            recording for body in bodies for recording in _read_recordings(folder, body)
         )
         return cls(folder, bodies, recordings=recordings)
 
 
 def _unchanged(folder: Path, name: str) -> Path:
-    """Return the file called `name` in a benchmark folder; a file that does not exist is accepted.
-
-    Raises
-    ------
-    InputError
-        If the file exists and was changed since it was written.
-    """
+    """Return the file called `name` in a benchmark folder; a file that does not exist is accepted."""
     file = folder / name
     if file.exists() and not is_written_here(file, folder):
         raise InputError(
@@ -101,13 +91,7 @@ def _unchanged(folder: Path, name: str) -> Path:
 
 
 def _read_recordings(folder: Path, body: str) -> list[StoredRecording]:
-    """Return the recordings of the body called `body` from a benchmark folder.
-
-    Raises
-    ------
-    InputError
-        If the folder of the body is missing or damaged, or one of its files was changed.
-    """
+    """Return the recordings of the body called `body` from a benchmark folder."""
     file = _unchanged(folder, f"{body}/{BODY_FILE}")
     content = read_json(file, "the folder of a body of a benchmark")
     with damage_refused(file.parent, BODY_FILE, REMEDY):
@@ -122,35 +106,13 @@ def _read_recordings(folder: Path, body: str) -> list[StoredRecording]:
         ]
 
 
-def _read_signals(
-    folder: Path, body: str, recording: Mapping[str, Any]
-) -> RecordingSignals:
-    """Return the measured and predicted signals of a recording of a body; blank cells are NaN.
-
-    Parameters
-    ----------
-    folder : Path
-        Benchmark folder.
-    body : str
-        Name of the body.
-    recording : mapping
-        Entry of "recordings" in body.json, with the names of the tables under "files", by the roles
-        "measured", "simulated" and "undeformed", and "quantity", "key", "columns" and "sigma".
-
-    Raises
-    ------
-    InputError
-        If a table is missing, cannot be read, or was changed.
-    KeyError, ValueError
-        If the entry lacks a key, or a table has other columns.
-    """
+def _read_signals(folder: Path, body: str, recording: Mapping[str, Any]) -> RecordingSignals:
+    """Return the measured and predicted signals of a recording of a body; blank cells are NaN."""
     tables = {}
     for role in ("measured", "simulated", "undeformed"):
         file = _unchanged(folder, f"{body}/{recording['files'][role]}")
         try:
-            tables[role] = np.atleast_2d(
-                np.genfromtxt(file, delimiter=",", skip_header=1)
-            )
+            tables[role] = np.atleast_2d(np.genfromtxt(file, delimiter=",", skip_header=1))
         except OSError as error:
             raise InputError(
                 f"this file cannot be read ({error.strerror}); {REMEDY}", file

@@ -28,12 +28,7 @@ from ...recording.specimen_files import specimen_strains
 from ...result.run_writers import replaced_folder
 from .benchmark_bodies import BenchmarkBody
 from .benchmark_content import BODY_FILE, CONTENT_FILE
-from .body_description import (
-    FOLDER_README,
-    body_readme,
-    damping_description,
-    law_description,
-)
+from .body_description import FOLDER_README, body_readme, damping_description, law_description
 from .identified_constants import CatalogueEntry, catalogue_entry
 from .signals import SAMPLE_KEY, RecordingSignals
 
@@ -64,9 +59,7 @@ class BodyTask:
     signals: dict[str, RecordingSignals]
 
     @classmethod
-    def simulated(
-        cls, body: BenchmarkBody, progress: Callable[[float], None] | None
-    ) -> BodyTask:
+    def simulated(cls, body: BenchmarkBody, progress: Callable[[float], None] | None) -> BodyTask:
         """Return the task of a body, with simulations of its recordings at the constants of the
         catalogue.
 
@@ -95,9 +88,7 @@ class BodyTask:
                 timestep_s=problem.rollout.timestep_s,
                 progress=progress,
             )
-            signals[experiment.name] = RecordingSignals.from_trajectory(
-                experiment, trajectory
-            )
+            signals[experiment.name] = RecordingSignals.from_trajectory(experiment, trajectory)
         return cls(body, entry, problem=problem, values=values, signals=signals)
 
     def make_experiments(self) -> list[Experiment]:
@@ -139,19 +130,12 @@ def write_benchmark(
         If a simulation fails; nothing is written then.
     """
     if not bodies:
-        raise InputError(
-            "found no body whose data are on this computer; install the package again"
-        )
-    with replaced_folder(
-        folder, marker_file=CONTENT_FILE, content_word="benchmark"
-    ) as draft:
+        raise InputError("found no body whose data are on this computer; install the package again")
+    with replaced_folder(folder, marker_file=CONTENT_FILE, content_word="benchmark") as draft:
         for body in bodies:
             task = BodyTask.simulated(body, progress)
             _write_body(task, draft / body.name)
-        content = {
-            "schema": SCHEMA,
-            "bodies": [body.name for body in bodies],
-        }
+        content = {"schema": SCHEMA, "bodies": [body.name for body in bodies]}
         write_text_file(draft / CONTENT_FILE, as_json(content) + "\n")
         write_text_file(draft / README_FILE, FOLDER_README)
     return Path(folder)
@@ -161,28 +145,11 @@ def _recordings(problem: Problem, body: BenchmarkBody) -> list[Experiment]:
     """Return the experiments of a problem that the benchmark asks to predict, in the order of the
     problem.
     """
-    return [
-        each for each in problem.experiments if each.name in body.recordings
-    ]
+    return [each for each in problem.experiments if each.name in body.recordings]
 
 
-def _parameter_values(
-    problem: Problem, entry: CatalogueEntry
-) -> dict[str, float]:
-    """Return the values of all parameters of a problem by name, in the units of the problem file.
-
-    Parameters
-    ----------
-    problem : Problem
-        Problem with the parameters.
-    entry : CatalogueEntry
-        Entry whose constants are used; a parameter that it lacks must be fixed, and has that value.
-
-    Raises
-    ------
-    InputError
-        If a parameter is neither in the catalogue nor fixed.
-    """
+def _parameter_values(problem: Problem, entry: CatalogueEntry) -> dict[str, float]:
+    """Return the values of all parameters of a problem by name, in the units of the problem file."""
     identified = {each.name: each.value for each in entry.constants}
     values = {}
     for item in problem.parameters.components:
@@ -201,18 +168,6 @@ def _parameter_values(
 def _write_body(task: BodyTask, folder: Path) -> None:
     """Write the data of a body to a new folder: mesh, nodes and tetrahedra, licence if there is
     one, recordings, description (body.json) and README.
-
-    Parameters
-    ----------
-    task : BodyTask
-        Task with at least one recording, of a body that `_body_content` can describe.
-    folder : Path
-        Folder of the body, which is created; its parent must exist.
-
-    Raises
-    ------
-    FileExistsError
-        If the folder exists; other faults of the file system are OSErrors, too.
     """
     mesh = _mesh(task.make_experiments()[0])
     folder.mkdir()
@@ -220,18 +175,13 @@ def _write_body(task: BodyTask, folder: Path) -> None:
         shutil.copyfile(licence, folder / LICENCE_FILE)
     mesh.write(folder / "mesh.vtu")
     write_columns_csv(
-        folder / "nodes.csv",
-        dict(zip(("x_m", "y_m", "z_m"), mesh.points_m.T, strict=True)),
+        folder / "nodes.csv", dict(zip(("x_m", "y_m", "z_m"), mesh.points_m.T, strict=True))
     )
     corners = (f"node_{k}" for k in range(1, 5))
-    write_columns_csv(
-        folder / "tetrahedra.csv",
-        dict(zip(corners, mesh.tetrahedra.T, strict=True)),
-    )
+    write_columns_csv(folder / "tetrahedra.csv", dict(zip(corners, mesh.tetrahedra.T, strict=True)))
     content = _body_content(task)
     content["recordings"] = [
-        _write_recording(task, experiment, folder=folder)
-        for experiment in task.make_experiments()
+        _write_recording(task, experiment, folder=folder) for experiment in task.make_experiments()
     ]
     write_text_file(folder / BODY_FILE, as_json(content) + "\n")
     write_text_file(folder / README_FILE, body_readme(content))
@@ -243,9 +193,7 @@ def _mesh(experiment: Experiment) -> TetMesh:
     """
     if experiment.specimen is None:
         return experiment.body.mesh
-    return box_mesh(
-        (CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0)
-    )
+    return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0))
 
 
 def _body_content(task: BodyTask) -> dict[str, Any]:
@@ -254,17 +202,6 @@ def _body_content(task: BodyTask) -> dict[str, Any]:
 
     "damping" and "damping_force" are None for a static test, "element" and "density_kg_m3" for a
     specimen without a mesh.
-
-    Parameters
-    ----------
-    task : BodyTask
-        Task with at least one recording, the first of which decides; its body must have a single
-        part.
-
-    Raises
-    ------
-    KeyError
-        If `body_description` has no formula for the law or the damping law.
     """
     experiment = task.make_experiments()[0]
     body = experiment.body
@@ -285,18 +222,14 @@ def _body_content(task: BodyTask) -> dict[str, Any]:
         "law": part.material.name,
         "energy": law_description(part.material.name),
         "damping": part.damping.name if is_motion else None,
-        "damping_force": damping_description(part.damping.name)
-        if is_motion
-        else None,
+        "damping_force": damping_description(part.damping.name) if is_motion else None,
         "element": body.element.name if experiment.specimen is None else None,
         "density_kg_m3": density if experiment.specimen is None else None,
         "constants": [asdict(each) for each in task.entry.constants],
     }
 
 
-def _write_recording(
-    task: BodyTask, experiment: Experiment, folder: Path
-) -> dict[str, Any]:
+def _write_recording(task: BodyTask, experiment: Experiment, folder: Path) -> dict[str, Any]:
     """Write the tables of a recording to the existing folder of its body, and return its entry of
     "recordings" in body.json.
 
@@ -305,22 +238,12 @@ def _write_recording(
     with a mesh also "grasps", and "symmetry" unless markers were measured. "files" are names in
     this folder by role: "times", "measured", "simulated", "undeformed", and "stretches" of a
     specimen without a mesh or "markers" where markers were measured.
-
-    Parameters
-    ----------
-    task : BodyTask
-        Task with the signals of the recording, by its name.
-    experiment : Experiment
-        The recording.
-    folder : Path
-        Folder of the body.
     """
     signals = task.signals[experiment.name]
     measured = signals.measured
     name = safe_name(experiment.name)
     files = {
-        role: f"{name}_{role}.csv"
-        for role in ("times", "measured", "simulated", "undeformed")
+        role: f"{name}_{role}.csv" for role in ("times", "measured", "simulated", "undeformed")
     }
     write_columns_csv(folder / files["times"], {measured.key: measured.keys})
     for role in ("measured", "simulated", "undeformed"):
@@ -352,21 +275,11 @@ def _write_recording(
     return content
 
 
-def _write_grasps(
-    experiment: Experiment, folder: Path, name: str
-) -> list[dict[str, Any]]:
+def _write_grasps(experiment: Experiment, folder: Path, name: str) -> list[dict[str, Any]]:
     """Write the nodes and poses of the grasps, and return what is written about them as JSON: for
     each grasp its "axes" and the file names "nodes" and "poses", None for a grasp at rest.
 
     Nodes are those of the linear mesh, numbered from 0; nodes on edges are left out.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    folder : Path
-        Existing folder of the body.
-    name : str
-        Beginning of the file names.
     """
     grasps = []
     corner_count = len(experiment.body.mesh.points_m)
@@ -378,9 +291,7 @@ def _write_grasps(
         poses_file = f"{name}_grasp_{number}_poses.csv" if is_moving else None
         if poses_file is not None:
             write_poses_csv(folder / poses_file, grasp.poses)
-        grasps.append(
-            {"nodes": nodes_file, "axes": grasp.axes, "poses": poses_file}
-        )
+        grasps.append({"nodes": nodes_file, "axes": grasp.axes, "poses": poses_file})
     return grasps
 
 

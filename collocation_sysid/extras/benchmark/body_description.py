@@ -121,14 +121,6 @@ def _material(content: Mapping[str, Any]) -> Iterator[str]:
 
     The table has name, unit, value, combined interval ("stated" or "none" instead where it is None)
     and true value (empty where it is None) of each constant.
-
-    Parameters
-    ----------
-    content : mapping
-        Content of body.json: "law", "energy", "damping" (None: no line), "damping_force",
-        "density_kg_m3" (None: no line), "identified_from" (names of recordings), and "constants", a
-        sequence of mappings with "name", "unit", "value", "combined95" ((lower, upper) or None),
-        "is_stated" and "true_value".
     """
     yield "## Material\n"
     yield f"- Energy density, law `{content['law']}`: {content['energy']}."
@@ -145,9 +137,7 @@ def _material(content: Mapping[str, Any]) -> Iterator[str]:
         if interval:
             shown = f"{interval[0]:.5g} to {interval[1]:.5g}"
         true = "" if each["true_value"] is None else f"{each['true_value']:.6g}"
-        yield (
-            f"| `{each['name']}` | {each['unit']} | {each['value']:.8g} | {shown} | {true} |"
-        )
+        yield (f"| `{each['name']}` | {each['unit']} | {each['value']:.8g} | {shown} | {true} |")
     fitted = ", ".join(content["identified_from"])
     yield f"\nIdentified from the recordings {fitted}. The interval contains noise,"
     yield "discretisation and systematic effects.\n"

@@ -77,11 +77,6 @@ def _catalogue() -> dict[str, dict[str, Any]]:
     """Return the entries of the catalogue, as they are in its JSON file, by name.
 
     The result is cached and must not be modified.
-
-    Raises
-    ------
-    InputError
-        If the catalogue is not part of the installation.
     """
     file = documentation_folder() / CATALOGUE_FILE
     try:

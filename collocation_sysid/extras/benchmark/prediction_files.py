@@ -76,9 +76,7 @@ def read_prediction(file: Path, measured: Signal) -> Signal:
     """
     require_regular(file)
     keys, values = (
-        _read_archive(file, measured)
-        if file.suffix == ".npz"
-        else _read_table(file, measured)
+        _read_archive(file, measured) if file.suffix == ".npz" else _read_table(file, measured)
     )
     rows = _rows_of_samples(file, keys, measured=measured)
     return measured.with_values(values[rows])
@@ -87,20 +85,13 @@ def read_prediction(file: Path, measured: Signal) -> Signal:
 def _read_table(file: Path, measured: Signal) -> tuple[Array, Array]:
     """Return the keys (N,) and the values (N, C) of all rows of a CSV table, with the columns of
     `measured` in their order; blank lines are skipped, other columns ignored.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, a column is missing or present twice, or a needed cell is not a
-        finite number.
     """
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
             rows = [row for row in csv.reader(lines)]
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(
-            f"this file cannot be read ({reason(error)}); expected a CSV table",
-            file,
+            f"this file cannot be read ({reason(error)}); expected a CSV table", file
         ) from error
     header = [name.strip() for name in rows[0]] if rows else []
     needed = (measured.key, *measured.columns)
@@ -126,29 +117,8 @@ def _read_table(file: Path, measured: Signal) -> tuple[Array, Array]:
     return table[:, 0], table[:, 1:]
 
 
-def _number(
-    file: Path, line: int, *, row: list[str], place: int, name: str
-) -> float:
-    """Return the finite number in a cell of a table.
-
-    Parameters
-    ----------
-    file : Path
-        The table, for the message.
-    line : int
-        Number of the line, counted from 1, for the message.
-    row : list of str
-        Cells of the line, which may be too few.
-    place : int
-        Index of the cell.
-    name : str
-        Name of the column, for the message.
-
-    Raises
-    ------
-    InputError
-        If the cell is missing, or has no finite number.
-    """
+def _number(file: Path, line: int, *, row: list[str], place: int, name: str) -> float:
+    """Return the finite number in a cell of a table."""
     text = row[place] if place < len(row) else ""
     try:
         number = float(text)
@@ -166,12 +136,6 @@ def _number(
 def _read_archive(file: Path, measured: Signal) -> tuple[Array, Array]:
     """Return the keys (N,) and the values (N, C) of an NPZ archive: its arrays called
     `measured.key` and "values". Positions of markers (N, M, 3) become (N, 3 M).
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, an array is missing or has another shape, or a value is not a
-        finite real number.
     """
     try:
         arrays = load_arrays(file)
@@ -179,8 +143,7 @@ def _read_archive(file: Path, measured: Signal) -> tuple[Array, Array]:
         if isinstance(error, InputError):
             raise error.located(file) from error
         raise InputError(
-            f"this file cannot be read ({reason(error)}); expected an archive of numpy.savez",
-            file,
+            f"this file cannot be read ({reason(error)}); expected an archive of numpy.savez", file
         ) from error
     for name in (measured.key, VALUES_NAME):
         if name not in arrays:
@@ -206,22 +169,7 @@ def _read_archive(file: Path, measured: Signal) -> tuple[Array, Array]:
 
 
 def _real_numbers(file: Path, name: str, array: Array) -> Array:
-    """Return an array of an archive as floats.
-
-    Parameters
-    ----------
-    file : Path
-        The archive, for the message.
-    name : str
-        Name of the array, for the message.
-    array : array
-        Array of any type and shape.
-
-    Raises
-    ------
-    InputError
-        For other types than integers and floats, and for values that are not finite.
-    """
+    """Return an array of an archive as floats."""
     if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
         raise InputError(
             "found an array with values that are not finite numbers; expected real, finite numbers",
@@ -232,29 +180,11 @@ def _real_numbers(file: Path, name: str, array: Array) -> Array:
 
 
 def _rows_of_samples(file: Path, keys: Array, measured: Signal) -> Index:
-    """Return the index (T,) of the row nearest to each of the T measured samples.
-
-    Parameters
-    ----------
-    file : Path
-        The file, for messages.
-    keys : (N,) array
-        Key of each row of the file in any order: times [s], or numbers of samples from 1, as in
-        `Signal.keys`.
-    measured : Signal
-        Its keys are the samples.
-
-    Raises
-    ------
-    InputError
-        If the file has no rows, or none whose key is that of a sample within `TIME_TOLERANCE` times
-        the shortest interval of the measured keys (at most 1).
-    """
+    """Return the index (T,) of the row nearest to each of the T measured samples."""
     needed = measured.keys
     if not keys.size:
         raise InputError(
-            f"the prediction has no rows; expected one for each of {needed.size} samples",
-            file,
+            f"the prediction has no rows; expected one for each of {needed.size} samples", file
         )
     rows = np.abs(keys[None, :] - needed[:, None]).argmin(axis=1)
     interval = np.diff(needed).min(initial=1.0)

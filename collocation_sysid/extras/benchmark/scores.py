@@ -10,12 +10,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...errors import InputError, listed, require_among
 from .benchmark_content import BenchmarkContent, StoredRecording
-from .prediction_files import (
-    PREDICTION_SUFFIXES,
-    find_prediction,
-    prediction_name,
-    read_prediction,
-)
+from .prediction_files import PREDICTION_SUFFIXES, find_prediction, prediction_name, read_prediction
 from .signals import AXES, Signal
 
 PREDICTION = "prediction"
@@ -108,31 +103,12 @@ def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
             SIMULATION: recording.signals.simulated,
             UNDEFORMED: recording.signals.undeformed,
         }
-        scores += [
-            score(recording, source, predicted=signal)
-            for source, signal in signals.items()
-        ]
+        scores += [score(recording, source, predicted=signal) for source, signal in signals.items()]
     return scores
 
 
-def _prediction_files(
-    folder: Path, recordings: list[StoredRecording]
-) -> list[Path]:
-    """Return the prediction file of each recording, in the same order.
-
-    Parameters
-    ----------
-    folder : Path
-        Benchmark folder.
-    recordings : list of StoredRecording
-        Recordings of its bodies.
-
-    Raises
-    ------
-    InputError
-        If a prediction is missing, naming all missing ones, or present as CSV table and as NPZ
-        archive.
-    """
+def _prediction_files(folder: Path, recordings: list[StoredRecording]) -> list[Path]:
+    """Return the prediction file of each recording, in the same order."""
     files = []
     missing = []
     for recording in recordings:
@@ -201,19 +177,10 @@ def _errors(predicted: Signal, measured: Signal) -> Array:
 def _distances(errors: Array, measured: Signal) -> Array:
     """Return the distances (k,) of markers [m], or the magnitudes of the differences of loads, of
     all samples in one array; those that are NaN are left out.
-
-    Parameters
-    ----------
-    errors : (T, C) array
-        Predicted minus measured values; three columns for each marker.
-    measured : Signal
-        The measured signal, whose quantity decides.
     """
     sizes = np.abs(errors)
     if measured.quantity == "markers":
-        sizes = np.linalg.norm(
-            errors.reshape(len(errors), -1, len(AXES)), axis=2
-        )
+        sizes = np.linalg.norm(errors.reshape(len(errors), -1, len(AXES)), axis=2)
     return sizes[np.isfinite(sizes)]
 
 

@@ -80,9 +80,7 @@ class RecordingSignals:
     undeformed: Signal
 
     @classmethod
-    def from_trajectory(
-        cls, experiment: Experiment, trajectory: Trajectory
-    ) -> RecordingSignals:
+    def from_trajectory(cls, experiment: Experiment, trajectory: Trajectory) -> RecordingSignals:
         """Return the measured signals of an experiment, with its simulation and the undeformed body
         as the two predictions.
 
@@ -113,36 +111,21 @@ def stress_columns(deformation: HomogeneousDeformation) -> tuple[str, ...]:
     return tuple(f"stress_{each}_pa" for each in components if each)
 
 
-def _marker_signals(
-    experiment: Experiment, trajectory: Trajectory
-) -> RecordingSignals:
+def _marker_signals(experiment: Experiment, trajectory: Trajectory) -> RecordingSignals:
     """Return the positions of the markers [m], three columns each, at the times of the experiment:
     measured (NaN where missing), simulated, and moved rigidly with the grasp.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment with markers.
-    trajectory : Trajectory
-        Its simulation, with `markers_m` (T, M, 3) at the same times.
     """
     markers = experiment.markers
     count = len(experiment.t_s)
-    present_m = np.where(
-        markers.is_present[..., None], markers.positions_m, np.nan
-    )
+    present_m = np.where(markers.is_present[..., None], markers.positions_m, np.nan)
     measured = Signal(
         "markers",
         TIME_KEY,
         keys=experiment.t_s,
-        columns=tuple(
-            f"{name}_{axis}" for name in markers.names for axis in AXES
-        ),
+        columns=tuple(f"{name}_{axis}" for name in markers.names for axis in AXES),
         values=present_m.reshape(count, -1),
     )
-    rigid_m = markers.predict_positions(
-        experiment.rigid_positions(experiment.t_s)
-    )
+    rigid_m = markers.predict_positions(experiment.rigid_positions(experiment.t_s))
     return RecordingSignals(
         measured,
         np.repeat(markers.sigma_m, len(AXES)),
@@ -151,18 +134,9 @@ def _marker_signals(
     )
 
 
-def _stress_signals(
-    experiment: Experiment, trajectory: Trajectory
-) -> RecordingSignals:
+def _stress_signals(experiment: Experiment, trajectory: Trajectory) -> RecordingSignals:
     """Return the nominal stresses [Pa] of a material test without a mesh by the number of the
     sample, from 1: measured, simulated, and zero for the undeformed body.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Test of a specimen, whose first custom sensors measure the stresses.
-    trajectory : Trajectory
-        Its simulation, with the predicted values (T, 1) of each custom sensor in the same order.
     """
     assert experiment.specimen is not None
     names = stress_columns(experiment.specimen)
@@ -174,35 +148,22 @@ def _stress_signals(
         SAMPLE_KEY,
         keys=np.arange(1.0, len(experiment.t_s) + 1),
         columns=names[: len(sensors)],
-        values=np.column_stack(
-            [sensor.measured_values[:, 0] for sensor in sensors]
-        ),
+        values=np.column_stack([sensor.measured_values[:, 0] for sensor in sensors]),
     )
     return RecordingSignals(
         measured,
         np.array([np.ravel(sensor.sigma)[0] for sensor in sensors]),
-        simulated=measured.with_values(
-            np.column_stack([v[:, 0] for v in simulated])
-        ),
+        simulated=measured.with_values(np.column_stack([v[:, 0] for v in simulated])),
         undeformed=measured.with_values(np.zeros(measured.values.shape)),
     )
 
 
-def _force_signals(
-    experiment: Experiment, trajectory: Trajectory
-) -> RecordingSignals:
+def _force_signals(experiment: Experiment, trajectory: Trajectory) -> RecordingSignals:
     """Return the measured components of the forces [N] of the grasps on the complete specimen:
     measured, simulated, and zero for the undeformed body.
 
     The columns are named after the number of the grasp, from 1, such as "grasp_1_fz_n". Values are
     multiplied by the symmetry of the sensor, torques are left out.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment with at least one sensor; all sensors must have the times of the first one.
-    trajectory : Trajectory
-        Its simulation, with the predicted wrenches (T, 6) of the sensors in the same order.
     """
     columns: list[str] = []
     measured: list[Array] = []
@@ -216,21 +177,13 @@ def _force_signals(
     for number, wrench, prediction in zip(
         instrumented, experiment.wrenches, trajectory.wrenches, strict=True
     ):
-        for component in np.flatnonzero(
-            wrench.measured_components[:FORCE_COUNT]
-        ):
+        for component in np.flatnonzero(wrench.measured_components[:FORCE_COUNT]):
             columns.append(f"grasp_{number}_{COMPONENTS[component]}_n")
             measured.append(wrench.symmetry * wrench.values[:, component])
             simulated.append(wrench.symmetry * prediction[:, component])
-            sigma.append(
-                wrench.symmetry * float(wrench.stack_sigmas()[component])
-            )
+            sigma.append(wrench.symmetry * float(wrench.stack_sigmas()[component]))
     signal = Signal(
-        "forces",
-        TIME_KEY,
-        experiment.wrenches[0].t_s,
-        tuple(columns),
-        np.column_stack(measured),
+        "forces", TIME_KEY, experiment.wrenches[0].t_s, tuple(columns), np.column_stack(measured)
     )
     return RecordingSignals(
         signal,

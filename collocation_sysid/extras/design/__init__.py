@@ -11,11 +11,4 @@ from .hand_motion import HandMotion
 from .motion_design import Design, DesignOptions, design_motion
 from .predicted_information import DesignCriterion
 
-__all__ = [
-    "Design",
-    "DesignCriterion",
-    "DesignOptions",
-    "HandMotion",
-    "Limits",
-    "design_motion",
-]
+__all__ = ["Design", "DesignCriterion", "DesignOptions", "HandMotion", "Limits", "design_motion"]

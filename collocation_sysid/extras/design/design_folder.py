@@ -40,15 +40,7 @@ FRAMES_PER_SECOND = 25.0
 # Keys of a grasp that describe the file of its poses: files of a design have the package's format.
 OF_POSES = MovedSection.model_fields.keys() - {"gripper_to_body"}
 # Keys whose texts are names of files, in any table.
-OF_FILES = (
-    "mesh",
-    "surface",
-    "file",
-    "poses",
-    "displacement",
-    "tension",
-    "pressure",
-)
+OF_FILES = ("mesh", "surface", "file", "poses", "displacement", "tension", "pressure")
 # Keys of an experiment that select samples, or exclude it from the fit.
 OF_TIME = ("window_s", "resample_hz", "every", "validation")
 HEAD = """\
@@ -59,10 +51,7 @@ HEAD = """\
 
 
 def write_design(
-    design: Design,
-    folder: str | Path,
-    with_film: bool = True,
-    say: Callable[[str], None] = print,
+    design: Design, folder: str | Path, with_film: bool = True, say: Callable[[str], None] = print
 ) -> Path:
     """Write the folder of a design atomically, and return its path.
 
@@ -87,35 +76,22 @@ def write_design(
         If the folder contains anything but an earlier design, or cannot be written.
     """
     target = Path(folder)
-    with replaced_folder(
-        target, marker_file=DESIGN_FILE, content_word="design"
-    ) as place:
+    with replaced_folder(target, marker_file=DESIGN_FILE, content_word="design") as place:
         write_poses_csv(place / POSES_FILE, _gripper_poses(design))
         experiment = design.experiment
         markers = experiment.markers
         for feature in FEATURES:
             feature.write_predicted(experiment, design.predicted, place)
         if design.recording.problem.origin is not None:
-            text = HEAD + tomli_w.dumps(
-                _problem_content(design, target.resolve())
-            )
+            text = HEAD + tomli_w.dumps(_problem_content(design, target.resolve()))
             (place / PROBLEM_FILE).write_text(text, encoding="utf-8")
         save_pictures(place, design_figures(design))
         if with_film:
             say("rendering the film of the motion")
             shapes_m = design.predicted.positions_m
-            replay = MotionRecord.from_experiment(
-                experiment, (shapes_m, markers.positions_m)
-            )
-            film(
-                replay,
-                place / FILM_FILE,
-                fps=FRAMES_PER_SECOND,
-                names=("predicted", ""),
-            )
-        (place / DESIGN_FILE).write_text(
-            as_json(design_json(design)), encoding="utf-8"
-        )
+            replay = MotionRecord.from_experiment(experiment, (shapes_m, markers.positions_m))
+            film(replay, place / FILM_FILE, fps=FRAMES_PER_SECOND, names=("predicted", ""))
+        (place / DESIGN_FILE).write_text(as_json(design_json(design)), encoding="utf-8")
     return target
 
 
@@ -141,9 +117,7 @@ def design_json(design: Design) -> dict[str, Any]:
             "relative_error": design.compute_minimised_error(),
         },
         "recordings_count": design.added,
-        "before": None
-        if design.before is None
-        else _error_bars_json(design.before),
+        "before": None if design.before is None else _error_bars_json(design.before),
         "after": _error_bars_json(design.after),
         "limits": {
             name: {"limit": getattr(limits, name), "share_used": share}
@@ -153,9 +127,7 @@ def design_json(design: Design) -> dict[str, Any]:
         "search": {
             "evaluations": len(search.history),
             "interrupted": search.is_interrupted,
-            "history": [
-                float(np.exp(min(value, 100.0))) for value in search.history
-            ],
+            "history": [float(np.exp(min(value, 100.0))) for value in search.history],
         },
         "motion": content(design.motion),
     }
@@ -185,9 +157,7 @@ def _gripper_poses(design: Design) -> PoseSequence:
     the grasp, `Design.poses`.
     """
     recording = design.recording
-    (body_in_gripper,) = gripper_transforms(
-        recording.problem, recording.template.name, grasps=[0]
-    )
+    (body_in_gripper,) = gripper_transforms(recording.problem, recording.template.name, grasps=[0])
     if body_in_gripper is None:
         return design.poses
     gripper_in_body = RigidTransform.from_matrix(body_in_gripper).inv()
@@ -215,23 +185,14 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     problem_table.pop("experiment_defaults", None)
     old_folder = origin.path.resolve().parent
     for key in ("object", "experiment"):
-        problem_table[key] = _relative_to(
-            problem_table[key], old_folder, new=folder
-        )
+        problem_table[key] = _relative_to(problem_table[key], old_folder, new=folder)
     tables = problem_table["experiment"]
     names = [each.get("name") for each in tables]
     new = deepcopy(tables[names.index(recording.template.name)])
     used_names = {*names} if design.added else set()
-    candidate_names = (
-        f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2)
-    )
-    new["name"] = next(
-        name for name in candidate_names if name not in used_names
-    )
-    problem_table["experiment"] = [
-        *(tables if design.added else []),
-        _designed_table(new),
-    ]
+    candidate_names = (f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2))
+    new["name"] = next(name for name in candidate_names if name not in used_names)
+    problem_table["experiment"] = [*(tables if design.added else []), _designed_table(new)]
     for item in recording.problem.parameters.free_scalars:
         section = problem_table["parameters"].get(item.name)
         guess = {"guess": design.after.values[item.name]}
@@ -248,19 +209,10 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
     Keys that select samples are removed (`OF_TIME`), and so are keys that describe the original
     file of poses in the table of the first grasp (`OF_POSES`). Each feature changes what it reads,
     see `Feature.read_predicted`.
-
-    Parameters
-    ----------
-    table : dict
-        Table ``[[experiment]]`` of the problem, with "grasp", a table or a list with at least one.
     """
     for key in OF_TIME:
         table.pop(key, None)
-    grasp = (
-        table["grasp"][0]
-        if isinstance(table["grasp"], list)
-        else table["grasp"]
-    )
+    grasp = table["grasp"][0] if isinstance(table["grasp"], list) else table["grasp"]
     for key in OF_POSES:
         grasp.pop(key, None)
     grasp["poses"] = POSES_FILE
@@ -275,11 +227,6 @@ def _relative_to(value: Any, old: Path, new: Path) -> Any:
 
     File names are the texts at the keys in `OF_FILES`, at any level; absolute ones become relative,
     too. What is at the key "columns" and all other values are returned as they are.
-
-    Raises
-    ------
-    ValueError
-        On Windows, if a file is on another drive than `new`.
     """
     if isinstance(value, list):
         return [_relative_to(each, old, new=new) for each in value]

@@ -32,9 +32,7 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
     which it was written. Nothing is written here.
     """
     tried = len(design.best.history)
-    interrupted = Line(
-        f"interrupted: the best of the {tried} motions so far", "check"
-    )
+    interrupted = Line(f"interrupted: the best of the {tried} motions so far", "check")
     return [
         *[interrupted] * design.best.is_interrupted,
         _error_table(design),
@@ -50,14 +48,7 @@ def _error_table(design: Design) -> Table:
     which the error is reduced. Without error bars before the design, "error before" and the factor
     are empty.
     """
-    heads = (
-        "",
-        "value",
-        "error before",
-        "error after",
-        "range over the prior",
-        "reduction factor",
-    )
+    heads = ("", "value", "error before", "error after", "range over the prior", "reduction factor")
     before = design.before
     after = design.after
     rows = []
@@ -70,9 +61,7 @@ def _error_table(design: Design) -> Table:
                 _percent(error_before),
                 _percent(relative),
                 f"{_percent(after.lowest[name])} … {_percent(after.highest[name])}",
-                f"{error_before / relative:.2g}"
-                if np.isfinite(error_before)
-                else "",
+                f"{error_before / relative:.2g}" if np.isfinite(error_before) else "",
             )
         )
     return Table("", heads, rows=tuple(rows))
@@ -106,10 +95,7 @@ def _column_note(design: Design) -> str:
 
 def design_figures(design: Design) -> dict[str, Figure]:
     """Return the figures of a design by file name without suffix: "motion" and "error_bars"."""
-    return {
-        "motion": motion_picture(design),
-        "error_bars": error_bars_picture(design),
-    }
+    return {"motion": motion_picture(design), "error_bars": error_bars_picture(design)}
 
 
 def motion_picture(design: Design) -> Figure:
@@ -121,20 +107,13 @@ def motion_picture(design: Design) -> Figure:
     t_s = design.motion.grid_s
     limits = design.limits
     place, rate, curvature = design.motion.derivatives(t_s)
-    angular = angular_motion(
-        place[:, 3:], rate[:, 3:], curvature=curvature[:, 3:]
-    )
+    angular = angular_motion(place[:, 3:], rate[:, 3:], curvature=curvature[:, 3:])
     for axis, colour in zip(range(3), COLOUR_CYCLE, strict=False):
         style = {"color": colour, "lw": LINE_PT, "label": "xyz"[axis]}
         shift.plot(t_s, 1e3 * place[:, axis], **style)
         turn.plot(t_s, np.degrees(place[:, 3 + axis]), **style)
     for axes, of_shift, of_turn, most in (
-        (
-            speed,
-            rate,
-            angular[0],
-            (limits.speed_m_s, limits.angular_speed_deg_s),
-        ),
+        (speed, rate, angular[0], (limits.speed_m_s, limits.angular_speed_deg_s)),
         (
             growth,
             curvature,
@@ -145,17 +124,13 @@ def motion_picture(design: Design) -> Figure:
         used = np.linalg.norm(of_shift[:, :3], axis=1) / most[0]
         turned = np.degrees(np.linalg.norm(of_turn, axis=1)) / most[1]
         axes.plot(t_s, 100 * used, color=BLUE, lw=LINE_PT, label="of the hand")
-        axes.plot(
-            t_s, 100 * turned, color=VERMILION, lw=LINE_PT, label="angular"
-        )
+        axes.plot(t_s, 100 * turned, color=VERMILION, lw=LINE_PT, label="angular")
         axes.axhline(100, color="black", lw=0.6, ls="--")
         axes.set_ylim(bottom=0)
     style_axes(shift, "", xlabel="", ylabel="displacement of the hand [mm]")
     style_axes(turn, "", xlabel="", ylabel="rotation vector [°]")
     style_axes(speed, "", xlabel="time [s]", ylabel="speed [% of limit]")
-    style_axes(
-        growth, "", xlabel="time [s]", ylabel="acceleration [% of limit]"
-    )
+    style_axes(growth, "", xlabel="time [s]", ylabel="acceleration [% of limit]")
     add_legend_above(shift, columns=3)
     add_legend_above(speed, columns=2)
     return figure
@@ -182,20 +157,10 @@ def error_bars_picture(design: Design) -> Figure:
             for each in (bars.relative, bars.lowest, bars.highest)
         )
         axes.hlines(rows + shift, low, high, color=colour, lw=2.5, alpha=0.4)
-        axes.plot(
-            middle,
-            rows + shift,
-            "o",
-            color=colour,
-            ms=4,
-            mec="none",
-            label=label,
-        )
+        axes.plot(middle, rows + shift, "o", color=colour, ms=4, mec="none", label=label)
     axes.set_xscale("log")
     format_plain_numbers(axes.xaxis)
-    axes.set_yticks(
-        rows, [symbol_as_mathtext(name) or symbol_of(name) for name in names]
-    )
+    axes.set_yticks(rows, [symbol_as_mathtext(name) or symbol_of(name) for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
     style_axes(axes, "", xlabel="predicted standard error [%]", ylabel="")
     axes.tick_params(axis="y", labelsize=SMALL_PT)

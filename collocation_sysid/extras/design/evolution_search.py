@@ -115,16 +115,13 @@ def minimise(
                 evaluate(rng.normal(size=dimension), best.value)
         assert best.coefficients is not None
         strategy = EvolutionStrategy(
-            best.coefficients,
-            FIRST_DEVIATION if start is None else SMALLEST_DISTANCE,
+            best.coefficients, FIRST_DEVIATION if start is None else SMALLEST_DISTANCE
         )
         bar = np.inf
         while len(best.history) < evaluations:
             count = min(strategy.offspring, evaluations - len(best.history))
             steps = rng.normal(size=(count, dimension))
-            sizes = np.array(
-                [evaluate(strategy.point(step), bar) for step in steps]
-            )
+            sizes = np.array([evaluate(strategy.point(step), bar) for step in steps])
             if count == strategy.offspring:
                 strategy.update(steps[np.argsort(sizes, kind="stable")])
             bar = float(np.median(sizes))
@@ -156,23 +153,15 @@ class EvolutionStrategy:
         self.mean = mean.copy()
         self.deviation = deviation
         self.offspring = 4 + int(3 * np.log(n))
-        weights = np.log((self.offspring + 1) / 2) - np.log(
-            np.arange(self.offspring // 2) + 1
-        )
+        weights = np.log((self.offspring + 1) / 2) - np.log(np.arange(self.offspring // 2) + 1)
         self.weights = weights / weights.sum()
         effective = self.effective = 1 / float(np.sum(self.weights**2))
         self.c_path = (effective + 2) / (n + effective + 5)
-        self.damping = (
-            1
-            + 2 * max(0.0, np.sqrt((effective - 1) / (n + 1)) - 1)
-            + self.c_path
-        )
+        self.damping = 1 + 2 * max(0.0, np.sqrt((effective - 1) / (n + 1)) - 1) + self.c_path
         self.c_rank = (4 + effective / n) / (n + 4 + 2 * effective / n)
         faster = (n + 2) / 3  # for a diagonal
         self.c_one = min(0.5, faster * 2 / ((n + 1.3) ** 2 + effective))
-        several = (
-            2 * (effective - 2 + 1 / effective) / ((n + 2) ** 2 + effective)
-        )
+        several = 2 * (effective - 2 + 1 / effective) / ((n + 2) ** 2 + effective)
         self.c_mu = min(1 - self.c_one, faster * several)
         self.usual = np.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
         self.variances = np.ones(n)
@@ -195,22 +184,14 @@ class EvolutionStrategy:
         self.mean = self.mean + self.deviation * scale * mean_step
         c = self.c_path
         r = self.c_rank
-        self.path = (1 - c) * self.path + np.sqrt(
-            c * (2 - c) * self.effective
-        ) * mean_step
+        self.path = (1 - c) * self.path + np.sqrt(c * (2 - c) * self.effective) * mean_step
         length = float(np.linalg.norm(self.path))
-        is_path_short = length < (
-            1.4 + 2 / (len(mean_step) + 1)
-        ) * self.usual * np.sqrt(2)
+        is_path_short = length < (1.4 + 2 / (len(mean_step) + 1)) * self.usual * np.sqrt(2)
         drift_step = np.sqrt(r * (2 - r) * self.effective) * scale * mean_step
         self.drift = (1 - r) * self.drift + is_path_short * drift_step
         spread = self.weights @ (scale * best) ** 2
         previous_weight = 1 - self.c_one - self.c_mu
         self.variances = (
-            previous_weight * self.variances
-            + self.c_one * self.drift**2
-            + self.c_mu * spread
+            previous_weight * self.variances + self.c_one * self.drift**2 + self.c_mu * spread
         )
-        self.deviation *= float(
-            np.exp(min(1.0, c / self.damping * (length / self.usual - 1)))
-        )
+        self.deviation *= float(np.exp(min(1.0, c / self.damping * (length / self.usual - 1))))

@@ -36,8 +36,7 @@ class CameraSection(Section):
         description="A point [x, y, z] that appears in the middle of its image."
     )
     field_of_view_deg: Positive = Field(
-        lt=180,
-        description="Full angle of the cone of view: that of the image's shorter side.",
+        lt=180, description="Full angle of the cone of view: that of the image's shorter side."
     )
 
     @model_validator(mode="after")
@@ -59,17 +58,12 @@ class Limits(Section):
         "hand may be, in the world frame of the poses."
     )
     speed_m_s: Positive = Field(description="Largest speed of the hand.")
-    acceleration_m_s2: Positive = Field(
-        description="Largest acceleration of the hand."
-    )
+    acceleration_m_s2: Positive = Field(description="Largest acceleration of the hand.")
     rotation_deg: Positive = Field(
-        lt=180,
-        description="Largest angle between its orientation and that of the start.",
+        lt=180, description="Largest angle between its orientation and that of the start."
     )
     angular_speed_deg_s: Positive = Field(description="Largest angular speed.")
-    angular_acceleration_deg_s2: Positive = Field(
-        description="Largest angular acceleration."
-    )
+    angular_acceleration_deg_s2: Positive = Field(description="Largest angular acceleration.")
     frequency_hz: Positive | None = Field(
         None,
         description="Largest frequency in the motion; a tenth of the sampling rate by default.",
@@ -93,10 +87,7 @@ class Limits(Section):
         """
         for key in ("workspace_m", "markers_box_m"):
             corners = getattr(self, key)
-            if (
-                corners is not None
-                and not (np.array(corners[0]) < corners[1]).all()
-            ):
+            if corners is not None and not (np.array(corners[0]) < corners[1]).all():
                 raise ValueError(f"{key} has the corners {list(map(list, corners))}; expected the "
                                  "lower one first, below the other along every axis")  # fmt: skip
         if self.camera and self.cameras_per_marker > len(self.camera):
@@ -121,9 +112,7 @@ class Limits(Section):
         try:
             return cls.model_validate(content)
         except ValidationError as error:
-            raise explain_validation_error(
-                error, content, path=file, root=cls
-            ) from error
+            raise explain_validation_error(error, content, path=file, root=cls) from error
 
     def bounds_from(self, hand_m: Array) -> HandBounds:
         """Return the limits of a hand that starts at the position `hand_m` (3,) in the world frame
@@ -159,15 +148,10 @@ class Limits(Section):
         worst = 0.0
         if self.markers_box_m is not None:
             low, high = (np.array(corner) for corner in self.markers_box_m)
-            beyond = np.maximum(low - markers_m, markers_m - high).max(
-                initial=0.0
-            )
+            beyond = np.maximum(low - markers_m, markers_m - high).max(initial=0.0)
             worst = float(beyond / np.linalg.norm(high - low))
         if self.camera and markers_m.size:
-            beyond = np.sort(
-                [_beyond_cone(camera, markers_m) for camera in self.camera],
-                axis=0,
-            )
+            beyond = np.sort([_beyond_cone(camera, markers_m) for camera in self.camera], axis=0)
             worst = max(worst, float(beyond[self.cameras_per_marker - 1].max()))
         return worst
 
@@ -179,15 +163,8 @@ def _beyond_cone(camera: CameraSection, points_m: Array) -> Array:
     position_m = np.array(camera.position_m)
     ray = points_m - position_m
     axis = np.array(camera.looks_at_m) - position_m
-    cosine = (
-        ray
-        @ axis
-        / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(axis) + 1e-300)
-    )
-    return (
-        np.arccos(np.clip(cosine, -1.0, 1.0))
-        - np.radians(camera.field_of_view_deg) / 2
-    )
+    cosine = ray @ axis / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(axis) + 1e-300)
+    return np.arccos(np.clip(cosine, -1.0, 1.0)) - np.radians(camera.field_of_view_deg) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,34 +216,19 @@ class HandBounds:
 
         The share of the translation is the largest along any axis, relative to the distance of the
         initial position from that side of the workspace; the others are norms.
-
-        Parameters
-        ----------
-        course : TimeDerivatives of (T, 6) arrays
-            Coordinates of a motion relative to its start and their derivatives, in SI units; the
-            first three columns are the translation.
         """
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits
         return {
-            "workspace_m": float(
-                np.maximum(shift / self.low_m, shift / self.high_m).max()
-            ),
+            "workspace_m": float(np.maximum(shift / self.low_m, shift / self.high_m).max()),
             "speed_m_s": _largest_norm(rate) / limits.speed_m_s,
-            "acceleration_m_s2": _largest_norm(curvature)
-            / limits.acceleration_m_s2,
+            "acceleration_m_s2": _largest_norm(curvature) / limits.acceleration_m_s2,
         }
 
     def _rotation_shares(self, course: TimeDerivatives) -> dict[str, float]:
         """Return the largest rotation, angular speed and angular acceleration as shares of their
         limits, by name of the limit: "rotation_deg", "angular_speed_deg_s" and
         "angular_acceleration_deg_s2".
-
-        Parameters
-        ----------
-        course : TimeDerivatives of (T, 6) arrays
-            Coordinates of a motion and their derivatives, in SI units (radians); the last three
-            columns are the rotation vector.
         """
         turn, rate, curvature = (each[:, 3:] for each in course)
         velocity, acceleration = angular_motion(turn, rate, curvature=curvature)
@@ -276,8 +238,7 @@ class HandBounds:
             "angular_acceleration_deg_s2": acceleration,
         }
         return {
-            name: np.degrees(_largest_norm(vectors))
-            / getattr(self.limits, name)
+            name: np.degrees(_largest_norm(vectors)) / getattr(self.limits, name)
             for name, vectors in quantities.items()
         }
 
@@ -296,16 +257,9 @@ class HandBounds:
     def _rotation_scale(self, course: TimeDerivatives) -> float:
         """Return the factor, at most 1, of the rotation vectors with which all limits of the
         rotation are satisfied, by repeated reduction.
-
-        Parameters
-        ----------
-        course : TimeDerivatives of (T, 6) arrays
-            Coordinates of the motion and their derivatives, as in `_rotation_shares`.
         """
         scale = 1.0
-        while (
-            largest := max(self._rotation_shares(course.scaled(scale)).values())
-        ) > WITHIN:
+        while (largest := max(self._rotation_shares(course.scaled(scale)).values())) > WITHIN:
             scale *= TIGHTER * WITHIN / largest
         return scale
 

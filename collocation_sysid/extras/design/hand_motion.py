@@ -60,9 +60,7 @@ class TimeDerivatives(NamedTuple):
     def scaled(self, factor: float) -> TimeDerivatives:
         """Return a copy with value and both derivatives multiplied by `factor`."""
         return TimeDerivatives(
-            factor * self.value,
-            factor * self.first,
-            second=factor * self.second,
+            factor * self.value, factor * self.first, second=factor * self.second
         )
 
 
@@ -111,11 +109,7 @@ class HandMotion:
 
     @classmethod
     def from_coefficients(
-        cls,
-        coefficients: Array,
-        duration_s: float,
-        highest_hz: float,
-        reach: TimeDerivatives,
+        cls, coefficients: Array, duration_s: float, highest_hz: float, reach: TimeDerivatives
     ) -> HandMotion:
         """Return the motion for unbounded coefficients whose expected magnitude is one.
 
@@ -136,25 +130,16 @@ class HandMotion:
         """
         rise, active = (
             low + (high - low) * _to_unit_interval(u)
-            for (low, high), u in zip(
-                (RISE, ACTIVE), coefficients[:OWN], strict=True
-            )
+            for (low, high), u in zip((RISE, ACTIVE), coefficients[:OWN], strict=True)
         )
         share, first, last, phase = coefficients[OWN:].reshape(PER_WAVE, 6, -1)
-        low, high = np.log(
-            [min(FEWEST_PERIODS / duration_s, highest_hz), highest_hz]
-        )
+        low, high = np.log([min(FEWEST_PERIODS / duration_s, highest_hz), highest_hz])
         first_hz, last_hz = (
-            np.exp(low + (high - low) * _to_unit_interval(u))
-            for u in (first, last)
+            np.exp(low + (high - low) * _to_unit_interval(u)) for u in (first, last)
         )
         angular = 2 * np.pi * np.maximum(first_hz, last_hz)
-        size, rate, rate_of_rate = (
-            np.repeat(each, 3)[:, None] for each in reach
-        )
-        largest_amplitude = np.minimum(
-            size, np.minimum(rate / angular, rate_of_rate / angular**2)
-        )
+        size, rate, rate_of_rate = (np.repeat(each, 3)[:, None] for each in reach)
+        largest_amplitude = np.minimum(size, np.minimum(rate / angular, rate_of_rate / angular**2))
         active_s = float(active * duration_s)
         return cls(
             duration_s,
@@ -171,9 +156,7 @@ class HandMotion:
         """Return the number of coefficients of a motion with `waves` waves per coordinate."""
         return OWN + PER_WAVE * 6 * waves
 
-    def scaled(
-        self, translation: float = 1.0, rotation: float = 1.0
-    ) -> HandMotion:
+    def scaled(self, translation: float = 1.0, rotation: float = 1.0) -> HandMotion:
         """Return a copy of the motion with all translations multiplied by `translation` and all
         rotation vectors by `rotation`, at all times.
         """
@@ -185,9 +168,7 @@ class HandMotion:
         """Times (T,) from 0 to the duration [s], evenly spaced, that resolve all peaks of the
         motion.
         """
-        fastest = max(
-            self.first_hz.max(), self.last_hz.max(), 0.5 / self.rise_s
-        )
+        fastest = max(self.first_hz.max(), self.last_hz.max(), 0.5 / self.rise_s)
         points = FEWEST_POINTS + POINTS_PER_PERIOD * fastest * self.duration_s
         return np.linspace(0.0, self.duration_s, int(points))
 
@@ -205,9 +186,7 @@ class HandMotion:
         window, rate, curvature = self._window(t)
         t = t[:, None, None]
         change = (self.last_hz - self.first_hz) / self.active_s
-        angle = (
-            2 * np.pi * (self.first_hz * t + change * t**2 / 2) + self.phase_rad
-        )
+        angle = 2 * np.pi * (self.first_hz * t + change * t**2 / 2) + self.phase_rad
         angular = 2 * np.pi * (self.first_hz + change * t)
         growth = 2 * np.pi * change
         sine = np.sin(angle)
@@ -215,15 +194,12 @@ class HandMotion:
         first = angular * cosine
         second = growth * cosine - angular**2 * sine
         wave, wave_rate, wave_curvature = (
-            (self.amplitude * each).sum(axis=-1)
-            for each in (sine, first, second)
+            (self.amplitude * each).sum(axis=-1) for each in (sine, first, second)
         )
         return TimeDerivatives(
             window * wave,
             rate * wave + window * wave_rate,
-            second=curvature * wave
-            + 2 * rate * wave_rate
-            + window * wave_curvature,
+            second=curvature * wave + 2 * rate * wave_rate + window * wave_curvature,
         )
 
     def _window(self, t: Array) -> TimeDerivatives:
@@ -234,21 +210,15 @@ class HandMotion:
         between it is one, and after `active_s` zero.
         """
         rising = t <= self.active_s / 2
-        u = np.clip(
-            np.where(rising, t, self.active_s - t) / self.rise_s, 0.0, 1.0
-        )
+        u = np.clip(np.where(rising, t, self.active_s - t) / self.rise_s, 0.0, 1.0)
         slope = np.where(rising, 1.0, -1.0) / self.rise_s
         value = u**3 * (10 - 15 * u + 6 * u**2)
         first = 30 * u**2 * (1 - u) ** 2 * slope
         second = 60 * u * (1 - u) * (1 - 2 * u) * slope**2
-        return TimeDerivatives(
-            value[:, None], first[:, None], second=second[:, None]
-        )
+        return TimeDerivatives(value[:, None], first[:, None], second=second[:, None])
 
 
-def angular_motion(
-    r: Array, rate: Array, curvature: Array
-) -> tuple[Array, Array]:
+def angular_motion(r: Array, rate: Array, curvature: Array) -> tuple[Array, Array]:
     """Return angular velocity [rad/s] and acceleration [rad/s²] (T, 3), in the fixed frame, of the
     rotation exp(r), from the rotation vector r (T, 3) [rad] and its first two derivatives `rate`
     and `curvature` with respect to time.
@@ -260,14 +230,8 @@ def angular_motion(
     double_cross = np.cross(r, across)
     drive = np.cross(r, curvature)
     velocity = rate + a * across + b * double_cross
-    acceleration = (
-        curvature
-        + a * drive
-        + b * (np.cross(rate, across) + np.cross(r, drive))
-    )
-    return velocity, acceleration + projection * (
-        a_slope * across + b_slope * double_cross
-    )
+    acceleration = curvature + a * drive + b * (np.cross(rate, across) + np.cross(r, drive))
+    return velocity, acceleration + projection * (a_slope * across + b_slope * double_cross)
 
 
 def _jacobian_factors(angle: Array) -> JacobianFactors:
@@ -291,9 +255,7 @@ def _jacobian_factors(angle: Array) -> JacobianFactors:
         -1 / 12 + square / 180,
         -1 / 60 + square / 1260,
     )
-    return JacobianFactors(
-        *(np.where(small, s, e) for s, e in zip(series, exact, strict=True))
-    )
+    return JacobianFactors(*(np.where(small, s, e) for s, e in zip(series, exact, strict=True)))
 
 
 def _to_unit_interval(u: Array | float) -> Array:

@@ -104,10 +104,7 @@ class ErrorBars:
         and the highest over all draws. `errors` are those at each draw, all with the same names.
         """
         each = [error.compute_relative() for error in errors]
-        lowest, highest = (
-            {n: pick(e[n] for e in each) for n in each[0]}
-            for pick in (min, max)
-        )
+        lowest, highest = ({n: pick(e[n] for e in each) for n in each[0]} for pick in (min, max))
         return cls(errors[0].values, each[0], lowest=lowest, highest=highest)
 
 
@@ -242,10 +239,7 @@ class MotionObjective:
         """
         parameters = self.recording.problem.parameters
         return PredictedErrors.from_information(
-            self.known_information + information,
-            parameters,
-            constants=self.constants,
-            q=q,
+            self.known_information + information, parameters, constants=self.constants, q=q
         )
 
     def first_guess(self, options: DesignOptions, say: Say) -> SearchResult:
@@ -289,16 +283,14 @@ class MotionObjective:
                 )
 
         def value(coefficients: Array, _: float) -> float:
-            """Return the logarithm of the error bar at the first draw, to first order; the bound is not
-            used.
+            """Return the logarithm of the error bar at the first draw, to first order; the bound is
+            not used.
             """
             information = linear.information(self.motion(coefficients))
             return self.criterion.log_size(self.errors(information, middle))
 
         size = HandMotion.coefficient_count(options.waves)
-        return minimise(
-            value, size, evaluations=count, seed=options.seed, watch=report
-        )
+        return minimise(value, size, evaluations=count, seed=options.seed, watch=report)
 
     def value(self, coefficients: Array, bound: float) -> float:
         """Return the logarithm of the relative error bar of a motion, combined over the draws;
@@ -315,23 +307,17 @@ class MotionObjective:
         bound : float
             Bound beyond which the value need not be exact; infinite for none.
         """
-        experiment = self.recording.experiment(
-            self.recording.poses(self.motion(coefficients))
-        )
+        experiment = self.recording.experiment(self.recording.poses(self.motion(coefficients)))
         sizes = []
         for q in self.draws:
             try:
                 result = self.recording.simulate_motion(experiment, q)
             except SimulationError as failure:
-                simulated_share = (
-                    failure.time_s - experiment.t_s[0]
-                ) / experiment.duration_s
+                simulated_share = (failure.time_s - experiment.t_s[0]) / experiment.duration_s
                 return FORBIDDEN * (3 - min(1.0, simulated_share))
             if (excess := self.limits.out_of_view(result.markers_m)) > 0:
                 return FORBIDDEN * (1 + excess / (1 + excess))
-            sizes.append(
-                self.criterion.log_size(self.errors(result.information, q))
-            )
+            sizes.append(self.criterion.log_size(self.errors(result.information, q)))
             if len(sizes) == 1 and sizes[0] > bound:
                 break
         return self.criterion.combine_draws(sizes)
@@ -391,9 +377,7 @@ def design_motion(
     """
     if not 0 < duration_s < np.inf:
         raise InputError(
-            f"found {duration_s:g}; expected a number of seconds above 0",
-            None,
-            where="--duration",
+            f"found {duration_s:g}; expected a number of seconds above 0", None, where="--duration"
         )
     recording = FutureRecording(
         problem, _select_experiment(problem, experiment), duration_s=duration_s
@@ -402,8 +386,7 @@ def design_motion(
     recording.highest_hz(limits)
     if not problem.parameters.free:
         raise InputError(
-            "every parameter is fixed; expected at least one that is estimated",
-            problem.path,
+            "every parameter is fixed; expected at least one that is estimated", problem.path
         )
     if add:
         say("identifying the parameters from the existing recordings")
@@ -411,18 +394,11 @@ def design_motion(
     else:
         _require_guesses(problem)
         draws = prior_draws(
-            problem.parameters,
-            options.spread,
-            pairs=options.pairs,
-            seed=options.seed,
+            problem.parameters, options.spread, pairs=options.pairs, seed=options.seed
         )
         known = np.zeros((len(draws[0]),) * 2)
     objective = MotionObjective(
-        recording,
-        limits,
-        criterion=criterion,
-        draws=draws,
-        known_information=known,
+        recording, limits, criterion=criterion, draws=draws, known_information=known
     )
     criterion.require_known(objective.errors(0.0, draws[0]))
     first = objective.first_guess(options, say)
@@ -443,40 +419,18 @@ def design_motion(
     return _evaluate_design(objective, best, add=add)
 
 
-def _evaluate_design(
-    objective: MotionObjective, best: SearchResult, add: bool
-) -> Design:
-    """Return the design with the best motion, its error bars and its simulation.
-
-    Parameters
-    ----------
-    objective : MotionObjective
-        Objective that was minimised.
-    best : SearchResult
-        Result of the search, which must have coefficients.
-    add : bool
-        Whether the new recording complements the existing ones.
-
-    Raises
-    ------
-    SimulationError
-        If the motion cannot be simulated at some draw.
-    """
+def _evaluate_design(objective: MotionObjective, best: SearchResult, add: bool) -> Design:
+    """Return the design with the best motion, its error bars and its simulation."""
     assert best.coefficients is not None
     recording = objective.recording
     motion = objective.motion(best.coefficients)
     experiment = recording.experiment(recording.poses(motion))
-    results = [
-        recording.simulate_motion(experiment, q) for q in objective.draws
-    ]
+    results = [recording.simulate_motion(experiment, q) for q in objective.draws]
     after = _error_bars(objective, results)
     problem = recording.problem
     values = problem.parameters.values(objective.draws[0])
     predicted = simulate(
-        experiment,
-        values,
-        integrator=problem.scheme,
-        substeps=problem.choose_first_substeps(),
+        experiment, values, integrator=problem.scheme, substeps=problem.choose_first_substeps()
     )
     return Design(
         recording,
@@ -502,68 +456,34 @@ def _before(objective: MotionObjective, add: bool) -> ErrorBars | None:
     at some draw.
     """
     if add:
-        return ErrorBars.from_draws(
-            [objective.errors(0.0, q) for q in objective.draws]
-        )
+        return ErrorBars.from_draws([objective.errors(0.0, q) for q in objective.draws])
     recording = objective.recording
     template = recording.template
     if len(template.grasps[0].poses.t_s) < 2:
         return None
     shipped = replace(recording, duration_s=template.duration_s)
     try:
-        simulations = [
-            shipped.simulate_motion(template, q) for q in objective.draws
-        ]
+        simulations = [shipped.simulate_motion(template, q) for q in objective.draws]
     except SimulationError:
         return None
     return _error_bars(objective, simulations)
 
 
-def _error_bars(
-    objective: MotionObjective, results: list[SimulatedMotion]
-) -> ErrorBars:
+def _error_bars(objective: MotionObjective, results: list[SimulatedMotion]) -> ErrorBars:
     """Return the error bars of a motion, together with existing recordings and priors: those at the
     middle, with the lowest and the highest relative error over all draws.
-
-    Parameters
-    ----------
-    objective : MotionObjective
-        Objective with the existing recordings and the draws of q.
-    results : list of SimulatedMotion
-        The motion simulated at each draw, in the order of `objective.draws`, the middle first; as
-        many as draws (otherwise `ValueError`).
     """
     pairs = zip(results, objective.draws, strict=True)
-    return ErrorBars.from_draws(
-        [objective.errors(each.information, q) for each, q in pairs]
-    )
+    return ErrorBars.from_draws([objective.errors(each.information, q) for each, q in pairs])
 
 
-def _draws_from_recordings(
-    problem: Problem, options: DesignOptions
-) -> tuple[list[Array], Array]:
+def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
     """Solve the existing recordings; return draws of the parameters q around the estimate, and the
     information of the recordings.
 
     q are the solver's coordinates: logarithms, or values of linear parameters. The draws are 1 + 2
     · `options.pairs` arrays (nq,), the estimate first. Poorly determined parameters are drawn no
     wider than `options.spread`. The information (nq, nq) is about q, without priors.
-
-    Parameters
-    ----------
-    problem : Problem
-        Problem with the recordings; not modified.
-    options : DesignOptions
-        Its pairs, spread and seed are used.
-
-    Raises
-    ------
-    InputError
-        If the solve does not converge.
-    SimulationError
-        If the solution cannot be linearised.
-    KeyboardInterrupt
-        If the solve is interrupted.
     """
     solution = solve(problem)
     solution.unless_interrupted()
@@ -585,27 +505,16 @@ def _draws_from_recordings(
     factors = np.minimum(1.0, largest_deviation / deviations)
     root = factors[:, None] * np.linalg.cholesky(errors.covariance)
     return symmetric_draws(
-        problem.parameters,
-        solution.q,
-        root=root,
-        pairs=options.pairs,
-        seed=options.seed,
+        problem.parameters, solution.q, root=root, pairs=options.pairs, seed=options.seed
     ), known
 
 
 def _select_experiment(problem: Problem, name: str | None) -> Experiment:
-    """Return the experiment with a name, or the first that is not static if `name` is None.
-
-    Raises
-    ------
-    InputError
-        If every experiment is static, or none that moves has this name.
-    """
+    """Return the experiment with a name, or the first that is not static if `name` is None."""
     moving = [each for each in problem.experiments if not each.is_static]
     if not moving:
         raise InputError(
-            "every experiment is static; expected at least one that moves",
-            problem.path,
+            "every experiment is static; expected at least one that moves", problem.path
         )
     if name is None:
         return moving[0]

@@ -94,15 +94,9 @@ class DesignCriterion:
         slopes = errors.slopes_of(self.names)
         covariance = slopes @ errors.covariance @ slopes.T
         if self.kind == "D":
-            return float(np.linalg.slogdet(covariance)[1]) / (
-                2 * len(covariance)
-            )
+            return float(np.linalg.slogdet(covariance)[1]) / (2 * len(covariance))
         variances = np.diag(covariance)
-        return 0.5 * float(
-            np.log(
-                variances.max() if self.kind == "worst" else variances.mean()
-            )
-        )
+        return 0.5 * float(np.log(variances.max() if self.kind == "worst" else variances.mean()))
 
     def combine_draws(self, sizes: Sequence[float]) -> float:
         """Return the mean of the logarithms `sizes` at one or more draws of θ, or the largest if
@@ -159,11 +153,7 @@ class PredictedErrors:
 
     @classmethod
     def from_information(
-        cls,
-        information: Array,
-        parameters: Parameters,
-        constants: ThetaMap,
-        q: Array,
+        cls, information: Array, parameters: Parameters, constants: ThetaMap, q: Array
     ) -> PredictedErrors:
         """Return the errors from the information (nq, nq) of all recordings and the priors of q.
 
@@ -183,9 +173,7 @@ class PredictedErrors:
             Parameters in the solver's coordinates.
         """
         sizes = relative_derivatives(parameters, q)
-        prior = (
-            parameters.prior_residuals(q)[1] ** 2 + (sizes / UNDETERMINED) ** 2
-        )
+        prior = parameters.prior_residuals(q)[1] ** 2 + (sizes / UNDETERMINED) ** 2
         units = 1 / np.sqrt(np.diag(information) + prior)
         scaled = units[:, None] * (information + np.diag(prior)) * units
         covariance = units[:, None] * np.linalg.inv(scaled) * units
@@ -197,18 +185,10 @@ class PredictedErrors:
             slopes[item.name] = np.diag(sizes)[k]
         estimated_count = len(values)
         derived = DerivedModuli.from_bodies([constants], q)
-        varying = {
-            name: by_q
-            for name, by_q in derived.derivatives.items()
-            if by_q.any()
-        }
+        varying = {name: by_q for name, by_q in derived.derivatives.items() if by_q.any()}
         values |= {name: derived.values[name] for name in varying}
-        slopes |= {
-            name: by_q / derived.values[name] for name, by_q in varying.items()
-        }
-        return cls(
-            covariance, values, slopes=slopes, estimated_count=estimated_count
-        )
+        slopes |= {name: by_q / derived.values[name] for name, by_q in varying.items()}
+        return cls(covariance, values, slopes=slopes, estimated_count=estimated_count)
 
     def slopes_of(self, names: Sequence[str]) -> Array:
         """Return the rows (k, nq) of `slopes` for these names; for all estimated parameters if
@@ -232,9 +212,7 @@ class PredictedErrors:
         }
 
 
-def prior_draws(
-    parameters: Parameters, spread: float, pairs: int, seed: int
-) -> list[Array]:
+def prior_draws(parameters: Parameters, spread: float, pairs: int, seed: int) -> list[Array]:
     """Return draws (nq,) of the parameters q, in the solver's coordinates: the middle, followed by
     `pairs` pairs on either side of it, inside the bounds, see `symmetric_draws`.
 
@@ -260,20 +238,13 @@ def prior_draws(
     """
     middle = parameters.guess_q.copy()
     deviation = np.array(
-        [
-            np.log(spread) if item.scale == "log" else spread - 1
-            for item in parameters.free
-        ]
+        [np.log(spread) if item.scale == "log" else spread - 1 for item in parameters.free]
     )
     for k, item in enumerate(parameters.free):
         if item.prior is not None:
             middle[k] = item.to_coordinate(item.prior[0])
-            deviation[k] = item.prior[1] / (
-                1.0 if item.scale == "log" else item.unit
-            )
-    return symmetric_draws(
-        parameters, middle, root=np.diag(deviation), pairs=pairs, seed=seed
-    )
+            deviation[k] = item.prior[1] / (1.0 if item.scale == "log" else item.unit)
+    return symmetric_draws(parameters, middle, root=np.diag(deviation), pairs=pairs, seed=seed)
 
 
 def symmetric_draws(
@@ -299,10 +270,7 @@ def symmetric_draws(
     deviations = [root @ rng.normal(size=len(middle)) for _ in range(pairs)]
     lower, upper = parameters.compute_bounds_q()
     margin = 1e-3 * np.minimum(upper - lower, 1.0)
-    draws = [
-        middle,
-        *(middle + sign * way for way in deviations for sign in (1, -1)),
-    ]
+    draws = [middle, *(middle + sign * way for way in deviations for sign in (1, -1))]
     return [np.clip(q, lower + margin, upper - margin) for q in draws]
 
 
@@ -323,9 +291,7 @@ def shared_information(fit: LinearisedFit) -> Array:
     included.
     """
     alone = least_squares_of_fit(fit).marginal(fit.shared_count)
-    return alone.compute_information() - np.diag(
-        fit.prior_jacobian[: fit.shared_count] ** 2
-    )
+    return alone.compute_information() - np.diag(fit.prior_jacobian[: fit.shared_count] ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,17 +333,13 @@ class FutureRecording:
     problem: Problem
     template: Experiment
     duration_s: float
-    _starts: dict[bytes, Array] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    _starts: dict[bytes, Array] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         try:
             self._validate()
         except InputError as error:
-            raise error.located(
-                self.problem.path, f"experiment '{self.template.name}'"
-            ) from error
+            raise error.located(self.problem.path, f"experiment '{self.template.name}'") from error
 
     def _validate(self) -> None:
         """Raise an `InputError` if a motion cannot be designed for the experiment.
@@ -397,9 +359,7 @@ class FutureRecording:
                 "designed"
             )
         (grasp,) = template.grasps
-        if grasp.axes != "xyz" or not (
-            np.isinf(grasp.from_s) and np.isinf(grasp.until_s)
-        ):
+        if grasp.axes != "xyz" or not (np.isinf(grasp.from_s) and np.isinf(grasp.until_s)):
             raise InputError(
                 "the grasp holds only some axes, or only a part of the time; expected one that holds "
                 "all axes throughout"
@@ -419,8 +379,7 @@ class FutureRecording:
     def since_start_s(self) -> Array:
         """Times (T,) of the samples since the start [s]."""
         return np.asarray(
-            np.arange(self.count_samples()) * self.template.timestep_s,
-            dtype=np.float64,
+            np.arange(self.count_samples()) * self.template.timestep_s, dtype=np.float64
         )
 
     @cached_property
@@ -428,19 +387,14 @@ class FutureRecording:
         """Rotation R (3, 3) and translation p (3,) [m] of the rigidly grasped body at the first
         sample of the template: a grasped node at X is at R X + p.
         """
-        rotations, translations = self.template.rigid_motion(
-            self.template.t_s[:1]
-        )
+        rotations, translations = self.template.rigid_motion(self.template.t_s[:1])
         return rotations[0], translations[0]
 
     @cached_property
     def hand_m(self) -> Array:
         """Centre (3,) of the grasped nodes in the undeformed body [m]."""
         (grasp,) = self.template.grasps
-        return np.asarray(
-            self.template.body.nodes_m[grasp.nodes].mean(axis=0),
-            dtype=np.float64,
-        )
+        return np.asarray(self.template.body.nodes_m[grasp.nodes].mean(axis=0), dtype=np.float64)
 
     def bounds(self, limits: Limits) -> HandBounds:
         """Return the limits of the hand relative to its initial position, the middle of the grasped
@@ -483,24 +437,18 @@ class FutureRecording:
         """Return the poses at `pose_times_s` of a motion of the hand relative to its initial pose,
         as grasps have them: a grasped node at X of the undeformed body is at R X + p.
         """
-        return self.poses_from_coordinates(
-            motion.derivatives(self.pose_times_s).value
-        )
+        return self.poses_from_coordinates(motion.derivatives(self.pose_times_s).value)
 
     def poses_from_coordinates(self, coordinates: Array) -> PoseSequence:
         """Return the poses at `pose_times_s` from the translation [m] and the rotation vector [rad]
         (P, 6) of the hand, relative to its initial position and orientation, in world axes.
         """
         rotation, translation = self.start_pose
-        turned = Rotation.from_rotvec(
-            coordinates[:, 3:]
-        ) * Rotation.from_matrix(rotation)
+        turned = Rotation.from_rotvec(coordinates[:, 3:]) * Rotation.from_matrix(rotation)
         hand = rotation @ self.hand_m + translation + coordinates[:, :3]
         placed = hand - turned.apply(self.hand_m)
         return PoseSequence(
-            self.pose_times_s + self.template.t_s[0],
-            placed,
-            quaternions_xyzw=turned.as_quat(),
+            self.pose_times_s + self.template.t_s[0], placed, quaternions_xyzw=turned.as_quat()
         )
 
     def experiment(self, poses: PoseSequence) -> Experiment:
@@ -522,9 +470,7 @@ class FutureRecording:
             markers=template.markers.with_samples(t_s, nowhere),
         )
 
-    def simulate_motion(
-        self, experiment: Experiment, q: Array
-    ) -> SimulatedMotion:
+    def simulate_motion(self, experiment: Experiment, q: Array) -> SimulatedMotion:
         """Return information and marker positions of an experiment simulated at the parameters q
         (nq,), in the solver's coordinates.
 
@@ -534,12 +480,9 @@ class FutureRecording:
             If the simulation does not reach the end.
         """
         fit, x = self.linearise(experiment, q)
-        positions = x[:: self.problem.choose_first_substeps()].reshape(
-            len(experiment.t_s), -1, 3
-        )
+        positions = x[:: self.problem.choose_first_substeps()].reshape(len(experiment.t_s), -1, 3)
         return SimulatedMotion(
-            shared_information(fit),
-            experiment.markers.predict_positions(positions),
+            shared_information(fit), experiment.markers.predict_positions(positions)
         )
 
     def program(self, experiment: Experiment) -> Collocation:
@@ -548,11 +491,7 @@ class FutureRecording:
         fitted, too.
         """
         problem = self.problem
-        fitted = (
-            replace(experiment, validation=False)
-            if experiment.validation
-            else experiment
-        )
+        fitted = replace(experiment, validation=False) if experiment.validation else experiment
         return Collocation(
             [fitted],
             problem.parameters,
@@ -560,9 +499,7 @@ class FutureRecording:
             substeps=problem.choose_first_substeps(),
         )
 
-    def linearise(
-        self, experiment: Experiment, q: Array
-    ) -> tuple[LinearisedFit, Array]:
+    def linearise(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
         """Return the linearised fit of a simulated experiment, and its node positions (N, 3n) [m]
         at the N time steps, substeps included.
 
@@ -583,11 +520,11 @@ class FutureRecording:
             If the simulation does not reach the end.
         """
         alone = self.program(experiment)
-        (segment,) = alone.transcriptions
+        (transcription,) = alone.transcriptions
         known = self._starts.get(q.tobytes())
         x, failure = continue_simulation(
             experiment,
-            segment.dynamics.with_theta(segment.constants.theta(q)),
+            transcription.dynamics.with_theta(transcription.constants.theta(q)),
             known=known,
             options=NewtonOptions(tolerance=TOLERANCE),
         )
@@ -595,7 +532,7 @@ class FutureRecording:
             raise failure
         self._starts[q.tobytes()] = x[:1]
         return linearise_fit(
-            alone, alone.pack(np.append(q, segment.compute_guess_phi()), [x])
+            alone, alone.pack(np.append(q, transcription.compute_guess_phi()), [x])
         ), x
 
 
@@ -635,20 +572,18 @@ class LinearRecording:
         """Return the approximate memory of the responses of a recording [GB], without computing
         them.
         """
-        (segment,) = recording.program(recording.template).transcriptions
+        (transcription,) = recording.program(recording.template).transcriptions
         markers = 3 * len(recording.template.markers.names)
         return (
             6
             * 16e-9
             * recording.count_samples()
             * markers
-            * len(segment.list_parameter_indices())
+            * len(transcription.list_parameter_indices())
         )
 
     @classmethod
-    def from_simulations(
-        cls, recording: FutureRecording, q: Array
-    ) -> LinearRecording:
+    def from_simulations(cls, recording: FutureRecording, q: Array) -> LinearRecording:
         """Return the response of a recording at the parameters q (nq,), in the solver's
         coordinates, from seven simulations: one at rest, and one for each coordinate.
 
@@ -657,17 +592,15 @@ class LinearRecording:
         SimulationError
             If a simulation does not reach the end.
         """
-        still = recording.linearise(
-            recording.experiment(_pulse_poses(recording, np.zeros(6))), q
-        )[0]
+        still = recording.linearise(recording.experiment(_pulse_poses(recording, np.zeros(6))), q)[
+            0
+        ]
         (at_rest,) = still.blocks
         count = recording.count_samples()
         length = 1 << (2 * count - 1).bit_length()
         answers = []
         for k, height in enumerate(HEIGHTS):
-            pulsed = recording.experiment(
-                _pulse_poses(recording, height * np.eye(6)[k])
-            )
+            pulsed = recording.experiment(_pulse_poses(recording, height * np.eye(6)[k]))
             (block,) = recording.linearise(pulsed, q)[0].blocks
             change = (block.channels[1] - at_rest.channels[1]) / height
             answers.append(np.fft.rfft(change, length, axis=0))
@@ -691,25 +624,13 @@ class LinearRecording:
         of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
         transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
         (rest,) = self.rest.blocks
-        change = np.fft.irfft(transform, self.length, axis=0)[
-            : recording.count_samples()
-        ]
+        change = np.fft.irfft(transform, self.length, axis=0)[: recording.count_samples()]
         slope = rest.jacobian + change.reshape(rest.jacobian.shape)
-        return shared_information(
-            replace(self.rest, blocks=(replace(rest, jacobian=slope),))
-        )
+        return shared_information(replace(self.rest, blocks=(replace(rest, jacobian=slope),)))
 
 
 def _pulse_poses(recording: FutureRecording, heights: Array) -> PoseSequence:
-    """Return one sequence of poses at `pose_times_s`, with a pulse of all coordinates at once.
-
-    Parameters
-    ----------
-    recording : FutureRecording
-    heights : (6,)
-        Heights of the pulse in translation [m] and rotation vector [rad]; zero for coordinates
-        without one. The pulse is a cubic B-spline of four timesteps, highest at sample `CENTRE`.
-    """
+    """Return one sequence of poses at `pose_times_s`, with a pulse of all coordinates at once."""
     t_s = recording.pose_times_s
     since = t_s / recording.template.timestep_s - CENTRE
     share = np.nan_to_num(np.asarray(PULSE(since), dtype=np.float64))

@@ -29,24 +29,15 @@ IDENTIFIED_FILE = "identified.json"
 
 
 TARGETS: dict[str, ExportTarget] = {
-    "mujoco": ExportTarget(
-        "MuJoCo", mujoco.MODEL, export=mujoco.export, verify=mujoco.verify
-    ),
+    "mujoco": ExportTarget("MuJoCo", mujoco.MODEL, export=mujoco.export, verify=mujoco.verify),
     "newton": ExportTarget("Newton", newton.MODULE_FILE, export=newton.export),
-    "usd": ExportTarget(
-        "OpenUSD", usd.STAGE_FILE, export=usd.export, verify=usd.verify
-    ),
+    "usd": ExportTarget("OpenUSD", usd.STAGE_FILE, export=usd.export, verify=usd.verify),
     "sofa": ExportTarget("SOFA", sofa.SCENE, export=sofa.export),
     "febio": ExportTarget("FEBio", febio.MODEL, export=febio.export),
     "calculix": ExportTarget(
-        "CalculiX",
-        calculix.DECK,
-        export=calculix.export,
-        verify=calculix.verify,
+        "CalculiX", calculix.DECK, export=calculix.export, verify=calculix.verify
     ),
-    "json": ExportTarget(
-        "JSON", IDENTIFIED_FILE, export=lambda body: ExportedFiles({}, ())
-    ),
+    "json": ExportTarget("JSON", IDENTIFIED_FILE, export=lambda body: ExportedFiles({}, ())),
 }
 # Main file of each format: the targets, and the recording for a viewer.
 MAIN_FILES = {
@@ -55,9 +46,7 @@ MAIN_FILES = {
 }
 
 
-def write_export(
-    body: IdentifiedBody, target_name: str, folder: str | Path
-) -> ExportedFiles:
+def write_export(body: IdentifiedBody, target_name: str, folder: str | Path) -> ExportedFiles:
     """Write a body for a target: its files, ``identified.json`` with all numbers and what the
     target cannot express, and ``poses_1.csv``, … with the poses of its grasps, followed by those of
     its obstacles.
@@ -82,18 +71,12 @@ def write_export(
         needs and that is not installed, or a folder with other files.
     """
     exported = target_named(target_name).export(body)
-    with replaced_folder(
-        folder, marker_file=IDENTIFIED_FILE, content_word="export"
-    ) as place:
+    with replaced_folder(folder, marker_file=IDENTIFIED_FILE, content_word="export") as place:
         for name, text in exported.files.items():
             (place / name).write_text(text, encoding="utf-8")
         content = {**body.as_dict(), "not_expressed": exported.limitations}
-        (place / IDENTIFIED_FILE).write_text(
-            as_json(content) + "\n", encoding="utf-8"
-        )
-        for k, grasp in enumerate(
-            (*body.experiment.grasps, *body.obstacles), start=1
-        ):
+        (place / IDENTIFIED_FILE).write_text(as_json(content) + "\n", encoding="utf-8")
+        for k, grasp in enumerate((*body.experiment.grasps, *body.obstacles), start=1):
             write_poses_csv(place / f"poses_{k}.csv", grasp.poses)
     return exported
 
@@ -128,41 +111,24 @@ def verify_export(
     """
     target = target_named(target_name)
     if target.verify is None:
-        able = ", ".join(
-            name for name, each in TARGETS.items() if each.verify is not None
-        )
-        raise InputError(
-            f"{target.name} cannot be run by this program; --verify works with {able}"
-        )
+        able = ", ".join(name for name, each in TARGETS.items() if each.verify is not None)
+        raise InputError(f"{target.name} cannot be run by this program; --verify works with {able}")
     # It may leave files of its own behind.
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(shutil.copytree(folder, Path(scratch) / "export"))
         return target.verify(body, place)
 
 
-def comparison_table(
-    name: str, comparisons: Sequence[PredictionComparison]
-) -> Table:
+def comparison_table(name: str, comparisons: Sequence[PredictionComparison]) -> Table:
     """Return the table of predictions of a simulator and of this package, a row for each quantity:
     name, both values with their unit, relative difference in percent ("+nan%" if this package
     predicts zero), and remark. `name` is the simulator's, for the heading.
     """
     rows = []
     for each in comparisons:
-        values = (
-            f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours)
-        )
-        rows.append(
-            (
-                each.what,
-                *values,
-                f"{each.compute_relative_difference():+.2%}",
-                each.remark,
-            )
-        )
-    return Table(
-        "", ("", name, "ours", "difference", ""), rows=tuple(rows), names=5
-    )
+        values = (f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours))
+        rows.append((each.what, *values, f"{each.compute_relative_difference():+.2%}", each.remark))
+    return Table("", ("", name, "ours", "difference", ""), rows=tuple(rows), names=5)
 
 
 def target_named(name: str) -> ExportTarget:
@@ -175,9 +141,7 @@ def target_named(name: str) -> ExportTarget:
     """
     if name not in TARGETS:
         known = (*TARGETS, rerun_recording.TARGET)
-        raise InputError(
-            f"no target {name!r}; available: {', '.join(known)}{hint_at(name, known)}"
-        )
+        raise InputError(f"no target {name!r}; available: {', '.join(known)}{hint_at(name, known)}")
     return TARGETS[name]
 
 

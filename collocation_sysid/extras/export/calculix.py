@@ -35,11 +35,7 @@ TETRAHEDRON_SIDES = (0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)
 # Constant D_i that removes a term of U = Σ (J − 1)^2i / D_i: zero would mean a very stiff term.
 ABSENT_TERM = 1e20
 CAPABILITIES = TargetCapabilities(
-    {},
-    other_materials="",
-    mass_damping="",
-    node_forces="",
-    has_quadratic_elements=True,
+    {}, other_materials="", mass_damping="", node_forces="", has_quadratic_elements=True
 )
 # Coefficients C_i of the series of Arruda and Boyce.
 _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
@@ -79,34 +75,21 @@ def export(body: IdentifiedBody) -> ExportedFiles:
             "CalculiX distributes the weight of an element with its shape functions, "
             "this program lumps it at the nodes"
         )
-    nodes = (
-        f"{k},{_format_values(*point)}\n"
-        for k, point in enumerate(body.nodes_m, start=1)
-    )
+    nodes = (f"{k},{_format_values(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
     mesh = f"*NODE,NSET=ALL\n{''.join(nodes)}"
     kind = "C3D10" if body.is_quadratic else "C3D4"
     for k, region in enumerate(body.regions):
         cells = body.body.cells[region.cells] + 1
-        lines = (
-            ", ".join(map(str, (n + 1, *c)))
-            for n, c in zip(region.cells, cells, strict=True)
-        )
-        mesh += f"*ELEMENT,TYPE={kind},ELSET=E{k}\n" + "".join(
-            f"{line}\n" for line in lines
-        )
-    mesh += "".join(
-        f"*ELSET,ELSET=BODY\nE{k}\n" for k in range(len(body.regions))
-    )
+        lines = (", ".join(map(str, (n + 1, *c))) for n, c in zip(region.cells, cells, strict=True))
+        mesh += f"*ELEMENT,TYPE={kind},ELSET=E{k}\n" + "".join(f"{line}\n" for line in lines)
+    mesh += "".join(f"*ELSET,ELSET=BODY\nE{k}\n" for k in range(len(body.regions)))
     head = comment_lines(body, limits, start="** ")
     obstacles = faceted_obstacles(body)
     steps = ""
     for t_s in _step_times_s(body):
         steps += _step_card(body, obstacles, t_s=t_s, is_linear=linear)
     return ExportedFiles(
-        {
-            DECK: f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"
-        },
-        tuple(limits),
+        {DECK: f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"}, tuple(limits)
     )
 
 
@@ -117,21 +100,12 @@ def _step_times_s(body: IdentifiedBody) -> Array:
     return body.experiment.t_s[: None if body.experiment.is_static else 1]
 
 
-def _obstacle_cards(
-    body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]
-) -> str:
+def _obstacle_cards(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
     """Return the obstacles as cards, which precede the steps: a tetrahedron under each facet, a
     common material, and a contact pair for each obstacle; empty without obstacles.
 
     The pressure is linear in the penetration, with friction if the obstacle has some. The step
     prescribes all nodes of the tetrahedra.
-
-    Parameters
-    ----------
-    body : IdentifiedBody
-        Body whose sides may touch the obstacles.
-    obstacles : sequence of FacetedObstacle
-        Its obstacles.
     """
     deck = ""
     tetrahedra = body.body.mesh.tetrahedra
@@ -139,26 +113,18 @@ def _obstacle_cards(
     faces = {
         tuple(sorted(corners)): f"{number},S{side}"
         for side, places in enumerate(TETRAHEDRON_SIDES, start=1)
-        for corners, number in zip(
-            tetrahedra[:, places].tolist(), element_numbers, strict=True
-        )
+        for corners, number in zip(tetrahedra[:, places].tolist(), element_numbers, strict=True)
     }
     for k, wall in enumerate(obstacles):
         deck += f"*NODE,NSET=W{k}\n"
         numbered = enumerate(wall.start_points_m, start=wall.first_node + 1)
-        deck += "".join(
-            f"{i},{_format_values(*point)}\n" for i, point in numbered
-        )
+        deck += "".join(f"{i},{_format_values(*point)}\n" for i, point in numbered)
         deck += f"*ELEMENT,TYPE=C3D4,ELSET=W{k}\n"
-        for i, nodes in enumerate(
-            wall.build_tetrahedra() + 1, start=wall.first_cell + 1
-        ):
+        for i, nodes in enumerate(wall.build_tetrahedra() + 1, start=wall.first_cell + 1):
             deck += f"{i},{','.join(map(str, nodes))}\n"
         touching = body.body.mesh.surface[wall.faces].tolist()
         sides = "".join(f"{faces[tuple(sorted(face))]}\n" for face in touching)
-        constants = _format_values(
-            float(wall.obstacle.friction), wall.stiffness_pa_m / 2
-        )
+        constants = _format_values(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)
         stick = f"*FRICTION\n{constants}\n"
         deck += (
             f"*SOLID SECTION,ELSET=W{k},MATERIAL=WALL\n*SURFACE,NAME=W{k}\nW{k},S1\n"
@@ -172,52 +138,27 @@ def _obstacle_cards(
 
 
 def _step_card(
-    body: IdentifiedBody,
-    obstacles: Sequence[FacetedObstacle],
-    t_s: float,
-    is_linear: bool,
+    body: IdentifiedBody, obstacles: Sequence[FacetedObstacle], t_s: float, is_linear: bool
 ) -> str:
     """Return the text of one step: prescribed nodes and obstacles at their places at `t_s`,
     gravity, and the node loads of the first sample.
-
-    Parameters
-    ----------
-    body : IdentifiedBody
-        Body with its recording.
-    obstacles : sequence of FacetedObstacle
-        The obstacles.
-    t_s : float
-        Time of the sample [s].
-    is_linear : bool
-        Whether the analysis is geometrically linear.
     """
-    displacements_m = [
-        body.experiment.prescribed_displacements([t_s])[1][0] - body.nodes_m
-    ]
-    displacements_m += [
-        wall.points_at_m(t_s) - wall.start_points_m for wall in obstacles
-    ]
+    displacements_m = [body.experiment.prescribed_displacements([t_s])[1][0] - body.nodes_m]
+    displacements_m += [wall.points_at_m(t_s) - wall.start_points_m for wall in obstacles]
     rows = np.concatenate(displacements_m)
     prescribed = np.argwhere(np.isfinite(rows))
     boundary = "".join(
-        f"{n + 1},{a + 1},{a + 1},{_format_values(float(rows[n, a]))}\n"
-        for n, a in prescribed
+        f"{n + 1},{a + 1},{a + 1},{_format_values(float(rows[n, a]))}\n" for n, a in prescribed
     )
-    prints = "".join(
-        f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n"
-        for k in range(len(obstacles))
-    )
+    prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n" for k in range(len(obstacles)))
     loaded = np.argwhere(body.node_loads_n)
     loads = "".join(
-        f"{n + 1},{a + 1},{_format_values(float(body.node_loads_n[n, a]))}\n"
-        for n, a in loaded
+        f"{n + 1},{a + 1},{_format_values(float(body.node_loads_n[n, a]))}\n" for n, a in loaded
     )
     pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
     direction = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
     weight = (
-        f"*DLOAD\nBODY,GRAV,{_format_values(pull)},{_format_values(*direction)}\n"
-        if pull
-        else ""
+        f"*DLOAD\nBODY,GRAV,{_format_values(pull)},{_format_values(*direction)}\n" if pull else ""
     )
     return (
         f"*STEP,INC=1000{'' if is_linear else ',NLGEOM'}\n"
@@ -235,21 +176,12 @@ def _format_values(*values: float) -> str:
     return ",".join(f"{float(value):.12g}" for value in values)
 
 
-def _material_card(
-    region: IdentifiedRegion, is_linear: bool
-) -> tuple[str, str]:
+def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]:
     """Return the card of a material, without its density, and a sentence on what the card does not
     express ("" if nothing).
 
     A material that CalculiX does not have becomes the neo-Hookean one of the same λ and μ at small
     strain.
-
-    Parameters
-    ----------
-    region : IdentifiedRegion
-        Region with the material and its constants.
-    is_linear : bool
-        Whether the analysis is geometrically linear.
     """
     c: Mapping[str, float] = region.constants
     volume = 2 / region.kappa_pa
@@ -260,10 +192,7 @@ def _material_card(
                 "in an analysis with large displacements the linear material becomes that of St. "
                 "Venant and Kirchhoff"
             )
-        return (
-            f"*ELASTIC\n{_format_values(region.young_pa, region.poisson)}\n",
-            limitation,
-        )
+        return (f"*ELASTIC\n{_format_values(region.young_pa, region.poisson)}\n", limitation)
     if region.material == "mooney-rivlin":
         constants = _format_values(c["c10_pa"], c["c01_pa"], volume)
         return f"*HYPERELASTIC,MOONEY-RIVLIN\n{constants}\n", ""
@@ -294,14 +223,9 @@ def _material_card(
             "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
             "agree for small changes of volume"
         )
-    if (
-        region.list_power_terms()
-        and len(region.list_power_terms()) <= MOST_TERMS
-    ):
+    if region.list_power_terms() and len(region.list_power_terms()) <= MOST_TERMS:
         is_foam = region.material.startswith("hyperfoam")
-        return _power_law_card(
-            region, volume
-        ), FOAM_LIMITATION if is_foam else ""
+        return _power_law_card(region, volume), FOAM_LIMITATION if is_foam else ""
     constants = _format_values(region.mu_pa / 2, volume)
     return f"*HYPERELASTIC,NEO HOOKE\n{constants}\n", (
         f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)²: the same λ and μ "
@@ -313,19 +237,11 @@ def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
     """Return the card of Ogden's law or of the foam.
 
     The energy of a term in the card is 2μ/α² (Σ λ^α − 3): μ is ½ μ_p α_p of Ogden's law.
-
-    Parameters
-    ----------
-    region : IdentifiedRegion
-    volume : float
-        Constant D₁ = 2/κ of the volumetric energy of Ogden's law [1/Pa].
     """
     terms = region.list_power_terms()
     if region.material.startswith("ogden"):
         keyword = "HYPERELASTIC,OGDEN"
-        values = [
-            value for t in terms for value in (t.mu_pa * t.alpha / 2, t.alpha)
-        ]
+        values = [value for t in terms for value in (t.mu_pa * t.alpha / 2, t.alpha)]
         values += [volume] + [ABSENT_TERM] * (len(terms) - 1)
     else:
         keyword = "HYPERFOAM"
@@ -335,9 +251,7 @@ def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
         _format_values(*values[k : k + VALUES_PER_LINE])
         for k in range(0, len(values), VALUES_PER_LINE)
     ]
-    return f"*{keyword},N={len(terms)}\n" + "".join(
-        f"{line}\n" for line in lines
-    )
+    return f"*{keyword},N={len(terms)}\n" + "".join(f"{line}\n" for line in lines)
 
 
 def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
@@ -360,18 +274,11 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     """
     program = shutil.which("ccx")
     if program is None:
-        raise InputError(
-            "the program ccx was not found: install CalculiX to verify the export"
-        )
+        raise InputError("the program ccx was not found: install CalculiX to verify the export")
     try:
         job = [program, "-i", DECK.removesuffix(".inp")]
         ended = subprocess.run(
-            job,
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            timeout=TIME_LIMIT_S,
-            check=False,
+            job, cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False
         )
     except subprocess.TimeoutExpired:
         raise InputError(
@@ -395,9 +302,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     (*_, ours), (*_, forces) = equilibria(body, len(times))
     sag_m = longest_displacement_m(ours)
     difference_m = longest_displacement_m(theirs - ours)
-    share = (
-        f" ({difference_m / sag_m:.2%} of the displacement)" if sag_m else ""
-    )
+    share = f" ({difference_m / sag_m:.2%} of the displacement)" if sag_m else ""
     remark = f"node positions differ by at most {difference_m:.3g} m{share}"
     what = "at rest" if len(times) == 1 else f"at {times[-1]:g} s"
     comparisons = [
@@ -409,38 +314,18 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
             remark=remark,
         )
     ]
-    for each, push, force in zip(
-        body.obstacles, their_forces, forces, strict=True
-    ):
+    for each, push, force in zip(body.obstacles, their_forces, forces, strict=True):
         their_n = float(np.linalg.norm(push))
         our_n = float(np.linalg.norm(force))
         comparisons.append(
-            PredictionComparison(
-                f"force of {each.name} {what}", their_n, ours=our_n, unit="N"
-            )
+            PredictionComparison(f"force of {each.name} {what}", their_n, ours=our_n, unit="N")
         )
     return comparisons
 
 
-def _read_final_state(
-    file: Path, count: int, steps: int
-) -> tuple[Array | None, Array]:
+def _read_final_state(file: Path, count: int, steps: int) -> tuple[Array | None, Array]:
     """Return the displacements (n, 3) [m] and obstacle forces (o, 3) [N] at the end of the last
     step.
-
-    Parameters
-    ----------
-    file : Path
-        The .dat file of CalculiX.
-    count : int
-        Number n of nodes of the body.
-    steps : int
-        Number of steps of the deck.
-
-    Returns
-    -------
-    displacements : (n, 3), or None if the last step was not completed
-    forces : (o, 3), with no rows if the file is missing
     """
     if not file.is_file():
         return None, np.zeros((0, 3))

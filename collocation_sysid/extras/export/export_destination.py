@@ -107,18 +107,13 @@ class ExportDestination:
             for file, each in contents.items():
                 draft = stack.enter_context(replaced_file(file))
                 draft.write_bytes(each.read_bytes())
-            listing = stack.enter_context(
-                replaced_file(self.folder / LIST_FILE)
-            )
+            listing = stack.enter_context(replaced_file(self.folder / LIST_FILE))
             text = list_as_text(listed_hashes(self.folder) | hashes)
             listing.write_text(text, encoding="utf-8")
 
 
 def parse_destination(
-    text: str,
-    main_files: Mapping[str, str],
-    run_folder: Path,
-    out: Path | None = None,
+    text: str, main_files: Mapping[str, str], run_folder: Path, out: Path | None = None
 ) -> ExportDestination:
     """Return the destination that --to names.
 
@@ -142,28 +137,17 @@ def parse_destination(
     """
     if text in main_files:
         folder = out or run_folder / f"export-{text}"
-        return ExportDestination(
-            text, folder, main_file=folder / main_files[text], is_folder=True
-        )
+        return ExportDestination(text, folder, main_file=folder / main_files[text], is_folder=True)
     path = Path(text)
     suffix = path.suffix.lower()
     if suffix:
-        formats = [
-            name
-            for name, file in main_files.items()
-            if Path(file).suffix == suffix
-        ]
+        formats = [name for name, file in main_files.items() if Path(file).suffix == suffix]
     else:
-        formats = [
-            name for name in main_files if f"-{path.name}".endswith(f"-{name}")
-        ]
+        formats = [name for name in main_files if f"-{path.name}".endswith(f"-{name}")]
     if not formats:
         raise InputError(
             f"found {text!r}; expected the name of a format, or a file with its suffix: "
-            + ", ".join(
-                f"{name} ({Path(file).suffix})"
-                for name, file in main_files.items()
-            )
+            + ", ".join(f"{name} ({Path(file).suffix})" for name, file in main_files.items())
             + hint_at(text, main_files),
             None,
             where="--to",
@@ -184,12 +168,8 @@ def parse_destination(
         )
     (name,) = formats
     if suffix:
-        return ExportDestination(
-            name, path.parent, main_file=path, is_folder=False
-        )
-    return ExportDestination(
-        name, path, main_file=path / main_files[name], is_folder=True
-    )
+        return ExportDestination(name, path.parent, main_file=path, is_folder=False)
+    return ExportDestination(name, path, main_file=path / main_files[name], is_folder=True)
 
 
 def _require_replaceable(file: Path) -> None:
@@ -198,9 +178,7 @@ def _require_replaceable(file: Path) -> None:
     is accepted.
     """
     if file.is_dir() and not file.is_symlink():
-        raise InputError(
-            "this is a folder; expected a file to write", file, where="--to"
-        )
+        raise InputError("this is a folder; expected a file to write", file, where="--to")
     if (file.exists() or file.is_symlink()) and not is_written_here(file):
         raise InputError(
             "this file exists and was not written by this program, or was changed since, so it "

@@ -37,7 +37,9 @@ MOTION = (
     "grasped nodes are fixed at their positions of the first sample; the motion is in the CSV "
     "files of poses beside this file, and your simulation has to apply it"
 )
-UNTESTED = "untested: written according to the description of the format, but never read by the simulator"
+UNTESTED = (
+    "untested: written according to the description of the format, but never read by the simulator"
+)
 
 
 @dataclass(frozen=True)
@@ -80,9 +82,7 @@ class PredictionComparison:
 
     def compute_relative_difference(self) -> float:
         """Return the relative difference (theirs − ours) / ours; NaN if ours is zero."""
-        return (
-            (self.theirs - self.ours) / self.ours if self.ours else float("nan")
-        )
+        return (self.theirs - self.ours) / self.ours if self.ours else float("nan")
 
 
 @dataclass(frozen=True)
@@ -105,9 +105,7 @@ class ExportTarget:
     name: str
     main_file: str
     export: Callable[[IdentifiedBody], ExportedFiles]
-    verify: (
-        Callable[[IdentifiedBody, Path], Sequence[PredictionComparison]] | None
-    ) = None
+    verify: Callable[[IdentifiedBody, Path], Sequence[PredictionComparison]] | None = None
 
 
 @dataclass(frozen=True)
@@ -139,7 +137,9 @@ class TargetCapabilities:
     """
 
     materials: Mapping[str, str]
-    other_materials: str = "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
+    other_materials: str = (
+        "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
+    )
     stiffness_damping: str = ""
     mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not supported"
     damping_law: str = ""
@@ -149,13 +149,7 @@ class TargetCapabilities:
     node_forces: str = "forces on nodes are not exported"
     point_masses: str = ""
     has_quadratic_elements: bool = False
-    obstacle_shapes: tuple[str, ...] = (
-        "plane",
-        "sphere",
-        "box",
-        "cylinder",
-        "capsule",
-    )
+    obstacle_shapes: tuple[str, ...] = ("plane", "sphere", "box", "cylinder", "capsule")
     has_rounded_edges: bool = True
     has_face_selection: bool = True
     has_friction: bool = True
@@ -174,19 +168,15 @@ class TargetCapabilities:
         for region in body.regions:
             damped = bool(region.gamma_r_s)
             templates = [
-                *[VISCOELASTICITY]
-                * (bool(region.branches) and not self.has_viscoelasticity),
-                *[self.other_materials]
-                * (region.material not in self.materials),
-                *[self.stiffness_damping]
-                * (damped and region.damping != self.damping_law),
+                *[VISCOELASTICITY] * (bool(region.branches) and not self.has_viscoelasticity),
+                *[self.other_materials] * (region.material not in self.materials),
+                *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),
             ]
             at_once = 1 + sum(branch.share for branch in region.branches)
             values = {**vars(region), "at_once": at_once}
             sentences += [
-                f"{region.name}: {each.format(**values)}"
-                for each in filter(None, templates)
+                f"{region.name}: {each.format(**values)}" for each in filter(None, templates)
             ]
         if not self.has_moving_grasps:
             sentences.append(MOTION)
@@ -225,15 +215,10 @@ class TargetCapabilities:
         Of an obstacle whose shape is not exported nothing else is said.
         """
         for each in body.obstacles:
-            if (
-                kind := Primitive.from_solid(each.shape).kind
-            ) not in self.obstacle_shapes:
+            if (kind := Primitive.from_solid(each.shape).kind) not in self.obstacle_shapes:
                 yield f"{each.name}: an obstacle of the kind {kind} is not exported"
                 continue
-            if (
-                getattr(each.shape, "rounding_m", 0.0)
-                and not self.has_rounded_edges
-            ):
+            if getattr(each.shape, "rounding_m", 0.0) and not self.has_rounded_edges:
                 yield f"{each.name}: its edges are not rounded"
             if each.faces is not None and not self.has_face_selection:
                 yield f"{each.name}: the whole surface of the body may touch it"
@@ -298,26 +283,18 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
         air_density_kg_m3="none",
     )
     if samples > 1:
-        states = (
-            simulate(experiment, body.theta)
-            .positions_m[:samples]
-            .reshape(samples, -1)
-        )
+        states = simulate(experiment, body.theta).positions_m[:samples].reshape(samples, -1)
     else:
         states = equilibrium(experiment, body.theta)[None]
     # In statics friction follows the displacement since the previous sample.
     ways = np.diff(states, axis=0, prepend=states[:1])
-    forces = Forces.from_experiment(
-        experiment, experiment.t_s[:samples], theta=body.theta
-    ).total(states, ways)
+    forces = Forces.from_experiment(experiment, experiment.t_s[:samples], theta=body.theta).total(
+        states, ways
+    )
     on_nodes = forces.reshape(samples, -1, 3)
     on_body = [-on_nodes[:, each.nodes].sum(axis=1) for each in body.obstacles]
-    moved_m = (
-        states.reshape(samples, -1, 3)[:, : len(body.nodes_m)] - body.nodes_m
-    )
-    return moved_m, np.stack(on_body, axis=1) if on_body else np.zeros(
-        (samples, 0, 3)
-    )
+    moved_m = states.reshape(samples, -1, 3)[:, : len(body.nodes_m)] - body.nodes_m
+    return moved_m, np.stack(on_body, axis=1) if on_body else np.zeros((samples, 0, 3))
 
 
 def longest_displacement_m(displacements_m: Array) -> float:
@@ -339,15 +316,11 @@ def linear_tetrahedra(body: IdentifiedBody) -> list[Index]:
     return [eight[region.cells].reshape(-1, 4) for region in body.regions]
 
 
-def values_as_text(
-    values: Iterable[float] | Array, separator: str = " "
-) -> str:
+def values_as_text(values: Iterable[float] | Array, separator: str = " ") -> str:
     """Return numbers, of an array in row-major order, as text from which they are read back
     exactly, with `separator` between them.
     """
-    return separator.join(
-        repr(float(value)) for value in np.ravel(np.asarray(values))
-    )
+    return separator.join(repr(float(value)) for value in np.ravel(np.asarray(values)))
 
 
 def comment_lines(
@@ -372,10 +345,7 @@ def comment_lines(
             f"gamma_m = {region.gamma_m_1_s:.6g} 1/s"
         )
     # No line may end the comment itself.
-    texts = (
-        re.sub("-(?=-)", "- ", " ".join(printable(line).split()))
-        for line in lines
-    )
+    texts = (re.sub("-(?=-)", "- ", " ".join(printable(line).split())) for line in lines)
     return "".join(f"{start}{text}{end}\n" for text in texts)
 
 

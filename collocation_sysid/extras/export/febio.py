@@ -11,12 +11,7 @@ import numpy as np
 
 from ...common.array_types import Index
 from ...fem.laws.constants import MOST_TERMS
-from .export_target import (
-    ExportedFiles,
-    TargetCapabilities,
-    comment_lines,
-    values_as_text,
-)
+from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
 from .identified import IdentifiedBody, IdentifiedRegion
 from .obstacle_shapes import FacetedObstacle, faceted_obstacles
 
@@ -71,8 +66,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     """
     limits = CAPABILITIES.limitations(body)
     materials = "".join(
-        _material_xml(k, region, limits=limits)
-        for k, region in enumerate(body.regions, 1)
+        _material_xml(k, region, limits=limits) for k, region in enumerate(body.regions, 1)
     )
     xml = '<?xml version="1.0" encoding="UTF-8"?>\n' + comment_lines(
         body, limits, start="<!-- ", end=" -->"
@@ -102,26 +96,14 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     return ExportedFiles({MODEL: f"{xml}</febio_spec>\n"}, tuple(limits))
 
 
-def _material_xml(
-    number: int, region: IdentifiedRegion, limits: list[str]
-) -> str:
-    """Return the XML of the material of a region, with its viscoelastic branches.
-
-    Parameters
-    ----------
-    number : int
-        Number of the material in the file, from 1.
-    region : IdentifiedRegion
-        Region with its constants.
-    limits : list of str
-        Sentences on what the material does not express are appended, in place.
-    """
+def _material_xml(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
+    """Return the XML of the material of a region, with its viscoelastic branches."""
     kind, values, uncoupled = _elastic_law(region, limits)
-    inner = "".join(
-        f"<{tag}>{value!r}</{tag}>" for tag, value in values.items()
-    )
+    inner = "".join(f"<{tag}>{value!r}</{tag}>" for tag, value in values.items())
     if uncoupled:
-        inner += f"<k>{region.kappa_pa!r}</k><pressure_model>{QUADRATIC_PRESSURE_MODEL}</pressure_model>"
+        inner += (
+            f"<k>{region.kappa_pa!r}</k><pressure_model>{QUADRATIC_PRESSURE_MODEL}</pressure_model>"
+        )
     density = f"<density>{region.density_kg_m3!r}</density>"
     name = f'name="{region.name}"'
     if not region.branches:
@@ -159,13 +141,8 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> ElasticLaw:
         # The energy of a term is c/m² (Σ λ̄^m − 3).
         values = {}
         for number, term in enumerate(region.list_power_terms(), start=1):
-            values |= {
-                f"c{number}": term.mu_pa * term.alpha,
-                f"m{number}": term.alpha,
-            }
-        return ElasticLaw(
-            CAPABILITIES.materials[region.material], values, is_uncoupled=True
-        )
+            values |= {f"c{number}": term.mu_pa * term.alpha, f"m{number}": term.alpha}
+        return ElasticLaw(CAPABILITIES.materials[region.material], values, is_uncoupled=True)
     moduli = {"E": region.young_pa, "v": region.poisson}
     if region.material == "linear":
         limits.append(
@@ -173,15 +150,11 @@ def _elastic_law(region: IdentifiedRegion, limits: list[str]) -> ElasticLaw:
             "of this program does not"
         )
     return ElasticLaw(
-        CAPABILITIES.materials.get(region.material, "neo-Hookean"),
-        moduli,
-        is_uncoupled=False,
+        CAPABILITIES.materials.get(region.material, "neo-Hookean"), moduli, is_uncoupled=False
     )
 
 
-def _mesh_xml(
-    body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]
-) -> str:
+def _mesh_xml(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
     """Return the XML of nodes, elements, node sets of prescribed axes, domains and prescribed
     displacements, also of obstacles; indices in the file count from 1.
     """
@@ -193,9 +166,7 @@ def _mesh_xml(
     for region in body.regions:
         kind = "tet10" if body.is_quadratic else "tet4"
         xml += f'<Elements type="{kind}" name="cells_{region.name}">\n'
-        for cell, nodes in zip(
-            region.cells, body.body.cells[region.cells] + 1, strict=True
-        ):
+        for cell, nodes in zip(region.cells, body.body.cells[region.cells] + 1, strict=True):
             xml += f'<elem id="{cell + 1}">{",".join(map(str, nodes))}</elem>\n'
         xml += "</Elements>\n"
     for axis, is_prescribed in zip("xyz", body.is_prescribed.T, strict=True):
@@ -205,15 +176,11 @@ def _mesh_xml(
     xml += facets
     domains = "".join(
         f'<SolidDomain name="cells_{name}" mat="{name}"/>\n'
-        for name in [r.name for r in body.regions]
-        + [f"wall_{k}" for k in range(len(obstacles))]
+        for name in [r.name for r in body.regions] + [f"wall_{k}" for k in range(len(obstacles))]
     )
     maps = ""
     for axis, is_prescribed, displacement in zip(
-        "xyz",
-        body.is_prescribed.T,
-        body.prescribed_displacements_m.T,
-        strict=True,
+        "xyz", body.is_prescribed.T, body.prescribed_displacements_m.T, strict=True
     ):
         if displacement.any():
             rows = "".join(
@@ -232,10 +199,7 @@ def _prescribed_displacement_xml(body: IdentifiedBody) -> str:
     """
     conditions = ""
     for axis, is_prescribed, displacement in zip(
-        "xyz",
-        body.is_prescribed.T,
-        body.prescribed_displacements_m.T,
-        strict=True,
+        "xyz", body.is_prescribed.T, body.prescribed_displacements_m.T, strict=True
     ):
         where = f'name="hold_{axis}" node_set="held_{axis}"'
         if displacement.any():
@@ -255,13 +219,6 @@ def _obstacle_mesh_xml(
     and obstacles; two empty texts without obstacles.
 
     Each obstacle has a tetrahedron under each facet.
-
-    Parameters
-    ----------
-    body : IdentifiedBody
-        Body whose faces may touch the obstacles.
-    obstacles : sequence of FacetedObstacle
-        Its obstacles.
     """
     solids = ""
     facets = ""
@@ -271,16 +228,11 @@ def _obstacle_mesh_xml(
             f'<node id="{i}">{values_as_text(point, ",")}</node>\n'
             for i, point in enumerate(wall.start_points_m, wall.first_node + 1)
         )
-        cells = _numbered_elements(
-            "elem", wall.build_tetrahedra() + 1, offset=wall.first_cell
-        )
+        cells = _numbered_elements("elem", wall.build_tetrahedra() + 1, offset=wall.first_cell)
         solids += f'<Nodes name="nodes_wall_{k}">\n{nodes}</Nodes>\n'
         solids += f'<Elements type="tet4" name="cells_wall_{k}">\n{cells}</Elements>\n'
         touching = body.body.nodes.nodes_of_faces(corners[wall.faces]) + 1
-        for name, sides in (
-            ("body", touching),
-            ("wall", wall.build_triangles() + 1),
-        ):
+        for name, sides in (("body", touching), ("wall", wall.build_triangles() + 1)):
             rows = _numbered_elements(f"tri{sides.shape[1]}", sides)
             facets += f'<Surface name="{name}_side_{k}">\n{rows}</Surface>\n'
         facets += (
@@ -309,9 +261,7 @@ def _contact_xml(obstacles: Sequence[FacetedObstacle]) -> str:
     driven = ""
     contacts = ""
     for k, wall in enumerate(obstacles):
-        fixed = "".join(
-            f"<{dof}_dof>1</{dof}_dof>" for dof in ("Ru", "Rv", "Rw")
-        )
+        fixed = "".join(f"<{dof}_dof>1</{dof}_dof>" for dof in ("Ru", "Rv", "Rw"))
         driven += f'<rigid_bc type="rigid_fixed"><rb>wall_{k}</rb>{fixed}</rigid_bc>\n'
         for axis, way in zip("xyz", -wall.retraction_m, strict=True):
             driven += (
@@ -324,8 +274,4 @@ def _contact_xml(obstacles: Sequence[FacetedObstacle]) -> str:
             "<auto_penalty>0</auto_penalty><symmetric_stiffness>0</symmetric_stiffness>"
             f"<fric_coeff>{float(wall.obstacle.friction)!r}</fric_coeff></contact>\n"
         )
-    return (
-        f"<Rigid>\n{driven}</Rigid>\n<Contact>\n{contacts}</Contact>\n"
-        if obstacles
-        else ""
-    )
+    return f"<Rigid>\n{driven}</Rigid>\n<Contact>\n{contacts}</Contact>\n" if obstacles else ""

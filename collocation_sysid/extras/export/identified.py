@@ -121,9 +121,7 @@ class IdentifiedRegion:
             return ()
         c = self.constants
         return tuple(
-            PowerTerm(
-                c[f"mu_{p}_pa"], c[f"alpha_{p}"], beta=c.get(f"beta_{p}", 0.0)
-            )
+            PowerTerm(c[f"mu_{p}_pa"], c[f"alpha_{p}"], beta=c.get(f"beta_{p}", 0.0))
             for p in term_numbers(c)
         )
 
@@ -145,24 +143,16 @@ def without_obstacles(experiment: Experiment) -> Experiment:
     t_s = experiment.t_s
     own = len(body.nodes.points_m)
     started = {
-        name: None
-        if (positions_m := getattr(experiment, name)) is None
-        else positions_m[:own]
+        name: None if (positions_m := getattr(experiment, name)) is None else positions_m[:own]
         for name in ("start_positions_m", "start_velocities_m_s")
     }
     # Placeholder: see the docstring.
     some = Markers(
-        t_s,
-        np.zeros((len(t_s), 1, 3)),
-        sigma_m=1e-3,
-        names=["corner"],
-        places_m=body.nodes_m[:1],
+        t_s, np.zeros((len(t_s), 1, 3)), sigma_m=1e-3, names=["corner"], places_m=body.nodes_m[:1]
     )
     unmeasured: dict[str, Any] = {"markers": some, **NO_SENSORS}
     try:
-        return replace(
-            experiment, grasps=experiment.body_grasps, **started, **unmeasured
-        )
+        return replace(experiment, grasps=experiment.body_grasps, **started, **unmeasured)
     except InputError as error:
         raise InputError(
             "exports leave obstacles out, and the body has no equilibrium without them; expected a "
@@ -209,10 +199,7 @@ class IdentifiedBody:
 
     @classmethod
     def read(
-        cls,
-        run: str | Path,
-        experiment: str | None = None,
-        allow_code: bool = False,
+        cls, run: str | Path, experiment: str | None = None, allow_code: bool = False
     ) -> IdentifiedBody:
         """Read the body from a run folder, as a run identified it; nothing is written.
 
@@ -244,55 +231,41 @@ class IdentifiedBody:
         )
         with damaged_run_refused(folder):
             _warnings(result)
-        problem = Problem.read(
-            folder / "problem.toml", allow_code=allow_code, folder=home
-        )
+        problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
         problem = problem.with_lengths(
             {n: each.shapes.length_m for n, each in result.fields.items()}
         )
         if problem.parameters.free:
-            problem = answer.apply_to_problem(
-                problem
-            )  # which may state no guess itself
+            problem = answer.apply_to_problem(problem)  # which may state no guess itself
         with located(folder):
             _require_stress_free(problem)
         collocation = problem.collocation()
-        names = [
-            segment.experiment.name for segment in collocation.transcriptions
-        ]
+        names = [transcription.experiment.name for transcription in collocation.transcriptions]
         if experiment is not None and experiment not in names:
             raise InputError(_not_fitted(experiment, names), folder)
-        segment = collocation.transcriptions[
-            names.index(experiment) if experiment else 0
-        ]
+        transcription = collocation.transcriptions[names.index(experiment) if experiment else 0]
         with damaged_run_refused(folder):
             values = {
                 item.name: result.parameters[item.name].value
                 for item in problem.parameters.components
             }
-        phi = answer.apply_to_nuisance(collocation)[0][
-            segment.nuisance_indices.indices
-        ]
+        phi = answer.apply_to_nuisance(collocation)[0][transcription.nuisance_indices.indices]
         with damaged_run_refused(folder):
-            replay = MotionRecord.from_arrays(
-                segment.experiment.name, read_arrays(folder)
-            )
-            nodes_m = segment.body.nodes.points_m
+            replay = MotionRecord.from_arrays(transcription.experiment.name, read_arrays(folder))
+            nodes_m = transcription.body.nodes.points_m
             if replay.undeformed_m.shape != nodes_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
         with located(folder):
             return cls._from_experiment(
                 result,
-                segment.corrected_experiment(phi),
+                transcription.corrected_experiment(phi),
                 values=values,
                 simulated_m=replay.rolled_out_positions_m,
                 title=problem.title,
             )
 
     @classmethod
-    def from_run(
-        cls, run: SolvedProblem, experiment: str | None = None
-    ) -> IdentifiedBody:
+    def from_run(cls, run: SolvedProblem, experiment: str | None = None) -> IdentifiedBody:
         """Build from a run in memory, which needs no problem file.
 
         Parameters
@@ -309,16 +282,14 @@ class IdentifiedBody:
             refused.
         """
         _require_stress_free(run.problem)
-        parts = {
-            part.segment.experiment.name: part for part in run.solution.parts
-        }
+        parts = {part.transcription.experiment.name: part for part in run.solution.parts}
         if experiment is not None and experiment not in parts:
             raise InputError(_not_fitted(experiment, list(parts)))
         part = parts[experiment] if experiment else next(iter(parts.values()))
-        rollout = run.rollouts[part.segment.experiment.name]
+        rollout = run.rollouts[part.transcription.experiment.name]
         return cls._from_experiment(
             build_result(run),
-            part.segment.corrected_experiment(part.phi),
+            part.transcription.corrected_experiment(part.phi),
             values=run.parameters,
             simulated_m=rollout.trajectory.positions_m
             if isinstance(rollout, ForwardSimulation)
@@ -336,50 +307,23 @@ class IdentifiedBody:
         simulated_m: Array | None,
         title: str,
     ) -> IdentifiedBody:
-        """Build from the result of a run.
-
-        Parameters
-        ----------
-        result : Result
-            Content of ``result.json``.
-        corrected : Experiment
-            The fitted experiment to export, with its estimated nuisance parameters.
-        values : mapping of name to float
-            Estimated and fixed parameters.
-        simulated_m : (T, n, 3) array or None
-            Node positions of the forward simulation [m].
-        title : str
-            Title of the problem.
-
-        Raises
-        ------
-        InputError
-            If the body cannot be separated from its obstacles, see `without_obstacles`.
-        """
+        """Build from the result of a run."""
         body = corrected.body
         obstacles = tuple(
-            replace(o, friction=values[o.friction])
-            if isinstance(o.friction, str)
-            else o
+            replace(o, friction=values[o.friction]) if isinstance(o.friction, str) else o
             for o in corrected.obstacles
         )
         touching = corrected.with_obstacles(obstacles) if obstacles else None
         if obstacles:
             corrected = without_obstacles(corrected)
             body = corrected.body
-            simulated_m = (
-                None
-                if simulated_m is None
-                else simulated_m[:, : len(body.nodes_m)]
-            )
+            simulated_m = None if simulated_m is None else simulated_m[:, : len(body.nodes_m)]
         return cls(
             title,
             result.trust.verdict,
             warnings=_warnings(result),
             parameters={
-                n: each
-                for n, each in result.parameters.items()
-                if n in result.collect_estimates()
+                n: each for n, each in result.parameters.items() if n in result.collect_estimates()
             },
             body=body,
             theta=body.theta_from_values(values),
@@ -463,9 +407,7 @@ class IdentifiedBody:
         point masses, but not that of the body.
         """
         weight = self.point_masses_kg[:, None] * self.experiment.gravity_m_s2
-        return (
-            self.experiment.declared_node_forces_n([self.start_s])[0] + weight
-        )
+        return self.experiment.declared_node_forces_n([self.start_s])[0] + weight
 
     @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:
@@ -475,13 +417,8 @@ class IdentifiedBody:
         lame = body.lame(self.theta)
         shares = body.split_theta(self.theta)
         densities = body.densities(self.theta)
-        for part, share, density in zip(
-            body.parts, shares, densities, strict=True
-        ):
-            values = {
-                c.name: float(v)
-                for c, v in zip(part.constants, share, strict=True)
-            }
+        for part, share, density in zip(body.parts, shares, densities, strict=True):
+            values = {c.name: float(v) for c, v in zip(part.constants, share, strict=True)}
             young, poisson = engineering_constants(*lame[part.name])
             regions.append(
                 IdentifiedRegion(
@@ -498,9 +435,7 @@ class IdentifiedBody:
                     values.get("gamma_m_1_s", 0.0),
                     tuple(
                         IdentifiedBranch(
-                            b.name,
-                            values[f"{b.name}.share"],
-                            tau_s=values[f"{b.name}.tau_s"],
+                            b.name, values[f"{b.name}.share"], tau_s=values[f"{b.name}.tau_s"]
                         )
                         for b in part.prony
                     ),
@@ -600,13 +535,9 @@ def _warnings(result: Result) -> tuple[str, ...]:
     if not result.converged:
         warnings.append("the run did not converge")
     if (verdict := result.trust.verdict) != "good":
-        warnings.append(
-            f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}"
-        )
+        warnings.append(f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}")
     if result.fields:
-        warnings.append(
-            f"{listed(result.fields)} varies in space: the mean is exported"
-        )
+        warnings.append(f"{listed(result.fields)} varies in space: the mean is exported")
     for name, each in result.parameters.items():
         if each.at_bound and not each.fixed:
             warnings.append(

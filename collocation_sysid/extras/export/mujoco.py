@@ -69,10 +69,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         For grasps that hold single axes, or not during the whole recording.
     """
     for k, grasp in enumerate(body.experiment.grasps, start=1):
-        if (
-            grasp.axes != "xyz"
-            or not grasp.is_active(body.experiment.t_s).all()
-        ):
+        if grasp.axes != "xyz" or not grasp.is_active(body.experiment.t_s).all():
             raise InputError(
                 f"grasp {k} holds only {grasp.axes}, from {grasp.from_s:g} s until "
                 f"{grasp.until_s:g} s; a mocap body of MuJoCo holds nodes along all axes, "
@@ -167,16 +164,9 @@ def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
     """Return position (3,) [m] and unit quaternion (w, x, y, z) of a grasp or obstacle at a time
     `t_s` [s], interpolated between its poses, or up to half a sample beyond them continued or held,
     see `PoseSequence.at`. A single pose holds at all times.
-
-    Raises
-    ------
-    InputError
-        If the time is more than half a sample before or after several poses.
     """
     rotations, positions = grasp.poses.at([t_s])
-    return positions[0], np.roll(
-        Rotation.from_matrix(rotations[0]).as_quat(), 1
-    )
+    return positions[0], np.roll(Rotation.from_matrix(rotations[0]).as_quat(), 1)
 
 
 def _node_xml(body: IdentifiedBody) -> str:
@@ -187,8 +177,7 @@ def _node_xml(body: IdentifiedBody) -> str:
     mass = body.total_node_mass_kg
     for n in np.flatnonzero(~body.is_node_prescribed):
         joints = "".join(
-            f'<joint type="slide" axis="{axis}"/>'
-            for axis in ("1 0 0", "0 1 0", "0 0 1")
+            f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1")
         )
         # Nodes do not rotate, but MuJoCo requires a moment of inertia.
         inertia = max(1e-6 * float(mass[n]), 1e-12)
@@ -207,18 +196,14 @@ def _flex_xml(body: IdentifiedBody) -> str:
     Bodies are named "node0", …, except those of grasped nodes, "grasp0", …, whose positions are
     those in the undeformed body. The thickness of the skin follows the mean edge of the mesh.
     """
-    names = np.array(
-        [f"node{n}" for n in range(len(body.nodes_m))], dtype=object
-    )
+    names = np.array([f"node{n}" for n in range(len(body.nodes_m))], dtype=object)
     places = np.zeros_like(body.nodes_m)
     for k, grasp in enumerate(body.experiment.grasps):
         names[grasp.nodes] = f"grasp{k}"
         places[grasp.nodes] = body.body.nodes_m[grasp.nodes]
     skin = RELATIVE_SKIN_RADIUS * _mean_edge_m(body)
     lines = ""
-    for region, cells in zip(
-        body.regions, linear_tetrahedra(body), strict=True
-    ):
+    for region, cells in zip(body.regions, linear_tetrahedra(body), strict=True):
         used, elements = np.unique(cells, return_inverse=True)
         lines += (
             f'<flex name="{region.name}" dim="3" radius="{skin!r}" body="{" ".join(names[used])}" '
@@ -249,15 +234,9 @@ def _keyframe_xml(body: IdentifiedBody) -> str:
     started = body.experiment.start_velocities_m_s
     velocity = np.zeros_like(shape) if started is None else started
     grasps = body.experiment.grasps
-    carriers = [
-        np.concatenate(_pose_at(grasp, body.start_s)) for grasp in grasps
-    ]
-    places = values_as_text(
-        np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()])
-    )
-    speeds = values_as_text(
-        np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()])
-    )
+    carriers = [np.concatenate(_pose_at(grasp, body.start_s)) for grasp in grasps]
+    places = values_as_text(np.concatenate([*carriers, (shape - body.nodes_m)[free].ravel()]))
+    speeds = values_as_text(np.concatenate([np.zeros(6 * len(grasps)), velocity[free].ravel()]))
     return f'<key name="start" qpos="{places}" qvel="{speeds}"/>\n'
 
 
@@ -315,13 +294,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
 
 
 def _import_mujoco() -> ModuleType:
-    """Return the module mujoco.
-
-    Raises
-    ------
-    InputError
-        If it is missing or older than version `OLDEST_VERSION`.
-    """
+    """Return the module mujoco."""
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -344,14 +317,6 @@ def _compare_first_frequency(
     here [Hz], in vacuum and without rigid modes.
 
     The stiffness in MuJoCo follows from central differences of its forces.
-
-    Parameters
-    ----------
-    body : IdentifiedBody
-    mujoco : module
-        Module of MuJoCo.
-    model : MjModel
-        Exported model.
     """
     data = mujoco.MjData(model)
     free = ~body.is_node_prescribed
@@ -369,46 +334,23 @@ def _compare_first_frequency(
         columns[:, column] = (ends[1] - ends[0]) / (2 * probe)
     mass = np.repeat((body.total_node_mass_kg)[free], 3)
     root = 1 / np.sqrt(mass)
-    squares = eigh(
-        (columns + columns.T) / 2 * np.outer(root, root), eigvals_only=True
-    )
+    squares = eigh((columns + columns.T) / 2 * np.outer(root, root), eigvals_only=True)
     oscillating = squares[squares > 1e-9 * squares[-1]]
     theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
     dofs = np.flatnonzero(np.repeat(free, 3))
     in_vacuum = replace(body.experiment, air_density_kg_m3="none")
     forces = Forces.from_experiment(in_vacuum, body.start_s, theta=body.theta)
-    ours = natural_modes(
-        forces, body.nodes_m, free_dofs=dofs, count=1
-    ).frequencies_hz
+    ours = natural_modes(forces, body.nodes_m, free_dofs=dofs, count=1).frequencies_hz
     return PredictionComparison(
-        "first natural frequency, undeformed",
-        theirs,
-        ours=float(ours[0]),
-        unit="Hz",
+        "first natural frequency, undeformed", theirs, ours=float(ours[0]), unit="Hz"
     )
 
 
-def _compare_motion(
-    body: IdentifiedBody, mujoco: ModuleType, model: Any
-) -> PredictionComparison:
+def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> PredictionComparison:
     """Return the comparison of the RMS deformation over the recording in MuJoCo and here [m].
 
     Deformation is the distance of free nodes from the rigidly moved body. The equality constraints
     of `model` are switched off, in place, and grasped bodies are moved directly.
-
-    Parameters
-    ----------
-    body : IdentifiedBody
-        Body with a forward simulation.
-    mujoco : module
-        Module of MuJoCo.
-    model : MjModel
-        Exported model.
-
-    Raises
-    ------
-    InputError
-        If more than `MAX_STEPS` steps are needed.
     """
     e = body.experiment
     free = ~body.is_node_prescribed
@@ -428,10 +370,7 @@ def _compare_motion(
             body,
             mujoco,
             data=data,
-            time_and_step_s=(
-                body.start_s + k * model.opt.timestep,
-                model.opt.timestep,
-            ),
+            time_and_step_s=(body.start_s + k * model.opt.timestep, model.opt.timestep),
         )
         mujoco.mj_step(model, data)
         if (k + 1) % steps == 0:
@@ -446,19 +385,12 @@ def _compare_motion(
     remark = f"both simulations differ by {difference_m:.3g} m (RMS){share}"
     what = "RMS deformation over the recording"
     return PredictionComparison(
-        what,
-        _rms_length(theirs - rigid_m),
-        ours=size_m,
-        unit="m",
-        remark=remark,
+        what, _rms_length(theirs - rigid_m), ours=size_m, unit="m", remark=remark
     )
 
 
 def _set_grasp_state(
-    body: IdentifiedBody,
-    mujoco: ModuleType,
-    data: Any,
-    time_and_step_s: tuple[float, float],
+    body: IdentifiedBody, mujoco: ModuleType, data: Any, time_and_step_s: tuple[float, float]
 ) -> None:
     """Set pose and velocity of the bodies that carry grasped nodes, and the pose of obstacles, in
     `data`, in place.
@@ -467,30 +399,15 @@ def _set_grasp_state(
     of `qvel`. Obstacles are mocap bodies, after those of the grasps in `mocap_pos` and
     `mocap_quat`; the mocap bodies of the grasps are not changed. After the last sample all stay at
     its pose.
-
-    Parameters
-    ----------
-    body : IdentifiedBody
-        Body with the poses.
-    mujoco : module
-        Module of MuJoCo.
-    data : MjData
-        Modified in place.
-    time_and_step_s : (float, float)
-        Time and timestep [s]; velocities lead to the pose one step later.
     """
     t_s, step_s = time_and_step_s
     last_s = float(body.experiment.t_s[-1])
     turning = np.zeros(3)
     for k, grasp in enumerate(body.experiment.grasps):
-        here, there = (
-            _pose_at(grasp, min(at_s, last_s)) for at_s in (t_s, t_s + step_s)
-        )
+        here, there = (_pose_at(grasp, min(at_s, last_s)) for at_s in (t_s, t_s + step_s))
         mujoco.mju_subQuat(turning, there[1], here[1])
         data.qpos[7 * k : 7 * k + 7] = np.concatenate(here)
-        data.qvel[6 * k : 6 * k + 6] = (
-            np.concatenate([there[0] - here[0], turning]) / step_s
-        )
+        data.qvel[6 * k : 6 * k + 6] = np.concatenate([there[0] - here[0], turning]) / step_s
     for k, each in enumerate(body.obstacles, len(body.experiment.grasps)):
         data.mocap_pos[k], data.mocap_quat[k] = _pose_at(each, min(t_s, last_s))
 

@@ -134,9 +134,7 @@ class SharedContact:
     limitations: tuple[str, ...]
 
     @classmethod
-    def from_obstacles(
-        cls, obstacles: Sequence[FacetedObstacle]
-    ) -> SharedContact:
+    def from_obstacles(cls, obstacles: Sequence[FacetedObstacle]) -> SharedContact:
         """Return the contact constants that represent all obstacles: the friction of the first one,
         the largest stiffness of a node, and half of the largest width as the particle radius; zeros
         without obstacles. If obstacles differ in a constant, `limitations` has one sentence on
@@ -147,9 +145,7 @@ class SharedContact:
             "stiffness": [wall.node_stiffness_n_m for wall in obstacles],
             "width": [wall.width_m for wall in obstacles],
         }
-        friction, stiffness, width = (
-            values or [0.0] for values in constants.values()
-        )
+        friction, stiffness, width = (values or [0.0] for values in constants.values())
         unlike = [
             name
             for name, values in constants.items()
@@ -185,9 +181,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         cells.append(own)
         # Damping stress of Newton: 4 k Ė; of this package: γ_r (2 μ Ė + λ tr(Ė) I).
         damping = region.gamma_r_s * region.mu_pa / 2
-        constants.append(
-            np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1))
-        )
+        constants.append(np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1)))
     contact = SharedContact.from_obstacles(faceted_obstacles(body))
     limits = [
         *CAPABILITIES.limitations(body),
@@ -198,9 +192,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     ]
     k_mu, k_lambda, k_damp = np.concatenate(constants).T
     data = {
-        "nodes_m": np.where(
-            body.is_prescribed, body.prescribed_m, body.nodes_m
-        ),
+        "nodes_m": np.where(body.is_prescribed, body.prescribed_m, body.nodes_m),
         "cells": np.concatenate(cells),
         "k_mu": k_mu,
         "k_lambda": k_lambda,
@@ -211,9 +203,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         "contact_m": contact.particle_radius_m,
         "contact_n_m": contact.node_stiffness_n_m,
         "contact_mu": contact.friction,
-        "obstacles": [
-            _obstacle_data(each, body.start_s) for each in body.obstacles
-        ],
+        "obstacles": [_obstacle_data(each, body.start_s) for each in body.obstacles],
     }
     files = {
         MODULE_FILE: comment_lines(body, limits, start="# ") + _MODULE_SOURCE,
@@ -236,9 +226,7 @@ def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
     return {
         "name": obstacle.name,
         "kind": shape.kind,
-        "size": dict(
-            zip(SIZE_ARGUMENTS[shape.kind], sizes.tolist(), strict=True)
-        ),
+        "size": dict(zip(SIZE_ARGUMENTS[shape.kind], sizes.tolist(), strict=True)),
         "place_m": place_m,
         "quaternion_xyzw": turn.as_quat(),
         "friction": float(obstacle.friction),
@@ -271,9 +259,7 @@ def compare_at_rest(
     try:
         newton: Any = import_module("newton")
     except ImportError as error:
-        raise InputError(
-            "install Newton to verify the export: pip install newton"
-        ) from error
+        raise InputError("install Newton to verify the export: pip install newton") from error
 
     builder = newton.ModelBuilder()
     contact = SharedContact.from_obstacles(faceted_obstacles(body))
@@ -293,9 +279,7 @@ def compare_at_rest(
     pipeline = newton.CollisionPipeline(model)
     # Obstacles do not move, so that rigid bodies need not be solved for.
     solver = newton.solvers.SolverVBD(
-        model,
-        iterations=SOLVER_ITERATIONS,
-        integrate_with_external_rigid_solver=True,
+        model, iterations=SOLVER_ITERATIONS, integrate_with_external_rigid_solver=True
     )
     before: Any = model.state()
     after = model.state()

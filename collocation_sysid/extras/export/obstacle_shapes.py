@@ -13,15 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...model.contact.contact_force import contact_terms
-from ...recording import (
-    Capsule,
-    Cuboid,
-    Cylinder,
-    Obstacle,
-    Plane,
-    Solid,
-    Sphere,
-)
+from ...recording import Capsule, Cuboid, Cylinder, Obstacle, Plane, Solid, Sphere
 from ...recording.obstacle_solids import solid_key
 from .identified import IdentifiedBody
 
@@ -60,18 +52,10 @@ class Primitive:
         turn = Rotation.identity()
         if isinstance(solid, Plane):
             return cls(
-                kind,
-                np.zeros(0),
-                centre_m=solid.point_m,
-                rotation=_rotation_of_z_to(solid.normal),
+                kind, np.zeros(0), centre_m=solid.point_m, rotation=_rotation_of_z_to(solid.normal)
             )
         if isinstance(solid, Sphere):
-            return cls(
-                kind,
-                np.array([solid.radius_m]),
-                centre_m=solid.centre_m,
-                rotation=turn,
-            )
+            return cls(kind, np.array([solid.radius_m]), centre_m=solid.centre_m, rotation=turn)
         if isinstance(solid, Cuboid):
             return cls(
                 kind,
@@ -82,12 +66,7 @@ class Primitive:
         assert isinstance(solid, (Cylinder, Capsule))
         way = np.diff(solid.ends_m, axis=0)[0]
         size = np.array([solid.radius_m, np.linalg.norm(way) / 2])
-        return cls(
-            kind,
-            size,
-            centre_m=solid.ends_m.mean(axis=0),
-            rotation=_rotation_of_z_to(way),
-        )
+        return cls(kind, size, centre_m=solid.ends_m.mean(axis=0), rotation=_rotation_of_z_to(way))
 
     def pose_at(self, obstacle: Obstacle, t_s: float) -> tuple[Array, Rotation]:
         """Return position (3,) [m] and rotation of the shape in the world at a time.
@@ -106,9 +85,7 @@ class Primitive:
             it.
         """
         (rotation,), (place,) = obstacle.poses.at([t_s])
-        return place + rotation @ self.centre_m, Rotation.from_matrix(
-            rotation
-        ) * self.rotation
+        return place + rotation @ self.centre_m, Rotation.from_matrix(rotation) * self.rotation
 
 
 def _rotation_of_z_to(axis: Array) -> Rotation:
@@ -127,9 +104,7 @@ def offset_solid(solid: Solid, distance_m: float) -> Solid:
     """
     if isinstance(solid, Plane):
         return replace(solid, point_m=solid.point_m + distance_m * solid.normal)
-    distance_m = max(
-        distance_m, -float(Primitive.from_solid(solid).size_m.min()) / 2
-    )
+    distance_m = max(distance_m, -float(Primitive.from_solid(solid).size_m.min()) / 2)
     outwards = distance_m * np.array([[-1.0], [1.0]])
     if isinstance(solid, Cuboid):
         return replace(solid, corners_m=solid.corners_m + outwards)
@@ -138,9 +113,7 @@ def offset_solid(solid: Solid, distance_m: float) -> Solid:
     if not isinstance(wider, Cylinder):
         return wider
     way = np.diff(wider.ends_m, axis=0)
-    return replace(
-        wider, ends_m=wider.ends_m + outwards * way / np.linalg.norm(way)
-    )
+    return replace(wider, ends_m=wider.ends_m + outwards * way / np.linalg.norm(way))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +132,7 @@ class Facets:
     triangles: Index
 
     @classmethod
-    def from_solid(
-        cls, solid: Solid, centre_m: Array, size_m: float, tolerance_m: float
-    ) -> Facets:
+    def from_solid(cls, solid: Solid, centre_m: Array, size_m: float, tolerance_m: float) -> Facets:
         """Return the facets of a solid; of a plane a square.
 
         On round surfaces the middles of facets are as deep below the surface as their corners are
@@ -186,44 +157,33 @@ class Facets:
                 np.vstack([corners, behind]), np.array([(0, 1, 2), (0, 2, 3)])
             )._oriented_outwards()
         places = _hull_points(
-            Primitive.from_solid(solid),
-            getattr(solid, "rounding_m", 0.0),
-            tolerance_m=tolerance_m,
+            Primitive.from_solid(solid), getattr(solid, "rounding_m", 0.0), tolerance_m=tolerance_m
         )
         hull = ConvexHull(places)
         used, triangles = np.unique(hull.simplices, return_inverse=True)
         points = places[used]
         behind = points.mean(axis=0)
-        return cls(
-            np.vstack([points, behind]), triangles.reshape(-1, 3)
-        )._oriented_outwards()
+        return cls(np.vstack([points, behind]), triangles.reshape(-1, 3))._oriented_outwards()
 
     def max_penetration_m(self, points_m: Array) -> float:
         """Return the penetration [m] of the deepest of points (n, 3), the distance to the nearest
         facet's plane; 0 if all are outside. The facets must enclose a convex solid.
         """
-        return max(
-            0.0, -float(self._signed_distances_m(points_m).max(axis=0).min())
-        )
+        return max(0.0, -float(self._signed_distances_m(points_m).max(axis=0).min()))
 
     def facing(self, points_m: Array) -> Facets:
         """Return the facets that have at least one of the points (n, 3) in front of them, with only
         their points and the one behind; itself is not changed.
         """
         is_facing = (self._signed_distances_m(points_m) > 0).any(axis=1)
-        used, triangles = np.unique(
-            self.triangles[is_facing], return_inverse=True
-        )
+        used, triangles = np.unique(self.triangles[is_facing], return_inverse=True)
         return Facets(self.points_m[[*used, -1]], triangles.reshape(-1, 3))
 
     def _signed_distances_m(self, points_m: Array) -> Array:
         """Return the distance (f, n) [m] of points (n, 3) in front of the plane of each facet."""
         corners = self.points_m[self.triangles]
         normals = _unit_normals(corners)
-        return (
-            normals @ points_m.T
-            - np.einsum("fk,fk->f", corners[:, 0], normals)[:, None]
-        )
+        return normals @ points_m.T - np.einsum("fk,fk->f", corners[:, 0], normals)[:, None]
 
     def _oriented_outwards(self) -> Facets:
         """Return a copy of the facets with the corners of each triangle ordered counter-clockwise
@@ -232,59 +192,34 @@ class Facets:
         """
         corners = self.points_m[self.triangles]
         inwards = (
-            np.einsum(
-                "fk,fk->f",
-                self.points_m[-1] - corners[:, 0],
-                _unit_normals(corners),
-            )
-            > 0
+            np.einsum("fk,fk->f", self.points_m[-1] - corners[:, 0], _unit_normals(corners)) > 0
         )
         order = np.where(inwards[:, None], [2, 1, 0], [0, 1, 2])
-        return replace(
-            self, triangles=np.take_along_axis(self.triangles, order, axis=1)
-        )
+        return replace(self, triangles=np.take_along_axis(self.triangles, order, axis=1))
 
 
 def _unit_normals(corners: Array) -> Array:
     """Return the unit normals (f, 3) of triangles with corners (f, 3, 3); for a triangle without
     area NaN, with a RuntimeWarning of NumPy.
     """
-    normals = np.cross(
-        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    )
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-def _hull_points(
-    shape: Primitive, rounding_m: float, tolerance_m: float
-) -> Array:
+def _hull_points(shape: Primitive, rounding_m: float, tolerance_m: float) -> Array:
     """Return points (p, 3) of a solid that are the furthest along some direction; their hull is the
     solid, with round surfaces replaced by facets.
-
-    Parameters
-    ----------
-    shape : Primitive
-        Any shape but a plane.
-    rounding_m : float
-        Radius of rounded edges of a box or cylinder; 0 for sharp ones.
-    tolerance_m : float
-        Allowed distance between the hull and the surface.
     """
     radius_m = rounding_m if shape.kind == "box" else shape.size_m[0]
     wide = float(
-        np.clip(
-            4 * np.sqrt(tolerance_m / max(radius_m, tolerance_m)),
-            *FACET_WIDTH_LIMITS_RAD,
-        )
+        np.clip(4 * np.sqrt(tolerance_m / max(radius_m, tolerance_m)), *FACET_WIDTH_LIMITS_RAD)
     )
     count = int(np.ceil(np.pi / wide))
     middles = (np.arange(2 * count) + 0.5) * np.pi / count
     azimuth, inclination = np.meshgrid(middles, middles[:count])
     azimuth = azimuth.ravel()
     inclination = inclination.ravel()
-    level = np.stack(
-        [np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=1
-    )
+    level = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=1)
     axial = np.cos(inclination)[:, None] * [0.0, 0.0, 1.0]
     direction = np.sin(inclination)[:, None] * level + axial
     stretch = 1 + wide**2 / 16
@@ -295,13 +230,9 @@ def _hull_points(
         core = core + np.sign(axial) * (shape.size_m[1] - rounding_m)
     else:
         rounding_m = radius_m
-        core = np.sign(axial) * (
-            shape.size_m[1] if shape.kind == "capsule" else 0.0
-        )
+        core = np.sign(axial) * (shape.size_m[1] if shape.kind == "capsule" else 0.0)
     places = core + stretch * rounding_m * direction
-    return np.unique(
-        shape.centre_m + shape.rotation.apply(places).round(12), axis=0
-    )
+    return np.unique(shape.centre_m + shape.rotation.apply(places).round(12), axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,8 +292,7 @@ class FacetedObstacle:
         each facet, whose last node is the point behind all facets.
         """
         inner = np.full(
-            (len(self.build_triangles()), 1),
-            self.first_node + len(self.start_points_m) - 1,
+            (len(self.build_triangles()), 1), self.first_node + len(self.start_points_m) - 1
         )
         return np.hstack([self.build_triangles()[:, [0, 2, 1]], inner])
 
@@ -384,43 +314,32 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
     nodes = len(body.nodes_m)
     cells = len(body.body.cells)
     for obstacle, contact in zip(
-        body.obstacles,
-        contact_terms(body.experiment_with_obstacles),
-        strict=True,
+        body.obstacles, contact_terms(body.experiment_with_obstacles), strict=True
     ):
         law = contact.law_of_contact
         penetration_m, normal = contact.deepest_point(shape.ravel())
         rotations, places = obstacle.poses.at(times)
         rigid_m = body.experiment.rigid_positions(times)
-        ends = (
-            np.stack([rigid_m.min(axis=1), rigid_m.max(axis=1)], axis=2)
-            - places[..., None]
-        )
+        ends = np.stack([rigid_m.min(axis=1), rigid_m.max(axis=1)], axis=2) - places[..., None]
         corners = np.array([list(product(*each)) for each in ends])
         box_m = np.einsum("tki,tij->tkj", corners, rotations).reshape(-1, 3)
         size_m = PLANE_SIZE_RATIO * float(np.ptp(box_m, axis=0).max())
         area_m2 = law.surface.area_m2
-        stiffness = 2 * float(
-            np.average(law.stiffness_at(body.theta), weights=area_m2)
-        )
+        stiffness = 2 * float(np.average(law.stiffness_at(body.theta), weights=area_m2))
         width_m = float(np.average(law.widths_m, weights=area_m2))
         solid = offset_solid(obstacle.shape, width_m / 2)
         facets = Facets.from_solid(
             solid, box_m.mean(axis=0), size_m=size_m, tolerance_m=width_m / 2
         )
         faces = law.surface.faces
-        touching = np.unique(
-            body.body.nodes.nodes_of_faces(body.body.mesh.surface[faces])
-        )
+        touching = np.unique(body.body.nodes.nodes_of_faces(body.body.mesh.surface[faces]))
         # Nodes may be deeper than the contact points of this package.
         back_m = -max(penetration_m, 0.0) * normal
         nearest = (rigid_m[0, touching] - places[0] - back_m) @ rotations[0]
         back_m -= facets.max_penetration_m(nearest) * normal
         of_node = stiffness * float(area_m2.sum()) / len(touching)
         shown = facets.facing(
-            np.concatenate(
-                [box_m, box_m[: len(corners[0])] - back_m @ rotations[0]]
-            )
+            np.concatenate([box_m, box_m[: len(corners[0])] - back_m @ rotations[0]])
         )
         start_m = shown.points_m @ rotations[0].T + places[0] + back_m
         made.append(

@@ -47,9 +47,7 @@ BLACK = (20, 20, 20)
 GREY = (150, 160, 170)
 
 
-def write_rerun(
-    run: str | Path, folder: str | Path, experiment: str | None = None
-) -> list[str]:
+def write_rerun(run: str | Path, folder: str | Path, experiment: str | None = None) -> list[str]:
     """Write the recording of a run folder for the Rerun viewer, ``recording.rrd``.
 
     Parameters
@@ -85,9 +83,7 @@ def write_rerun(
             run,
         )
     stresses = [_stress_on_faces(run, replay) for replay in replays]
-    with replaced_folder(
-        folder, marker_file=RECORDING_FILE, content_word="recording"
-    ) as place:
+    with replaced_folder(folder, marker_file=RECORDING_FILE, content_word="recording") as place:
         recording = _Recording(place / RECORDING_FILE, result, replays=replays)
         limits = _limits(stresses)
         for replay, stress in zip(replays, stresses, strict=True):
@@ -104,13 +100,6 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
     """Return the von Mises stress (T, F) [Pa] on the F triangles of the surface of an experiment,
     at each sample that of the nearest frame; None if the run has no frames of it or damaged ones,
     or the experiment was not fitted.
-
-    Parameters
-    ----------
-    run : str or Path
-        The run folder.
-    replay : MotionRecord
-        Experiment of this run.
     """
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
@@ -125,23 +114,14 @@ def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
     scale; 0 and 1 if none is known. Entries of `stresses` are (T, F) arrays, or None; NaN does not
     count.
     """
-    known = [
-        each
-        for each in stresses
-        if each is not None and np.isfinite(each).any()
-    ]
+    known = [each for each in stresses if each is not None and np.isfinite(each).any()]
     if not known:
         return 0.0, 1.0
-    return min(float(np.nanmin(s)) for s in known), max(
-        float(np.nanmax(s)) for s in known
-    )
+    return min(float(np.nanmin(s)) for s in known), max(float(np.nanmax(s)) for s in known)
 
 
 def vertex_colours(
-    faces: NDArray[np.integer],
-    values: Array,
-    limits: tuple[float, float],
-    count: int,
+    faces: NDArray[np.integer], values: Array, limits: tuple[float, float], count: int
 ) -> NDArray[np.uint8]:
     """Return the colours of vertices from values on the triangles around them.
 
@@ -189,9 +169,7 @@ class _Recording:
         Experiments that will be written; they determine the layout and the time span.
     """
 
-    def __init__(
-        self, file: Path, result: Result, replays: Sequence[MotionRecord]
-    ) -> None:
+    def __init__(self, file: Path, result: Result, replays: Sequence[MotionRecord]) -> None:
         rr: Any = import_module("rerun")
         self.rr = rr
         self.stream = rr.RecordingStream(APPLICATION)
@@ -201,10 +179,7 @@ class _Recording:
         summary = as_markdown(run_summary(result))
         document = rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN)
         self.stream.log("summary", document, static=True)
-        span_s = (
-            min(each.t_s[0] for each in replays),
-            max(each.t_s[-1] for each in replays),
-        )
+        span_s = (min(each.t_s[0] for each in replays), max(each.t_s[-1] for each in replays))
         self._write_parameters(result, np.array(span_s))
 
     def close(self) -> None:
@@ -217,20 +192,14 @@ class _Recording:
         of residuals and parameters and the summary.
         """
         views: Any = import_module("rerun.blueprint")
-        bodies = [
-            views.Spatial3DView(origin=self._path(e.name), name=e.name)
-            for e in replays
-        ]
+        bodies = [views.Spatial3DView(origin=self._path(e.name), name=e.name) for e in replays]
         curves = [
             views.TimeSeriesView(
-                origin=self._path(e.name, "residuals_mm"),
-                name=f"{e.name}: residuals [mm]",
+                origin=self._path(e.name, "residuals_mm"), name=f"{e.name}: residuals [mm]"
             )
             for e in replays
         ]
-        parameters = views.TimeSeriesView(
-            origin="parameters", name="parameters"
-        )
+        parameters = views.TimeSeriesView(origin="parameters", name="parameters")
         summary = views.TextDocumentView(origin="summary", name="summary")
         right = views.Vertical(views.Tabs(*curves), parameters, summary)
         return views.Blueprint(views.Horizontal(views.Tabs(*bodies), right))
@@ -248,22 +217,14 @@ class _Recording:
         for name, each in result.collect_estimates().items():
             curves = {"value": each.value}
             if each.combined95 is not None:
-                curves |= {
-                    "lower": each.combined95[0],
-                    "upper": each.combined95[1],
-                }
+                curves |= {"lower": each.combined95[0], "upper": each.combined95[1]}
             for curve, value in curves.items():
                 self._write_curve(
-                    self._path("parameters", name, curve),
-                    span_s,
-                    values=[value, value],
+                    self._path("parameters", name, curve), span_s, values=[value, value]
                 )
 
     def write_experiment(
-        self,
-        replay: MotionRecord,
-        stress: Array | None,
-        limits: tuple[float, float],
+        self, replay: MotionRecord, stress: Array | None, limits: tuple[float, float]
     ) -> None:
         """Write the motion of an experiment into the recording: the deforming surface, grasped
         nodes, markers (measured, fitted, simulated), points of depth cameras, obstacles, residuals
@@ -285,9 +246,7 @@ class _Recording:
         radius_m = MARKER_RADIUS_RATIO * extent_m
         shapes_m = replay.shapes_m
         assert shapes_m is not None
-        grasped_m = [
-            x[h] for x, h in zip(shapes_m, replay.is_prescribed, strict=True)
-        ]
+        grasped_m = [x[h] for x, h in zip(shapes_m, replay.is_prescribed, strict=True)]
         self._write_points(
             self._path(name, "grasped"),
             replay.t_s,
@@ -303,23 +262,13 @@ class _Recording:
             if markers_m is not None and len(replay.marker_names):
                 path = self._path(name, "markers", kind)
                 self._write_points(
-                    path,
-                    replay.t_s,
-                    points_m=[*markers_m],
-                    colour=colour,
-                    radius_m=radius_m,
+                    path, replay.t_s, points_m=[*markers_m], colour=colour, radius_m=radius_m
                 )
-        depth_points_m = [
-            replay.camera_points_m(k) for k in range(len(replay.t_s))
-        ]
+        depth_points_m = [replay.camera_points_m(k) for k in range(len(replay.t_s))]
         if any(map(len, depth_points_m)):
             path = self._path(name, "depth_points")
             self._write_points(
-                path,
-                replay.t_s,
-                points_m=depth_points_m,
-                colour=ORANGE,
-                radius_m=radius_m / 4,
+                path, replay.t_s, points_m=depth_points_m, colour=ORANGE, radius_m=radius_m / 4
             )
         self._write_obstacles(replay)
         self._write_residuals(replay)
@@ -331,28 +280,13 @@ class _Recording:
         """
         axis = int(np.abs(up).argmax())
         end = "UP" if up[axis] > 0 else "DOWN"
-        return getattr(
-            self.rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{end}"
-        )
+        return getattr(self.rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{end}")
 
     def _write_surface(
-        self,
-        replay: MotionRecord,
-        stress: Array | None,
-        limits: tuple[float, float],
+        self, replay: MotionRecord, stress: Array | None, limits: tuple[float, float]
     ) -> None:
         """Write the deforming surface, and, if the stress is known, the curve of the largest stress
         on it; samples with a position that is not finite have no surface.
-
-        Parameters
-        ----------
-        replay : MotionRecord
-            Experiment with a fitted or simulated trajectory.
-        stress : (T, F) array or None
-            Von Mises stress on the F triangles of the surface [Pa], which colours it; None for a
-            grey surface.
-        limits : (low, high)
-            Ends of the colour scale [Pa]; not used without stress.
         """
         rr = self.rr
         shapes_m = replay.shapes_m
@@ -364,17 +298,12 @@ class _Recording:
         count = len(nodes)
         path = self._path(replay.name, "body")
         topology = rr.Mesh3D.from_fields(
-            triangle_indices=triangles,
-            albedo_factor=GREY if stress is None else None,
+            triangle_indices=triangles, albedo_factor=GREY if stress is None else None
         )
         self.stream.log(path, topology, static=True)
-        columns: dict[str, Any] = {
-            "vertex_positions": positions_m.reshape(-1, 3)
-        }
+        columns: dict[str, Any] = {"vertex_positions": positions_m.reshape(-1, 3)}
         if stress is not None:
-            colours = vertex_colours(
-                triangles, stress[there], limits=limits, count=count
-            )
+            colours = vertex_colours(triangles, stress[there], limits=limits, count=count)
             columns["vertex_colors"] = colours.reshape(-1, 4)
         self._send(
             path,
@@ -397,19 +326,6 @@ class _Recording:
     ) -> None:
         """Write points at each time; points that are not finite are left out. Nothing is written if
         none remains.
-
-        Parameters
-        ----------
-        path : str
-            Path of the entity.
-        t_s : (T,) array
-            Times [s].
-        points_m : sequence of T (k, 3) arrays
-            Points at each time [m]; their number may change.
-        colour : tuple of int
-            Red, green and blue, from 0 to 255.
-        radius_m : float
-            Radius of a point [m].
         """
         rr = self.rr
         there = [each[np.isfinite(each).all(axis=1)] for each in points_m]
@@ -418,18 +334,14 @@ class _Recording:
         style = rr.Points3D.from_fields(colors=colour, radii=radius_m)
         self.stream.log(path, style, static=True)
         columns = rr.Points3D.columns(positions=np.concatenate(there))
-        self._send(
-            path, t_s, columns=columns, counts=[len(each) for each in there]
-        )
+        self._send(path, t_s, columns=columns, counts=[len(each) for each in there])
 
     def _write_obstacles(self, replay: MotionRecord) -> None:
         """Write the outlines of obstacles at each sample; without obstacles nothing."""
         if replay.obstacles_m is None:
             return
         path = self._path(replay.name, "obstacles")
-        for time_s, points_m in zip(
-            replay.t_s, replay.obstacles_m, strict=True
-        ):
+        for time_s, points_m in zip(replay.t_s, replay.obstacles_m, strict=True):
             strips = [*_polylines(points_m)]
             self.stream.set_time(TIMELINE, duration=float(time_s))
             self.stream.log(path, self.rr.LineStrips3D(strips, colors=BLACK))
@@ -439,17 +351,11 @@ class _Recording:
         """Write the distances [mm] of the fitted (or else simulated) markers from the measured
         ones; without either nothing.
         """
-        model_m = (
-            replay.rolled_out_m
-            if replay.markers_m is None
-            else replay.markers_m
-        )
+        model_m = replay.rolled_out_m if replay.markers_m is None else replay.markers_m
         if model_m is None:
             return
         distances_mm = 1e3 * np.linalg.norm(model_m - replay.measured_m, axis=2)
-        for marker, values in zip(
-            replay.marker_names, distances_mm.T, strict=True
-        ):
+        for marker, values in zip(replay.marker_names, distances_mm.T, strict=True):
             path = self._path(replay.name, "residuals_mm", str(marker))
             self._write_curve(path, replay.t_s, values=values)
 
@@ -459,25 +365,17 @@ class _Recording:
         """
         for series in replay.sensor_series:
             t_s = series.columns[:, 0]
-            values = series.columns[:, 1:].reshape(
-                len(t_s), 3, len(series.names)
-            )
+            values = series.columns[:, 1:].reshape(len(t_s), 3, len(series.names))
             for kind, each in zip(
-                ("measured", "fitted", "simulated"),
-                np.moveaxis(values, 1, 0),
-                strict=True,
+                ("measured", "fitted", "simulated"), np.moveaxis(values, 1, 0), strict=True
             ):
-                for component, unit, curve in zip(
-                    series.names, series.units, each.T, strict=True
-                ):
+                for component, unit, curve in zip(series.names, series.units, each.T, strict=True):
                     label = f"{component} [{unit}]"
                     sensor = f"{series.kind}_{series.number}"
                     path = self._path(replay.name, sensor, label, kind)
                     self._write_curve(path, t_s, values=curve)
 
-    def _write_curve(
-        self, path: str, t_s: Array, values: Sequence[float] | Array
-    ) -> None:
+    def _write_curve(self, path: str, t_s: Array, values: Sequence[float] | Array) -> None:
         """Write a number `values` (T,) over the times `t_s` (T,) [s] under the entity `path`; times
         at which it is not finite are left out.
         """
@@ -487,9 +385,7 @@ class _Recording:
             columns = self.rr.Scalars.columns(scalars=curve[is_finite])
             self._send(path, t_s[is_finite], columns=columns, counts=None)
 
-    def _send(
-        self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None
-    ) -> None:
+    def _send(self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None) -> None:
         """Send columns of the entity `path` at the times `t_s` (T,) [s]; `counts` are the numbers
         of rows per time, None for one row each.
         """

@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...errors import InputError
-from .export_target import (
-    ExportedFiles,
-    TargetCapabilities,
-    comment_lines,
-    values_as_text,
-)
+from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
 from .identified import IdentifiedBody, IdentifiedRegion
 from .obstacle_shapes import Primitive, faceted_obstacles, offset_solid
 
@@ -74,9 +69,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         )
     region = body.regions[0]
     limits = [*CAPABILITIES.limitations(body)]
-    limits.append(
-        OGDEN_VOLUME if region.material == "ogden-1" else NEO_HOOKEAN_VERSIONS
-    )
+    limits.append(OGDEN_VOLUME if region.material == "ogden-1" else NEO_HOOKEAN_VERSIONS)
     force = _elastic_law_xml(region)
     if (np.abs(body.prescribed_displacements_m) > 1e-9).any():
         limits.append(
@@ -86,14 +79,10 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     mass = values_as_text(body.total_node_mass_kg)
     grasped = " ".join(map(str, np.flatnonzero(body.is_node_prescribed)))
     cells = " ".join(map(str, body.body.cells.ravel()))
-    x = '<?xml version="1.0"?>\n' + comment_lines(
-        body, limits, start="<!-- ", end=" -->"
-    )
+    x = '<?xml version="1.0"?>\n' + comment_lines(body, limits, start="<!-- ", end=" -->")
     x += f'<Node name="root" dt="{body.experiment.timestep_s / 4!r}" '
     x += f'gravity="{values_as_text(body.experiment.gravity_m_s2)}">\n'
-    x += "".join(
-        f'<RequiredPlugin name="Sofa.Component.{name}"/>\n' for name in PLUGINS
-    )
+    x += "".join(f'<RequiredPlugin name="Sofa.Component.{name}"/>\n' for name in PLUGINS)
     x += '<DefaultAnimationLoop/>\n<Node name="body">\n'
     x += f'<EulerImplicitSolver rayleighStiffness="{region.gamma_r_s!r}" '
     x += f'rayleighMass="{region.gamma_m_1_s!r}"/>\n'
@@ -116,9 +105,7 @@ def _obstacle_xml(body: IdentifiedBody) -> str:
     """
     lines = ""
     for wall in faceted_obstacles(body):
-        shape = Primitive.from_solid(
-            offset_solid(wall.obstacle.shape, wall.width_m / 2)
-        )
+        shape = Primitive.from_solid(offset_solid(wall.obstacle.shape, wall.width_m / 2))
         place_m, turn = shape.pose_at(wall.obstacle, body.start_s)
         stiff = f'stiffness="{wall.node_stiffness_n_m!r}" damping="0"'
         if shape.kind == "plane":
@@ -145,7 +132,7 @@ def _elastic_law_xml(region: IdentifiedRegion) -> str:
     if region.material == "ogden-1":
         (term,) = region.list_power_terms()
         # The energy is μ/α² (Σ λ̄^α − 3) + ½ κ ln² J.
-        moduli = values_as_text(
-            (term.mu_pa * term.alpha, term.alpha, region.kappa_pa)
-        )
-    return f'<TetrahedronHyperelasticityFEMForceField materialName="{name}" ParameterSet="{moduli}"/>'
+        moduli = values_as_text((term.mu_pa * term.alpha, term.alpha, region.kappa_pa))
+    return (
+        f'<TetrahedronHyperelasticityFEMForceField materialName="{name}" ParameterSet="{moduli}"/>'
+    )

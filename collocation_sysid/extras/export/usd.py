@@ -53,7 +53,9 @@ TILT = (
     "gravity points {degrees:.3g}° away from −z of the stage, as estimated from the recording; a "
     "simulator that uses its magnitude only, along −z, ignores this"
 )
-NO_SIMULATION = "the points of the body are those of the first sample: the run has no forward simulation"
+NO_SIMULATION = (
+    "the points of the body are those of the first sample: the run has no forward simulation"
+)
 # Angle from which gravity counts as tilted: single precision of its direction rounds to less.
 LEAST_TILT_DEG = 1e-3
 # Frames per second of a single sample, which has no rate of its own.
@@ -96,92 +98,48 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     gravity = body.experiment.gravity_m_s2
     size = float(np.linalg.norm(gravity))
     scene.CreateGravityMagnitudeAttr(size)
-    scene.CreateGravityDirectionAttr(
-        pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist())
-    )
+    scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist()))
     placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
     _add_mesh(pxr, stage, body=body, start_positions_m=placed_m)
     for k, grasp in enumerate(body.experiment.grasps, start=1):
-        _add_gripper(
-            pxr,
-            stage,
-            number=k,
-            grasp=grasp,
-            body=body,
-            start_positions_m=placed_m,
-        )
+        _add_gripper(pxr, stage, number=k, grasp=grasp, body=body, start_positions_m=placed_m)
     for k, obstacle in enumerate(body.obstacles, start=1):
-        _add_obstacle(
-            pxr,
-            stage,
-            path=f"/World/Obstacle_{k}",
-            obstacle=obstacle,
-            body=body,
-        )
-    return ExportedFiles(
-        {STAGE_FILE: stage.GetRootLayer().ExportToString()}, tuple(limits)
-    )
+        _add_obstacle(pxr, stage, path=f"/World/Obstacle_{k}", obstacle=obstacle, body=body)
+    return ExportedFiles({STAGE_FILE: stage.GetRootLayer().ExportToString()}, tuple(limits))
 
 
 def _rate_hz(t_s: Array) -> float:
     """Return the time codes per second, so that each sample at `t_s` (T,) [s] has one, on average
     where samples are uneven; `SINGLE_RATE_HZ` for fewer than two samples.
     """
-    return (
-        (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
-    )
+    return (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
 
 
 def _tilt_deg(gravity_m_s2: Array) -> float:
     """Return the angle between gravity (3,) and −z, from 0 to 180 [°]; 0 without gravity."""
     downwards = -gravity_m_s2[2]
     across = np.linalg.norm(gravity_m_s2[:2])
-    return (
-        float(np.degrees(np.arctan2(across, downwards)))
-        if gravity_m_s2.any()
-        else 0.0
-    )
+    return float(np.degrees(np.arctan2(across, downwards))) if gravity_m_s2.any() else 0.0
 
 
 def _import_usd() -> Any:
     """Return the modules of usd-core as attributes of one object: `Gf`, `Sdf`, `Usd`, `UsdGeom`,
     `UsdPhysics`, `UsdShade` and `Vt`.
-
-    Raises
-    ------
-    InputError
-        If usd-core is not installed.
     """
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
     except ImportError as error:
-        raise InputError(
-            "USD needs usd-core: pip install 'collocation-sysid[usd]'"
-        ) from error
+        raise InputError("USD needs usd-core: pip install 'collocation-sysid[usd]'") from error
     modules = (Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt)
-    return SimpleNamespace(
-        **{each.__name__.rpartition(".")[2]: each for each in modules}
-    )
+    return SimpleNamespace(**{each.__name__.rpartition(".")[2]: each for each in modules})
 
 
-def _add_mesh(
-    pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array
-) -> None:
+def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
     """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
 
     The default positions, with which a simulator begins, are `start_positions_m`; the forward
     simulation, if there is one, is stored as time samples for playback. Several regions become
     subsets of tetrahedra; the body has the material of the region with most tetrahedra.
-
-    Parameters
-    ----------
-    pxr : namespace
-        Modules of `_import_usd`.
-    stage : Usd.Stage
-        Modified in place.
-    body : IdentifiedBody
-    start_positions_m : (n, 3)
-        Initial node positions.
     """
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
     body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
@@ -198,41 +156,24 @@ def _add_mesh(
         for code, shape_m in zip(codes, body.simulated_m, strict=True):
             points.Set(shape_m.astype(np.float32), code)
     mesh.CreateTetVertexIndicesAttr(np.concatenate(cells).astype(np.int32))
-    mesh.CreateSurfaceFaceVertexIndicesAttr(
-        pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh)
-    )
+    mesh.CreateSurfaceFaceVertexIndicesAttr(pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh))
     number = pxr.Sdf.ValueTypeNames
-    rest = prim.CreateAttribute(
-        "physics:restShapePoints", number.Point3fArray, False
-    )
+    rest = prim.CreateAttribute("physics:restShapePoints", number.Point3fArray, False)
     rest.Set(body.nodes_m.astype(np.float32))
     masses = prim.CreateAttribute("physics:masses", number.FloatArray, False)
     masses.Set(_cell_masses_kg(body, cells).astype(np.float32))
     _set_token(pxr, prim, name="physics:masses:elementType", text="tetrahedron")
-    grasped = prim.CreateAttribute(
-        f"{ATTRIBUTE_NAMESPACE}:graspedPoints", number.IntArray
-    )
+    grasped = prim.CreateAttribute(f"{ATTRIBUTE_NAMESPACE}:graspedPoints", number.IntArray)
     grasped.Set(np.flatnonzero(body.is_node_prescribed).astype(np.int32))
     names = _unique_prim_names([region.name for region in body.regions])
     pairs = zip(body.regions, names, strict=True)
-    materials = [
-        _add_material(pxr, stage, region=region, name=name)
-        for region, name in pairs
-    ]
-    _bind_material(
-        pxr,
-        prim,
-        material=materials[int(np.argmax([len(each) for each in cells]))],
-    )
+    materials = [_add_material(pxr, stage, region=region, name=name) for region, name in pairs]
+    _bind_material(pxr, prim, material=materials[int(np.argmax([len(each) for each in cells]))])
     firsts = np.cumsum([0, *map(len, cells)])
     for k, material in enumerate(materials if len(cells) > 1 else ()):
         indices = pxr.Vt.IntArray(range(firsts[k], firsts[k + 1]))
         subset = pxr.UsdGeom.Subset.CreateGeomSubset(
-            mesh,
-            names[k],
-            pxr.UsdGeom.Tokens.tetrahedron,
-            indices,
-            "materialBind",
+            mesh, names[k], pxr.UsdGeom.Tokens.tetrahedron, indices, "materialBind"
         )
         _bind_material(pxr, subset.GetPrim(), material=material)
 
@@ -240,25 +181,14 @@ def _add_mesh(
 def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
     """Return the mass of each linear tetrahedron [kg] in one array, region after region, from its
     undeformed volume and the density of its region, without point masses.
-
-    Parameters
-    ----------
-    body : IdentifiedBody
-        Body with nodes and regions.
-    cells : list of (k, 4)
-        Corner nodes of the tetrahedra of each region, see `linear_tetrahedra`.
     """
     edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
     volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]
     pairs = zip(body.regions, volumes, strict=True)
-    return np.concatenate(
-        [region.density_kg_m3 * volume for region, volume in pairs]
-    )
+    return np.concatenate([region.density_kg_m3 * volume for region, volume in pairs])
 
 
-def _add_material(
-    pxr: Any, stage: Any, region: IdentifiedRegion, name: str
-) -> Any:
+def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
     """Add the material of a region to the stage under /World/Materials/`name`, in place, and return
     it.
 
@@ -275,22 +205,14 @@ def _add_material(
         f"{ATTRIBUTE_NAMESPACE}:gammaR_s": region.gamma_r_s,
         f"{ATTRIBUTE_NAMESPACE}:gammaM_1_s": region.gamma_m_1_s,
     }
-    values |= {
-        f"{ATTRIBUTE_NAMESPACE}:{name}": value
-        for name, value in region.constants.items()
-    }
+    values |= {f"{ATTRIBUTE_NAMESPACE}:{name}": value for name, value in region.constants.items()}
     number = pxr.Sdf.ValueTypeNames
     for name, value in values.items():
-        prim.CreateAttribute(
-            name, number.Float, name.startswith(ATTRIBUTE_NAMESPACE)
-        ).Set(float(value))
-    for name, text in (
-        ("material", region.material),
-        ("damping", region.damping),
-    ):
-        prim.CreateAttribute(
-            f"{ATTRIBUTE_NAMESPACE}:{name}", number.String
-        ).Set(text)
+        prim.CreateAttribute(name, number.Float, name.startswith(ATTRIBUTE_NAMESPACE)).Set(
+            float(value)
+        )
+    for name, text in (("material", region.material), ("damping", region.damping)):
+        prim.CreateAttribute(f"{ATTRIBUTE_NAMESPACE}:{name}", number.String).Set(text)
     return material
 
 
@@ -312,36 +234,14 @@ def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
 
 
 def _add_gripper(
-    pxr: Any,
-    stage: Any,
-    number: int,
-    grasp: Grasp,
-    body: IdentifiedBody,
-    start_positions_m: Array,
+    pxr: Any, stage: Any, number: int, grasp: Grasp, body: IdentifiedBody, start_positions_m: Array
 ) -> None:
     """Add a kinematic rigid body that follows the poses of a grasp to the stage, in place, as
     /World/Gripper_NUMBER, and attach the nodes to it that the grasp holds along all axes.
-
-    Parameters
-    ----------
-    pxr : namespace
-        Modules of `_import_usd`.
-    stage : Stage
-        Modified in place.
-    number : int
-        Number of the grasp, from 1.
-    grasp : Grasp
-        Its poses at the samples become those of the rigid body.
-    body : IdentifiedBody
-        Body with the times of the samples.
-    start_positions_m : (n, 3)
-        Initial node positions in the world [m].
     """
     path = f"/World/Gripper_{number}"
     gripper = pxr.UsdGeom.Xform.Define(stage, path)
-    pxr.UsdPhysics.RigidBodyAPI.Apply(
-        gripper.GetPrim()
-    ).CreateKinematicEnabledAttr(True)
+    pxr.UsdPhysics.RigidBodyAPI.Apply(gripper.GetPrim()).CreateKinematicEnabledAttr(True)
     matrices, positions_m = grasp.poses.at(body.experiment.t_s)
     _set_poses(
         pxr,
@@ -354,9 +254,7 @@ def _add_gripper(
     prim = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment")
     types = pxr.Sdf.ValueTypeNames
     for name, target in (("src0", "/World/Body/Mesh"), ("src1", path)):
-        prim.CreateRelationship(f"physics:{name}", False).SetTargets(
-            [pxr.Sdf.Path(target)]
-        )
+        prim.CreateRelationship(f"physics:{name}", False).SetTargets([pxr.Sdf.Path(target)])
     for name, text in (("type0", "point"), ("type1", "xform")):
         _set_token(pxr, prim, name=f"physics:{name}", text=text)
     local_m = (start_positions_m[nodes] - positions_m[0]) @ matrices[0]
@@ -367,9 +265,7 @@ def _add_gripper(
         prim.CreateAttribute(f"physics:{name}", kind, False).Set(values)
 
 
-def _set_poses(
-    pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array
-) -> None:
+def _set_poses(pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array) -> None:
     """Place a prim at positions (T, 3) [m] and rotations (T) at times (T,) [s]; its default pose is
     that of the first row.
 
@@ -394,36 +290,16 @@ def _add_obstacle(
 
     It is a kinematic rigid body, with a pose for each sample of `body`, if it has more than one
     pose; otherwise it stays at its pose of the first sample. Rounded edges are left out.
-
-    Parameters
-    ----------
-    pxr : namespace
-        Modules of `_import_usd`.
-    stage : Stage
-        Modified in place.
-    path : str
-        Path of the obstacle in the stage, such as "/World/Obstacle_1".
-    obstacle : Obstacle
-        Its friction coefficient must be a number, not the name of a parameter; zero is exported,
-        too.
-    body : IdentifiedBody
-        Body with the times of the samples.
     """
     shape = Primitive.from_solid(obstacle.shape)
     t_s = body.experiment.t_s
     frame = path
     if len(obstacle.poses.t_s) > 1:
         moving = pxr.UsdGeom.Xform.Define(stage, path)
-        pxr.UsdPhysics.RigidBodyAPI.Apply(
-            moving.GetPrim()
-        ).CreateKinematicEnabledAttr(True)
+        pxr.UsdPhysics.RigidBodyAPI.Apply(moving.GetPrim()).CreateKinematicEnabledAttr(True)
         matrices, places_m = obstacle.poses.at(t_s)
         _set_poses(
-            pxr,
-            moving,
-            positions_m=places_m,
-            rotations=Rotation.from_matrix(matrices),
-            t_s=t_s,
+            pxr, moving, positions_m=places_m, rotations=Rotation.from_matrix(matrices), t_s=t_s
         )
         place_m = shape.centre_m
         turn = shape.rotation
@@ -431,21 +307,13 @@ def _add_obstacle(
     else:
         place_m, turn = shape.pose_at(obstacle, body.start_s)
     kinds = {"box": "Cube"}
-    solid = getattr(
-        pxr.UsdGeom, kinds.get(shape.kind, shape.kind.title())
-    ).Define(stage, frame)
+    solid = getattr(pxr.UsdGeom, kinds.get(shape.kind, shape.kind.title())).Define(stage, frame)
     _set_poses(
-        pxr,
-        solid,
-        positions_m=place_m[None],
-        rotations=Rotation.concatenate([turn]),
-        t_s=t_s[:0],
+        pxr, solid, positions_m=place_m[None], rotations=Rotation.concatenate([turn]), t_s=t_s[:0]
     )
     if shape.kind == "box":
         solid.CreateSizeAttr(2.0)
-        solid.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(
-            pxr.Gf.Vec3d(*shape.size_m)
-        )
+        solid.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*shape.size_m))
     elif shape.kind != "plane":
         solid.CreateRadiusAttr(float(shape.size_m[0]))
     if shape.kind in ("plane", "cylinder", "capsule"):
@@ -454,14 +322,9 @@ def _add_obstacle(
         solid.CreateHeightAttr(2 * float(shape.size_m[1]))
     pxr.UsdPhysics.CollisionAPI.Apply(solid.GetPrim())
     solid.GetPrim().SetDisplayName(printable(obstacle.name))
-    material = pxr.UsdShade.Material.Define(
-        stage, f"/World/Materials/{path.rpartition('/')[2]}"
-    )
+    material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{path.rpartition('/')[2]}")
     rubbing = pxr.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-    for attribute in (
-        rubbing.CreateStaticFrictionAttr,
-        rubbing.CreateDynamicFrictionAttr,
-    ):
+    for attribute in (rubbing.CreateStaticFrictionAttr, rubbing.CreateDynamicFrictionAttr):
         attribute(float(obstacle.friction))
     _bind_material(pxr, solid.GetPrim(), material=material)
 
@@ -506,8 +369,6 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     def add_to(builder: Any) -> None:
         """Add the stage to a builder of Newton."""
         # Grippers are left out, since Newton would simulate them too.
-        builder.add_usd(
-            str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"]
-        )
+        builder.add_usd(str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"])
 
     return compare_at_rest(body, add_to)

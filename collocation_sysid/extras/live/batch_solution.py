@@ -27,9 +27,9 @@ def recording_from_log(
     """Return the model's experiment with the poses, markers and samples of all rows.
 
     Its times are those of the model's experiment at the same interval, whatever the times of the
-    frames. Samples of a custom sensor or grasp sensor replace its stated series; if fewer than three are
-    within the rows, or all are NaN, the sensor is left out. Missing markers are NaN. Samples after
-    the last row are left out.
+    frames. Samples of a custom sensor or grasp sensor replace its stated series; if fewer than
+    three are within the rows, or all are NaN, the sensor is left out. Missing markers are NaN.
+    Samples after the last row are left out.
 
     None if there are fewer than three sample times or no measured marker, or if markers were
     measured between samples.
@@ -45,9 +45,7 @@ def recording_from_log(
     """
     experiment = model.experiment
     at_samples = log[:: model.collocation.substeps]
-    t_s = experiment.t_s[0] + model.experiment.timestep_s * np.arange(
-        len(at_samples)
-    )
+    t_s = experiment.t_s[0] + model.experiment.timestep_s * np.arange(len(at_samples))
     tracks_m = np.full((len(t_s), len(experiment.markers.names), 3), np.nan)
     for when, tracks in intake.marker_samples(log):
         if abs(when - round(when)) > STEP_TOLERANCE:
@@ -69,31 +67,21 @@ def recording_from_log(
     sampled_grasps = set()
     sensors = *experiment.readings, *experiment.sensors_by_grasp
     for number, gauge in enumerate(sensors, 1):
-        samples = {
-            when: values
-            for of, when, values in intake.all_samples(log)
-            if of == number
-        }
+        samples = {when: values for of, when, values in intake.all_samples(log) if of == number}
         inside = [when for when in sorted(samples) if when <= len(t_s) - 1]
         values = np.array([samples[when] for when in inside])
         if len(inside) < FEWEST or not np.isfinite(values).any():
             continue
-        series = {
-            "t_s": t_s[0] + model.experiment.timestep_s * np.array(inside),
-            "values": values,
-        }
+        series = {"t_s": t_s[0] + model.experiment.timestep_s * np.array(inside), "values": values}
         if isinstance(gauge, Gauge):
             readings.append(replace(gauge, **series))
         else:
             sampled_grasps.add(gauge - 1)
             grasps[gauge - 1] = grasps[gauge - 1].with_loads(**series)
     grasps = [
-        grasp if k in sampled_grasps else grasp.without_sensor()
-        for k, grasp in enumerate(grasps)
+        grasp if k in sampled_grasps else grasp.without_sensor() for k, grasp in enumerate(grasps)
     ]
-    return replace(
-        experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings
-    )
+    return replace(experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings)
 
 
 def solve_recording(problem: Problem, recording: Experiment) -> Run:
@@ -114,9 +102,5 @@ def solve_recording(problem: Problem, recording: Experiment) -> Run:
         If the recording is refused, see `run`.
     """
     options = replace(problem.uncertainty, profile=())
-    batch_problem = replace(
-        problem, experiments=[recording], uncertainty=options
-    )
-    return run(
-        batch_problem, problem.solver(ReducedSpace.name), seek_causes=False
-    )
+    batch_problem = replace(problem, experiments=[recording], uncertainty=options)
+    return run(batch_problem, problem.solver(ReducedSpace.name), seek_causes=False)

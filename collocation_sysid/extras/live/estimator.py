@@ -28,12 +28,7 @@ from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError, SimulationError
 from ...pipeline import Run
 from ...problem import Problem
-from ...program.streaming import (
-    LoggedRow,
-    Sample,
-    SquareRootInformation,
-    one_blas_thread,
-)
+from ...program.streaming import LoggedRow, Sample, SquareRootInformation, one_blas_thread
 from ...recording.poses import Poses
 from ...statistics.assessment import GROSS_MISFIT, Assessment
 from ...statistics.concerns import concern_if
@@ -164,10 +159,7 @@ class LiveUpdate:
     marker_distances_m: Array = field(default_factory=lambda: np.zeros(0))
 
     def __repr__(self) -> str:
-        values = ", ".join(
-            f"{name} = {each.value:.4g}"
-            for name, each in self.estimates.items()
-        )
+        values = ", ".join(f"{name} = {each.value:.4g}" for name, each in self.estimates.items())
         return f"Update(t = {self.t_s:.4g} s: {values}; {self.trust.verdict})"
 
 
@@ -240,7 +232,7 @@ class LiveEstimator:
         most_motion_m = REACH_BODY_SIZES * model.body_size_m
         neighbours = model.neighbouring_samples
         self._reach_m = most_motion_m + float(
-            np.linalg.norm(model.segment.body.nodes_m.mean(axis=0))
+            np.linalg.norm(model.transcription.body.nodes_m.mean(axis=0))
         )
         stencils = [each.stencil for each in model.instruments]
         self.intake = FrameBuffer(
@@ -251,24 +243,15 @@ class LiveEstimator:
             instruments=stencils,
         )
         self.counts = self.intake.counts
-        self._initial_rest = InitialRest(
-            model.body_size_m, model.experiment.markers.sigma_m
-        )
+        self._initial_rest = InitialRest(model.body_size_m, model.experiment.markers.sigma_m)
         self.samples = 0
-        self.budget_s = (
-            options.budget_s or BUDGET_FRACTION * model.experiment.timestep_s
-        )
+        self.budget_s = options.budget_s or BUDGET_FRACTION * model.experiment.timestep_s
         self.rows = options.rows
         samples = max(
-            LARGEST_GAP,
-            round(
-                options.window_s / model.experiment.timestep_s / WINDOW_BLOCKS
-            ),
+            LARGEST_GAP, round(options.window_s / model.experiment.timestep_s / WINDOW_BLOCKS)
         )
         self._block_rows = samples * model.collocation.substeps
-        self._blocks = max(
-            2, round(options.window_s / model.experiment.timestep_s / samples)
-        )
+        self._blocks = max(2, round(options.window_s / model.experiment.timestep_s / samples))
         self._set_bounds()
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.prior = SquareRootInformation.empty(model.parameter_count)
@@ -277,11 +260,7 @@ class LiveEstimator:
         self._last_positions_m = np.full((1, 3), np.nan)
         self.second_pass: WindowPass | None = None
         self.log: list[LoggedRow] = []
-        self.search = (
-            self._new_search()
-            if problem.parameters.list_names_without_guess()
-            else None
-        )
+        self.search = self._new_search() if problem.parameters.list_names_without_guess() else None
         self.scatter = ResidualScatter()
         self._trust = INITIAL_RADIUS
         self._rejected = 0
@@ -329,9 +308,7 @@ class LiveEstimator:
         poses = parse_pose(pose, self.model.moving_grasps + 1)
         tracks = parse_markers(markers, self.names)
         gauges = self.model.experiment.readings
-        instrument_samples = parse_custom_readings(
-            readings, gauges, t_s=parse_time(t_s)
-        )
+        instrument_samples = parse_custom_readings(readings, gauges, t_s=parse_time(t_s))
         instrument_samples += parse_wrenches(
             wrench,
             self.model.experiment.sensors_by_grasp,
@@ -389,16 +366,9 @@ class LiveEstimator:
             rows = rows[done:]
         notes += self._add_samples(buffered.late_samples, squares)
         self._update_estimate()
-        if (
-            self.first_pass is not None
-            and not self.first_pass.has_failed
-            and self.search is None
-        ):
+        if self.first_pass is not None and not self.first_pass.has_failed and self.search is None:
             self._relinearise_if_moved(
-                self.first_pass,
-                self.first_pass,
-                began=began,
-                distance=RELINEARISE_DISTANCE_FIRST,
+                self.first_pass, self.first_pass, began=began, distance=RELINEARISE_DISTANCE_FIRST
             )
         self.budget.frame_s = self.clock() - before
         done = self._repeat_rows(began, notes, done=caught_up)
@@ -406,11 +376,7 @@ class LiveEstimator:
         self._drop_old_rows()
         squared_distances = np.concatenate([*squares, np.zeros(0)])
         squared_distances = squared_distances[np.isfinite(squared_distances)]
-        rms_m = (
-            float(np.sqrt(squared_distances.mean()))
-            if len(squared_distances)
-            else float("nan")
-        )
+        rms_m = float(np.sqrt(squared_distances.mean())) if len(squared_distances) else float("nan")
         estimates, trust = self._estimates_and_trust(frame.t_s)
         self.budget.record_remainder(self.clock() - before)
         latency_s = self.clock() - began
@@ -469,13 +435,9 @@ class LiveEstimator:
             estimates, trust = self._estimates_and_trust(last.t_s)
         else:
             rows = len(batch_run.solution.history) * len(self.log)
-            estimates = {
-                name: batch_run.estimates[name] for name in last.estimates
-            }
+            estimates = {name: batch_run.estimates[name] for name in last.estimates}
             unassessed = Assessment.from_concerns(
-                data_concerns(
-                    ResidualScatter(), self.counts, samples=self.samples
-                )
+                data_concerns(ResidualScatter(), self.counts, samples=self.samples)
             )
             trust = batch_run.trust.combined_with(unassessed)
             last = replace(last, marker_rms_m=batch_run.solution.rms_m)
@@ -488,21 +450,12 @@ class LiveEstimator:
             relinearised=rows,
         )
 
-    def _solve_batch(
-        self, first_pass: WindowPass, notes: list[str]
-    ) -> Run | None:
+    def _solve_batch(self, first_pass: WindowPass, notes: list[str]) -> Run | None:
         """Return the run of the batch solve of the complete recording.
 
         None if the window does not hold the whole recording, if that cannot be solved as a batch
         (see `recording_from_log`), or if the solve is refused, which adds a sentence to `notes`, in
         place. The estimator is not changed.
-
-        Parameters
-        ----------
-        first_pass : WindowPass
-            Its prior is empty if the window holds the whole recording.
-        notes : list of str
-            Extended in place.
         """
         recording = (
             None
@@ -510,15 +463,9 @@ class LiveEstimator:
             else recording_from_log(self.model, self.intake, log=self.log)
         )
         try:
-            return (
-                None
-                if recording is None
-                else solve_recording(self.problem, recording)
-            )
+            return None if recording is None else solve_recording(self.problem, recording)
         except InputError as error:
-            notes.append(
-                f"the final estimate from the complete recording failed: {error.message}"
-            )
+            notes.append(f"the final estimate from the complete recording failed: {error.message}")
             return None
 
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
@@ -527,18 +474,6 @@ class LiveEstimator:
 
         The state of the estimator is changed as by `_repeat_rows`: passes are accepted or rejected
         and the estimate moves. The attribute `rows` is the same afterwards.
-
-        Parameters
-        ----------
-        began : float
-            Time at which the work began, by `clock` [s].
-        notes : list of str
-            Events of the passes; extended in place.
-
-        Returns
-        -------
-        int
-            Number of rows that were computed; rows computed in several passes count in each.
         """
         rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:
@@ -558,23 +493,16 @@ class LiveEstimator:
         if frame.has_wrench and not self.model.experiment.sensors_by_grasp:
             self.counts["with a wrench"] += 1
             if self.counts["with a wrench"] == 1:
-                notes.append(
-                    "wrenches are ignored: no grasp of the problem has a sensor"
-                )
+                notes.append("wrenches are ignored: no grasp of the problem has a sensor")
         if frame.pose is not None:
             self._last_positions_m = frame.pose[0]
-        distances_m = np.linalg.norm(
-            frame.tracks_m[:, None] - self._last_positions_m, axis=2
-        )
+        distances_m = np.linalg.norm(frame.tracks_m[:, None] - self._last_positions_m, axis=2)
         self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
         is_implausible = (distances_m > self._reach_m).all(axis=1)
         if is_implausible.any():
             notes.append(self._note_outliers(is_implausible))
             frame = replace(
-                frame,
-                tracks_m=np.where(
-                    is_implausible[:, None], np.nan, frame.tracks_m
-                ),
+                frame, tracks_m=np.where(is_implausible[:, None], np.nan, frame.tracks_m)
             )
         return frame, notes
 
@@ -598,20 +526,6 @@ class LiveEstimator:
         The first row starts the pass. If the initial state cannot be computed, all frames in the
         buffer are discarded; if a later row cannot be simulated, the pass is marked as failed, and
         rows are only logged.
-
-        Parameters
-        ----------
-        rows : sequence of LoggedRow
-            New rows, at least one; not modified. The caller passes those that are not done again.
-        squares : list of (M,) array
-            Squared distances [m²] of the markers of the frame's samples from the estimate's; an
-            array is appended for each marker sample, in place; none without a pass, or if it
-            has failed.
-
-        Returns
-        -------
-        tuple of int and list of str
-            Number of rows that are done, at least one, and notes.
         """
         done = 1
         notes = []
@@ -621,21 +535,14 @@ class LiveEstimator:
                 self._start_pass(rows[0])
             elif not first_pass.has_failed:
                 done = first_pass.add_rows(
-                    [
-                        row.poses
-                        for row in rows[: first_pass.count_remaining_rows()]
-                    ]
+                    [row.poses for row in rows[: first_pass.count_remaining_rows()]]
                 )
         except SimulationError as error:
             if first_pass is None:
                 self.intake.reset()
-                return 1, [
-                    f"the initial state of the motion cannot be computed: {error}"
-                ]
+                return 1, [f"the initial state of the motion cannot be computed: {error}"]
             first_pass.has_failed = True
-            notes = [
-                f"the body cannot be simulated with these parameters: {error}"
-            ]
+            notes = [f"the body cannot be simulated with these parameters: {error}"]
         for k, row in enumerate(rows[:done], 1):
             self.log.append(LoggedRow(row.poses, []))
             notes += self._add_samples(row.samples, squares, rows=done - k)
@@ -648,22 +555,12 @@ class LiveEstimator:
 
         Outliers among the markers are counted and become NaN. Without a pass nothing is added; if
         the pass has failed, all samples are added to the log alone, as they are.
-
-        Parameters
-        ----------
-        readings : sequence of Sample
-            Samples after the last row of the log.
-        squares : list of array
-            Squared residuals [m²] of the markers (M,), NaN where missing; an array is appended for
-            each marker sample, in place.
-        rows : int
-            Number of rows computed since the row after which the samples are evaluated.
         """
         first_pass = self.first_pass
         if first_pass is None:
             return []
         notes = []
-        sigma_m = self.model.segment.experiment.markers.sigma_m[:, None]
+        sigma_m = self.model.transcription.experiment.markers.sigma_m[:, None]
         if first_pass.has_failed:
             self.log[-1].samples.extend(readings)
             return notes
@@ -672,15 +569,11 @@ class LiveEstimator:
         )
         for reading, linearised in zip(readings, all_linearised, strict=True):
             if not reading.instrument:
-                residual = linearised.evaluate_at(
-                    self.model.transformed(self.p)
-                )
+                residual = linearised.evaluate_at(self.model.transformed(self.p))
                 outliers = self._outliers(residual)
                 if outliers.any():
                     notes.append(self._note_outliers(outliers))
-                    remaining = np.where(
-                        outliers[:, None], np.nan, reading.values
-                    )
+                    remaining = np.where(outliers[:, None], np.nan, reading.values)
                     reading = reading._replace(values=remaining)
                     linearised.at_zero[outliers] = residual[outliers] = np.nan
                 squared = np.sum((residual * sigma_m) ** 2, axis=1)
@@ -696,11 +589,6 @@ class LiveEstimator:
         It is false for all markers while the estimate has not settled, the scatter of the residuals
         is unknown or gross, and if most markers would be outliers; and for missing ones. Nothing is
         changed.
-
-        Parameters
-        ----------
-        residual : (M, 3) array
-            Residuals of one sample, in standard deviations of the markers; NaN where missing.
         """
         if (
             self.distance_from_linearisation() > LARGEST_SETTLED_DISTANCE
@@ -719,9 +607,7 @@ class LiveEstimator:
         """Set the attributes `lower` and `upper`, bounds (P,) of the parameters p in the solver's
         coordinates, from the model.
         """
-        self.lower, self.upper = (
-            self.model.collocation.compute_parameter_bounds()
-        )
+        self.lower, self.upper = self.model.collocation.compute_parameter_bounds()
 
     def _new_search(self) -> StiffnessSearch:
         """Return a new search for initial values over a range of stiffness, with the present
@@ -732,25 +618,13 @@ class LiveEstimator:
     def _warm_up(self) -> tuple[Poses, Array] | None:
         """Compile the kernels before the first frame with rows at the first pose of the problem's
         recording, and set `budget` to their measured computing times.
-
-        Returns
-        -------
-        tuple or None
-            The first poses of all grasps of the problem's recording, each a rotation (3, 3) and a
-            position (3,) [m], and the node positions (3n,) [m] in equilibrium there. None if these
-            cannot be computed at the initial parameters; `budget` then stays without times.
         """
         poses = self.model.first_poses
         moving_poses = tuple(poses[k] for k in self.model.moving_grasps)
         no_markers = np.full((len(self.names), 3), np.nan)
         no_markers[0] = 0.0
         try:
-            trial = WindowPass(
-                self.model,
-                self.p,
-                prior=self.prior,
-                block_rows=self._block_rows,
-            )
+            trial = WindowPass(self.model, self.p, prior=self.prior, block_rows=self._block_rows)
             row = LoggedRow(moving_poses, [Sample(0.0, no_markers)])
             for _ in range(self.model.template_rows + 2):
                 trial.repeat_rows([row])
@@ -763,25 +637,12 @@ class LiveEstimator:
     def _measure_times(self, trial: WindowPass, row: LoggedRow) -> TimeBudget:
         """Return the computing times of one and of many repeated rows, each the shortest of
         `TIMING_REPETITIONS` measurements.
-
-        Parameters
-        ----------
-        trial : WindowPass
-            Pass with enough rows to be repeated; not modified.
-        row : LoggedRow
-            Input of every repeated row.
         """
         took_s: dict[int, float] = {}
-        most = min(
-            trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1
-        )
+        most = min(trial.rows - 1, self.model.rows_per_chunk, self._block_rows - 1)
         for count in (1, most) * TIMING_REPETITIONS:
             second_pass = WindowPass(
-                self.model,
-                self.p,
-                prior=self.prior,
-                block_rows=self._block_rows,
-                base=trial,
+                self.model, self.p, prior=self.prior, block_rows=self._block_rows, base=trial
             )
             second_pass.repeat_rows([row])
             began = self.clock()
@@ -796,16 +657,6 @@ class LiveEstimator:
         rigidly with the pose, if there is a single grasp. If marker places are set, `model`, the
         bounds, the nuisance parameters in `p` and `prior` are replaced, and the row is computed
         again. `first_pass` is set; the samples of the row are not added to it.
-
-        Parameters
-        ----------
-        row : LoggedRow
-            First row, with the samples of its markers, if there are any.
-
-        Raises
-        ------
-        SimulationError
-            If the initial state cannot be computed; there is then no first pass.
         """
         model = self.model
         guesses = []
@@ -815,38 +666,20 @@ class LiveEstimator:
             x = self._rest[1]
             (rotation, position) = poses[0]
             guesses = [
-                (
-                    (x.reshape(-1, 3) - old_position)
-                    @ old_rotation
-                    @ rotation.T
-                    + position
-                ).ravel()
+                ((x.reshape(-1, 3) - old_position) @ old_rotation @ rotation.T + position).ravel()
             ]
-        first_pass = WindowPass(
-            model, self.p, prior=self.prior, block_rows=self._block_rows
-        )
+        first_pass = WindowPass(model, self.p, prior=self.prior, block_rows=self._block_rows)
         first_pass.add_rows([row.poses], guesses)
-        marker_samples = [
-            reading.values for reading in row.samples if not reading.instrument
-        ]
-        first = (
-            marker_samples[0]
-            if marker_samples
-            else np.full((len(self.names), 3), np.nan)
-        )
-        self.model = model.with_marker_places(
-            first, first_pass.blocks[0].stored_rows[0].x
-        )
+        marker_samples = [reading.values for reading in row.samples if not reading.instrument]
+        first = marker_samples[0] if marker_samples else np.full((len(self.names), 3), np.nan)
+        self.model = model.with_marker_places(first, first_pass.blocks[0].stored_rows[0].x)
         if self.model is not model:
             self._set_bounds()
             places = self.model.collocation.guess_p[model.collocation.nq :]
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
             self.prior = SquareRootInformation.empty(self.model.parameter_count)
             first_pass = WindowPass(
-                self.model,
-                self.p,
-                prior=self.prior,
-                block_rows=self._block_rows,
+                self.model, self.p, prior=self.prior, block_rows=self._block_rows
             )
             first_pass.add_rows([row.poses], guesses)
         self.first_pass = first_pass
@@ -864,22 +697,13 @@ class LiveEstimator:
         self.intake.reset()
         self.counts["begun anew"] += 1
 
-    def _rows_before_motion(
-        self, frame: Frame, notes: list[str]
-    ) -> list[LoggedRow]:
+    def _rows_before_motion(self, frame: Frame, notes: list[str]) -> list[LoggedRow]:
         """Start anew if the motion begins with this frame after a long rest, and return the rows of
         the last frames at rest, with their samples.
 
         Otherwise, and while there is no first pass, the list is empty. Starting anew discards
         estimate and information, see `_start_anew`, and the frames at rest are added to the buffer
         again; this frame is not.
-
-        Parameters
-        ----------
-        frame : Frame
-            Next frame, whose pose may be None.
-        notes : list of str
-            Extended in place if the motion begins.
         """
         frames = self._initial_rest.frames_before_motion(frame)
         if not frames or self.first_pass is None:
@@ -922,9 +746,7 @@ class LiveEstimator:
         self.prior = SquareRootInformation.empty(model.parameter_count)
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
         self.search = (
-            self._new_search()
-            if self.problem.parameters.list_names_without_guess()
-            else None
+            self._new_search() if self.problem.parameters.list_names_without_guess() else None
         )
         self.scatter = ResidualScatter()
         self._trust = INITIAL_RADIUS
@@ -941,35 +763,19 @@ class LiveEstimator:
         """
         if self.first_pass is None or self.first_pass.has_failed:
             return np.inf
-        return self._largest_distance(
-            self.first_pass, self.p, points=self._combined.points
-        )
+        return self._largest_distance(self.first_pass, self.p, points=self._combined.points)
 
-    def _largest_distance(
-        self, first_pass: WindowPass, p: Array, points: Sequence[Array]
-    ) -> float:
+    def _largest_distance(self, first_pass: WindowPass, p: Array, points: Sequence[Array]) -> float:
         """Return the largest distance of p from some points, in the standard errors of a pass; 0
         without points.
 
         It is the largest absolute difference of a single material parameter over its standard
         error; parameters of the recording do not count.
-
-        Parameters
-        ----------
-        first_pass : WindowPass
-            Pass whose standard errors are used.
-        p : (P,)
-            Parameters in the solver's coordinates, not transformed.
-        points : sequence of (P,)
-            Points in transformed parameters, see `StreamingModel.transformed`.
         """
         nq = self.model.collocation.nq
         distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
         return float(
-            np.max(
-                distances / first_pass.sweep.information.standard_errors[:nq],
-                initial=0.0,
-            )
+            np.max(distances / first_pass.sweep.information.standard_errors[:nq], initial=0.0)
         )
 
     def _update_estimate(self) -> None:
@@ -978,32 +784,17 @@ class LiveEstimator:
         that failed.
         """
         if self.first_pass is not None and not self.first_pass.has_failed:
-            self._combined = CombinedPasses.from_passes(
-                self.first_pass, self.second_pass
-            )
-            self.p = self._constrained_minimum(
-                self.first_pass, self._combined.information
-            )
+            self._combined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
+            self.p = self._constrained_minimum(self.first_pass, self._combined.information)
 
-    def _constrained_minimum(
-        self, first_pass: WindowPass, known: SquareRootInformation
-    ) -> Array:
+    def _constrained_minimum(self, first_pass: WindowPass, known: SquareRootInformation) -> Array:
         """Return the parameters p (P,), in the solver's coordinates, that minimise a quadratic loss
         within the bounds and the trust region about the linearisation point of a pass.
-
-        Parameters
-        ----------
-        first_pass : WindowPass
-            Pass whose linearisation point is the centre of the trust region.
-        known : SquareRootInformation
-            Quadratic loss, in transformed parameters.
         """
         reach = self._trust * self.model.collocation.compute_reach_p()
         low = np.maximum(self.lower, first_pass.sweep.p - reach)
         high = np.minimum(self.upper, first_pass.sweep.p + reach)
-        best = known.minimiser(
-            self.model.transformed(low), self.model.transformed(high)
-        )
+        best = known.minimiser(self.model.transformed(low), self.model.transformed(high))
         return np.clip(self.model.physical(best), low, high)
 
     def _next_linearisation_point(self, first_pass: WindowPass) -> Array:
@@ -1014,31 +805,19 @@ class LiveEstimator:
         the linearisation point of the first one, within the bounds and the trust region about that
         point. The prior keeps poorly determined parameters there, and is weaker the more rows are
         in the window. Nothing is changed.
-
-        Parameters
-        ----------
-        first_pass : WindowPass
-            The first pass.
         """
         size = self.model.parameter_count
         samples = len(self.log) / self.model.collocation.substeps
         deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
         slopes = np.diag(
-            1
-            / (
-                deviation
-                * self.model.collocation.compute_reach_p()
-                * first_pass.sweep.rates
-            )
+            1 / (deviation * self.model.collocation.compute_reach_p() * first_pass.sweep.rates)
         )
         information = self._combined.information.with_rows(
             np.zeros(size), slopes, parameters=first_pass.sweep.transformed
         )
         return self._constrained_minimum(first_pass, information)
 
-    def _estimates_and_trust(
-        self, t_s: float
-    ) -> tuple[Mapping[str, Estimate], Assessment]:
+    def _estimates_and_trust(self, t_s: float) -> tuple[Mapping[str, Estimate], Assessment]:
         """Return estimates by name and the verdict at the time t_s [s].
 
         Without a successful first pass the estimates are the values at the current p without
@@ -1066,100 +845,56 @@ class LiveEstimator:
             estimates_only = {name: Estimate(v) for name, v in values.items()}
             return estimates_only, Assessment.from_concerns(grave)
         if self.counts["looked"] % SCATTER_INTERVAL_FRAMES == 0:
-            self.scatter = self._combined.scatter(
-                self.model.transformed(self.p)
-            )
+            self.scatter = self._combined.scatter(self.model.transformed(self.p))
         self.counts["looked"] += 1
         estimates = self._estimates_at(self._combined.information, self.p)
         grave += data_concerns(self.scatter, self.counts, samples=self.samples)
-        grave += estimate_concerns(
-            estimates, self.distance_from_linearisation()
-        )
+        grave += estimate_concerns(estimates, self.distance_from_linearisation())
         return estimates, Assessment.from_concerns(grave)
 
-    def _estimates_at(
-        self, known: SquareRootInformation, p: Array
-    ) -> dict[str, Estimate]:
+    def _estimates_at(self, known: SquareRootInformation, p: Array) -> dict[str, Estimate]:
         """Return estimates with standard errors and 95 % intervals by name, in the units of the
         problem, without the coefficients of fields.
 
         Their variances are scaled by `variance_factor` with the present scatter of the residuals.
-
-        Parameters
-        ----------
-        known : SquareRootInformation
-            Information in transformed parameters, including the priors.
-        p : (P,)
-            Parameters in the solver's coordinates, not transformed; those within `AT_BOUND` of a
-            bound count as at it.
         """
         collocation = self.model.collocation
         nq = self.model.collocation.nq
         transformed = self.model.transformed(p)
         parameter_count = self.model.parameter_count
         factor, quantile = variance_factor(
-            known,
-            transformed,
-            parameter_count=parameter_count,
-            scatter=self.scatter,
+            known, transformed, parameter_count=parameter_count, scatter=self.scatter
         )
         rates = self.model.transformation_derivatives(transformed)[:nq]
         of_q = factor * known.covariance()[:nq, :nq] / np.outer(rates, rates)
-        bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[
-            :nq
-        ]
+        bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
         quantiles = np.full(nq, quantile)
         return user_estimates(
-            collocation.parameters,
-            p[:nq],
-            covariance_q=of_q,
-            at_bound=bounded,
-            quantiles=quantiles,
+            collocation.parameters, p[:nq], covariance_q=of_q, at_bound=bounded, quantiles=quantiles
         )
 
     # Passing again ----------------------------------------------------------------------------
 
-    def _repeat_rows(
-        self, began: float, notes: list[str], done: int = 0
-    ) -> int:
+    def _repeat_rows(self, began: float, notes: list[str], done: int = 0) -> int:
         """Continue the second pass, or start one, within the rest of the frame's budget.
 
         Passes follow one another, the trials of a search included, until none is needed or no
         further row is affordable. Passes, estimate and budget are changed. Without effect before
         the first pass.
-
-        Parameters
-        ----------
-        began : float
-            Time at which the frame began, by `clock` [s].
-        notes : list of str
-            Extended in place.
-        done : int
-            Number of rows that were already computed again in this frame.
-
-        Returns
-        -------
-        int
-            Number of rows computed again in this frame, `done` included.
         """
         while self.first_pass is not None:
             pass_began = self.clock()
             if self.second_pass is None and self._affordable_rows(
                 done, pass_began - began + self.budget.turn_s
             ):
-                self.second_pass = self._start_second_pass(
-                    self.first_pass, notes
-                )
+                self.second_pass = self._start_second_pass(self.first_pass, notes)
                 self.budget.record_relinearisation(self.clock() - pass_began)
             second_pass = self.second_pass
             if second_pass is None:
                 break
             if not done and second_pass.base is not None:
                 self._relinearise_if_moved(
-                    self.first_pass,
-                    second_pass,
-                    began=began,
-                    distance=RELINEARISE_DISTANCE,
+                    self.first_pass, second_pass, began=began, distance=RELINEARISE_DISTANCE
                 )
             affordable = min(
                 self._affordable_rows(done, self.clock() - began),
@@ -1167,27 +902,12 @@ class LiveEstimator:
             )
             if not affordable:
                 break
-            done += self._advance_second_pass(
-                second_pass, affordable, notes=notes
-            )
+            done += self._advance_second_pass(second_pass, affordable, notes=notes)
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
         """Complete a second pass that lags by few rows, if there is time, before new rows come; it
         is then accepted or rejected.
-
-        Parameters
-        ----------
-        began : float
-            Time at which the frame began, by `clock` [s].
-        notes : list of str
-            Extended in place.
-
-        Returns
-        -------
-        int
-            Number of rows that were computed again; 0 without a second pass, if it is a trial of a
-            search, or if the remaining rows do not fit into the budget beside a usual frame.
         """
         second_pass = self.second_pass
         if second_pass is None or second_pass.base is None:
@@ -1201,29 +921,13 @@ class LiveEstimator:
             return 0
         return self._advance_second_pass(second_pass, lag, notes=notes)
 
-    def _advance_second_pass(
-        self, second_pass: WindowPass, count: int, notes: list[str]
-    ) -> int:
+    def _advance_second_pass(self, second_pass: WindowPass, count: int, notes: list[str]) -> int:
         """Compute further rows of the second pass; if it has caught up or failed, accept or reject
         it, or record it as a trial of the search.
 
         While trials of a search are left, the pass is such a trial, which ends after
         `StiffnessSearch.rows` rows. A row that cannot be solved marks the pass as failed. The
         computing time is recorded in `budget`.
-
-        Parameters
-        ----------
-        second_pass : WindowPass
-            The second pass, changed in place.
-        count : int
-            Largest number of rows, at least 1; those of the log that follow the rows of the pass.
-        notes : list of str
-            Extended in place.
-
-        Returns
-        -------
-        int
-            Number of rows that were computed.
         """
         before = self.clock()
         first_row = second_pass.rows
@@ -1233,9 +937,7 @@ class LiveEstimator:
             second_pass.has_failed = True
         self.budget.record_steps(count, self.clock() - before)
         if self.search is not None and not self.search.is_done:
-            if second_pass.has_failed or second_pass.rows >= min(
-                self.search.rows, len(self.log)
-            ):
+            if second_pass.has_failed or second_pass.rows >= min(self.search.rows, len(self.log)):
                 self.search.record_trial(second_pass)
                 self.second_pass = None
         elif (
@@ -1248,21 +950,12 @@ class LiveEstimator:
         """Return how many rows may be computed again: as many as fit into the rest of the time
         budget of the frame, or, if the attribute `rows`, the number per frame, is fixed, these
         minus `done`.
-
-        Parameters
-        ----------
-        done : int
-            Rows that were computed again in this frame; used only if `rows` is fixed.
-        elapsed_s : float
-            Time since the frame began, and that of work that comes first [s]; used otherwise.
         """
         if self.rows is not None:
             return self.rows - done
         return self.budget.affordable_steps(self.budget_s - elapsed_s)
 
-    def _start_second_pass(
-        self, first_pass: WindowPass, notes: list[str]
-    ) -> WindowPass | None:
+    def _start_second_pass(self, first_pass: WindowPass, notes: list[str]) -> WindowPass | None:
         """Return a new second pass, without rows yet, if one is needed, otherwise None; the caller
         sets `second_pass`.
 
@@ -1272,27 +965,16 @@ class LiveEstimator:
         note. Without a search a pass is needed if the estimate has moved farther than
         `REPEAT_DISTANCE` from a linearisation point of the first pass, or if its sweep needs
         another pass, but not after a failure.
-
-        Parameters
-        ----------
-        first_pass : WindowPass
-            The first pass, not changed; a new pass repeats it, but for a trial.
-        notes : list of str
-            Beginning and failure of a search; extended in place.
         """
         search = self.search
         at_start = first_pass.start[0] is None
         if search is None and first_pass.has_failed and at_start:
             search = self.search = self._new_search()
-            notes.append(
-                "searching for initial values over a range of stiffnesses"
-            )
+            notes.append("searching for initial values over a range of stiffnesses")
         p = self.p
         base = first_pass
         if search is not None:
-            if not search.is_done and (
-                len(self.log) < search.rows or not at_start
-            ):
+            if not search.is_done and (len(self.log) < search.rows or not at_start):
                 return None
             p = search.find_best() if search.is_done else search.next_trial()
             base = None
@@ -1309,28 +991,18 @@ class LiveEstimator:
             p = self._next_linearisation_point(first_pass)
             if (
                 self._largest_distance(
-                    first_pass,
-                    p,
-                    points=first_pass.linearisation_points_from(0),
+                    first_pass, p, points=first_pass.linearisation_points_from(0)
                 )
                 <= REPEAT_DISTANCE
                 and not first_pass.sweep.needs_another_pass()
             ):
                 return None
         return WindowPass(
-            self.model,
-            p,
-            prior=first_pass.prior,
-            block_rows=self._block_rows,
-            base=base,
+            self.model, p, prior=first_pass.prior, block_rows=self._block_rows, base=base
         )
 
     def _relinearise_if_moved(
-        self,
-        first_pass: WindowPass,
-        pass_to_move: WindowPass,
-        began: float,
-        distance: float,
+        self, first_pass: WindowPass, pass_to_move: WindowPass, began: float, distance: float
     ) -> None:
         """Move the linearisation point of a pass towards the estimate if it is far and there is
         time.
@@ -1340,36 +1012,18 @@ class LiveEstimator:
 
         Without effect if fewer than `StreamingModel.rows_per_chunk` rows were computed since the
         last change. With a fixed number of rows per frame there is always time.
-
-        Parameters
-        ----------
-        first_pass : WindowPass
-            First pass, which gives the standard errors.
-        pass_to_move : WindowPass
-            Pass to change, in place; may be the first one.
-        began : float
-            Time at which the frame began, by `clock` [s].
-        distance : float
-            Smallest distance between point and estimate, in standard errors.
         """
         current_point = [pass_to_move.sweep.transformed]
         if (
-            pass_to_move.rows
-            < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
-            or self._largest_distance(first_pass, self.p, points=current_point)
-            <= distance
+            pass_to_move.rows < pass_to_move.last_relinearised_row + self.model.rows_per_chunk
+            or self._largest_distance(first_pass, self.p, points=current_point) <= distance
         ):
             return
         before = self.clock()
-        if self.rows is None and not self._affordable_rows(
-            0, before - began + self.budget.turn_s
-        ):
+        if self.rows is None and not self._affordable_rows(0, before - began + self.budget.turn_s):
             return
         p = self._next_linearisation_point(first_pass)
-        if (
-            self._largest_distance(first_pass, p, points=current_point)
-            > distance
-        ):
+        if self._largest_distance(first_pass, p, points=current_point) > distance:
             pass_to_move.relinearise_at(p)
             self.budget.record_relinearisation(self.clock() - before)
 
@@ -1382,15 +1036,6 @@ class LiveEstimator:
         A pass that has not failed always replaces one that has. A search for initial values ends
         either way. After `LARGEST_REJECTIONS` rejections in a row with grossly large residuals, a
         search begins, once in the life of the estimator. The estimate is updated.
-
-        Parameters
-        ----------
-        first_pass : WindowPass
-            The present first pass.
-        second_pass : WindowPass
-            Pass over all rows of the log, or one that has failed.
-        notes : list of str
-            Extended in place.
         """
         self.second_pass = None
         was_search = self.search is not None
@@ -1399,50 +1044,36 @@ class LiveEstimator:
             *first_pass.linearisation_points_from(0),
             second_pass.linearisation_points_from(0)[0],
         ]
-        expected = max(
-            first_pass.sweep.information.loss(point) for point in points
-        )
+        expected = max(first_pass.sweep.information.loss(point) for point in points)
         # The loss of a pass whose linearisation point was changed is not that of a simulation.
         is_within_trust_region = (
             first_pass.last_relinearised_row
             and self._largest_distance(
-                first_pass,
-                first_pass.sweep.p,
-                points=second_pass.linearisation_points_from(0),
+                first_pass, first_pass.sweep.p, points=second_pass.linearisation_points_from(0)
             )
             <= REPEAT_DISTANCE
         )
         fits = (
             first_pass.has_failed
             or is_within_trust_region
-            or second_pass.compute_loss()
-            <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
+            or second_pass.compute_loss() <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
         )
         if not second_pass.has_failed and fits:
             second_pass.base = None
             self.first_pass = second_pass
-            self._trust = (
-                INITIAL_RADIUS
-                if was_search
-                else min(2 * self._trust, LARGEST_RADIUS)
-            )
+            self._trust = INITIAL_RADIUS if was_search else min(2 * self._trust, LARGEST_RADIUS)
             self._rejected = 0
             if was_search:
                 notes.append("continued from another initial stiffness")
-            self.scatter = CombinedPasses.from_passes(
-                second_pass, None
-            ).scatter(second_pass.sweep.transformed)
+            self.scatter = CombinedPasses.from_passes(second_pass, None).scatter(
+                second_pass.sweep.transformed
+            )
         else:
             reach = self.model.collocation.compute_reach_p()
-            length = float(
-                np.abs((second_pass.sweep.p - first_pass.sweep.p) / reach).max()
-            )
+            length = float(np.abs((second_pass.sweep.p - first_pass.sweep.p) / reach).max())
             self._trust = max(RADIUS_REDUCTION * length, 1e-6)
             self._rejected += 1
-            is_stuck = (
-                self._rejected >= LARGEST_REJECTIONS
-                and self.scatter.rms > GROSS_MISFIT
-            )
+            is_stuck = self._rejected >= LARGEST_REJECTIONS and self.scatter.rms > GROSS_MISFIT
             if (
                 is_stuck
                 and not was_search

@@ -108,9 +108,7 @@ class FrameBuffer:
         """Time of the last pose [s]; None if there is none since the start or a reset."""
         return self._poses[-1][0] if self._poses else None
 
-    def marker_samples(
-        self, log: Sequence[LoggedRow]
-    ) -> Iterator[tuple[float, Array]]:
+    def marker_samples(self, log: Sequence[LoggedRow]) -> Iterator[tuple[float, Array]]:
         """Yield time and positions (M, 3) [m] of all marker samples of `all_samples`, NaN where
         missing; times are in samples from the first row on, 1.5 for half way between the second and
         the third.
@@ -119,9 +117,7 @@ class FrameBuffer:
             if not of:
                 yield when, tracks_m
 
-    def all_samples(
-        self, log: Sequence[LoggedRow]
-    ) -> Iterator[InstrumentSample]:
+    def all_samples(self, log: Sequence[LoggedRow]) -> Iterator[InstrumentSample]:
         """Yield instrument number, time and values of all samples; markers have the number 0, their
         values are (M, 3).
 
@@ -180,17 +176,12 @@ class FrameBuffer:
         """
         sample_s = self.interval_s
         notes = []
-        if any(
-            abs(t_s - other) <= TIME_TOLERANCE_SAMPLES * sample_s
-            for other in self._times
-        ):
+        if any(abs(t_s - other) <= TIME_TOLERANCE_SAMPLES * sample_s for other in self._times):
             self.counts["doubled"] += 1
             return BufferedFrame(
                 [],
                 [],
-                notes=[
-                    f"a frame at {t_s:.6g} s was received before: the second one is ignored"
-                ],
+                notes=[f"a frame at {t_s:.6g} s was received before: the second one is ignored"],
             )
         late = t_s < self.last_s
         if late:
@@ -198,16 +189,10 @@ class FrameBuffer:
                 self.counts["late"] += 1
                 self._too_late += 1
                 return BufferedFrame(
-                    [],
-                    [],
-                    notes=[
-                        f"the frame at {t_s:.6g} s arrived too late and is ignored"
-                    ],
+                    [], [], notes=[f"the frame at {t_s:.6g} s arrived too late and is ignored"]
                 )
             self.counts["unordered"] += 1
-            notes.append(
-                f"the frame at {t_s:.6g} s is late: its markers are used, its pose is not"
-            )
+            notes.append(f"the frame at {t_s:.6g} s is late: its markers are used, its pose is not")
         self._too_late = 0
         self._times.append(t_s)
         has_started = self.start_s is not None or pose is not None
@@ -245,9 +230,7 @@ class FrameBuffer:
             return False
         before_s, before_m, _ = self._poses[-1]
         samples = max(1.0, (t_s - before_s) / self.interval_s)
-        return bool(
-            np.abs(positions_m - before_m).max() > samples * self.largest_jump_m
-        )
+        return bool(np.abs(positions_m - before_m).max() > samples * self.largest_jump_m)
 
     def _note_gaps(self, t_s: float) -> list[str]:
         """Count missing frames and frames between samples, and return notes about them.
@@ -258,11 +241,7 @@ class FrameBuffer:
         if not np.isfinite(self.last_s):
             return []
         missing = round((t_s - self.last_s) / self.interval_s) - 1
-        offset = (
-            (t_s - self.start_s) / self.interval_s
-            if self.start_s is not None
-            else 0.0
-        )
+        offset = (t_s - self.start_s) / self.interval_s if self.start_s is not None else 0.0
         notes = []
         if missing > 0:
             self.counts["dropped"] += missing
@@ -279,27 +258,14 @@ class FrameBuffer:
             self.counts["off the grid"] += 1
         return notes
 
-    def _add_pose(
-        self, t_s: float, positions_m: Array, quaternions: Array
-    ) -> None:
+    def _add_pose(self, t_s: float, positions_m: Array, quaternions: Array) -> None:
         """Store a pose, with the sign of each quaternion nearest to the previous one.
 
         The time of the first pose becomes `start_s`.
-
-        Parameters
-        ----------
-        t_s : float
-            Time [s], later than that of the previous pose.
-        positions_m : (G, 3)
-            Positions of the moving grasps [m].
-        quaternions : (G, 4)
-            Unit quaternions x y z w of the moving grasps.
         """
         if self._poses:
             before = self._poses[-1][2]
-            signs = np.where(
-                np.sum(quaternions * before, axis=1) < 0, -1.0, 1.0
-            )
+            signs = np.where(np.sum(quaternions * before, axis=1) < 0, -1.0, 1.0)
             quaternions = quaternions * signs[:, None]
         elif self.start_s is None:
             self.start_s = t_s
@@ -351,19 +317,15 @@ class FrameBuffer:
         for at_s, positions_m, quaternions in self._poses:
             if abs(at_s - t_s) <= TIME_TOLERANCE_S:
                 return positions_m, quaternions
-        times, places, quaternions = (
-            list(each) for each in zip(*self._poses, strict=True)
-        )
+        times, places, quaternions = (list(each) for each in zip(*self._poses, strict=True))
         has_large_gap = any(
-            b - a
-            > (LARGEST_CUBIC_GAP + TIME_TOLERANCE_SAMPLES) * self.interval_s
+            b - a > (LARGEST_CUBIC_GAP + TIME_TOLERANCE_SAMPLES) * self.interval_s
             for a, b in pairwise(times)
         )
         used = slice(-2, None) if has_large_gap else slice(None)
         weights = lagrange_weights(t_s, times[used])
         position_m, quaternion = (
-            np.einsum("k,kgi->gi", weights, each[used])
-            for each in (places, quaternions)
+            np.einsum("k,kgi->gi", weights, each[used]) for each in (places, quaternions)
         )
         return position_m, quaternion
 
@@ -388,20 +350,15 @@ class FrameBuffer:
             if not of:
                 return t_s <= latest_s
             instrument = self.instruments[of - 1]
-            rows = instrument.rows_of_sample(
-                self.rows - 1 - (now_s - t_s) / step_s
-            )
+            rows = instrument.rows_of_sample(self.rows - 1 - (now_s - t_s) / step_s)
             return rows.stop + instrument.delay <= self.rows
 
         available = [each for each in self._waiting if ready(*each[:2])]
         self._waiting = [each for each in self._waiting if not ready(*each[:2])]
         # Before the first row nothing is known.
         available = [
-            each
-            for each in available
-            if each[1] >= self.start_s - (0 if each[0] else room_s)
+            each for each in available if each[1] >= self.start_s - (0 if each[0] else room_s)
         ]
         return [
-            Sample((now_s - t_s) / step_s, values, instrument=of)
-            for of, t_s, values in available
+            Sample((now_s - t_s) / step_s, values, instrument=of) for of, t_s, values in available
         ]

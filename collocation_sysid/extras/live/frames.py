@@ -110,38 +110,19 @@ def parse_pose(
     if any(one is None for one in each):
         return None
     parts = [_parse_single_pose(one) for one in each]
-    return np.array([part[0] for part in parts]), np.array(
-        [part[1] for part in parts]
-    )
+    return np.array([part[0] for part in parts]), np.array([part[1] for part in parts])
 
 
 def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
-    """Return position (3,) [m] and unit quaternion (4,), x y z w, of one pose.
-
-    Parameters
-    ----------
-    pose : mapping, tuple or (4, 4) array
-        See `parse_pose`; a tuple of two values is (position, quaternion), anything else a matrix.
-
-    Raises
-    ------
-    InputError
-        If the mapping lacks a key, a number is None, NaN or beyond `LARGEST_NUMBER`, the norm of
-        the quaternion differs from 1 by more than `QUATERNION_NORM_TOLERANCE`, or the matrix is not
-        a rigid motion (`first_matrix_fault`).
-    """
+    """Return position (3,) [m] and unit quaternion (4,), x y z w, of one pose."""
     if isinstance(pose, Mapping):
         if missing := [key for key in _POSE_KEYS if key not in pose]:
-            raise InputError(
-                f"the pose has no {missing[0]}; expected {' and '.join(_POSE_KEYS)}"
-            )
+            raise InputError(f"the pose has no {missing[0]}; expected {' and '.join(_POSE_KEYS)}")
         pose = tuple(pose[key] for key in _POSE_KEYS)
     if isinstance(pose, tuple) and len(pose) == 2:
         position = _parse_array(pose[0], (3,))
         quaternion = _parse_array(pose[1], (4,))
-        fault = first_pose_fault(
-            np.zeros(1), position[None], quaternions_xyzw=quaternion[None]
-        )
+        fault = first_pose_fault(np.zeros(1), position[None], quaternions_xyzw=quaternion[None])
         if fault is not None:
             raise InputError(fault[1].replace(" at t_s = 0", ""))
         return position, quaternion / np.linalg.norm(quaternion)
@@ -152,9 +133,7 @@ def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
     return matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3]).as_quat()
 
 
-def parse_markers(
-    markers: ArrayLike | Mapping[str, Any] | None, names: Sequence[str]
-) -> Array:
+def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence[str]) -> Array:
     """Return marker positions (M, 3) [m], NaN where missing.
 
     A marker of which any coordinate is None or NaN is missing as a whole.
@@ -186,9 +165,7 @@ def parse_markers(
                 )
             if place is not None:
                 tracks[list(names).index(name)] = _parse_array(place, (3,))
-    return np.where(
-        np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan
-    )
+    return np.where(np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan)
 
 
 def parse_custom_readings(
@@ -217,9 +194,7 @@ def parse_custom_readings(
     if readings is None:
         return ()
     if not isinstance(readings, Mapping):
-        raise InputError(
-            f"readings are {reprlib.repr(readings)}; expected samples by name"
-        )
+        raise InputError(f"readings are {reprlib.repr(readings)}; expected samples by name")
     names = [gauge.name for gauge in gauges]
     collected = []
     for name, samples in readings.items():
@@ -229,24 +204,18 @@ def parse_custom_readings(
                 if names
                 else "none, because the problem has no readings"
             )
-            raise InputError(
-                f"found a reading {reprlib.repr(name)}; expected {known}"
-            )
+            raise InputError(f"found a reading {reprlib.repr(name)}; expected {known}")
         number = names.index(name)
         count = gauges[number].measured_values.shape[1]
         what = f"the reading '{name}'"
         collected += [
-            (number + 1, *sample)
-            for sample in _parse_samples(samples, what, count=count, t_s=t_s)
+            (number + 1, *sample) for sample in _parse_samples(samples, what, count=count, t_s=t_s)
         ]
     return tuple(collected)
 
 
 def parse_wrenches(
-    wrench_data: Any,
-    wrenches: Mapping[int, Wrench],
-    instruments_before: int,
-    t_s: float,
+    wrench_data: Any, wrenches: Mapping[int, Wrench], instruments_before: int, t_s: float
 ) -> tuple[InstrumentSample, ...]:
     """Return samples of the sensors of grasps, each as number of the instrument, time [s] and
     values (6,); a sample without a time has the time of the frame.
@@ -277,9 +246,7 @@ def parse_wrenches(
     if wrench_data is None or not wrenches:
         return ()
     known = {str(number): k for k, number in enumerate(wrenches)}
-    if not isinstance(wrench_data, Mapping) or set(wrench_data) & set(
-        _SAMPLE_KEYS
-    ):
+    if not isinstance(wrench_data, Mapping) or set(wrench_data) & set(_SAMPLE_KEYS):
         if len(known) > 1:
             raise InputError(
                 f"found one wrench; expected those of the grasps {' and '.join(known)}, by number"
@@ -298,54 +265,24 @@ def parse_wrenches(
         for at_s, values in _parse_samples(
             samples, what, count=len(measured), t_s=t_s, alternative_count=3
         ):
-            wrench_values = np.where(
-                measured, np.pad(values, (0, 6 - len(values))), np.nan
-            )
+            wrench_values = np.where(measured, np.pad(values, (0, 6 - len(values))), np.nan)
             wrench_values[len(values) :] = np.nan
-            collected.append(
-                (instruments_before + known[name] + 1, at_s, wrench_values)
-            )
+            collected.append((instruments_before + known[name] + 1, at_s, wrench_values))
     return tuple(collected)
 
 
 def _parse_samples(
     samples: Any, what: str, count: int, t_s: float, alternative_count: int = 0
 ) -> Iterator[tuple[float, Array]]:
-    """Yield time [s] and values of the samples of one instrument; missing samples are skipped.
-
-    Parameters
-    ----------
-    samples : samples
-        Values, a mapping with exactly the keys ``t_s`` and ``values``, or a list of such mappings.
-        Values are a sequence, or a number if `count` is 1; None is a missing sample, and None among
-        the values becomes NaN.
-    what : str
-        Name of the instrument for messages.
-    count : int
-        Number of values.
-    t_s : float
-        Time of samples without a time [s].
-    alternative_count : int
-        Second admissible number of values; 0 for none.
-
-    Raises
-    ------
-    InputError
-        For other keys, a time that is not finite, or values that are not as many numbers, up to
-        `LARGEST_NUMBER` in magnitude.
-    """
-    several = isinstance(samples, Sequence) and any(
-        isinstance(s, Mapping) for s in samples
-    )
+    """Yield time [s] and values of the samples of one instrument; missing samples are skipped."""
+    several = isinstance(samples, Sequence) and any(isinstance(s, Mapping) for s in samples)
     for sample in samples if several else [samples]:
         at_s = t_s
         values = sample
         if isinstance(sample, Mapping):
             if set(sample) != set(_SAMPLE_KEYS):
                 keys = ", ".join(map(reprlib.repr, sample)) or "nothing"
-                raise InputError(
-                    f"a sample of {what} has the keys {keys}; expected t_s and values"
-                )
+                raise InputError(f"a sample of {what} has the keys {keys}; expected t_s and values")
             at_s = parse_time(sample["t_s"])
             values = sample["values"]
         one = isinstance(values, (int, float)) and not isinstance(values, bool)
@@ -355,8 +292,7 @@ def _parse_samples(
                 yield (
                     at_s,
                     _parse_array(
-                        [values] if one else values,
-                        (alternative_count if few else count,),
+                        [values] if one else values, (alternative_count if few else count,)
                     ),
                 )
             except InputError as error:
@@ -364,28 +300,17 @@ def _parse_samples(
 
 
 def _parse_array(raw_values: Any, shape: tuple[int, ...]) -> Array:
-    """Return an array of floats of the given shape; entries that are None become NaN.
-
-    Raises
-    ------
-    InputError
-        For anything else, another shape (None in place of an array, too), or magnitudes beyond
-        `LARGEST_NUMBER`.
-    """
+    """Return an array of floats of the given shape; entries that are None become NaN."""
     size = " × ".join(map(str, shape))
     try:
         values = np.array(raw_values, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"found {reprlib.repr(raw_values)}; expected {size} numbers"
-        ) from None
+        raise InputError(f"found {reprlib.repr(raw_values)}; expected {size} numbers") from None
     if values.shape != shape:
         sizes = " × ".join(map(str, values.shape)) or "single"
         raise InputError(f"found {sizes} numbers; expected {size} numbers")
     if (beyond := np.abs(values) > LARGEST_NUMBER).any():
-        raise InputError(
-            f"found {values[beyond][0]:g}; expected numbers up to {LARGEST_NUMBER:g}"
-        )
+        raise InputError(f"found {values[beyond][0]:g}; expected numbers up to {LARGEST_NUMBER:g}")
     return values
 
 
@@ -488,11 +413,6 @@ class FrameReader:
 
         The keys are "t_s", "pose", "markers", "wrench" and "readings"; all but "t_s" may be omitted
         or null, which means that nothing was measured.
-
-        Raises
-        ------
-        InputError
-            For an unknown key, without "t_s", or for an invalid value.
         """
         if unknown := [key for key in json_object if key not in _KEYS]:
             raise InputError(
@@ -500,50 +420,24 @@ class FrameReader:
             )
         if "t_s" not in json_object:
             raise InputError("there is no t_s; expected the time in seconds")
-        pose = self._pose_of_body(
-            parse_pose(json_object.get("pose"), self.grasps)
-        )
+        pose = self._pose_of_body(parse_pose(json_object.get("pose"), self.grasps))
         tracks = parse_markers(json_object.get("markers"), self.names)
         t_s = parse_time(json_object["t_s"])
         wrench = json_object.get("wrench")
-        samples = parse_custom_readings(
-            json_object.get("readings"), self.gauges, t_s=t_s
-        )
+        samples = parse_custom_readings(json_object.get("readings"), self.gauges, t_s=t_s)
         samples += parse_wrenches(
-            wrench,
-            self.wrenches,
-            instruments_before=len(self.gauges),
-            t_s=t_s,
+            wrench, self.wrenches, instruments_before=len(self.gauges), t_s=t_s
         )
         return Frame(
-            t_s,
-            pose,
-            tracks_m=tracks,
-            has_wrench=wrench is not None,
-            instrument_samples=samples,
+            t_s, pose, tracks_m=tracks, has_wrench=wrench is not None, instrument_samples=samples
         )
 
-    def _pose_of_body(
-        self, pose: tuple[Array, Array] | None
-    ) -> tuple[Array, Array] | None:
+    def _pose_of_body(self, pose: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
         """Return the pose of the undeformed body in each moving grasp from the pose in a line,
         which is that of the gripper if the grasp has a transform in `gripper_transforms`: both are
         multiplied. Grasps without a transform keep their pose.
-
-        Parameters
-        ----------
-        pose : (positions, quaternions) or None
-            Positions (G, 3) [m] and unit quaternions (G, 4), x y z w, of the moving grasps; not
-            modified. None if missing.
-
-        Returns
-        -------
-        (positions, quaternions) or None
-            New arrays of the same shapes, or `pose` itself without any transform; None for None.
         """
-        if pose is None or not any(
-            each is not None for each in self.gripper_transforms
-        ):
+        if pose is None or not any(each is not None for each in self.gripper_transforms):
             return pose
         positions = pose[0].copy()
         quaternions = pose[1].copy()
@@ -561,16 +455,6 @@ class FrameReader:
 
         The pose is missing if any cell of any moving grasp is NaN or empty. Columns of markers and
         instruments may be absent. An instrument without any number in the row has no sample.
-
-        Parameters
-        ----------
-        cells : list of str
-            Cells of the row, stripped.
-
-        Raises
-        ------
-        InputError
-            For an invalid header, a wrong number of cells, or a cell that is not a number.
         """
         if self._columns is None:
             self._columns = self._checked_header(cells)
@@ -581,29 +465,19 @@ class FrameReader:
                 "header has columns"
             )
         by_name = dict(zip(self._columns, map(_parse_cell, cells), strict=True))
-        poses = [
-            [by_name[name] for name in self._pose_columns(k)]
-            for k in self.grasps
-        ]
+        poses = [[by_name[name] for name in self._pose_columns(k)] for k in self.grasps]
         each = [(values[:3], values[3:]) for values in poses]
         is_complete = not np.isnan(poses).any()
         pose = (
-            self._pose_of_body(
-                parse_pose(each[0] if len(each) == 1 else each, self.grasps)
-            )
+            self._pose_of_body(parse_pose(each[0] if len(each) == 1 else each, self.grasps))
             if is_complete
             else None
         )
-        tracks = [
-            [by_name.get(f"{m}_{a}", np.nan) for a in ("x", "y", "z")]
-            for m in self.names
-        ]
+        tracks = [[by_name.get(f"{m}_{a}", np.nan) for a in ("x", "y", "z")] for m in self.names]
         t_s = parse_time(by_name["t_s"])
         instrument_samples = list[InstrumentSample]()
         for number, columns in enumerate(self._list_instrument_columns(), 1):
-            values = np.array(
-                [by_name.get(column, np.nan) for column in columns]
-            )
+            values = np.array([by_name.get(column, np.nan) for column in columns])
             if np.isfinite(values).any():
                 instrument_samples.append((number, t_s, values))
         return Frame(
@@ -627,13 +501,8 @@ class FrameReader:
         of a grasp, "fx_n" to "tz_nm"; the latter with the number of the grasp and a dot in front if
         there are several.
         """
-        before = [
-            "" if len(self.wrenches) == 1 else f"{number}."
-            for number in self.wrenches
-        ]
-        of_wrenches = [
-            [each + name for name in WRENCH_COLUMNS] for each in before
-        ]
+        before = ["" if len(self.wrenches) == 1 else f"{number}." for number in self.wrenches]
+        of_wrenches = [[each + name for name in WRENCH_COLUMNS] for each in before]
         return [*(gauge.columns for gauge in self.gauges), *of_wrenches]
 
     def _checked_header(self, columns: list[str]) -> list[str]:
@@ -641,30 +510,15 @@ class FrameReader:
 
         Needed are "t_s" and the pose of each moving grasp; three columns of each marker, such as
         "m1_x", and those of instruments are allowed.
-
-        Raises
-        ------
-        InputError
-            If a needed column is missing, or for an unknown one.
         """
-        needed = [
-            "t_s",
-            *(name for k in self.grasps for name in self._pose_columns(k)),
-        ]
+        needed = ["t_s", *(name for k in self.grasps for name in self._pose_columns(k))]
         if missing := [name for name in needed if name not in columns]:
             raise InputError(
                 f"the first line is neither a JSON object nor a header with the column {missing[0]!r}; "
                 f"expected {', '.join(needed)} and the columns of the markers"
             )
-        known = {
-            *needed,
-            *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z")),
-        }
-        known |= {
-            column
-            for each in self._list_instrument_columns()
-            for column in each
-        }
+        known = {*needed, *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z"))}
+        known |= {column for each in self._list_instrument_columns() for column in each}
         if unknown := [name for name in columns if name not in known]:
             raise InputError(
                 f"found a column {reprlib.repr(unknown[0])}; expected some of "
@@ -684,10 +538,7 @@ def _parse_json(text: str) -> Mapping[str, Any]:
             f"this line is not valid JSON ({error.msg} at column {error.colno}); expected one JSON "
             "object per line"
         ) from error
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # Python's limits of digits and of nesting
+    except (ValueError, RecursionError) as error:  # Python's limits of digits and of nesting
         raise InputError(
             "this line is not a frame: a number is too long, or brackets are nested too deeply; "
             f"expected one JSON object with {', '.join(_KEYS)}"
@@ -698,9 +549,7 @@ def parse_time(time: Any) -> float:
     """Return a time [s] as a float; raise an `InputError` if it is not a number (text, boolean,
     None, NaN) or beyond `LARGEST_NUMBER` in magnitude.
     """
-    number = isinstance(time, (int, float, np.number)) and not isinstance(
-        time, bool
-    )
+    number = isinstance(time, (int, float, np.number)) and not isinstance(time, bool)
     if not number or not abs(time) <= LARGEST_NUMBER:
         expected = f"a finite number of seconds, up to {LARGEST_NUMBER:g}"
         raise InputError(f"t_s is {reprlib.repr(time)}; expected {expected}")
@@ -708,18 +557,10 @@ def parse_time(time: Any) -> float:
 
 
 def _parse_cell(text: str) -> float:
-    """Return the number of a table cell; NaN for an empty cell or "nan".
-
-    Raises
-    ------
-    InputError
-        For any other text.
-    """
+    """Return the number of a table cell; NaN for an empty cell or "nan"."""
     if text == "" or text.lower() == "nan":
         return float("nan")
     try:
         return number_from_text(text)
     except ValueError:
-        raise InputError(
-            f"found {reprlib.repr(text)}; expected a number"
-        ) from None
+        raise InputError(f"found {reprlib.repr(text)}; expected a number") from None

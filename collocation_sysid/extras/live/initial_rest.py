@@ -51,9 +51,7 @@ class InitialRest:
     is_over: bool = False
     _largest_rest_m: float = 0.0
     _first: list[Frame] = field(default_factory=list)
-    _recent: deque[Frame] = field(
-        default_factory=lambda: deque(maxlen=REPLAYED_FRAMES)
-    )
+    _recent: deque[Frame] = field(default_factory=lambda: deque(maxlen=REPLAYED_FRAMES))
 
     def frames_before_motion(self, frame: Frame) -> list[Frame]:
         """Add a frame and return the last frames at rest, at most `REPLAYED_FRAMES`, if the motion
@@ -84,8 +82,7 @@ class InitialRest:
         """
         first = self._first[0]
         return all(
-            self._displacement_m(frame, reference=first) <= self._largest_rest_m
-            for frame in frames
+            self._displacement_m(frame, reference=first) <= self._largest_rest_m for frame in frames
         )
 
     def _largest_displacement_at_rest_m(self) -> float:
@@ -96,14 +93,10 @@ class InitialRest:
         least two.
         """
         steps_m = [
-            self._displacement_m(after, reference=before)
-            for before, after in pairwise(self._first)
+            self._displacement_m(after, reference=before) for before, after in pairwise(self._first)
         ]
         noise_m = float(np.sqrt(np.mean(np.square(steps_m)) / 2))
-        return max(
-            LARGEST_REST_BODY_SIZES * self.body_size_m,
-            LARGEST_REST_DEVIATIONS * noise_m,
-        )
+        return max(LARGEST_REST_BODY_SIZES * self.body_size_m, LARGEST_REST_DEVIATIONS * noise_m)
 
     def _displacement_m(self, frame: Frame, reference: Frame) -> float:
         """Return the largest displacement [m] of a grasp from one frame to another, both with

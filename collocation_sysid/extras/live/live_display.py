@@ -15,13 +15,7 @@ from ...common.files import replaced_file
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...errors import InputError
 from ...fem.laws.constants import unit_of
-from ...result.figure_style import (
-    BLUE,
-    ORANGE,
-    new_figure,
-    style_axes,
-    symbol_as_mathtext,
-)
+from ...result.figure_style import BLUE, ORANGE, new_figure, style_axes, symbol_as_mathtext
 from ...result.run_sections import verdict_section
 from .estimator import LiveUpdate
 
@@ -60,9 +54,7 @@ def sparkline(values: Sequence[float], columns: int = COLUMNS) -> str:
     shown = np.log(last) if (last > 0).all() else last
     low = float(shown.min())
     high = float(shown.max())
-    share = (
-        (shown - low) / (high - low) if high > low else np.full(len(shown), 0.5)
-    )
+    share = (shown - low) / (high - low) if high > low else np.full(len(shown), 0.5)
     return "".join(BARS[round(s * (len(BARS) - 1))] for s in share)
 
 
@@ -86,28 +78,17 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
             if estimate.statistical_std_error is None
             else f"{estimate.statistical_std_error:.2g}"
         )
-        history = sparkline(
-            [update.estimates[name].value for update in updates[-COLUMNS:]]
-        )
-        rows.append(
-            (name, f"{estimate.value:.5g}", error, unit_of(name), history)
-        )
+        history = sparkline([update.estimates[name].value for update in updates[-COLUMNS:]])
+        rows.append((name, f"{estimate.value:.5g}", error, unit_of(name), history))
     return [
         f"t = {last.t_s:.2f} s   marker error {millimetres(last.marker_rms_m)} RMS   latency "
         f"{1e3 * last.latency_s:.1f} ms",
-        Table(
-            "",
-            ("", "estimate", "±", "unit", "history"),
-            rows=tuple(rows),
-            names=5,
-        ),
+        Table("", ("", "estimate", "±", "unit", "history"), rows=tuple(rows), names=5),
         verdict_section(last.trust, max_reasons=SHOWN_REASONS),
     ]
 
 
-def final_display(
-    updates: Sequence[LiveUpdate], settled: LiveUpdate
-) -> list[Shown]:
+def final_display(updates: Sequence[LiveUpdate], settled: LiveUpdate) -> list[Shown]:
     """Return the display of the final estimate, as by `display_of`, and a line with the median and
     99 % quantile of the latency of the frames.
 
@@ -120,19 +101,17 @@ def final_display(
     """
     took_ms = 1e3 * np.array([update.latency_s for update in updates])
     median, late = np.percentile(took_ms, [50, 99])
-    latency_text = f"{len(updates)} frames, latency {median:.1f} ms (median), {late:.1f} ms (99 % quantile); "
-    latency_text += (
-        f"final estimate {1e3 * settled.latency_s:.0f} ms after the last frame"
+    latency_text = (
+        f"{len(updates)} frames, latency {median:.1f} ms (median), {late:.1f} ms (99 % quantile); "
     )
+    latency_text += f"final estimate {1e3 * settled.latency_s:.0f} ms after the last frame"
     return [*display_of([*updates, settled]), latency_text]
 
 
 def require_gif(file: Path) -> None:
     """Raise an `InputError` unless the file's name ends in .gif, in any case of letters."""
     if file.suffix.lower() != ".gif":
-        raise InputError(
-            f"found '{file.suffix}'; expected .gif", file, where="--film"
-        )
+        raise InputError(f"found '{file.suffix}'; expected .gif", file, where="--film")
 
 
 def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
@@ -164,14 +143,10 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     names = list(updates[-1].estimates)
     figure = new_figure(WIDTH_MM, ROW_MM * len(names))
     lines = [
-        _draw_parameter(
-            figure, k, count=len(names), name=name, t_s=t_s, updates=updates
-        )
+        _draw_parameter(figure, k, count=len(names), name=name, t_s=t_s, updates=updates)
         for k, name in enumerate(names)
     ]
-    step = max(
-        1, round(len(t_s) / max(1.0, (t_s[-1] - t_s[0]) * FRAMES_A_SECOND))
-    )
+    step = max(1, round(len(t_s) / max(1.0, (t_s[-1] - t_s[0]) * FRAMES_A_SECOND)))
     writer = PillowWriter(fps=FRAMES_A_SECOND)
     stops = [*range(1, len(t_s), step), len(t_s)]
     with (
@@ -189,36 +164,14 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
 
 
 def _draw_parameter(
-    figure: Figure,
-    k: int,
-    count: int,
-    name: str,
-    t_s: Array,
-    updates: Sequence[LiveUpdate],
+    figure: Figure, k: int, count: int, name: str, t_s: Array, updates: Sequence[LiveUpdate]
 ) -> tuple[list, list[Array]]:
     """Add the axes of a parameter to a figure; return the three lines of its value and of the ends
     of its interval, without data yet, and their data (T,), NaN for ends that are unknown.
-
-    Parameters
-    ----------
-    figure : Figure
-        Modified in place.
-    k : int
-        Index of the panel, from the top.
-    count : int
-        Number of panels.
-    name : str
-        Name of the parameter.
-    t_s : (T,)
-        Times of the updates.
-    updates : sequence of LiveUpdate
-        Updates that contain the parameter.
     """
     estimates = [update.estimates[name] for update in updates]
     value = np.array([each.value for each in estimates])
-    ends = np.array(
-        [each.statistical95 or (np.nan, np.nan) for each in estimates]
-    )
+    ends = np.array([each.statistical95 or (np.nan, np.nan) for each in estimates])
     axes = figure.add_subplot(count, 1, k + 1)
     # Intervals of the beginning would leave no room for those of the end.
     later_values = value[len(value) // 4 :]
@@ -235,7 +188,5 @@ def _draw_parameter(
     label = symbol_as_mathtext(name) + (f" [{unit}]" if unit else "")
     style_axes(axes, "", xlabel="t [s]" if k == count - 1 else "", ylabel=label)
     styles = ((BLUE, "-"), (ORANGE, "--"), (ORANGE, "--"))
-    lines = [
-        axes.plot([], [], style, color=colour)[0] for colour, style in styles
-    ]
+    lines = [axes.plot([], [], style, color=colour)[0] for colour, style in styles]
     return lines, [value, ends[:, 0], ends[:, 1]]

@@ -44,14 +44,7 @@ def model_from_problem(problem: Problem) -> StreamingModel:
 
 
 def _only_experiment(problem: Problem) -> Experiment:
-    """Return the single fitted experiment of a problem.
-
-    Raises
-    ------
-    InputError
-        If not exactly one experiment is fitted, or for the first of its features that live
-        estimation does not support.
-    """
+    """Return the single fitted experiment of a problem."""
     fitted = [each for each in problem.experiments if not each.validation]
 
     if len(fitted) != 1:
@@ -66,15 +59,11 @@ def _only_experiment(problem: Problem) -> Experiment:
         if is_present:
             where = f"experiment '{experiment.name}'"
             message = f"live estimates do not support {feature}"
-            raise InputError(
-                f"{message}; expected {expected}", problem.path, where=where
-            )
+            raise InputError(f"{message}; expected {expected}", problem.path, where=where)
     return experiment
 
 
-def _unsupported_features(
-    experiment: Experiment,
-) -> Iterator[tuple[str, object, str]]:
+def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
     """Yield for each feature that live estimation lacks, whether the experiment has it or not: its
     description, a value that is true if the experiment has the feature, and the supported
     alternative.
@@ -84,21 +73,9 @@ def _unsupported_features(
     nuisance = experiment.nuisance
     yield "a static experiment", experiment.is_static, "a motion"
     has_declared_start = experiment.start == "given"
-    yield (
-        'start = "given"',
-        has_declared_start,
-        'start = "equilibrium" or "undeformed"',
-    )
-    yield (
-        "a material with memory",
-        body.has_memory,
-        "one without Prony branches",
-    )
-    yield (
-        "a mesh made under gravity",
-        body.scan_conditions is not None,
-        "a stress-free one",
-    )
+    yield ('start = "given"', has_declared_start, 'start = "equilibrium" or "undeformed"')
+    yield ("a material with memory", body.has_memory, "one without Prony branches")
+    yield ("a mesh made under gravity", body.scan_conditions is not None, "a stress-free one")
     has_internal_variables = any(
         placed.force.internal_variable_count for placed in body.placed_forces
     )
@@ -111,24 +88,13 @@ def _unsupported_features(
     for feature in FEATURES:
         yield from feature.live_limitations(experiment)
     delayed = experiment.obstacles and nuisance.obstacle_time_s
-    yield (
-        "an obstacle whose delay is estimated",
-        delayed,
-        "one whose clock is known",
-    )
+    yield ("an obstacle whose delay is estimated", delayed, "one whose clock is known")
     filtered = nuisance.sensor_lag_s and experiment.sensors_by_grasp
     yield "a sensor with a low-pass (sensor_lag)", filtered, "one without"
-    laws = (
-        law_function(each.force, each.points.dofs)
-        for each in body.placed_forces
-    )
+    laws = (law_function(each.force, each.points.dofs) for each in body.placed_forces)
     depends_on_time = any(law.depends_on_datum(0) for law in laws)
     yield "a force that depends on time", depends_on_time, "one that does not"
-    yield (
-        "an experiment without markers",
-        not experiment.markers.names,
-        "markers",
-    )
+    yield ("an experiment without markers", not experiment.markers.names, "markers")
     is_temporary = any(np.isfinite([g.from_s, g.until_s]).any() for g in grasps)
     yield (
         "a grasp that holds during a part of the recording",
@@ -138,17 +104,10 @@ def _unsupported_features(
     has_zero = any(grasp.zero for grasp in grasps)
     yield "a grasp whose zero is estimated", has_zero, "one whose zero is known"
     moves = any(len(grasp.poses.t_s) > 1 for grasp in grasps)
-    yield (
-        "an experiment whose grasps never move",
-        not moves,
-        "a pose that moves",
-    )
+    yield ("an experiment whose grasps never move", not moves, "a pose that moves")
     loads = (
         each(experiment.t_s)
-        for each in (
-            experiment.point_mass_at_nodes_kg,
-            experiment.declared_node_forces_n,
-        )
+        for each in (experiment.point_mass_at_nodes_kg, experiment.declared_node_forces_n)
     )
     changing = not all(np.allclose(each, each[:1]) for each in loads)
     yield "a load that changes in time", changing, "constant loads"

@@ -18,13 +18,7 @@ from ...common.array_types import Array
 from ...common.files import require_possible
 from ...errors import InputError
 from ...recording import Experiment
-from ..export.rerun_recording import (
-    APPLICATION,
-    GREY,
-    MARKER_RADIUS_RATIO,
-    ORANGE,
-    TIMELINE,
-)
+from ..export.rerun_recording import APPLICATION, GREY, MARKER_RADIUS_RATIO, ORANGE, TIMELINE
 from .estimator import LiveUpdate
 from .frames import Frame
 
@@ -44,9 +38,7 @@ def require_recordable(file: Path) -> None:
     if find_spec("rerun") is None:
         raise InputError(MISSING)
     if file.suffix.lower() != SUFFIX:
-        raise InputError(
-            f"found {file.suffix!r}; expected {SUFFIX}", file, where="--rerun"
-        )
+        raise InputError(f"found {file.suffix!r}; expected {SUFFIX}", file, where="--rerun")
     if file.exists() or file.is_symlink():
         raise InputError(
             "this file exists, and live recordings are not overwritten; choose another name",
@@ -79,18 +71,13 @@ class LiveRecording:
         self._stream = rr.RecordingStream(APPLICATION)
         self._stream.save(file)
         topology = rr.Mesh3D.from_fields(
-            triangle_indices=triangles.reshape(surface.shape),
-            albedo_factor=GREY,
+            triangle_indices=triangles.reshape(surface.shape), albedo_factor=GREY
         )
         self._stream.log("body", topology, static=True)
-        style = rr.Points3D.from_fields(
-            colors=ORANGE, radii=MARKER_RADIUS_RATIO * extent_m
-        )
+        style = rr.Points3D.from_fields(colors=ORANGE, radii=MARKER_RADIUS_RATIO * extent_m)
         self._stream.log("markers", style, static=True)
 
-    def write(
-        self, frame: Frame, update: LiveUpdate, positions_m: Array | None
-    ) -> None:
+    def write(self, frame: Frame, update: LiveUpdate, positions_m: Array | None) -> None:
         """Write a frame and what was estimated after it into the file, at the time of the update.
 
         Parameters
@@ -106,16 +93,12 @@ class LiveRecording:
         rr = self._rr
         self._stream.set_time(TIMELINE, duration=update.t_s)
         if positions_m is not None and np.isfinite(positions_m).all():
-            surface = rr.Mesh3D.from_fields(
-                vertex_positions=positions_m[self._nodes]
-            )
+            surface = rr.Mesh3D.from_fields(vertex_positions=positions_m[self._nodes])
             self._stream.log("body", surface)
         seen_m = frame.tracks_m[np.isfinite(frame.tracks_m).all(axis=1)]
         self._stream.log("markers", rr.Points3D.from_fields(positions=seen_m))
         distances_mm = 1e3 * update.marker_distances_m
-        for name, distance in zip(
-            self._marker_names, distances_mm, strict=False
-        ):
+        for name, distance in zip(self._marker_names, distances_mm, strict=False):
             self._write_number(distance, "residuals_mm", str(name))
         self._write_estimates(update)
 

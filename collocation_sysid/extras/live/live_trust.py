@@ -10,12 +10,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...program.streaming import SquareRootInformation
-from ...statistics.assessment import (
-    GROSS_MISFIT,
-    HARDLY_TAME,
-    MISFIT,
-    WILD,
-)
+from ...statistics.assessment import GROSS_MISFIT, HARDLY_TAME, MISFIT, WILD
 from ...statistics.concerns import Concern, concern_if
 from ...statistics.distributions import chi2_sf, student_ppf
 from ...statistics.estimates import Estimate
@@ -70,16 +65,12 @@ class ResidualScatter:
         lag1 = float(np.nanmean(products) / square)
         is_significant = lag1 > max(CORRELATED, DEVIATIONS / np.sqrt(count))
         return cls(
-            float(np.sqrt(square)),
-            min(lag1, LARGEST_AUTOCORRELATION) if is_significant else 0.0,
+            float(np.sqrt(square)), min(lag1, LARGEST_AUTOCORRELATION) if is_significant else 0.0
         )
 
 
 def variance_factor(
-    known: SquareRootInformation,
-    p: Array,
-    parameter_count: float,
-    scatter: ResidualScatter,
+    known: SquareRootInformation, p: Array, parameter_count: float, scatter: ResidualScatter
 ) -> tuple[float, float]:
     """Return the factor of all variances, and the half width of 95 % intervals in standard
     deviations.
@@ -111,9 +102,7 @@ def variance_factor(
     return factor * (1 + scatter.lag1) / (1 - scatter.lag1), quantile
 
 
-def data_concerns(
-    scatter: ResidualScatter, counts: Counter[str], samples: int
-) -> list[Concern]:
+def data_concerns(scatter: ResidualScatter, counts: Counter[str], samples: int) -> list[Concern]:
     """Return the concerns due to residuals, outliers and restarts; empty if there are none.
 
     They are residuals larger than σ, correlated residuals, a large share of outliers among
@@ -135,17 +124,9 @@ def data_concerns(
     size = {"factor": scatter.rms, "stated": "sigma_m"}
     times = "once" if restarts == 1 else f"{restarts} times"
     return [
+        *concern_if(scatter.rms > MISFIT, scatter.rms > GROSS_MISFIT, code="noise/larger", **size),
         *concern_if(
-            scatter.rms > MISFIT,
-            scatter.rms > GROSS_MISFIT,
-            code="noise/larger",
-            **size,
-        ),
-        *concern_if(
-            scatter.lag1 > PERSISTENT,
-            False,
-            code="residuals/persist",
-            autocorrelation=scatter.lag1,
+            scatter.lag1 > PERSISTENT, False, code="residuals/persist", autocorrelation=scatter.lag1
         ),
         *concern_if(
             outlier_share > WILD,
@@ -157,9 +138,7 @@ def data_concerns(
     ]
 
 
-def estimate_concerns(
-    estimates: Mapping[str, Estimate], distance: float
-) -> list[Concern]:
+def estimate_concerns(estimates: Mapping[str, Estimate], distance: float) -> list[Concern]:
     """Return the concerns due to the estimates themselves; empty if there are none.
 
     One concern if the estimate may still change (`LARGEST_SETTLED_DISTANCE`), and one for each
@@ -172,21 +151,13 @@ def estimate_concerns(
     distance : float
         Distance of the estimate from the linearisation point, in standard errors.
     """
-    concerns = concern_if(
-        distance > LARGEST_SETTLED_DISTANCE, False, code="solve/moves"
-    )
+    concerns = concern_if(distance > LARGEST_SETTLED_DISTANCE, False, code="solve/moves")
     for name, estimate in estimates.items():
         if estimate.at_bound:
-            concerns += concern_if(
-                True, False, code="information/at-bound", name=name
-            )
+            concerns += concern_if(True, False, code="information/at-bound", name=name)
         elif estimate.reason is not None:
             reason = estimate.reason
             concerns += concern_if(
-                True,
-                False,
-                code="information/not-yet",
-                name=name,
-                reason=reason,
+                True, False, code="information/not-yet", name=name, reason=reason
             )
     return concerns

@@ -36,9 +36,7 @@ def decode_lines(lines: Iterable[bytes]) -> Iterator[str]:
     return (line.decode("utf-8", errors="replace") for line in lines)
 
 
-def receive_datagrams(
-    port: int, opened: Callable[[int], None] | None = None
-) -> Iterator[str]:
+def receive_datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterator[str]:
     """Yield lines of text that arrive as UDP datagrams at a port of this machine, until an empty
     datagram.
 
@@ -67,9 +65,7 @@ def receive_datagrams(
             yield from decode_lines(datagram.splitlines())
 
 
-def read_problem(
-    recording: Path, overrides: Sequence[str], allow_code: bool
-) -> Problem:
+def read_problem(recording: Path, overrides: Sequence[str], allow_code: bool) -> Problem:
     """Return the problem of a file, or that of the folder of a run.
 
     Parameters
@@ -90,20 +86,12 @@ def read_problem(
     if not recording.is_dir():
         return Problem.read(recording, overrides, allow_code=allow_code)
     home = Result.read(recording).problem_folder(
-        recording,
-        "which a replay needs: replay its problem from a problem file",
+        recording, "which a replay needs: replay its problem from a problem file"
     )
-    return Problem.read(
-        recording / "problem.toml",
-        overrides,
-        allow_code=allow_code,
-        folder=home,
-    )
+    return Problem.read(recording / "problem.toml", overrides, allow_code=allow_code, folder=home)
 
 
-def frames_of_recording(
-    experiment: Experiment, model: StreamingModel
-) -> Iterator[Frame]:
+def frames_of_recording(experiment: Experiment, model: StreamingModel) -> Iterator[Frame]:
     """Yield the frames of an experiment's recording, one for each sample time of `experiment`.
 
     Each has the poses of the moving grasps and the markers of that time. Samples of instruments
@@ -116,36 +104,21 @@ def frames_of_recording(
     model : StreamingModel
         Model of the experiment, which gives the moving grasps and the order of the instruments.
     """
-    poses = [
-        experiment.grasps[k].poses.at(experiment.t_s)
-        for k in model.moving_grasps
-    ]
-    quaternion_series = [
-        Rotation.from_matrix(rotations).as_quat() for rotations, _ in poses
-    ]
-    series = [
-        (gauge.sample_times_s, gauge.measured_values)
-        for gauge in experiment.readings
-    ]
-    series += [
-        (sensor.t_s, sensor.values)
-        for sensor in model.experiment.sensors_by_grasp.values()
-    ]
+    poses = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moving_grasps]
+    quaternion_series = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in poses]
+    series = [(gauge.sample_times_s, gauge.measured_values) for gauge in experiment.readings]
+    series += [(sensor.t_s, sensor.values) for sensor in model.experiment.sensors_by_grasp.values()]
     samples = [
         (number, float(at_s), values)
         for number, each in enumerate(series, 1)
         for at_s, values in zip(*each, strict=True)
     ]
-    frame_of = np.searchsorted(
-        experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in samples]
-    )
+    frame_of = np.searchsorted(experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in samples])
     for k, t_s in enumerate(experiment.t_s):
         positions_m = np.array([translations[k] for _, translations in poses])
         quaternions = np.array([each[k] for each in quaternion_series])
         frame_samples = tuple(
-            each
-            for each, frame in zip(samples, frame_of, strict=True)
-            if frame == k
+            each for each, frame in zip(samples, frame_of, strict=True) if frame == k
         )
         tracks_m = experiment.markers.positions_at_samples_m[k]
         yield Frame(
@@ -220,10 +193,7 @@ def update_as_json(update: LiveUpdate) -> str:
         {
             "t_s": update.t_s,
             "parameters": parameters,
-            "trust": {
-                "verdict": update.trust.verdict,
-                "reasons": update.trust.reasons,
-            },
+            "trust": {"verdict": update.trust.verdict, "reasons": update.trust.reasons},
             "marker_rms_m": rms_m if np.isfinite(rms_m) else None,
             "latency_s": round(update.latency_s, 6),
             "notes": update.notes,

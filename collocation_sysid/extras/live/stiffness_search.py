@@ -8,11 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...common.array_types import Array
-from ...methods.stiffness_scan import (
-    STIFFEST_PA,
-    typical_parameters,
-    without_guesses,
-)
+from ...methods.stiffness_scan import STIFFEST_PA, typical_parameters, without_guesses
 from ...program.streaming import StreamingModel
 from .window_pass import WindowPass
 
@@ -47,9 +43,7 @@ class StiffnessSearch:
     def __init__(self, model: StreamingModel, phi: Array) -> None:
         self.rows = (TRIAL_SAMPLES - 1) * model.collocation.substeps + 1
         forgotten = without_guesses(model.collocation).parameters
-        self._waiting = [
-            typical_parameters(forgotten, young).guess_q for young in TRIED_PA
-        ]
+        self._waiting = [typical_parameters(forgotten, young).guess_q for young in TRIED_PA]
         self._phi = phi
         self._tried: list[tuple[float, Array]] = []
 
@@ -63,11 +57,7 @@ class StiffnessSearch:
         parameters in the solver's coordinates; None if no trial is left. Repeated calls return the
         same, until `record_trial` advances to the trial after it.
         """
-        return (
-            np.concatenate([self._waiting[0], self._phi])
-            if self._waiting
-            else None
-        )
+        return np.concatenate([self._waiting[0], self._phi]) if self._waiting else None
 
     def record_trial(self, trial: WindowPass) -> None:
         """Record the loss of the pass `trial` as the result of the next trial; a failed pass has an
@@ -82,12 +72,7 @@ class StiffnessSearch:
             If no trial is left.
         """
         self._waiting.pop(0)
-        self._tried.append(
-            (
-                np.inf if trial.has_failed else trial.compute_loss(),
-                trial.sweep.p,
-            )
-        )
+        self._tried.append((np.inf if trial.has_failed else trial.compute_loss(), trial.sweep.p))
         least = min(loss for loss, _ in self._tried)
         worse = [not loss <= FAILURE_RATIO * least for loss, _ in self._tried]
         if np.isfinite(least) and all(worse[-2:]) and len(worse) > 2:

@@ -96,9 +96,7 @@ class WindowPass:
         block_rows: int,
         base: WindowPass | None = None,
     ) -> None:
-        first_block = (
-            base.blocks[0] if base is not None and base.blocks else None
-        )
+        first_block = base.blocks[0] if base is not None and base.blocks else None
         self.prior = prior
         self.base = base
         self.block_rows = block_rows
@@ -109,10 +107,7 @@ class WindowPass:
         )
         self.model = model
         self.sweep = StreamingSweep(
-            model,
-            p,
-            prior.with_problem(model.prior_information(p)),
-            *self.start,
+            model, p, prior.with_problem(model.prior_information(p)), *self.start
         )
         self.blocks: list[WindowBlock] = []
         self._base_changes = [(0, self.sweep.transformed)]
@@ -126,9 +121,7 @@ class WindowPass:
         """
         return self.sweep.information.loss(self.sweep.transformed)
 
-    def add_rows(
-        self, poses: Sequence[Poses], guesses: Sequence[Array] = ()
-    ) -> int:
+    def add_rows(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> int:
         """Compute further rows of one block and return how many, at least one; `add_residuals` adds
         their samples.
 
@@ -150,21 +143,12 @@ class WindowPass:
             If a row cannot be solved.
         """
         if self.rows % self.block_rows == 0:
-            new = (
-                self.start
-                if not self.blocks
-                else (self.sweep.copy_state(), self.sweep.p)
-            )
+            new = self.start if not self.blocks else (self.sweep.copy_state(), self.sweep.p)
             self.blocks.append(WindowBlock(*new))
         rows_of_base = self._rows_of_base(len(poses))
-        computed = self.sweep.advance(
-            poses, guesses or self._initial_guesses(rows_of_base)
-        )
+        computed = self.sweep.advance(poses, guesses or self._initial_guesses(rows_of_base))
         last_rows = list(zip(computed, rows_of_base, strict=False))[-2:]
-        errors = [
-            stored.x - self._predicted_positions(base)
-            for stored, base in last_rows
-        ]
+        errors = [stored.x - self._predicted_positions(base) for stored, base in last_rows]
         self._off = [*self._off, *errors][-2:]
         self.blocks[-1].stored_rows += computed
         self.rows += len(computed)
@@ -198,18 +182,10 @@ class WindowPass:
         """Return the transformed parameters (P,) at which the rows from the index `row` of the
         window on are linearised, in order of the rows; one for each change.
         """
-        before = [
-            transformed
-            for first, transformed in self._base_changes
-            if first <= row
-        ]
+        before = [transformed for first, transformed in self._base_changes if first <= row]
         return [
             *before[-1:],
-            *[
-                transformed
-                for first, transformed in self._base_changes
-                if first > row
-            ],
+            *[transformed for first, transformed in self._base_changes if first > row],
         ]
 
     def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
@@ -221,13 +197,11 @@ class WindowPass:
 
     def list_residuals(self) -> list[LinearisedResidual]:
         """Return the linearised residuals of all samples in the window."""
-        return [
-            residual for block in self.blocks for residual in block.residuals
-        ]
+        return [residual for block in self.blocks for residual in block.residuals]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
-        """Compute the first of the logged rows, at most `count_repeatable_rows`, and add their samples to
-        the pass.
+        """Compute the first of the logged rows, at most `count_repeatable_rows`, and add their
+        samples to the pass.
 
         Fewer rows, but at least one, are computed if an initial guess turns out to be far off. The
         rows after them are ignored; the attribute `rows` increases by the number of rows that were
@@ -244,24 +218,15 @@ class WindowPass:
         SimulationError
             If a row cannot be solved; no samples are added then.
         """
-        done = self.add_rows(
-            [row.poses for row in rows[: self.count_repeatable_rows()]]
-        )
-        pairs = [
-            (each, done - k)
-            for k, row in enumerate(rows[:done], 1)
-            for each in row.samples
-        ]
+        done = self.add_rows([row.poses for row in rows[: self.count_repeatable_rows()]])
+        pairs = [(each, done - k) for k, row in enumerate(rows[:done], 1) for each in row.samples]
         self.add_residuals(self.sweep.linearise_samples(pairs))
 
     def count_remaining_rows(self) -> int:
         """Return the largest number of rows that can be computed at once: those left in the block,
         or in a new one if it is full, at most `StreamingModel.rows_per_chunk`.
         """
-        return min(
-            self.model.rows_per_chunk,
-            self.block_rows - self.rows % self.block_rows,
-        )
+        return min(self.model.rows_per_chunk, self.block_rows - self.rows % self.block_rows)
 
     def count_repeatable_rows(self) -> int:
         """Return the largest number of rows that can be computed at once with initial guesses from
@@ -277,10 +242,7 @@ class WindowPass:
         if self.base is None or self.rows + count > self.base.rows:
             return []
         places = (divmod(self.rows + k, self.block_rows) for k in range(count))
-        return [
-            self.base.blocks[block].stored_rows[place]
-            for block, place in places
-        ]
+        return [self.base.blocks[block].stored_rows[place] for block, place in places]
 
     def _initial_guesses(self, known: Sequence[StoredRow]) -> list[Array]:
         """Return an initial guess of the positions, (3n,) [m], for each of the rows `known` of the
@@ -300,8 +262,7 @@ class WindowPass:
             previous_error = last_error
         predicted = map(self._predicted_positions, known)
         return [
-            x + last_error + k * (last_error - previous_error)
-            for k, x in enumerate(predicted, 1)
+            x + last_error + k * (last_error - previous_error) for k, x in enumerate(predicted, 1)
         ]
 
     def latest_positions_at(self, transformed: Array) -> Array | None:
@@ -353,9 +314,7 @@ class WindowPass:
         """
         information = self.prior
         for block in self.blocks:
-            information = self.sweep.with_residuals(
-                information, block.residuals
-            )
+            information = self.sweep.with_residuals(information, block.residuals)
         return information
 
 
@@ -379,9 +338,7 @@ class CombinedPasses(NamedTuple):
     points: list[Array]
 
     @classmethod
-    def from_passes(
-        cls, first_pass: WindowPass, second_pass: WindowPass | None
-    ) -> CombinedPasses:
+    def from_passes(cls, first_pass: WindowPass, second_pass: WindowPass | None) -> CombinedPasses:
         """Return the joint information of a first pass and of a second one that repeats it and has
         nearly caught up: the samples that both have count from the second, the rest from the first.
 
@@ -419,9 +376,7 @@ class CombinedPasses(NamedTuple):
             *first_pass.linearisation_points_from(second_pass.rows),
         ]
         return cls(
-            first_pass.sweep.with_residuals(
-                second_pass.sweep.information, remaining
-            ),
+            first_pass.sweep.with_residuals(second_pass.sweep.information, remaining),
             [*repeated, *remaining],
             points=points,
         )

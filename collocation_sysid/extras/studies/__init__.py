@@ -11,13 +11,7 @@ predictions, and `law_disagreements` evaluates how much an estimate depends on t
 """
 
 from .run_execution import RunOptions, RunStore, run_all
-from .study_planning import (
-    PlannedRun,
-    Starts,
-    plan_comparison,
-    plan_models,
-    plan_sweep,
-)
+from .study_planning import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
 
 __all__ = [
     "PlannedRun",

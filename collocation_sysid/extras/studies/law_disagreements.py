@@ -14,12 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.display import Table
-from ...fem.laws.constants import (
-    is_damping,
-    symbol_of,
-    symbol_with_unit,
-    without_region,
-)
+from ...fem.laws.constants import is_damping, symbol_of, symbol_with_unit, without_region
 from ...statistics.budget.uncertainty_budget import BudgetLine
 from ...statistics.estimates import IntervalCoordinate
 from ...statistics.remedies import LAW
@@ -63,15 +58,14 @@ class Disagreement:
         high = max(self.values.values())
         symbol = symbol_of(self.name)
         unit = symbol_with_unit(self.name).removeprefix(symbol)
-        range_text = f"The models that predict equally well have {symbol} from {low:.3g} to {high:.3g}{unit}"
-        conclusion = (
-            f"{range_text}: these recordings do not determine it better."
+        range_text = (
+            f"The models that predict equally well have {symbol} from {low:.3g} to {high:.3g}{unit}"
         )
+        conclusion = f"{range_text}: these recordings do not determine it better."
         if self.chosen_budget is None or self.combined95 is None:
             return conclusion
         ends, least = (
-            "{:.3g} to {:.3g}".format(*w)
-            for w in (self.combined95, self.chosen_budget.combined95)
+            "{:.3g} to {:.3g}".format(*w) for w in (self.combined95, self.chosen_budget.combined95)
         )
         share = f"{self.share:.0%} of the variance"
         return (
@@ -99,66 +93,34 @@ def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
     others = [row for row in rows if row is not chosen]
     result = []
     for name in chosen["parameters"]:
-        values = {
-            r["model"]: r["parameters"].get(name) for r in (chosen, *others)
-        }
+        values = {r["model"]: r["parameters"].get(name) for r in (chosen, *others)}
         if (without_region(name) in MODULI or is_damping(name)) and all(
             v and v > 0 for v in values.values()
         ):
-            estimates = {
-                model: float(value or 0.0) for model, value in values.items()
-            }
-            if max(estimates.values()) > LEAST_DISAGREEMENT_RATIO * min(
-                estimates.values()
-            ):
+            estimates = {model: float(value or 0.0) for model, value in values.items()}
+            if max(estimates.values()) > LEAST_DISAGREEMENT_RATIO * min(estimates.values()):
                 result.append(
-                    _disagreement(
-                        name, estimates, budget_line=chosen["budget"].get(name)
-                    )
+                    _disagreement(name, estimates, budget_line=chosen["budget"].get(name))
                 )
     return result
 
 
 def _disagreement(
-    name: str,
-    values: Mapping[str, float],
-    budget_line: Mapping[str, object] | None,
+    name: str, values: Mapping[str, float], budget_line: Mapping[str, object] | None
 ) -> Disagreement:
-    """Return the disagreement of one parameter.
-
-    Parameters
-    ----------
-    name : str
-        Name of the parameter.
-    values : mapping of str to float
-        Positive estimates by model, the chosen one first.
-    budget_line : mapping or None
-        Fields of the chosen model's `BudgetLine`, which becomes `chosen_budget` as it is; interval
-        and share are those with the choice of the law as a further source. None if it is unknown,
-        which leaves budget and interval None and the share 0.
-    """
+    """Return the disagreement of one parameter."""
     if budget_line is None:
-        return Disagreement(
-            name, values, chosen_budget=None, combined95=None, share=0.0
-        )
+        return Disagreement(name, values, chosen_budget=None, combined95=None, share=0.0)
     line = BudgetLine(**budget_line)  # type: ignore[arg-type]
     coordinate = IntervalCoordinate.for_estimate(
         name, (*values.values(), *line.combined95), linear=False
     )
-    coordinates = np.array(
-        [coordinate.from_value(value) for value in values.values()]
-    )
+    coordinates = np.array([coordinate.from_value(value) for value in values.values()])
     with_law = line.with_source(
-        LAW,
-        float(np.sqrt(np.mean((coordinates - coordinates[0]) ** 2))),
-        coordinate=coordinate,
+        LAW, float(np.sqrt(np.mean((coordinates - coordinates[0]) ** 2))), coordinate=coordinate
     )
     return Disagreement(
-        name,
-        values,
-        chosen_budget=line,
-        combined95=with_law.combined95,
-        share=with_law.shares[LAW],
+        name, values, chosen_budget=line, combined95=with_law.combined95, share=with_law.shares[LAW]
     )
 
 
@@ -179,19 +141,11 @@ def law_table(differences: Sequence[Disagreement]) -> Table:
         spread = 100 * (max(values) / min(values) - 1)
         intervals = (
             w and "{:.3g} … {:.3g}".format(*w)
-            for w in (
-                each.chosen_budget and each.chosen_budget.combined95,
-                each.combined95,
-            )
+            for w in (each.chosen_budget and each.chosen_budget.combined95, each.combined95)
         )
         cells = (f"{value:.4g}" for value in values)
         rows.append(
-            (
-                symbol_with_unit(each.name),
-                *cells,
-                f"{spread:.0f} %",
-                *(w or "" for w in intervals),
-            )
+            (symbol_with_unit(each.name), *cells, f"{spread:.0f} %", *(w or "" for w in intervals))
         )
     heads = ("", *laws, "spread", "combined interval", "including the law")
     return Table("Estimates by material law", heads, rows=tuple(rows))

@@ -47,10 +47,7 @@ from ...statistics.linearised import (
     linearise_fit,
     parameter_values,
 )
-from ...statistics.residuals.autocorrelation import (
-    ErrorProcess,
-    error_processes,
-)
+from ...statistics.residuals.autocorrelation import ErrorProcess, error_processes
 from ...statistics.residuals.noise_level import ROUNDING
 from ...statistics.uncertainty import uncertainty_from_fit
 from .law_disagreements import Disagreement, find_disagreements
@@ -70,9 +67,7 @@ SURE = 2.0
 LIKELY = 1.0
 
 
-def model_rows(
-    planned: Sequence[PlannedRun], records: Mapping[str, Record]
-) -> list[Row]:
+def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> list[Row]:
     """Return one row for each model, in the order of the first run of each.
 
     Parameters
@@ -98,9 +93,7 @@ def model_rows(
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
         fit = (records.get(run.key) or {}).get("model") or {}
-        of_model.setdefault(run.varied_values["model"], {})[
-            run.test_name or ""
-        ] = fit
+        of_model.setdefault(run.varied_values["model"], {})[run.test_name or ""] = fit
     rows = [_model_row(label, fits) for label, fits in of_model.items()]
     _add_criterion(rows)
     _add_ratios(rows)
@@ -114,19 +107,9 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
     """Return the row of a model from its fits, without the columns that compare models
     ("independent", "delta_aic", "log_ratio", "log_ratio_error", "chosen"); see `model_rows` for the
     others.
-
-    Parameters
-    ----------
-    label : str
-        Name of the model.
-    fits : mapping of str to mapping
-        Results of `fit_record` by name of the held-out recording, "" for the fit to all; empty
-        mappings for runs without a result. The unit is that of the first prediction, else "m".
     """
     complete_fit = fits.get("", {})
-    predictions = {
-        name: fit.get("prediction") or {} for name, fit in fits.items() if name
-    }
+    predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
     evidence = complete_fit.get("evidence")
     free = complete_fit.get("free")
     unit = next((each["unit"] for each in predictions.values() if each), "m")
@@ -138,15 +121,9 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
         "unit": unit,
         "rms": (complete_fit.get("rms") or {}).get(unit),
         "held_out_rms": _pooled_rms([*predictions.values()]),
-        "predictions": {
-            name: each.get("rms") for name, each in predictions.items()
-        },
-        "blocks": {
-            name: each.get("blocks") for name, each in predictions.items()
-        },
-        "failures": {
-            n: fits[n]["failure"] for n in predictions if fits[n].get("failure")
-        },
+        "predictions": {name: each.get("rms") for name, each in predictions.items()},
+        "blocks": {name: each.get("blocks") for name, each in predictions.items()},
+        "failures": {n: fits[n]["failure"] for n in predictions if fits[n].get("failure")},
         "evidence": evidence,
         "parameters": complete_fit.get("parameters") or {},
         "at_bound": complete_fit.get("at_bound") or {},
@@ -158,22 +135,13 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
 def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the RMS over the samples of all predictions, in their common unit; None if there is no
     prediction, one of them is missing, or their units differ.
-
-    Parameters
-    ----------
-    predictions : sequence of mapping
-        Results of `_prediction_error`, of which "rms", "samples" and "unit" are used; an empty one,
-        or one whose "rms" is None, is missing.
     """
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
     if len({each["unit"] for each in predictions}) > 1:
         return None  # metres and newtons have no common measure
     samples = sum(each["samples"] for each in predictions)
-    return sqrt(
-        sum(each["samples"] * each["rms"] ** 2 for each in predictions)
-        / samples
-    )
+    return sqrt(sum(each["samples"] * each["rms"] ** 2 for each in predictions) / samples)
 
 
 def _add_criterion(rows: Sequence[Row]) -> None:
@@ -183,11 +151,6 @@ def _add_criterion(rows: Sequence[Row]) -> None:
     converge or have no evidence. "independent" is equal for all models: the equivalent number of
     independent measurements of the converged model with the smallest misfit, with which all
     criteria are computed; None if no converged model has evidence.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `model_rows`, with "converged" and "evidence" (fields of `Evidence`, or None).
     """
     known = [row for row in rows if row["converged"] and row["evidence"]]
     evidences = [Evidence(**row["evidence"]) for row in known]
@@ -207,11 +170,6 @@ def _add_ratios(rows: Sequence[Row]) -> None:
     The smallest is that of the converged models. Both are None for rows whose "held_out_rms" is
     None, and for all rows if no converged model predicts all held-out data. Models that did not
     converge may have a negative "log_ratio".
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `model_rows`, with "converged", "held_out_rms", "predictions" and "blocks".
     """
     best = _best_prediction(rows)
     for row in rows:
@@ -219,10 +177,7 @@ def _add_ratios(rows: Sequence[Row]) -> None:
         if best is None or row["held_out_rms"] is None:
             continue
         names = [name for name, rms in best["predictions"].items() if rms]
-        logs = [
-            log(row["predictions"][name] / best["predictions"][name])
-            for name in names
-        ]
+        logs = [log(row["predictions"][name] / best["predictions"][name]) for name in names]
         row["log_ratio"] = log(row["held_out_rms"] / best["held_out_rms"])
         row["log_ratio_error"] = _log_ratio_error(row, best, logs=logs)
 
@@ -233,29 +188,15 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
 
     It is the larger of the errors from the scatter between blocks in time and from the scatter
     between recordings; NaN if there is only one block in total.
-
-    Parameters
-    ----------
-    row, best : Row
-        Rows of `model_rows` with predictions of the same recordings: "blocks" has the squared
-        errors of each block by recording, as many in both.
-    logs : sequence of float
-        Logarithmic ratio for each recording; fewer than two have no scatter.
     """
     if row is best:
         return 0.0
-    pairs = [
-        (row["blocks"][name], best["blocks"][name]) for name in best["blocks"]
-    ]
-    squares, best_squares = (
-        np.concatenate(each) for each in zip(*pairs, strict=True)
-    )
+    pairs = [(row["blocks"][name], best["blocks"][name]) for name in best["blocks"]]
+    squares, best_squares = (np.concatenate(each) for each in zip(*pairs, strict=True))
     change = squares - best_squares
     # d ln √(a/b) = (a − b) / (a + b) to first order
     of_sum = float(np.std(change, ddof=1)) * sqrt(len(change))
-    between = (
-        float(np.std(logs, ddof=1)) / sqrt(len(logs)) if len(logs) > 1 else 0.0
-    )
+    between = float(np.std(logs, ddof=1)) / sqrt(len(logs)) if len(logs) > 1 else 0.0
     return max(between, of_sum / float(np.sum(squares + best_squares)))
 
 
@@ -299,8 +240,7 @@ def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
         for row in rows
         if row["converged"]
         and row["log_ratio"] is not None
-        and row["log_ratio"]
-        <= max(EQUIVALENT_ERROR, errors * row["log_ratio_error"])
+        and row["log_ratio"] <= max(EQUIVALENT_ERROR, errors * row["log_ratio_error"])
     ]
 
 
@@ -348,13 +288,6 @@ def bound_sentences(rows: Sequence[Row]) -> list[str]:
 def _reasons(rows: Sequence[Row], chosen: Row) -> str:
     """Return in words which model to use, why, and how certain that is, and in which estimates
     equally good laws disagree, see `advice`.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `model_rows`; those of models that converged must have "delta_aic".
-    chosen : Row
-        The chosen one of them (the same object).
     """
     others = [row for row in rows if row is not chosen and row["converged"]]
     use = f"Use {chosen['model']}"
@@ -367,24 +300,12 @@ def _reasons(rows: Sequence[Row], chosen: Row) -> str:
             f"{rival['delta_aic']:.3g} lower than that of {rival['model']}."
         )
     predicted = [row for row in others if row["log_ratio"] is not None]
-    failures = [
-        _failed_prediction(row, chosen)
-        for row in others
-        if row["log_ratio"] is None
-    ]
+    failures = [_failed_prediction(row, chosen) for row in others if row["log_ratio"] is None]
     if not predicted:
-        return " ".join(
-            [f"{use}: no other model predicts the held-out samples.", *failures]
-        )
+        return " ".join([f"{use}: no other model predicts the held-out samples.", *failures])
     rival = min(predicted, key=lambda row: row["log_ratio"])
-    sentences = [
-        f"{use}: {_comparison(chosen, rival)}.",
-        _certainty(chosen, rival),
-        *failures,
-    ]
-    return " ".join(
-        [*sentences, *(each.describe() for each in law_disagreements(rows))]
-    )
+    sentences = [f"{use}: {_comparison(chosen, rival)}.", _certainty(chosen, rival), *failures]
+    return " ".join([*sentences, *(each.describe() for each in law_disagreements(rows))])
 
 
 def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
@@ -409,9 +330,7 @@ def _failed_prediction(row: Row, chosen: Row) -> str:
 
     Both are rows of `model_rows` of converged models, whose "delta_aic" must not be None.
     """
-    without = " and ".join(
-        f"'{name}'" for name, rms in row["predictions"].items() if not rms
-    )
+    without = " and ".join(f"'{name}'" for name, rms in row["predictions"].items() if not rms)
     sentence = f"{row['model']} does not predict {without}"
     if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
         return f"{sentence}."
@@ -446,13 +365,6 @@ def _ratio_text(ratio: float, error: float) -> str:
     """Return the ratio of two prediction errors as text, with its standard error if its logarithm
     is positive and exceeds `LIKELY` standard errors, otherwise with the interval of `SURE` standard
     errors, as a ratio that may be one.
-
-    Parameters
-    ----------
-    ratio : float
-        Logarithm of the ratio.
-    error : float
-        Its standard error.
     """
     if ratio > LIKELY * error:
         return f"{exp(ratio):.3g} times as large (±{100 * error:.2g} %)"
@@ -495,12 +407,6 @@ def _certainty(chosen: Row, rival: Row) -> str:
     It is significant if both the predictions (in standard errors, `SURE`) and AIC (`NO_SUPPORT`)
     favour the chosen model clearly, likely if both do less clearly (`LIKELY`, `SUPPORT`); otherwise
     the sentence says which of them does not.
-
-    Parameters
-    ----------
-    chosen, rival : Row
-        Rows of `model_rows` of converged models that predict all held-out data: "log_ratio",
-        "log_ratio_error" and "delta_aic" must not be None.
     """
     ratio, error = _log_ratio_between(chosen, rival)
     support = rival["delta_aic"] - chosen["delta_aic"]
@@ -537,11 +443,7 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
         "evidence", "status", "converged" and "failures".
     """
     names = rows[0]["predictions"]
-    test_data = (
-        "each recording in turn"
-        if len(names) > 1
-        else "the last third of the recording"
-    )
+    test_data = "each recording in turn" if len(names) > 1 else "the last third of the recording"
     counted = rows[0]["independent"]
     evidence = next((row["evidence"] for row in rows if row["evidence"]), None)
     equivalent = ""
@@ -553,11 +455,7 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
         equivalent += "independent ones."
     return [
         f"Held out: {test_data}; ±: standard error of the ratio to the best.{equivalent}",
-        *(
-            f"{row['model']}: {row['status']}"
-            for row in rows
-            if not row["converged"]
-        ),
+        *(f"{row['model']}: {row['status']}" for row in rows if not row["converged"]),
         *(
             f"{row['model']} without '{name}': {why}"
             for row in rows
@@ -599,11 +497,7 @@ class Evidence:
             Equivalent number N of independent measurements, equal for all compared models; it
             replaces this fit's own.
         """
-        return (
-            independent * float(np.log(self.misfit))
-            + self.prior
-            + 2 * self.fitted
-        )
+        return independent * float(np.log(self.misfit)) + self.prior + 2 * self.fitted
 
 
 def evidence_from_fit(fit: LinearisedFit) -> Evidence:
@@ -619,9 +513,7 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
         processes = error_processes(fit, factored)
         pairs = zip(fit.blocks, processes, strict=True)
         independent = sum(
-            _independent_measurements(b, p)
-            for b, p in pairs
-            if b.count_measurements()
+            _independent_measurements(b, p) for b, p in pairs if b.count_measurements()
         )
     return Evidence(
         max(fit.compute_chi_squared(), rounding),
@@ -632,34 +524,19 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
     )
 
 
-def _independent_measurements(
-    block: ResidualBlock, process: ErrorProcess
-) -> float:
+def _independent_measurements(block: ResidualBlock, process: ErrorProcess) -> float:
     """Return the equivalent number of independent measurements in one block of residuals, above
     zero and at most the number of measurements.
-
-    Parameters
-    ----------
-    block : ResidualBlock
-        Residuals with at least one measurement.
-    process : ErrorProcess
-        Correlation of the errors of this block in time and between its channels.
     """
     lags = np.arange(1, len(process.autocorrelation))
-    in_time = 1 + 2 * float(
-        (1 - lags / len(block.t_s)) @ process.autocorrelation[1:]
-    )
+    in_time = 1 + 2 * float((1 - lags / len(block.t_s)) @ process.autocorrelation[1:])
     is_observed = block.channels[2].any(axis=0)
     among = process.channel_covariance[np.ix_(is_observed, is_observed)]
     total = float(np.trace(among)) ** 2
     # Few samples make channels look alike that are not: that much is taken off tr Σ².
     sum_of_squares = float(np.sum(among**2)) - total / max(process.samples, 1.0)
-    channels = float(
-        np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among))
-    )
-    return (
-        block.count_measurements() * channels / len(among) / max(1.0, in_time)
-    )
+    channels = float(np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among)))
+    return block.count_measurements() * channels / len(among) / max(1.0, in_time)
 
 
 # Share of a single recording that is fitted.
@@ -701,11 +578,7 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     StopIteration
         If the problem has no recording called `test_name`.
     """
-    known, start_s = (
-        reserve_test_data(problem, test_name)
-        if test_name
-        else (problem, np.inf)
-    )
+    known, start_s = reserve_test_data(problem, test_name) if test_name else (problem, np.inf)
     solution = solve(known, method)
     record: dict[str, Any] = {
         "status": solution.status.value,
@@ -730,20 +603,12 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     experiment = next(e for e in known.experiments if e.name == test_name)
     # With the scheme that was fitted: what is compared are models, not integrators.
     rollout = simulate_experiment(
-        replace(known, rollout=RolloutOptions("scheme")),
-        solution,
-        experiment=experiment,
+        replace(known, rollout=RolloutOptions("scheme")), solution, experiment=experiment
     )
     if not isinstance(rollout, ForwardSimulation):
         return record | {"prediction": None, "failure": rollout}
-    complete_experiment = next(
-        e for e in problem.experiments if e.name == test_name
-    )
-    return record | {
-        "prediction": _prediction_error(
-            complete_experiment, rollout, start_s=start_s
-        )
-    }
+    complete_experiment = next(e for e in problem.experiments if e.name == test_name)
+    return record | {"prediction": _prediction_error(complete_experiment, rollout, start_s=start_s)}
 
 
 def _names_at_bounds(solution: Solution) -> dict[str, str]:
@@ -765,50 +630,28 @@ def _names_at_bounds(solution: Solution) -> dict[str, str]:
     return at_bound
 
 
-def _budget_record(
-    problem: Problem, solution: Solution, fit: LinearisedFit
-) -> dict[str, Any]:
+def _budget_record(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[str, Any]:
     """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh, as
     the fields of `BudgetLine` by name.
 
     Empty if the error bars cannot be computed.
-
-    Parameters
-    ----------
-    problem : Problem
-        Problem with the options of the uncertainty.
-    solution : Solution
-        Its converged solution.
-    fit : LinearisedFit
-        The measurements linearised at the solution.
     """
     options = problem.uncertainty
     parameters = solution.collocation.parameters
     try:
-        known = uncertainty_from_fit(
-            fit, parameters, q=solution.q, error_model=options
-        )
+        known = uncertainty_from_fit(fit, parameters, q=solution.q, error_model=options)
         changes = changes_of_assumptions(
-            solution.collocation,
-            solution.z,
-            deviations=options.collect_considered(),
+            solution.collocation, solution.z, deviations=options.collect_considered()
         )
     except (InputError, SimulationError):
         return {}  # without error bars there is none
     means = options.assumptions.collect_means()
     sources = VarianceSources.from_fit(
-        fit,
-        changes,
-        parameters=parameters,
-        q=solution.q,
-        uncertainty=known,
-        means=means,
+        fit, changes, parameters=parameters, q=solution.q, uncertainty=known, means=means
     )
     return {
         name: asdict(line)
-        for name, line in budget(
-            sources, known, numerical={}, parameters=parameters
-        ).items()
+        for name, line in budget(sources, known, numerical={}, parameters=parameters).items()
     }
 
 
@@ -844,37 +687,13 @@ def _prediction_error(
 
     The measurements are those of the first feature that is measured, see
     `Feature.prediction_residuals`; "unit" says which. Missing ones (NaN) do not count.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Recording with all its measurements, at least one of a feature that judges predictions
-        (otherwise `ValueError`).
-    rollout : ForwardSimulation
-        Simulation at the same samples, which must be finite: a marker that is NaN would not count
-        as an error.
-    start_s : float
-        Samples up to this time [s] are ignored; −∞ for none.
-
-    Returns
-    -------
-    dict
-        "rms" (None without samples), "unit", "samples" (number of marker positions, force vectors
-        or stresses), and "blocks", `BLOCKS` sums of squares in the order of time.
     """
-    residuals = prediction_residuals(
-        experiment, rollout.trajectory, rollout.predicted
-    )
+    residuals = prediction_residuals(experiment, rollout.trajectory, rollout.predicted)
     is_test_sample = residuals.t_s > start_s
-    squares = np.where(
-        residuals.is_counted, np.nansum(residuals.values**2, axis=2), 0.0
-    )[is_test_sample]
+    squares = np.where(residuals.is_counted, np.nansum(residuals.values**2, axis=2), 0.0)[
+        is_test_sample
+    ]
     samples = int(residuals.is_counted[is_test_sample].sum())
     blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
     rms = float(np.sqrt(squares.sum() / samples)) if samples else None
-    return {
-        "rms": rms,
-        "unit": residuals.unit,
-        "samples": samples,
-        "blocks": blocks,
-    }
+    return {"rms": rms, "unit": residuals.unit, "samples": samples, "blocks": blocks}

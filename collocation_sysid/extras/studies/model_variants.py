@@ -81,25 +81,8 @@ def parse_dampings(text: str) -> tuple[str, ...]:
     return _parse_names(text, DAMPINGS, option="--damping")
 
 
-def _parse_names(
-    text: str, known_names: Iterable[str], option: str
-) -> tuple[str, ...]:
-    """Return names from text separated by commas, each once, in the order of the text.
-
-    Parameters
-    ----------
-    text : str
-        Names, with or without spaces.
-    known_names : iterable of str
-        Names that are allowed.
-    option : str
-        Command-line option, for the message.
-
-    Raises
-    ------
-    InputError
-        For an unknown name or none.
-    """
+def _parse_names(text: str, known_names: Iterable[str], option: str) -> tuple[str, ...]:
+    """Return names from text separated by commas, each once, in the order of the text."""
     names = unique_items(text)
     for name in names or ("",):
         require_among(name, known_names, where=option, count="some")
@@ -116,16 +99,10 @@ def parse_branches(text: str) -> tuple[int, ...]:
         For anything but whole numbers from 0 to `MOST_BRANCHES`, and without any number.
     """
     items = [item.strip() for item in text.split(",") if item.strip()]
-    counts = [
-        int(item)
-        for item in items
-        if item.isascii() and item.isdecimal() and len(item) < 3
-    ]
+    counts = [int(item) for item in items if item.isascii() and item.isdecimal() and len(item) < 3]
     if not items or len(counts) < len(items) or max(counts) > MOST_BRANCHES:
         expected = f"whole numbers up to {MOST_BRANCHES}, such as 0,1,2"
-        raise InputError(
-            f"found {text!r}; expected {expected}", None, where="--prony"
-        )
+        raise InputError(f"found {text!r}; expected {expected}", None, where="--prony")
     return tuple(dict.fromkeys(counts))
 
 
@@ -157,10 +134,7 @@ def models(
     compared = file_variants(problems, overrides)
     if materials or branches or dampings:
         fitted = [e for e in problems[0].experiments if not e.validation]
-        times_s = (
-            min(e.timestep_s for e in fitted),
-            max(e.duration_s for e in fitted),
-        )
+        times_s = (min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted))
         files, compared = compared, []
         for file in files:
             of_file = variants(
@@ -173,19 +147,14 @@ def models(
                 dampings=dampings,
             )
             front = f"{file.label}: " * (len(files) > 1)
-            compared += [
-                replace(v, label=front + v.label, path=file.path)
-                for v in of_file
-            ]
+            compared += [replace(v, label=front + v.label, path=file.path) for v in of_file]
     if len(compared) < 2:
         options = {
             "--materials": (materials, "neo-hookean,yeoh"),
             "--damping": (dampings, "kelvin-voigt,material"),
             "--prony": (branches or (0,), "0,1"),
         }
-        option, example = next(
-            (o, e) for o, (is_declared, e) in options.items() if is_declared
-        )
+        option, example = next((o, e) for o, (is_declared, e) in options.items() if is_declared)
         raise InputError(
             f"found the model {compared[0].label} alone; expected two or more to compare, such as "
             f"{example}",
@@ -251,47 +220,27 @@ def variants(
             parameters = _with_material(parameters, material, region=region)
         if damping is not None:
             label.append(damping)
-            laws = {"damping": damping} | (
-                {} if material is None else {"material": material}
-            )
+            laws = {"damping": damping} | ({} if material is None else {"material": material})
             changes |= _law_changes(body, laws, region=region)
             for name in DAMPING_ASSUMPTIONS:
                 changes[f"uncertainty.assumptions.{name}"] = "none"
         if count is not None:
-            label.append(
-                "no memory"
-                if count == 0
-                else f"{count} branch{'es' * (count > 1)}"
-            )
-            own = [
-                t for t in body.get("prony", []) if t.get("region") == region
-            ]
-            others = [
-                t for t in body.get("prony", []) if t.get("region") != region
-            ]
-            tables = _branch_tables(
-                own, count, others={t["name"] for t in others}, region=region
-            )
+            label.append("no memory" if count == 0 else f"{count} branch{'es' * (count > 1)}")
+            own = [t for t in body.get("prony", []) if t.get("region") == region]
+            others = [t for t in body.get("prony", []) if t.get("region") != region]
+            tables = _branch_tables(own, count, others={t["name"] for t in others}, region=region)
             if tables or body.get("prony"):
                 changes["object.prony"] = [*others, *tables]
             old = [each["name"] for each in own]
-            parameters = _with_memory(
-                parameters, old, tables=tables, times_s=times_s
-            )
+            parameters = _with_memory(parameters, old, tables=tables, times_s=times_s)
         changes["parameters"] = parameters
-        settings = tuple(
-            f"{key}={as_inline_toml(value)}" for key, value in changes.items()
-        )
+        settings = tuple(f"{key}={as_inline_toml(value)}" for key, value in changes.items())
         label_text = f"{region}: " * (region is not None) + ", ".join(label)
-        varied.append(
-            ModelVariant(label_text, (*overrides, *settings), path=path)
-        )
+        varied.append(ModelVariant(label_text, (*overrides, *settings), path=path))
     return varied
 
 
-def file_variants(
-    problems: Sequence[Problem], overrides: Sequence[str]
-) -> list[ModelVariant]:
+def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list[ModelVariant]:
     """Return a model for each problem file of the same recordings, in the order of `problems`.
 
     Labels are the names of the files without suffix, or the paths of all of them if two have the
@@ -320,17 +269,11 @@ def file_variants(
             )
     paths = [Path(str(problem.path)) for problem in problems]
     if len({path.resolve() for path in paths}) < len(paths):
-        raise InputError(
-            "this file is given twice; expected another",
-            paths[-1],
-            where="--with",
-        )
+        raise InputError("this file is given twice; expected another", paths[-1], where="--with")
     stems = [path.stem for path in paths]
     distinct = len(set(stems)) == len(stems)
     return [
-        ModelVariant(
-            path.stem if distinct else str(path), tuple(overrides), path=path
-        )
+        ModelVariant(path.stem if distinct else str(path), tuple(overrides), path=path)
         for path in paths
     ]
 
@@ -339,20 +282,14 @@ def _measured_counts(problem: Problem) -> dict[str, int]:
     """Return how many numbers are measured in each fitted recording, by name, see
     `measured_count`.
     """
-    return {
-        e.name: measured_count(e)
-        for e in problem.experiments
-        if not e.validation
-    }
+    return {e.name: measured_count(e) for e in problem.experiments if not e.validation}
 
 
 def _measured_text(measured: Mapping[str, int]) -> str:
     """Return the names of recordings and how many numbers are measured in each as text, for
     messages: "'swing' (600 numbers) and 'press' (80 numbers)"; empty without recordings.
     """
-    return " and ".join(
-        f"'{name}' ({count} numbers)" for name, count in measured.items()
-    )
+    return " and ".join(f"'{name}' ({count} numbers)" for name, count in measured.items())
 
 
 def _require_region(
@@ -360,17 +297,6 @@ def _require_region(
 ) -> None:
     """Raise `InputError` for an unknown region, or, if `branches` are compared, for branches in the
     file that belong to other regions.
-
-    Parameters
-    ----------
-    body : mapping
-        Table ``[object]`` of the problem.
-    region : str or None
-        Name of the region; None for the complete body.
-    branches : bool
-        Whether numbers of branches are compared.
-    path : Path
-        Problem file, for messages.
     """
     names = [each["name"] for each in body.get("region", [])]
     if region is not None and not names:
@@ -382,9 +308,7 @@ def _require_region(
     if branches and owners - {region}:
         other_region = next(iter(owners - {region}))
         whose = (
-            "all parts without their own"
-            if other_region is None
-            else f"region '{other_region}'"
+            "all parts without their own" if other_region is None else f"region '{other_region}'"
         )
         expected = (
             "no --region, so that --prony varies these"
@@ -392,9 +316,7 @@ def _require_region(
             else f"--region {other_region}, so that --prony varies these"
         )
         raise InputError(
-            f"found branches of {whose}; expected {expected}",
-            path,
-            where="object.prony",
+            f"found branches of {whose}; expected {expected}", path, where="object.prony"
         )
 
 
@@ -406,15 +328,6 @@ def _law_changes(
 
     For all parts the laws of the body are set, and those of regions are removed, so that they
     follow the body. With regions, "object.region" is the complete list of their tables.
-
-    Parameters
-    ----------
-    body : mapping
-        Table ``[object]`` of the problem; not modified.
-    laws : mapping
-        Name of the law by key ("material", "damping").
-    region : str or None
-        Name of the region.
     """
     regions = [dict(each) for each in body.get("region", [])]
     for each in regions:
@@ -438,31 +351,15 @@ def _with_material(
     that the new material does not have are left out. Those that it needs are added with a guess of
     the same shear modulus, or for a scan if that is unknown; see `_with_part_material` for when
     shared constants are enough.
-
-    Parameters
-    ----------
-    parameters : mapping
-        Table by parameter name, such as "mu_pa" or "tip.mu_pa"; not modified.
-    material : str
-        Name in `MATERIALS`.
-    region : str or None
-        Region that gets the material, or None for all parts. Without elastic constants of its own
-        it shares those of the body that the material has; other constants are its own.
     """
-    of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {
-        *ELASTIC
-    }
+    of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {*ELASTIC}
     fronts = {
-        name[: -len(without_region(name))]
-        for name in parameters
-        if without_region(name) in of_any
+        name[: -len(without_region(name))] for name in parameters if without_region(name) in of_any
     }
     if region is not None:
         fronts = {f"{region}."}
     for front in sorted(fronts):  # what is shared is first
-        parameters = _with_part_material(
-            parameters, front, material=material, of_any=of_any
-        )
+        parameters = _with_part_material(parameters, front, material=material, of_any=of_any)
     return dict(parameters)
 
 
@@ -481,62 +378,29 @@ def _with_part_material(
     - Poisson's ratio, if the material has a compressibility, for which the part neither has nor
       shares a constant (`VOLUMETRIC`),
     - each other constant of the material that the part does not have itself, even if it is shared.
-
-    Parameters
-    ----------
-    parameters : mapping
-        Table by parameter name; not modified.
-    prefix : str
-        Region with a dot, such as "tip."; empty for the constants that parts share.
-    material : str
-        Name in `MATERIALS`.
-    of_any : set of str
-        Names of the constants of all materials, without regions.
     """
     own = [constant.name for constant in MATERIALS[material].constants]
     possible = {*own, *elastic_names(MATERIALS[material])}
     mine = {prefix + name for name in of_any}
     unchanged = {
-        n: v
-        for n, v in parameters.items()
-        if n not in mine or without_region(n) in possible
+        n: v for n, v in parameters.items() if n not in mine or without_region(n) in possible
     }
     alone = any(name in mine for name in parameters)
-    elastic = {
-        without_region(name)
-        for name in unchanged
-        if name in (mine if alone else of_any)
-    }
+    elastic = {without_region(name) for name in unchanged if name in (mine if alone else of_any)}
     shear_pa = _shear_pa(parameters, prefix)
     if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
         unchanged[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
-    own_or_shared = {
-        without_region(name) for name in unchanged if name in mine | of_any
-    }
+    own_or_shared = {without_region(name) for name in unchanged if name in mine | of_any}
     if elastic_names(MATERIALS[material]) and not own_or_shared & VOLUMETRIC:
         # A foam has no modulus that another material could take over.
         unchanged[f"{prefix}poisson"] = _starting_guess("poisson", shear_pa)
-    needed = [
-        name
-        for name in own
-        if name not in ELASTIC and prefix + name not in unchanged
-    ]
-    return unchanged | {
-        prefix + name: _starting_guess(name, shear_pa) for name in needed
-    }
+    needed = [name for name in own if name not in ELASTIC and prefix + name not in unchanged]
+    return unchanged | {prefix + name: _starting_guess(name, shear_pa) for name in needed}
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
     """Return the shear modulus at small strain [Pa] that follows from guesses or fixed values; None
     if unknown.
-
-    Parameters
-    ----------
-    parameters : mapping
-        Table by parameter name.
-    prefix : str
-        Prefix of the constants of a part, such as "tip."; constants that the part lacks are those
-        without a prefix.
     """
 
     def guess(name: str) -> float:
@@ -547,9 +411,7 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
         return float("nan") if value is None else float(value)
 
     linear = 0.0 if math.isnan(guess("c01_pa")) else guess("c01_pa")
-    poisson = (
-        USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
-    )
+    poisson = USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
     terms = range(1, MOST_TERMS + 1)
     if any(not math.isnan(guess(f"beta_{p}")) for p in terms):
         factors = {p: 1.0 for p in terms}  # of a foam
@@ -574,45 +436,23 @@ def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
     """
     if shear_pa is None:
         return {}
-    usual = usual_value(
-        name, 2 * (1 + USUAL_POISSON) * shear_pa, poisson=USUAL_POISSON
-    )
+    usual = usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, poisson=USUAL_POISSON)
     if usual is None:
         return {}
-    return (
-        {"guess": usual}
-        if usual
-        else {"guess": usual, "typical": LESS * shear_pa}
-    )
+    return {"guess": usual} if usual else {"guess": usual, "typical": LESS * shear_pa}
 
 
 def _branch_tables(
-    own: Sequence[Mapping[str, Any]],
-    count: int,
-    others: set[str],
-    region: str | None,
+    own: Sequence[Mapping[str, Any]], count: int, others: set[str], region: str | None
 ) -> list[dict[str, Any]]:
     """Return the tables of `count` branches: the first ones of the file, followed by new ones if
     there are fewer.
-
-    Parameters
-    ----------
-    own : sequence of mapping
-        Tables of the file's branches of this region.
-    count : int
-        Number of branches.
-    others : set of str
-        Names of the branches of other regions, which new names avoid.
-    region : str or None
-        Region of the new branches; None for the complete body.
     """
     tables = [dict(each) for each in own[:count]]
     used_names = {each["name"] for each in tables} | others
     names = (f"prony_{k}" for k in range(1, count + len(used_names) + 1))
     region_key = {} if region is None else {"region": region}
-    new = [
-        {"name": name, **region_key} for name in names if name not in used_names
-    ]
+    new = [{"name": name, **region_key} for name in names if name not in used_names]
     return [*tables, *new[: count - len(tables)]]
 
 
@@ -624,17 +464,6 @@ def _with_memory(
 ) -> dict[str, Any]:
     """Return the parameters with a share and a time constant of each branch; those that the file
     has are kept.
-
-    Parameters
-    ----------
-    parameters : mapping
-        Parameters of the file; not modified.
-    old : sequence of str
-        Names of the file's branches; parameters of those that are removed are removed.
-    tables : sequence of mapping
-        Tables of all branches of the model.
-    times_s : tuple of two floats
-        Interval in which time constants of new branches start, evenly on a logarithmic scale [s].
     """
     names = [each["name"] for each in tables]
     removed_names = {name for name in old if name not in names}
@@ -659,10 +488,7 @@ def as_inline_toml(value: Any) -> str:
     if isinstance(value, Mapping):
         return (
             "{"
-            + ", ".join(
-                f"{json.dumps(k)} = {as_inline_toml(v)}"
-                for k, v in value.items()
-            )
+            + ", ".join(f"{json.dumps(k)} = {as_inline_toml(v)}" for k, v in value.items())
             + "}"
         )
     if isinstance(value, (list, tuple)):

@@ -89,33 +89,17 @@ def execute(
         record["wall_s"] = time.monotonic() - began
         if record["outcome"] != CRASHED:
             break
-    return {
-        **planned,
-        **record,
-        "attempts": attempts,
-        "time_limit_s": time_limit_s,
-    }
+    return {**planned, **record, "attempts": attempts, "time_limit_s": time_limit_s}
 
 
 def _attempt(
-    planned: dict[str, Any],
-    time_limit_s: float | None,
-    stopped: Callable[[], bool],
+    planned: dict[str, Any], time_limit_s: float | None, stopped: Callable[[], bool]
 ) -> Record:
     """Execute a run once, in a process with one thread, and return its record.
 
     After a time limit it is the record with the best iterate, if the process wrote one, with the
     outcome `TIMEOUT`; an error that the process reported stays an error. Without a record of the
     process the outcome is `TIMEOUT`, `STOPPED` or `CRASHED`.
-
-    Parameters
-    ----------
-    planned : dict
-        A `PlannedRun` as a dictionary.
-    time_limit_s : float or None
-        Time limit [s]; None for no limit.
-    stopped : callable
-        Function that is called now and then; the process is killed once it returns true.
     """
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         file = Path(place) / "record.json"
@@ -130,10 +114,7 @@ def _attempt(
             )
             try:
                 interruption = _watch(
-                    process,
-                    planned,
-                    time_limit_s=time_limit_s,
-                    is_stopped=stopped,
+                    process, planned, time_limit_s=time_limit_s, is_stopped=stopped
                 )
             finally:
                 process.kill()
@@ -164,23 +145,6 @@ def _watch(
 
     At the time limit the process is asked to end and waited for, at most `GRACE_S`. A process that
     is to be stopped is left running; the caller kills it.
-
-    Parameters
-    ----------
-    process : Popen
-        Process of `run_worker`, whose stdin is closed at the end.
-    planned : dict
-        A `PlannedRun` as a dictionary.
-    time_limit_s : float or None
-        Time limit [s]; None for no limit.
-    is_stopped : callable
-        Function that is called now and then, and returns whether to stop.
-
-    Returns
-    -------
-    Record or None
-        None if the process ended by itself, otherwise "outcome" (`TIMEOUT` or `STOPPED`) and
-        "message".
     """
     assert process.stdin is not None
     deadline = None if time_limit_s is None else time.monotonic() + time_limit_s
@@ -189,11 +153,7 @@ def _watch(
         process.stdin.flush()
     try:
         while True:
-            remaining_s = (
-                LOOK_EVERY_S
-                if deadline is None
-                else deadline - time.monotonic()
-            )
+            remaining_s = LOOK_EVERY_S if deadline is None else deadline - time.monotonic()
             if remaining_s <= 0:
                 process.terminate()  # as Ctrl-C: it may write what it has
                 with contextlib.suppress(subprocess.TimeoutExpired):
@@ -204,10 +164,7 @@ def _watch(
                 process.wait(min(remaining_s, LOOK_EVERY_S))
                 return None
             if is_stopped():
-                return {
-                    "outcome": STOPPED,
-                    "message": "stopped when the study was stopped",
-                }
+                return {"outcome": STOPPED, "message": "stopped when the study was stopped"}
     finally:
         with contextlib.suppress(OSError):
             process.stdin.close()
@@ -268,15 +225,9 @@ class RunStore:
             record = json.loads(self._file(key).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        return (
-            record
-            if isinstance(record, dict) and record.get("key") == key
-            else None
-        )
+        return record if isinstance(record, dict) and record.get("key") == key else None
 
-    def load_finished(
-        self, key: str, time_limit_s: float | None
-    ) -> Record | None:
+    def load_finished(self, key: str, time_limit_s: float | None) -> Record | None:
         """Return the record of a run; None if the run should be executed again.
 
         A run is repeated if it crashed, or if it exceeded a time limit below the present one. A run
@@ -294,11 +245,7 @@ class RunStore:
             return None
         if record["outcome"] == TIMEOUT:
             previous_limit_s = record.get("time_limit_s") or 0.0
-            return (
-                record
-                if time_limit_s is not None and time_limit_s <= previous_limit_s
-                else None
-            )
+            return record if time_limit_s is not None and time_limit_s <= previous_limit_s else None
         return record
 
     def _file(self, key: str) -> Path:
@@ -358,9 +305,7 @@ def run_all(
     planned: Sequence[PlannedRun],
     store: RunStore,
     options: RunOptions,
-    on_record: Callable[[Record, int], None] = lambda record, worker_count: (
-        None
-    ),
+    on_record: Callable[[Record, int], None] = lambda record, worker_count: None,
 ) -> None:
     """Execute the runs of a study and store their records, each as soon as it has ended; return
     when all have ended.
@@ -389,9 +334,7 @@ def run_all(
     """
     if not planned:
         return
-    with (_cluster_executor if options.scheduler else _thread_executor)(
-        options
-    ) as pool:
+    with (_cluster_executor if options.scheduler else _thread_executor)(options) as pool:
         futures = {pool.submit(run): run for run in planned}
         try:
             for future in as_completed(futures):
@@ -406,20 +349,9 @@ def run_all(
             raise
 
 
-def _result_record(
-    future: Future, planned: PlannedRun, limits: RunOptions
-) -> Record:
+def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
     """Return the record of a run from its finished future; if that raises, a record of a crash,
     because its worker was lost.
-
-    Parameters
-    ----------
-    future : Future
-        Future of the record.
-    planned : PlannedRun
-        The run.
-    limits : RunOptions
-        Options with the time limit, which the record of a crash contains.
     """
     try:
         return future.result()
@@ -447,9 +379,7 @@ def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
 
         def submit(run: PlannedRun) -> Future:
             """Start a run and return the future of its record."""
-            return executor.submit(
-                execute, run.as_dict(), limits.time_limit_s, stop.is_set
-            )
+            return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
 
         yield RunExecutor(submit, worker_count, stop=stop.set)
 
@@ -461,11 +391,6 @@ def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
 
     `RunExecutor.stop` tells running runs to end, through an event of the cluster; the end of the
     context alone does not stop them. It waits for submitted runs, and closes the connection.
-
-    Raises
-    ------
-    InputError
-        If dask.distributed is not installed, or the scheduler does not answer.
     """
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
     with connected(limits.scheduler) as client:
@@ -474,29 +399,11 @@ def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
 
             def submit(run: PlannedRun) -> Future:
                 """Start a run and return the future of its record."""
-                return executor.submit(
-                    _execute_on_worker, run.as_dict(), limits.time_limit_s, flag
-                )
+                return executor.submit(_execute_on_worker, run.as_dict(), limits.time_limit_s, flag)
 
-            yield RunExecutor(
-                submit, max(1, sum(client.nthreads().values())), stop=stop.set
-            )
+            yield RunExecutor(submit, max(1, sum(client.nthreads().values())), stop=stop.set)
 
 
-def _execute_on_worker(
-    planned: dict[str, Any], time_limit_s: float | None, flag: str
-) -> Record:
-    """Execute a run in a process of its own on a worker, and return its record, see `execute`.
-
-    Parameters
-    ----------
-    planned : dict
-        A `PlannedRun` as a dictionary.
-    time_limit_s : float or None
-        Time limit of the run [s]; None for no limit.
-    flag : str
-        Name of an event of the cluster; once it is set, the process is killed.
-    """
-    return execute(
-        planned, time_limit_s, is_stopped=distributed().Event(flag).is_set
-    )
+def _execute_on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
+    """Execute a run in a process of its own on a worker, and return its record, see `execute`."""
+    return execute(planned, time_limit_s, is_stopped=distributed().Event(flag).is_set)

@@ -58,9 +58,7 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
     """
     try:
         problem = Problem.read(
-            planned["problem"],
-            planned["overrides"],
-            allow_code=planned["allow_code"],
+            planned["problem"], planned["overrides"], allow_code=planned["allow_code"]
         )
         test_name = planned.get("test_name")
         if test_name is not None:
@@ -77,11 +75,7 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
         return {"outcome": ERROR, "message": str(error)}
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
-        return {
-            "outcome": ERROR,
-            "message": message,
-            "traceback": traceback.format_exc(),
-        }
+        return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
 
 
 def _tip_record(finished: Run) -> dict[str, Any] | None:
@@ -89,14 +83,6 @@ def _tip_record(finished: Run) -> dict[str, Any] | None:
     body, of the first fitted experiment, for JSON; None without markers.
 
     The distance is that from the mean of the grasped nodes, or of all nodes without a grasp.
-
-    Returns
-    -------
-    dict or None
-        "experiment" and "marker" (names); "t_s" (T); "measured_m" (T, 3), NaN where missing;
-        "rolled_out_m" (T, 3), the simulated track, None if the forward simulation failed; and
-        "max_m", the largest distance between the tracks [m], None also if the marker was never
-        measured.
     """
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers
@@ -104,20 +90,12 @@ def _tip_record(finished: Run) -> dict[str, Any] | None:
     grasped_nodes = prescribed_nodes(experiment.grasps)
     if not markers.names:
         return None
-    centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(
-        axis=0
-    )
-    tip = int(
-        np.linalg.norm(
-            markers.predict_positions(nodes_m) - centre, axis=1
-        ).argmax()
-    )
+    centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0)
+    tip = int(np.linalg.norm(markers.predict_positions(nodes_m) - centre, axis=1).argmax())
     measured = markers.positions_m[:, tip]
     rollout = finished.rollouts[experiment.name]
     rolled = (
-        rollout.trajectory.markers_m[:, tip]
-        if isinstance(rollout, ForwardSimulation)
-        else None
+        rollout.trajectory.markers_m[:, tip] if isinstance(rollout, ForwardSimulation) else None
     )
     error = None
     if rolled is not None and markers.is_present[:, tip].any():

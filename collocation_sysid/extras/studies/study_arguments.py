@@ -24,9 +24,7 @@ def unique_items(text: str) -> tuple[str, ...]:
     """Return the items of text separated by commas, stripped, each once, in their order; empty ones
     are left out, so that the result may be empty.
     """
-    return tuple(
-        dict.fromkeys(item.strip() for item in text.split(",") if item.strip())
-    )
+    return tuple(dict.fromkeys(item.strip() for item in text.split(",") if item.strip()))
 
 
 def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
@@ -41,9 +39,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     names = unique_items(text)
     if not names:
         raise InputError(
-            f"found no name; expected some of {', '.join(METHODS)}",
-            None,
-            where=option,
+            f"found no name; expected some of {', '.join(METHODS)}", None, where=option
         )
     for name in names:
         require_method(name, option)
@@ -94,16 +90,9 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
 
     A text `item` with "=" is read as name=value pairs, separated by commas, with values as text;
     the file is then None. Any other text is the path of a TOML file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or has no such table.
     """
     if "=" in item:
-        pairs = [
-            pair.partition("=") for pair in item.split(",") if pair.strip()
-        ]
+        pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
         return None, {name.strip(): value.strip() for name, _, value in pairs}
     path = Path(item)
     require_regular(path, "--truth")
@@ -117,36 +106,17 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
             where="--truth",
         ) from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"this file cannot be read: {error}", path, where="--truth"
-        ) from error
+        raise InputError(f"this file cannot be read: {error}", path, where="--truth") from error
     table = content.get("parameters", content)
     if not isinstance(table, Mapping):
         raise InputError(
-            "parameters is not a table; expected true values by name",
-            path,
-            where="--truth",
+            "parameters is not a table; expected true values by name", path, where="--truth"
         )
     return path, table
 
 
 def _positive_value(name: str, value: Any, source: Path | None) -> float:
-    """Return a value as a positive, finite float.
-
-    Parameters
-    ----------
-    name : str
-        Name of the parameter, for the message.
-    value : Any
-        A number, or text of one.
-    source : Path or None
-        File of the value, for the message; None for the command line.
-
-    Raises
-    ------
-    InputError
-        If the value is not a positive, finite number.
-    """
+    """Return a value as a positive, finite float."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -154,9 +124,7 @@ def _positive_value(name: str, value: Any, source: Path | None) -> float:
     if not 0 < number < np.inf:
         quoted = value[:60] if isinstance(value, str) else shortened(value)
         raise InputError(
-            f"found {name} = {quoted}; expected a positive number",
-            source,
-            where="--truth",
+            f"found {name} = {quoted}; expected a positive number", source, where="--truth"
         )
     return number
 
@@ -191,20 +159,12 @@ def parse_varied_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
             )
         if key in over:
             raise InputError(
-                f"{key} is given twice; put its values in one list",
-                None,
-                where="--over",
+                f"{key} is given twice; put its values in one list", None, where="--over"
             )
         ranged = ":" in values and not values.startswith(('"', "'", "[", "{"))
-        over[key] = tuple(
-            _range_values(key, values) if ranged else _split_values(values)
-        )
+        over[key] = tuple(_range_values(key, values) if ranged else _split_values(values))
     if not over:
-        raise InputError(
-            "missing; expected at least one key to sweep over",
-            None,
-            where="--over",
-        )
+        raise InputError("missing; expected at least one key to sweep over", None, where="--over")
     require_few(math.prod(map(len, over.values())), "--over", noun="runs")
     return over
 
@@ -233,19 +193,6 @@ def require_few(count: int, option: str, noun: str) -> None:
 def _range_values(key: str, text: str) -> Iterable[str]:
     """Return the values of a range "first:last:count" or "first:last:log:count", ends included,
     evenly spaced, or so in the logarithm, as text with 12 digits.
-
-    Parameters
-    ----------
-    key : str
-        Swept key, for the message.
-    text : str
-        The range.
-
-    Raises
-    ------
-    InputError
-        For another form, numbers that are not finite, a count below 1 or above `MOST_RUNS`, an
-        unknown spacing, or a logarithmic range that is not positive.
     """
     first, *middle, count = text.split(":")
     try:
@@ -253,11 +200,7 @@ def _range_values(key: str, text: str) -> Iterable[str]:
         high = float(middle[0])
         number = int(count)
         spacing = middle[1] if len(middle) == 2 else "linear"
-        if (
-            len(middle) > 2
-            or number < 1
-            or not np.isfinite([low, high, high - low]).all()
-        ):
+        if len(middle) > 2 or number < 1 or not np.isfinite([low, high, high - low]).all():
             raise ValueError
     except (ValueError, IndexError):
         raise InputError(
@@ -274,9 +217,7 @@ def _range_values(key: str, text: str) -> Iterable[str]:
         )
     if spacing == "log" and not (low > 0 and high > 0):
         raise InputError(
-            f"found {text} for {key}; a logarithmic range needs ends above 0",
-            None,
-            where="--over",
+            f"found {text} for {key}; a logarithmic range needs ends above 0", None, where="--over"
         )
     spaced = np.geomspace if spacing == "log" else np.linspace
     # Without the rounding errors of their computation.

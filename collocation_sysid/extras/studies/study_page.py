@@ -10,25 +10,12 @@ from math import exp
 from pathlib import Path
 from typing import Any
 
-from ...common.display import (
-    Items,
-    Line,
-    Shown,
-    Table,
-    TitledParts,
-    as_markdown,
-)
+from ...common.display import Items, Line, Shown, Table, TitledParts, as_markdown
 from ...common.files import SCHEMA, replaced_file, write_text_file
 from ...common.serialisation import as_json
 from ...fem.laws.constants import symbol_of, symbol_with_unit, unit_of
 from .law_disagreements import law_table
-from .model_choice import (
-    advice,
-    display_unit,
-    law_disagreements,
-    model_notes,
-    model_rows,
-)
+from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
 from .run_execution import Record, RunStore
 from .study_kinds import METHOD_STUDY, MODEL_STUDY
 from .study_planning import PlannedRun, shortened_keys
@@ -62,9 +49,7 @@ WORDS = {
 }
 # Units that a short heading may end with.
 UNITS = ("Pa", "s", "1/s", "kg/m³")
-MEDIANS_NOTE = (
-    "Errors, misfits and costs are medians over the runs with a result."
-)
+MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with a result."
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +101,7 @@ class StudyReport:
                 *model_views(self.list_rows()),
                 *([law_table(disagreements)] if disagreements else []),
             ]
-        return sweep_views(
-            self.list_rows(), list(self.planned[0].varied_values)
-        )
+        return sweep_views(self.list_rows(), list(self.planned[0].varied_values))
 
     def build_headline(self) -> list[str]:
         """Return the result of the study in a few sentences: the advice of a comparison of models,
@@ -128,9 +111,7 @@ class StudyReport:
         if self.kind == MODEL_STUDY:
             return [advice(self.list_rows())]
         if self.kind == METHOD_STUDY:
-            return [
-                _method_sentence(row) for row in method_rows(self.list_rows())
-            ]
+            return [_method_sentence(row) for row in method_rows(self.list_rows())]
         return sweep_sentences(self.list_rows())
 
     def build_tables(self) -> list[Table]:
@@ -138,14 +119,9 @@ class StudyReport:
         comparison of methods one more table with all its runs.
         """
         views = [
-            replace(view, heads=tuple(map(_in_words, view.heads)))
-            for view in self.build_views()
+            replace(view, heads=tuple(map(_in_words, view.heads))) for view in self.build_views()
         ]
-        return (
-            [*views, run_view(self.list_rows())]
-            if self.kind == METHOD_STUDY
-            else views
-        )
+        return [*views, run_view(self.list_rows())] if self.kind == METHOD_STUDY else views
 
     def list_failures(self) -> list[str]:
         """Return the one line for each run that has a record without a result: its label, outcome
@@ -163,19 +139,11 @@ class StudyReport:
         methods, and the number of runs without a record, if there are any.
         """
         missing = len(self.planned) - len(self.records)
-        notes = (
-            [f"{missing} of {len(self.planned)} runs remain to be done."]
-            if missing
-            else []
-        )
+        notes = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
         if self.kind == MODEL_STUDY:
             return [*model_notes(self.list_rows()), *notes]
         return [
-            *(
-                (self.yardstick.describe(), MEDIANS_NOTE)
-                if self.kind == METHOD_STUDY
-                else ()
-            ),
+            *((self.yardstick.describe(), MEDIANS_NOTE) if self.kind == METHOD_STUDY else ()),
             *notes,
         ]
 
@@ -201,9 +169,7 @@ def load_report(
         Criterion of success; by default convergence alone.
     """
     loaded = {run.key: store.load(run.key) for run in planned}
-    records = {
-        key: record for key, record in loaded.items() if record is not None
-    }
+    records = {key: record for key, record in loaded.items() if record is not None}
     return StudyReport(
         title,
         kind,
@@ -229,16 +195,11 @@ def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
         Folder to which it was written, for the last line; nothing is written here.
     """
     # What no line of the tables says.
-    parts: list[Shown] = (
-        [*report.build_headline(), ""] if report.kind == MODEL_STUDY else []
-    )
+    parts: list[Shown] = [*report.build_headline(), ""] if report.kind == MODEL_STUDY else []
     for table in report.build_views():
         parts += [table, ""]
     failures = report.list_failures()
-    parts += [
-        *report.list_notes(),
-        *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES]),
-    ]
+    parts += [*report.list_notes(), *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES])]
     if len(failures) > SHOWN_FAILURES:
         more = f"and {len(failures) - SHOWN_FAILURES} more in summary.md"
         parts.append(Line(more, "doubtful"))
@@ -260,9 +221,7 @@ def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
         (
             str(number),
             run.make_label(),
-            " ".join(
-                "–" if g is None else f"{g:.4g}" for g in run.guess.values()
-            ),
+            " ".join("–" if g is None else f"{g:.4g}" for g in run.guess.values()),
             "finished" if run.key in finished else "to do",
         )
         for number, run in enumerate(planned, start=1)
@@ -296,18 +255,12 @@ def write_report(report: StudyReport, folder: Path) -> None:
     write_text_file(folder / "runs.csv", as_csv(rows))
     if report.kind == METHOD_STUDY:
         write_text_file(folder / "summary.csv", as_csv(method_rows(rows)))
-    write_text_file(
-        folder / "summary.json", as_json(report_json(report)) + "\n"
-    )
-    write_text_file(
-        folder / "summary.md", as_markdown([report_section(report)])
-    )
+    write_text_file(folder / "summary.json", as_json(report_json(report)) + "\n")
+    write_text_file(folder / "summary.md", as_markdown([report_section(report)]))
     if report.kind == MODEL_STUDY:
         figures = {}
     elif report.kind == METHOD_STUDY:
-        figures = comparison_plots(
-            rows, report.records, yardstick=report.yardstick
-        )
+        figures = comparison_plots(rows, report.records, yardstick=report.yardstick)
     else:
         figures = sweep_plots(rows, list(report.planned[0].varied_values))
     for name, figure in figures.items():
@@ -364,23 +317,13 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 
 def report_section(report: StudyReport) -> TitledParts:
-    """Return sentences, notes, tables (`StudyReport.build_views()`) and failures of a study as a section
-    with its title, for a paper's appendix or an issue; without failures it has no part on them.
+    """Return sentences, notes, tables (`StudyReport.build_views()`) and failures of a study as a
+    section with its title, for a paper's appendix or an issue; without failures it has no part on
+    them.
     """
-    failures = (
-        (Items(tuple(report.list_failures())),)
-        if report.list_failures()
-        else ()
-    )
-    without = tuple(
-        TitledParts("Runs without a result", (each,)) for each in failures
-    )
-    parts = (
-        *report.build_headline(),
-        *report.list_notes(),
-        *report.build_views(),
-        *without,
-    )
+    failures = (Items(tuple(report.list_failures())),) if report.list_failures() else ()
+    without = tuple(TitledParts("Runs without a result", (each,)) for each in failures)
+    parts = (*report.build_headline(), *report.list_notes(), *report.build_views(), *without)
     return TitledParts(report.title, parts, level=1)
 
 
@@ -391,9 +334,7 @@ def _in_words(head: str) -> str:
     if head.startswith("Δ") and head.endswith(" %"):
         return f"error of {head[1:-2]} [%]"
     symbol, space, unit = head.partition(" ")
-    return WORDS.get(
-        head, f"{symbol} [{unit}]" if space and unit in UNITS else head
-    )
+    return WORDS.get(head, f"{symbol} [{unit}]" if space and unit in UNITS else head)
 
 
 # Views --------------------------------------------------------------------------------------------
@@ -413,34 +354,16 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
         "success": lambda row: f"{row['successes']}/{row['runs']}",
-        "95 %": lambda row: (
-            f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %"
-        ),
+        "95 %": lambda row: f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %",
     }
     success |= _error_cells(summaries)
-    quality = [
-        "violation_n",
-        "violation_relative",
-        "rms_m",
-        "rollout_rms_m",
-        "tip_max_m",
-    ]
-    cost = [
-        "iterations",
-        "evaluations",
-        "build_s",
-        "evaluations_s",
-        "linear_algebra_s",
-        "total_s",
-    ]
+    quality = ["violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m"]
+    cost = ["iterations", "evaluations", "build_s", "evaluations_s", "linear_algebra_s", "total_s"]
     if all(row["evaluations"] is None for row in summaries):
         cost.remove("evaluations")
     return [
         _table_view(
-            "Success",
-            {"method": _text_cell("method")},
-            number_columns=success,
-            rows=summaries,
+            "Success", {"method": _text_cell("method")}, number_columns=success, rows=summaries
         ),
         _table_view(
             "Quality",
@@ -471,35 +394,22 @@ def run_view(rows: Sequence[Row]) -> Table:
         "ended": _text_cell("status"),
         "succeeded": lambda row: "yes" if row["success"] else "no",
     }
-    cells |= _error_cells(rows) | _number_cells(
-        "rms_m", "rollout_rms_m", "iterations", "total_s"
-    )
+    cells |= _error_cells(rows) | _number_cells("rms_m", "rollout_rms_m", "iterations", "total_s")
     ordered = sorted(rows, key=lambda row: row["start"])
     view = _table_view("Runs", names, number_columns=cells, rows=ordered)
     return replace(view, heads=tuple(map(_in_words, view.heads)))
 
 
 def _method_sentence(row: Row) -> str:
-    """Return how often, how accurately and how fast a method found the solution, in words.
-
-    Parameters
-    ----------
-    row : Row
-        Row of `method_rows`; if "total_s" is None, no run gave a result, otherwise "rms_m" must not
-        be None.
-    """
+    """Return how often, how accurately and how fast a method found the solution, in words."""
     low = 100 * row["success_low"]
     high = 100 * row["success_high"]
-    sentence = (
-        f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
-    )
+    sentence = f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
     sentence += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
     if row["total_s"] is None:
         return f"{sentence}, and gave no result."
     misfit = f"with a marker error of {1e3 * row['rms_m']:.2g} mm"
-    return (
-        f"{sentence}, {misfit} and a time of {row['total_s']:.2g} s (medians)."
-    )
+    return f"{sentence}, {misfit} and a time of {row['total_s']:.2g} s (medians)."
 
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
@@ -515,22 +425,12 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
     sentences = [f"{len(converged)} of {len(rows)} runs converged."]
     for name in parameters_in(rows):
         values = [row[f"value_{name}"] for row in converged]
-        errors = [
-            e
-            for row in converged
-            if (e := row[f"std_error_{name}"]) is not None
-        ]
+        errors = [e for row in converged if (e := row[f"std_error_{name}"]) is not None]
         if len(values) > 1:
-            spread = (
-                f"; the largest standard error is {max(errors):.2g}"
-                if errors
-                else ""
-            )
+            spread = f"; the largest standard error is {max(errors):.2g}" if errors else ""
             low = f"{min(values):.4g}"
             high = f"{max(values):.4g} {unit_of(name)}".strip()
-            sentences.append(
-                f"Their {symbol_of(name)} is from {low} to {high}{spread}."
-            )
+            sentences.append(f"Their {symbol_of(name)} is from {low} to {high}{spread}.")
     return sentences
 
 
@@ -545,26 +445,15 @@ def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
     varied_keys : sequence of str
         Swept keys.
     """
-    places = {
-        short: _varied_cell(key) for key, short in shortened_keys(varied_keys)
-    }
+    places = {short: _varied_cell(key) for key, short in shortened_keys(varied_keys)}
     estimates: dict[str, Cell] = {}
     for name in parameters_in(rows):
         estimates[symbol_with_unit(name)] = _estimate_cell(name)
-    number_columns = _number_cells(
-        "rms_m", "rollout_rms_m", "iterations", "total_s"
-    )
+    number_columns = _number_cells("rms_m", "rollout_rms_m", "iterations", "total_s")
     quality = {"status": _text_cell("status"), **number_columns}
     return [
-        _table_view(
-            "Estimates ± standard error",
-            places,
-            number_columns=estimates,
-            rows=rows,
-        ),
-        _table_view(
-            "Quality and cost", places, number_columns=quality, rows=rows
-        ),
+        _table_view("Estimates ± standard error", places, number_columns=estimates, rows=rows),
+        _table_view("Quality and cost", places, number_columns=quality, rows=rows),
     ]
 
 
@@ -592,17 +481,10 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
     names = dict.fromkeys(name for row in rows for name in row["parameters"])
     for name in names:
         moduli[symbol_with_unit(name)] = _bounded_cell(name)
-    model = {
-        "": lambda row: "→" if row["chosen"] else "",
-        "model": _text_cell("model"),
-    }
-    views = [
-        _table_view("Models", model, number_columns=number_columns, rows=rows)
-    ]
+    model = {"": lambda row: "→" if row["chosen"] else "", "model": _text_cell("model")}
+    views = [_table_view("Models", model, number_columns=number_columns, rows=rows)]
     test_columns = {
-        f"'{n}' {unit}": _number_cell(
-            n, factor, form=".3g", among="predictions"
-        )
+        f"'{n}' {unit}": _number_cell(n, factor, form=".3g", among="predictions")
         for n in dict.fromkeys(n for r in rows for n in r["predictions"])
     }
     if len(test_columns) > 1:
@@ -616,37 +498,18 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
         )
     return [
         *views,
-        _transposed_view(
-            "Parameters",
-            {"model": _text_cell("model")},
-            cells=moduli,
-            rows=rows,
-        ),
+        _transposed_view("Parameters", {"model": _text_cell("model")}, cells=moduli, rows=rows),
     ]
 
 
 def _transposed_view(
-    title: str,
-    names: Mapping[str, Cell],
-    cells: Mapping[str, Cell],
-    rows: Sequence[Row],
+    title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
     """Return a table with a line for each cell and a column for each row, for many cells and few
     rows.
-
-    Parameters
-    ----------
-    title : str
-    names : mapping of heading to Cell
-        One cell, which gives the headings of the columns.
-    cells : mapping of heading to Cell
-        Cells of the lines.
-    rows : sequence of Row
     """
     (name,) = names.values()
-    lines = tuple(
-        (head, *(cell(row) for row in rows)) for head, cell in cells.items()
-    )
+    lines = tuple((head, *(cell(row) for row in rows)) for head, cell in cells.items())
     return Table(title, ("", *(name(row) for row in rows)), rows=lines)
 
 
@@ -663,22 +526,9 @@ def _ratio_text(row: Row) -> str:
 
 
 def _table_view(
-    title: str,
-    names: Mapping[str, Cell],
-    number_columns: Mapping[str, Cell],
-    rows: Sequence[Row],
+    title: str, names: Mapping[str, Cell], number_columns: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
-    """Return a table with a line for each row and a column for each cell.
-
-    Parameters
-    ----------
-    title : str
-        Title; empty for none.
-    names, number_columns : mapping of heading to Cell
-        Cells of the first columns, which name the row, and of the others.
-    rows : sequence of Row
-        Rows in the order of the lines.
-    """
+    """Return a table with a line for each row and a column for each cell."""
     columns = {**names, **number_columns}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
     return Table(title, tuple(columns), rows=cells, names=len(names))
@@ -706,27 +556,12 @@ def _varied_cell(key: str) -> Cell:
     return cell
 
 
-def _number_cell(
-    name: str, factor: float = 1.0, form: str = ".2g", among: str = ""
-) -> Cell:
+def _number_cell(name: str, factor: float = 1.0, form: str = ".2g", among: str = "") -> Cell:
     """Return the cell of a number: a function of a row that returns the number as text, "–" if it
     is unknown.
-
-    Parameters
-    ----------
-    name : str
-        Key of the number.
-    factor : float
-        Multiplies the number.
-    form : str
-        Format.
-    among : str
-        Key of the mapping in the row that contains the number; "" if it is in the row itself.
     """
     shown = NumberColumn(factor=factor, form=form)
-    return lambda row: shown.format(
-        row[among].get(name) if among else row[name]
-    )
+    return lambda row: shown.format(row[among].get(name) if among else row[name])
 
 
 def _bounded_cell(name: str) -> Cell:
@@ -750,10 +585,7 @@ def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
     those of `run_row` or `method_rows`; the first one decides which parameters these are.
     """
     names = parameters_in(rows, "error_")
-    return {
-        f"Δ{symbol_of(name)} %": _number_cell(f"error_{name}", 100)
-        for name in names
-    }
+    return {f"Δ{symbol_of(name)} %": _number_cell(f"error_{name}", 100) for name in names}
 
 
 def _number_cells(*names: str) -> dict[str, Cell]:
@@ -784,10 +616,6 @@ def _estimate_cell(name: str) -> Cell:
         spread = row.get(f"std_error_{name}")
         if value is None:
             return "–"
-        return (
-            f"{value:.4g}"
-            if spread is None
-            else f"{value:.4g} ± {float(f'{spread:.1g}'):g}"
-        )
+        return f"{value:.4g}" if spread is None else f"{value:.4g} ± {float(f'{spread:.1g}'):g}"
 
     return cell

@@ -90,9 +90,7 @@ class PlannedRun:
         return asdict(self)
 
 
-def shortened_keys(
-    keys: Sequence[str] | Mapping[str, Any],
-) -> Iterator[tuple[str, str]]:
+def shortened_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield each dotted key with the shortest ending that distinguishes it from the others, in
     order; of parameters at least two parts, name and key: "parameters.mu_pa.guess" with
     "mu_pa.guess". If no ending does, it is the complete key. Of a mapping the keys are used.
@@ -100,15 +98,8 @@ def shortened_keys(
     for key in keys:
         parts = key.split(".")
         fewest_parts = 2 if parts[0] == "parameters" else 1
-        ends = [
-            ".".join(parts[-count:])
-            for count in range(fewest_parts, len(parts) + 1)
-        ]
-        unique_ends = (
-            e
-            for e in ends
-            if sum(f".{other}".endswith(f".{e}") for other in keys) == 1
-        )
+        ends = [".".join(parts[-count:]) for count in range(fewest_parts, len(parts) + 1)]
+        unique_ends = (e for e in ends if sum(f".{other}".endswith(f".{e}") for other in keys) == 1)
         yield key, next(unique_ends, key)
 
 
@@ -137,9 +128,7 @@ class Starts:
     def __post_init__(self) -> None:
         require_few(self.starts, "starts", noun="starts")
 
-    def overrides(
-        self, problem: Problem, truth: Mapping[str, float], start: int
-    ) -> Iterator[str]:
+    def overrides(self, problem: Problem, truth: Mapping[str, float], start: int) -> Iterator[str]:
         """Yield the overrides "parameters.NAME.guess=VALUE" of one start: guesses of the estimated
         parameters, log-uniform around truth or guess within the factor `spread`, limited to the
         bounds.
@@ -159,9 +148,7 @@ class Starts:
             For a parameter with neither a guess nor a true value.
         """
         free = problem.parameters.free if start else ()
-        exponents = np.random.default_rng([self.seed, start]).uniform(
-            -1, 1, len(free)
-        )
+        exponents = np.random.default_rng([self.seed, start]).uniform(-1, 1, len(free))
         for item, exponent in zip(free, exponents, strict=True):
             centre = truth.get(item.name, item.guess)
             if centre is None:
@@ -171,9 +158,7 @@ class Starts:
                     problem.path,
                     where=f"parameters.{item.name}",
                 )
-            inside = float(
-                np.clip(centre * self.spread**exponent, item.lower, item.upper)
-            )
+            inside = float(np.clip(centre * self.spread**exponent, item.lower, item.upper))
             yield f"parameters.{item.name}.guess={inside!r}"
 
 
@@ -219,26 +204,14 @@ def plan_comparison(
             "file; write one, and use Problem.read"
         )
     if problem.substeps == "auto":  # or each method would choose for itself
-        overrides = [
-            *overrides,
-            f"transcription.substeps={problem.choose_first_substeps()}",
-        ]
+        overrides = [*overrides, f"transcription.substeps={problem.choose_first_substeps()}"]
     planned = []
     for start in range(starts.starts):
-        start_overrides = [
-            *overrides,
-            *starts.overrides(problem, truth or {}, start=start),
-        ]
+        start_overrides = [*overrides, *starts.overrides(problem, truth or {}, start=start)]
         file, _ = read_problem_file(problem.path, start_overrides)
         details = {"start": start, "allow_code": allow_code}
         planned += [
-            _planned_run(
-                problem.path,
-                file,
-                method=method,
-                overrides=start_overrides,
-                **details,
-            )
+            _planned_run(problem.path, file, method=method, overrides=start_overrides, **details)
             for method in methods
         ]
     return planned
@@ -275,21 +248,14 @@ def plan_sweep(
     planned = []
     for values in itertools.product(*over.values()):
         varied_values = dict(zip(over, values, strict=True))
-        run_overrides = [
-            *overrides,
-            *(f"{key}={value}" for key, value in varied_values.items()),
-        ]
+        run_overrides = [*overrides, *(f"{key}={value}" for key, value in varied_values.items())]
         try:
             file, _ = read_problem_file(path, run_overrides)
         except InputError as error:
             where = "--over" if error.source == "--set" else error.source
             raise InputError(error.message, where, where=error.where) from error
         details = {"varied_values": varied_values, "allow_code": allow_code}
-        planned.append(
-            _planned_run(
-                path, file, method=method, overrides=run_overrides, **details
-            )
-        )
+        planned.append(_planned_run(path, file, method=method, overrides=run_overrides, **details))
     return planned
 
 
@@ -324,9 +290,7 @@ def plan_models(
     """
     for each in problem.experiments:
         is_compared = (
-            each.markers.count_samples()
-            or each.sensors_by_grasp
-            or each.specimen is not None
+            each.markers.count_samples() or each.sensors_by_grasp or each.specimen is not None
         )
         if not (each.validation or is_compared):
             raise InputError(
@@ -338,18 +302,11 @@ def plan_models(
     for test_name in ("", *fitted_recordings(problem)):
         for variant in variants:
             file, _ = read_problem_file(variant.path, variant.overrides)
-            details = {
-                "varied_values": {"model": variant.label},
-                "test_name": test_name,
-            }
+            details = {"varied_values": {"model": variant.label}, "test_name": test_name}
             details |= {"allow_code": allow_code}
             planned.append(
                 _planned_run(
-                    variant.path,
-                    file,
-                    method=method,
-                    overrides=variant.overrides,
-                    **details,
+                    variant.path, file, method=method, overrides=variant.overrides, **details
                 )
             )
     return planned
@@ -363,11 +320,7 @@ def fitted_recordings(problem: Problem) -> list[str]:
 
 
 def _planned_run(
-    path: Path,
-    file: ProblemFile,
-    method: str | None,
-    overrides: Sequence[str],
-    **more: Any,
+    path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
 ) -> PlannedRun:
     """Return the run of a file with its overrides, with a key that depends on all that decides its
     result.
@@ -375,19 +328,6 @@ def _planned_run(
     The key is a hash of the content of the file (with only the solver's options for this method),
     the start, for a comparison of models the held-out recording, the data files, and the version of
     this package; not of the path.
-
-    Parameters
-    ----------
-    path : Path
-        Problem file.
-    file : ProblemFile
-        Its content with the overrides.
-    method : str or None
-        Name of the method; None means the file's own.
-    overrides : sequence of str
-        Overrides "key=value".
-    more : Any
-        Further fields of `PlannedRun`.
     """
     method = method or file.solver.method
     start = more.get("start", 0)
@@ -400,26 +340,15 @@ def _planned_run(
     }
     content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
     solver = content.get("solver", {})
-    content["solver"] = {
-        key: solver[key] for key in ("huber", method) if key in solver
-    }
+    content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
     content["solver"]["method"] = method
-    of_study = (
-        start
-        if more.get("test_name") is None
-        else f"without {more['test_name']}"
-    )
+    of_study = start if more.get("test_name") is None else f"without {more['test_name']}"
     hashes = _file_hashes(content, path.parent)
     decisive = [content, of_study, hashes, version("collocation-sysid")]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
     return PlannedRun(
-        key,
-        str(path.resolve()),
-        method=method,
-        overrides=tuple(overrides),
-        guess=guess,
-        **more,
+        key, str(path.resolve()), method=method, overrides=tuple(overrides), guess=guess, **more
     )
 
 
@@ -427,22 +356,12 @@ def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
     """Return SHA-256 hashes, by the name as it is written, of the files that the content of a
     problem names, so that changed data give another run. A topic of a log with several files has
     their hashes, separated by spaces. Names of missing files and of folders are left out.
-
-    Parameters
-    ----------
-    content : Any
-        Nested mappings, lists and texts; every text except keys is tried as the name of a file.
-    folder : Path
-        Folder of the problem file, to which names are relative.
     """
     hashes = {}
     for text in _texts(content):
         with suppress(OSError, ValueError):  # a text that is no file's name
             if files := stored_files(folder / text):
-                each = [
-                    hashlib.sha256(file.read_bytes()).hexdigest()
-                    for file in files
-                ]
+                each = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
                 hashes[text] = " ".join(each)
     return hashes
 

@@ -57,9 +57,7 @@ PANEL_MM = 32.0
 
 
 def comparison_plots(
-    rows: Sequence[Row],
-    records: Mapping[str, Record],
-    yardstick: SuccessCriterion,
+    rows: Sequence[Row], records: Mapping[str, Record], yardstick: SuccessCriterion
 ) -> dict[str, Figure]:
     """Return the figures of a comparison of methods by file name without suffix; those without data
     are left out.
@@ -86,18 +84,10 @@ def comparison_plots(
     done = [row for row in rows if row["status"] != "missing"]
     centre = reference_parameters(done, yardstick) if done else {}
     # A run without a guess that failed has no place among the starts.
-    done = [
-        row
-        for row in done
-        if all(row[f"guess_{name}"] is not None for name in centre)
-    ]
+    done = [row for row in done if all(row[f"guess_{name}"] is not None for name in centre)]
     if centre and len({row["start"] for row in done}) > 1:
-        figures["success"] = success_by_distance(
-            done, centre, is_truth_known=bool(yardstick.truth)
-        )
-        figures["basins"] = basins(
-            done, centre, is_truth_known=bool(yardstick.truth)
-        )
+        figures["success"] = success_by_distance(done, centre, is_truth_known=bool(yardstick.truth))
+        figures["basins"] = basins(done, centre, is_truth_known=bool(yardstick.truth))
     return figures
 
 
@@ -115,9 +105,7 @@ def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
     }
 
 
-def convergence_in_time(
-    rows: Sequence[Row], records: Mapping[str, Record]
-) -> Figure:
+def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     """Return a figure of loss and violation of the equations of motion against time [s], a line per
     run and a colour per method; values that are not positive are left out.
 
@@ -131,28 +119,15 @@ def convergence_in_time(
     figure = new_figure(PAGE_MM, 70)
     panels = figure.subplots(1, 2)
     for method, (colour, runs) in _by_method(rows).items():
-        style: dict[str, Any] = {
-            "color": colour,
-            "lw": LINE_PT,
-            "marker": ".",
-            "ms": 3,
-        }
+        style: dict[str, Any] = {"color": colour, "lw": LINE_PT, "marker": ".", "ms": 3}
         for k, row in enumerate(runs):
             history = read(Result, records[row["key"]]["result"]).history
             times = [line.time_s for line in history]
             for axes, name in zip(panels, ("loss", "violation_n"), strict=True):
-                values = np.array(
-                    [getattr(line, name) for line in history], dtype=float
-                )
+                values = np.array([getattr(line, name) for line in history], dtype=float)
                 values[~(values > 0)] = np.nan
                 label = None if k else method
-                axes.plot(
-                    times,
-                    values,
-                    label=label,
-                    alpha=max(0.2, len(runs) ** -0.5),
-                    **style,
-                )
+                axes.plot(times, values, label=label, alpha=max(0.2, len(runs) ** -0.5), **style)
     style_axes(panels[0], "Loss", xlabel="time [s]", ylabel="Σ (residual / σ)²")
     style_axes(
         panels[1],
@@ -163,9 +138,7 @@ def convergence_in_time(
     for axes in panels:
         make_log_axis(axes)
         axes.set_xscale("log", nonpositive="mask")
-        axes.xaxis.set_major_locator(
-            LogLocator(subs=(1.0, 2.0, 5.0), numticks=7)
-        )
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
         format_plain_numbers(axes.xaxis)
     add_legend_above(panels[0], 3, height=1.1)
     return figure
@@ -192,9 +165,7 @@ def success_by_distance(
     figure = new_figure(PAGE_MM / 2, 65)
     axes = figure.subplots()
     factors = np.array([guess_distance(row, centre) for row in rows])
-    edges = np.geomspace(
-        max(1.0, factors.min()), factors.max() * (1 + 1e-9), DISTANCE_BINS + 1
-    )
+    edges = np.geomspace(max(1.0, factors.min()), factors.max() * (1 + 1e-9), DISTANCE_BINS + 1)
     methods = _by_method(rows)
     for k, (method, (colour, runs)) in enumerate(methods.items()):
         off = np.array([guess_distance(row, centre) for row in runs])
@@ -202,11 +173,7 @@ def success_by_distance(
         rates = []
         bars = []
         for low, high in itertools.pairwise(edges):
-            hits = [
-                row["success"]
-                for row, f in zip(runs, off, strict=True)
-                if low <= f < high
-            ]
+            hits = [row["success"] for row, f in zip(runs, off, strict=True) if low <= f < high]
             if hits:
                 rate = np.mean(hits)
                 least, most = wilson_interval(sum(hits), len(hits))
@@ -214,23 +181,12 @@ def success_by_distance(
                 places.append(low ** (1 - shift) * high**shift)
                 rates.append(100 * rate)
                 bars.append((100 * (rate - least), 100 * (most - rate)))
-        style = {
-            "fmt": "o-",
-            "ms": 3,
-            "lw": LINE_PT,
-            "elinewidth": 0.7,
-            "capsize": 2,
-        }
+        style = {"fmt": "o-", "ms": 3, "lw": LINE_PT, "elinewidth": 0.7, "capsize": 2}
         axes.errorbar(
             places, rates, np.abs(np.array(bars)).T, color=colour, label=method, **style
         )  # fmt: skip
     title = f"Success over distance from the {'true values' if is_truth_known else 'best estimate'}"
-    style_axes(
-        axes,
-        title,
-        xlabel="factor by which the worst guess is wrong",
-        ylabel="success [%]",
-    )
+    style_axes(axes, title, xlabel="factor by which the worst guess is wrong", ylabel="success [%]")
     axes.set_xscale("log")
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
     axes.xaxis.set_minor_locator(NullLocator())
@@ -239,9 +195,7 @@ def success_by_distance(
     return figure
 
 
-def basins(
-    rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool
-) -> Figure:
+def basins(rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: bool) -> Figure:
     """Return a figure of the guesses of all runs, relative to a reference, over each pair of
     parameters, a row of panels for each method; a single parameter is paired with itself. Successes
     and failures have different marks.
@@ -258,18 +212,11 @@ def basins(
     names = list(centre)
     pairs = list(itertools.combinations(names, 2)) or [(names[0], names[0])]
     methods = _by_method(rows)
-    figure = new_figure(
-        max(PAGE_MM / 2, PANEL_MM * len(pairs)), 14 + PANEL_MM * len(methods)
-    )
-    panels = figure.subplots(
-        len(methods), len(pairs), sharex=True, sharey=True, squeeze=False
-    )
+    figure = new_figure(max(PAGE_MM / 2, PANEL_MM * len(pairs)), 14 + PANEL_MM * len(methods))
+    panels = figure.subplots(len(methods), len(pairs), sharex=True, sharey=True, squeeze=False)
     for (method, (_, runs)), line in zip(methods.items(), panels, strict=True):
         for axes, (first, second) in zip(line, pairs, strict=True):
-            for success, colour, marker in (
-                (False, VERMILION, "x"),
-                (True, BLUE, "o"),
-            ):
+            for success, colour, marker in ((False, VERMILION, "x"), (True, BLUE, "o")):
                 chosen = [row for row in runs if row["success"] is success]
                 axes.scatter(
                     [row[f"guess_{first}"] / centre[first] for row in chosen],
@@ -278,12 +225,7 @@ def basins(
                     label="success" if success else "failure",
                 )  # fmt: skip
             axes.plot(
-                1,
-                1,
-                "+",
-                color=BLACK,
-                ms=6,
-                label="truth" if is_truth_known else "best estimate",
+                1, 1, "+", color=BLACK, ms=6, label="truth" if is_truth_known else "best estimate"
             )
             style_axes(
                 axes,
@@ -310,18 +252,9 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
     is at least 1.
     """
     digit = 10 ** np.floor(np.log10(factor))
-    tick = (
-        max(
-            (t for t in (1.5, 2.0, 5.0, 10.0) if t * digit <= factor),
-            default=1.0,
-        )
-        * digit
-    )
+    tick = max((t for t in (1.5, 2.0, 5.0, 10.0) if t * digit <= factor), default=1.0) * digit
     axes.set(xscale="log", yscale="log")
-    for axis, limit in (
-        (axes.xaxis, axes.set_xlim),
-        (axes.yaxis, axes.set_ylim),
-    ):
+    for axis, limit in ((axes.xaxis, axes.set_xlim), (axes.yaxis, axes.set_ylim)):
         limit(0.8 / factor, 1.25 * factor)
         axis.set_major_locator(FixedLocator([1 / tick, 1, tick]))
         format_plain_numbers(axis, ".2g")
@@ -347,20 +280,11 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     figure = new_figure(PAGE_MM, 65)
     panels = figure.subplots(1, 3, sharex=True)
     tip = records[rows[0]["key"]]["tip"]
-    dots: dict[str, Any] = {
-        "ms": 3.5,
-        "color": BLACK,
-        "mec": "none",
-        "zorder": 3,
-    }
+    dots: dict[str, Any] = {"ms": 3.5, "color": BLACK, "mec": "none", "zorder": 3}
     measured = 1e3 * np.array(tip["measured_m"], dtype=float)
     for axis, (axes, letter) in enumerate(zip(panels, "xyz", strict=True)):
         axes.plot(tip["t_s"], measured[:, axis], ".", label="measured", **dots)
-        title = (
-            f"Tip: marker {tip['marker']} of {tip['experiment']}"
-            if axis == 0
-            else ""
-        )
+        title = f"Tip: marker {tip['marker']} of {tip['experiment']}" if axis == 0 else ""
         style_axes(axes, title, xlabel="time [s]", ylabel=f"{letter} [mm]")
         axes.yaxis.set_major_locator(MaxNLocator(5))
     for method, (colour, runs) in _by_method(rows).items():
@@ -369,26 +293,14 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
         if not track.get("rolled_out_m"):
             continue
         rolled = 1e3 * np.array(track["rolled_out_m"], dtype=float)
-        off = (
-            f", error at most {1e3 * track['max_m']:.2g} mm"
-            if track["max_m"]
-            else ""
-        )
+        off = f", error at most {1e3 * track['max_m']:.2g} mm" if track["max_m"] else ""
         for axis, axes in enumerate(panels):
-            axes.plot(
-                track["t_s"],
-                rolled[:, axis],
-                color=colour,
-                lw=LINE_PT,
-                label=method + off,
-            )
+            axes.plot(track["t_s"], rolled[:, axis], color=colour, lw=LINE_PT, label=method + off)
     add_figure_legend(figure, 2)
     return figure
 
 
-def sweep_plots(
-    rows: Sequence[Row], varied_keys: Sequence[str]
-) -> dict[str, Figure]:
+def sweep_plots(rows: Sequence[Row], varied_keys: Sequence[str]) -> dict[str, Figure]:
     """Return the figures of a sweep by file name without suffix: one, "sweep"; empty if no run has
     a result.
 
@@ -404,9 +316,7 @@ def sweep_plots(
     return {"sweep": estimates_against(rows, varied_keys)}
 
 
-def estimates_against(
-    rows: Sequence[Row], varied_keys: Sequence[str]
-) -> Figure:
+def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure:
     """Return a figure of estimates with their combined 95 % intervals: a row for each parameter, a
     column for each swept key.
 
@@ -430,9 +340,7 @@ def estimates_against(
     for column, key in enumerate(varied_keys):
         places, texts = _axis_positions([row[key] for row in rows])
         for line, name in zip(panels, names, strict=True):
-            for label, colour, shift, chosen in _groups(
-                rows, varied_keys, key=key, shorts=shorts
-            ):
+            for label, colour, shift, chosen in _groups(rows, varied_keys, key=key, shorts=shorts):
                 _draw_estimates(
                     line[column],
                     rows,
@@ -456,9 +364,7 @@ def estimates_against(
         if len(varied_keys) > 1:
             add_legend_above(panels[0, column], 2)
     for line in panels:
-        drawn = np.concatenate([c.get_segments() for c in line[0].collections])[
-            ..., 1
-        ].ravel()
+        drawn = np.concatenate([c.get_segments() for c in line[0].collections])[..., 1].ravel()
         if drawn.size and drawn.min() > 0 and drawn.max() > WIDE * drawn.min():
             make_log_axis(line[0])
     return figure
@@ -469,12 +375,8 @@ def _axis_positions(values: Sequence[str]) -> tuple[Array, dict[float, str]]:
     0 in the order of their first occurrence, and the label of each position.
     """
     order = list(dict.fromkeys(values))
-    names = {
-        float(place): _shortened(value) for place, value in enumerate(order)
-    }
-    return np.array(
-        [order.index(value) for value in values], dtype=float
-    ), names
+    names = {float(place): _shortened(value) for place, value in enumerate(order)}
+    return np.array([order.index(value) for value in values], dtype=float), names
 
 
 def _shortened(value: str) -> str:
@@ -486,23 +388,10 @@ def _shortened(value: str) -> str:
 
 
 def _groups(
-    rows: Sequence[Row],
-    varied_keys: Sequence[str],
-    key: str,
-    shorts: Mapping[str, str],
+    rows: Sequence[Row], varied_keys: Sequence[str], key: str, shorts: Mapping[str, str]
 ) -> Iterator[tuple[str | None, str, float, Array]]:
     """Yield label, colour, offset on the axis, and mask (rows,) of the rows that share a value of
     the first other key; one group of all rows, without a label, if `key` is the only one.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-    varied_keys : sequence of str
-        All swept keys.
-    key : str
-        Key of the axis.
-    shorts : mapping of str to str
-        Short form of each key, for the label.
     """
     other = next((name for name in varied_keys if name != key), None)
     if other is None:
@@ -527,43 +416,15 @@ def _draw_estimates(
 ) -> None:
     """Draw the estimates and intervals of one group of rows into `axes`: dots if converged, else
     crosses; unknown ones are left out.
-
-    Parameters
-    ----------
-    axes : Axes
-        Modified in place.
-    rows : sequence of Row
-        All rows of the sweep.
-    places : (rows,) array
-        Position of each row on the axis.
-    name : str
-        Name of the parameter.
-    chosen : (rows,) array of bool
-        Rows of the group.
-    colour : str
-    label : str or None
-        Entry in the legend, once; None for none.
     """
     value, low, high = (
         np.array([row[f"{what}_{name}"] for row in rows], dtype=float)
         for what in ("value", "low", "high")
     )
     converged = np.array([row["converged"] for row in rows])
-    style: dict[str, Any] = {
-        "ms": 3.5,
-        "lw": 0.8,
-        "capsize": 2,
-        "color": colour,
-    }
+    style: dict[str, Any] = {"ms": 3.5, "lw": 0.8, "capsize": 2, "color": colour}
     for form, shown in (("o", chosen & converged), ("x", chosen & ~converged)):
         if (shown & np.isfinite(value)).any():
             bars = np.clip([value - low, high - value], 0, None)[:, shown]
-            axes.errorbar(
-                places[shown],
-                value[shown],
-                bars,
-                fmt=form,
-                label=label,
-                **style,
-            )
+            axes.errorbar(places[shown], value[shown], bars, fmt=form, label=label, **style)
             label = None

@@ -38,25 +38,17 @@ class StudyProgress(SolveProgress):
     """
 
     def __init__(
-        self,
-        console: Console,
-        remaining: Sequence[PlannedRun],
-        total: int,
-        quiet: bool = False,
+        self, console: Console, remaining: Sequence[PlannedRun], total: int, quiet: bool = False
     ) -> None:
         self.total = total
         self._skipped = total - len(remaining)
         self._waiting = {run.key: run for run in remaining}
         self._walls: dict[str, list[float]] = {}
-        super().__init__(
-            console, quiet=quiet, activity=f"{self._skipped}/{total} runs"
-        )
+        super().__init__(console, quiet=quiet, activity=f"{self._skipped}/{total} runs")
 
     def __enter__(self) -> Self:
         if self._skipped:
-            self.line(
-                f"{self._skipped} of {self.total} runs are finished already"
-            )
+            self.line(f"{self._skipped} of {self.total} runs are finished already")
         super().__enter__()
         self.say(f"{self._skipped}/{self.total} runs")
         if self._live is not None:
@@ -82,9 +74,7 @@ class StudyProgress(SolveProgress):
         run = self._waiting.pop(record["key"])
         if record.get("wall_s") is not None:
             self._walls.setdefault(run.method, []).append(record["wall_s"])
-        status = (record.get("result") or record).get(
-            "status", record["outcome"]
-        )
+        status = (record.get("result") or record).get("status", record["outcome"])
         count = f"{self.total - len(self._waiting)}/{self.total} runs"
         wall = record.get("wall_s") or 0.0
         self.announce(
@@ -96,15 +86,9 @@ class StudyProgress(SolveProgress):
         of runs at once; empty if no run waits or none has finished.
         """
         remaining_s = remaining_time_s(
-            [run.method for run in self._waiting.values()],
-            self._walls,
-            worker_count=worker_count,
+            [run.method for run in self._waiting.values()], self._walls, worker_count=worker_count
         )
-        return (
-            ""
-            if remaining_s is None
-            else f"; about {duration(remaining_s)} left"
-        )
+        return "" if remaining_s is None else f"; about {duration(remaining_s)} left"
 
 
 class DesignProgress(SolveProgress):
@@ -121,12 +105,8 @@ class DesignProgress(SolveProgress):
         Whether to show nothing.
     """
 
-    def __init__(
-        self, console: Console, evaluations: int, quiet: bool = False
-    ) -> None:
-        super().__init__(
-            console, quiet=quiet, activity=f"preparing the design ({STOPPING})"
-        )
+    def __init__(self, console: Console, evaluations: int, quiet: bool = False) -> None:
+        super().__init__(console, quiet=quiet, activity=f"preparing the design ({STOPPING})")
         self.evaluations = evaluations
 
     def show_best(self, number: int, log_size: float) -> None:
@@ -141,18 +121,12 @@ class DesignProgress(SolveProgress):
             Logarithm of the smallest relative error bar; from `FORBIDDEN` on, no motion was
             feasible.
         """
-        best = (
-            "none feasible yet"
-            if log_size >= FORBIDDEN
-            else f"{100 * np.exp(log_size):.3g} %"
-        )
+        best = "none feasible yet" if log_size >= FORBIDDEN else f"{100 * np.exp(log_size):.3g} %"
         line = f"{number} of {self.evaluations} motions evaluated, smallest error bar: {best}"
         share = number / self.evaluations
         self.share(share if share < 1 else None)
         self.state(partial(str, line))
-        if self._live is None and (
-            number % EVERY == 0 or number == self.evaluations
-        ):
+        if self._live is None and (number % EVERY == 0 or number == self.evaluations):
             self.line(line)
 
     def show_activity(self, what: str) -> None:
@@ -164,9 +138,7 @@ class DesignProgress(SolveProgress):
 
 
 def remaining_time_s(
-    waiting: Sequence[str],
-    walls: Mapping[str, Sequence[float]],
-    worker_count: int,
+    waiting: Sequence[str], walls: Mapping[str, Sequence[float]], worker_count: int
 ) -> float | None:
     """Return the estimated time for the waiting runs [s]; None if no run waits or none has
     finished.
@@ -188,9 +160,6 @@ def remaining_time_s(
     if not waiting or not every:
         return None
     overall = sum(every) / len(every)
-    means = {
-        method: sum(of_method) / len(of_method)
-        for method, of_method in walls.items()
-    }
+    means = {method: sum(of_method) / len(of_method) for method, of_method in walls.items()}
     expected = [means.get(method, overall) for method in waiting]
     return max(sum(expected) / worker_count, max(expected))

@@ -54,23 +54,16 @@ class NumberColumn:
         if value is None:
             return "–"
         value *= self.factor
-        return format(
-            value,
-            ".0f" if self.form == ".2g" and abs(value) >= 100 else self.form,
-        )
+        return format(value, ".0f" if self.form == ".2g" and abs(value) >= 100 else self.form)
 
 
 # Quality and cost of a run.
 COLUMNS = {
     "loss": NumberColumn(
-        from_result=lambda r: r.history[-1].loss if r.history else None,
-        has_median=False,
+        from_result=lambda r: r.history[-1].loss if r.history else None, has_median=False
     ),
     "rms_m": NumberColumn(
-        "markers mm",
-        "markers, RMS [mm]",
-        factor=1e3,
-        from_result=lambda r: r.fit.rms_m,
+        "markers mm", "markers, RMS [mm]", factor=1e3, from_result=lambda r: r.fit.rms_m
     ),
     "violation_n": NumberColumn(
         "violation N",
@@ -92,40 +85,22 @@ COLUMNS = {
         factor=1e3,
         from_result=lambda r: r.rollout.rms_m,
     ),
-    "rollout_max_m": NumberColumn(
-        from_result=lambda r: r.rollout.max_m, has_median=False
-    ),
+    "rollout_max_m": NumberColumn(from_result=lambda r: r.rollout.max_m, has_median=False),
     "tip_max_m": NumberColumn("tip mm", "tip, at most [mm]", factor=1e3),
     "iterations": NumberColumn(
-        "iter.",
-        "iterations",
-        factor=1,
-        form=".4g",
-        from_result=lambda r: r.iterations,
+        "iter.", "iterations", factor=1, form=".4g", from_result=lambda r: r.iterations
     ),
     "evaluations": NumberColumn(
-        "evals",
-        "evaluations",
-        factor=1,
-        form=".4g",
-        from_result=lambda r: r.evaluations,
+        "evals", "evaluations", factor=1, form=".4g", from_result=lambda r: r.evaluations
     ),
-    "build_s": NumberColumn(
-        "build s", "set-up [s]", from_result=lambda r: r.timing_s.build
-    ),
+    "build_s": NumberColumn("build s", "set-up [s]", from_result=lambda r: r.timing_s.build),
     "evaluations_s": NumberColumn(
-        "evaluate s",
-        "evaluations [s]",
-        from_result=lambda r: r.timing_s.evaluations,
+        "evaluate s", "evaluations [s]", from_result=lambda r: r.timing_s.evaluations
     ),
     "linear_algebra_s": NumberColumn(
-        "solve s",
-        "linear algebra [s]",
-        from_result=lambda r: r.timing_s.linear_algebra,
+        "solve s", "linear algebra [s]", from_result=lambda r: r.timing_s.linear_algebra
     ),
-    "total_s": NumberColumn(
-        "total s", "in all [s]", from_result=lambda r: r.timing_s.total
-    ),
+    "total_s": NumberColumn("total s", "in all [s]", from_result=lambda r: r.timing_s.total),
 }
 # 97.5 % quantile of the standard normal distribution.
 NORMAL_975 = 1.959963984540054
@@ -167,9 +142,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     rate = successes / trials
     z2 = NORMAL_975**2
     centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    spread = sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (
-        1 + z2 / trials
-    )
+    spread = sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)
     low = 0.0 if successes == 0 else centre - spread
     return low, 1.0 if successes == trials else centre + spread
 
@@ -177,9 +150,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 # Runs ---------------------------------------------------------------------------------------------
 
 
-def run_row(
-    run: PlannedRun, record: Record | None, yardstick: SuccessCriterion
-) -> Row:
+def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion) -> Row:
     """Return one run as a flat row; values are None if they are not known or NaN.
 
     The columns are "key", "method", "start", one for each swept key, "status", "converged",
@@ -202,14 +173,8 @@ def run_row(
     is_timeout = record["outcome"] == TIMEOUT
     converged = result is not None and result.converged and not is_timeout
     parameters = _parameter_columns(run, result, truth=yardstick.truth)
-    errors = [
-        parameters[f"error_{name}"]
-        for name in run.guess
-        if name in yardstick.truth
-    ]
-    is_accurate = all(
-        error is not None and error <= yardstick.within for error in errors
-    )
+    errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
+    is_accurate = all(error is not None and error <= yardstick.within for error in errors)
     values = {
         name: None if result is None else column.from_result(result)
         for name, column in COLUMNS.items()
@@ -220,9 +185,7 @@ def run_row(
         "method": run.method,
         "start": run.start,
         **run.varied_values,
-        "status": record["outcome"]
-        if is_timeout or result is None
-        else result.status,
+        "status": record["outcome"] if is_timeout or result is None else result.status,
         "converged": converged,
         "success": converged and is_accurate,
         **parameters,
@@ -232,28 +195,15 @@ def run_row(
         "attempts": record.get("attempts"),
         "message": record.get("message", ""),
     }
-    return {
-        key: None if each != each else each for key, each in row.items()
-    }  # NaN is no number
+    return {key: None if each != each else each for key, each in row.items()}  # NaN is no number
 
 
-def _parameter_columns(
-    run: PlannedRun, result: Result | None, truth: Mapping[str, float]
-) -> Row:
+def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
     """Return the columns of the estimated parameters of a run: first ``guess_NAME`` of all, then
     for each ``value_NAME``, ``std_error_NAME``, ``low_NAME`` and ``high_NAME`` (combined standard
     error and interval), and ``error_NAME`` if its truth is known.
 
     The error is that of the optimum, relative to the truth, without a sign.
-
-    Parameters
-    ----------
-    run : PlannedRun
-        Run with its guesses; one that is None is replaced by that of the result.
-    result : Result or None
-        Its result; None leaves all columns None but the guesses that the run states.
-    truth : mapping of str to float
-        True values by name.
     """
     row: Row = {}
     estimates = {} if result is None else result.parameters
@@ -264,21 +214,13 @@ def _parameter_columns(
         estimate = estimates.get(name)
         value = None if estimate is None else estimate.value
         row[f"value_{name}"] = value
-        row[f"std_error_{name}"] = (
-            None if estimate is None else estimate.combined_std_error
-        )
+        row[f"std_error_{name}"] = None if estimate is None else estimate.combined_std_error
         interval = None if estimate is None else estimate.combined95
         row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
         if name in truth:
             # Methods are compared by the optimum that they find, not by its correction.
-            optimum = (
-                value
-                if estimate is None or estimate.optimum is None
-                else estimate.optimum
-            )
-            row[f"error_{name}"] = (
-                None if optimum is None else abs(optimum / truth[name] - 1)
-            )
+            optimum = value if estimate is None or estimate.optimum is None else estimate.optimum
+            row[f"error_{name}"] = None if optimum is None else abs(optimum / truth[name] - 1)
     return row
 
 
@@ -293,9 +235,7 @@ def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
     kind : str
         Prefix of columns, such as "guess_", "value_" or "error_".
     """
-    return [
-        name.removeprefix(kind) for name in rows[0] if name.startswith(kind)
-    ]
+    return [name.removeprefix(kind) for name in rows[0] if name.startswith(kind)]
 
 
 # Methods ------------------------------------------------------------------------------------------
@@ -311,9 +251,7 @@ def method_rows(rows: Sequence[Row]) -> list[Row]:
     """
     methods = dict.fromkeys(row["method"] for row in rows)
     return [
-        _method_summary(
-            method, [row for row in rows if row["method"] == method]
-        )
+        _method_summary(method, [row for row in rows if row["method"] == method])
         for method in methods
     ]
 
@@ -322,31 +260,13 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
     """Return the summary of the runs of one method.
 
     Runs with the status "missing" are not counted.
-
-    Parameters
-    ----------
-    method : str
-        Name for the summary.
-    rows : sequence of dict
-        Rows of `run_row` of this method's runs, at least one.
-
-    Returns
-    -------
-    dict
-        "method"; the numbers of "runs", "converged" and "successes"; "success_rate", None without
-        runs, with its 95 % interval from "success_low" to "success_high", 0 and 1 without runs; and
-        under their own names the medians of the relative errors ``error_NAME`` and of the `COLUMNS`
-        that have a median, over the runs that have a value, None if no run has one.
     """
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
     low, high = wilson_interval(successes, len(done))
     errors = [f"error_{name}" for name in parameters_in(rows, "error_")]
     medians = [name for name, column in COLUMNS.items() if column.has_median]
-    known = {
-        n: [row[n] for row in done if row[n] is not None]
-        for n in (*errors, *medians)
-    }
+    known = {n: [row[n] for row in done if row[n] is not None] for n in (*errors, *medians)}
     return {
         "method": method,
         "runs": len(done),
@@ -355,10 +275,7 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
         "success_rate": successes / len(done) if done else None,
         "success_low": low,
         "success_high": high,
-        **{
-            name: float(np.median(each)) if each else None
-            for name, each in known.items()
-        },
+        **{name: float(np.median(each)) if each else None for name, each in known.items()},
     }
 
 
@@ -388,9 +305,7 @@ def best_run(rows: Sequence[Row]) -> Row | None:
     return min(candidates, key=loss, default=None)
 
 
-def reference_parameters(
-    rows: Sequence[Row], yardstick: SuccessCriterion
-) -> dict[str, float]:
+def reference_parameters(rows: Sequence[Row], yardstick: SuccessCriterion) -> dict[str, float]:
     """Return the parameters by name relative to which guesses are measured: the truth, or the
     estimates of the best run, see `best_run`.
 
@@ -423,8 +338,5 @@ def guess_distance(row: Row, centre: Mapping[str, float]) -> float:
     centre : mapping of str to float
         Positive reference by name.
     """
-    logs = [
-        abs(np.log(row[f"guess_{name}"] / value))
-        for name, value in centre.items()
-    ]
+    logs = [abs(np.log(row[f"guess_{name}"] / value)) for name, value in centre.items()]
     return float(np.exp(max(logs))) if logs else nan

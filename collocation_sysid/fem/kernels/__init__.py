@@ -30,17 +30,8 @@ import casadi as ca
 
 from ...errors import InputError
 from .batch import CasadiEvaluator, Evaluator, KernelBatch, VectorCodeError
-from .combine import (
-    CombinationPlan,
-    Combiner,
-    combine_with_numpy,
-    compile_combiner,
-)
-from .instances import (
-    Instances,
-    compile_instance_evaluator,
-    make_casadi_instance_evaluator,
-)
+from .combine import CombinationPlan, Combiner, combine_with_numpy, compile_combiner
+from .instances import Instances, compile_instance_evaluator, make_casadi_instance_evaluator
 from .threads import (
     COMPILING,
     available_threads,
@@ -95,19 +86,13 @@ def choose_evaluator(choice: str = "auto") -> str:
     choice = _requested_evaluator(choice)
     has_llvm = find_spec("llvmlite") is not None
     if choice == "simd" and not has_llvm:
-        raise InputError(
-            "evaluator 'simd' needs llvmlite: pip install llvmlite, or use 'casadi'"
-        )
+        raise InputError("evaluator 'simd' needs llvmlite: pip install llvmlite, or use 'casadi'")
     return "casadi" if choice == "casadi" or not has_llvm else "simd"
 
 
 def _requested_evaluator(choice: str) -> str:
-    """Return the choice, or for "auto" that of the environment variable: "auto" itself if none is set.
-
-    Raises
-    ------
-    InputError
-        If choice or variable is unknown.
+    """Return the choice, or for "auto" that of the environment variable: "auto" itself if none is
+    set.
     """
     origin = "evaluator"
     if choice == "auto":
@@ -115,9 +100,7 @@ def _requested_evaluator(choice: str) -> str:
         choice = os.environ.get(variable, "auto")
         origin = f"the environment variable {variable}"
     if choice not in EVALUATORS:
-        raise InputError(
-            f"{origin} is {choice!r}; expected one of {', '.join(EVALUATORS)}"
-        )
+        raise InputError(f"{origin} is {choice!r}; expected one of {', '.join(EVALUATORS)}")
     return choice
 
 
@@ -239,8 +222,8 @@ def make_instance_evaluator(function: ca.Function, compiled: bool) -> Instances:
 
 
 def make_combiner(plan: CombinationPlan) -> Combiner:
-    """Return the loop that fills sparse values according to a plan, compiled if llvmlite can, else in
-    NumPy; see `combine.combine_with_numpy` for its arguments.
+    """Return the loop that fills sparse values according to a plan, compiled if llvmlite can, else
+    in NumPy; see `combine.combine_with_numpy` for its arguments.
     """
     if find_spec("llvmlite"):
         try:

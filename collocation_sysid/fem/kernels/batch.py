@@ -57,24 +57,7 @@ class Evaluator(Protocol):
         add: bool = False,
         data_of_points: Array | None = None,
     ) -> None:
-        """Sum the kernel over elements and quadrature points, for each time step.
-
-        Parameters
-        ----------
-        fields : sequence of (T, 3n)
-            Node fields of the kernel, contiguous.
-        theta : (k,)
-            Constants of the points, not of the body.
-        out : (T, width)
-            Result; overwritten, or added to if `add`.
-        threads : int
-            Number of threads over which time steps are distributed.
-        add : bool
-            Whether to add to `out`.
-        data_of_points : (T, any) or (1, any), optional
-            Data of the points, (1, any) if they are equal at all times; None for a kernel without
-            data.
-        """
+        """Sum the kernel over elements and quadrature points, for each time step."""
         ...
 
 
@@ -96,21 +79,14 @@ class CasadiEvaluator:
         self._mapped = kernel.element_function(points).map(
             "element_map", "serial", count, [len(kernel.fields) + 1], []
         )
-        self._geometry = np.asfortranarray(
-            batch.geometry.reshape(count * points, size).T
-        )
+        self._geometry = np.asfortranarray(batch.geometry.reshape(count * points, size).T)
         self._dofs = dofs_of(batch.cells).T
         self._point_data_columns = None
         if batch.data_columns is not None:
-            self._point_data_columns = batch.data_columns.reshape(
-                count * points, -1
-            ).T
+            self._point_data_columns = batch.data_columns.reshape(count * points, -1).T
         destinations = batch.destinations.ravel()
         self._sum = sp.csr_array(
-            (
-                np.ones(len(destinations)),
-                (destinations, np.arange(len(destinations))),
-            ),
+            (np.ones(len(destinations)), (destinations, np.arange(len(destinations)))),
             shape=(batch.width, len(destinations)),
         )
 
@@ -128,20 +104,13 @@ class CasadiEvaluator:
         """
         for t in range(len(out)):
             inputs = [field[t][self._dofs] for field in fields]
-            if (
-                self._point_data_columns is not None
-                and data_of_points is not None
-            ):
+            if self._point_data_columns is not None and data_of_points is not None:
                 point_data = [
-                    data_of_points[t if len(data_of_points) > 1 else 0][
-                        self._point_data_columns
-                    ]
+                    data_of_points[t if len(data_of_points) > 1 else 0][self._point_data_columns]
                 ]
             else:
                 point_data = []
-            outputs = self._mapped.call(
-                [*inputs, self._geometry, theta, *point_data]
-            )
+            outputs = self._mapped.call([*inputs, self._geometry, theta, *point_data])
             stacked = np.concatenate([value.full() for value in outputs])
             total = self._sum @ stacked.ravel(order="F")
             out[t] = out[t] + total if add else total

@@ -54,9 +54,7 @@ def combine_with_numpy(plan: CombinationPlan) -> Combiner:
     sources] + β b[row, sources], or adds that; a matrix with the coefficient 0 is not read.
     """
 
-    def combine(
-        start: int, stop: int, a: Array, b: Array, values: Array
-    ) -> None:
+    def combine(start: int, stop: int, a: Array, b: Array, values: Array) -> None:
         """Run the tasks of column blocks `start` … `stop` − 1 on rows a and b, writing to
         `values`.
         """
@@ -89,17 +87,12 @@ def compile_combiner(plan: CombinationPlan) -> Combiner:
     from .jit import NativeCode, compile_function
 
     signature = (*[ctypes.c_int64] * 3, *[ctypes.c_void_p] * 7)
-    run = compile_function(
-        NativeCode("combine", "combine", signature=signature, build=_emit)
-    )
+    run = compile_function(NativeCode("combine", "combine", signature=signature, build=_emit))
     constants = [
-        array.ctypes.data
-        for array in (plan.tasks, plan.coefficients, plan.targets, plan.sources)
+        array.ctypes.data for array in (plan.tasks, plan.coefficients, plan.targets, plan.sources)
     ]
 
-    def combine(
-        start: int, stop: int, a: Array, b: Array, values: Array
-    ) -> None:
+    def combine(start: int, stop: int, a: Array, b: Array, values: Array) -> None:
         """Run the tasks of column blocks `start` … `stop` − 1 on rows a and b, writing to
         `values`.
         """
@@ -135,52 +128,37 @@ def _emit() -> Any:
     module = ir.Module()
     i64s = I64.as_pointer()
     kind = ir.FunctionType(
-        ir.VoidType(),
-        [I64, I64, I64, i64s, DOUBLES, I32S, I32S, DOUBLES, DOUBLES, DOUBLES],
+        ir.VoidType(), [I64, I64, I64, i64s, DOUBLES, I32S, I32S, DOUBLES, DOUBLES, DOUBLES]
     )
     function = ir.Function(module, kind, "combine")
-    start, stop, stride, tasks, coefficients, targets, sources, a, b, values = (
-        function.args
-    )
+    start, stop, stride, tasks, coefficients, targets, sources, a, b, values = function.args
     for pointer in function.args[3:]:
         pointer.add_attribute("noalias")
     builder: Any = ir.IRBuilder(function.append_basic_block("entry"))
     with for_range(builder, start, stop=stop, name="task") as task:
         first = builder.mul(task, I64(5))
         out, begin, length, row, add = (
-            builder.load(builder.gep(tasks, [builder.add(first, I64(k))]))
-            for k in range(5)
+            builder.load(builder.gep(tasks, [builder.add(first, I64(k))])) for k in range(5)
         )
         pair = builder.mul(task, I64(2))
         alpha, beta = (
-            builder.load(builder.gep(coefficients, [builder.add(pair, I64(k))]))
-            for k in range(2)
+            builder.load(builder.gep(coefficients, [builder.add(pair, I64(k))])) for k in range(2)
         )
         row_start = builder.mul(row, stride)
         a_row, b_row = (builder.gep(matrix, [row_start]) for matrix in (a, b))
         out_row = builder.gep(values, [out])
-        targets_here, sources_here = (
-            builder.gep(m, [begin]) for m in (targets, sources)
-        )
+        targets_here, sources_here = (builder.gep(m, [begin]) for m in (targets, sources))
 
         def loop(accumulate: bool) -> None:
             """Emit the loop over the entries of a task that overwrites the values, or adds to
             them.
             """
             with for_range(builder, I64(0), stop=length, name="entry") as i:
-                source = builder.sext(
-                    builder.load(builder.gep(sources_here, [i])), I64
-                )
-                target = builder.sext(
-                    builder.load(builder.gep(targets_here, [i])), I64
-                )
+                source = builder.sext(builder.load(builder.gep(sources_here, [i])), I64)
+                target = builder.sext(builder.load(builder.gep(targets_here, [i])), I64)
                 new = builder.fadd(
-                    builder.fmul(
-                        alpha, builder.load(builder.gep(a_row, [source]))
-                    ),
-                    builder.fmul(
-                        beta, builder.load(builder.gep(b_row, [source]))
-                    ),
+                    builder.fmul(alpha, builder.load(builder.gep(a_row, [source]))),
+                    builder.fmul(beta, builder.load(builder.gep(b_row, [source]))),
                     flags=["contract"],
                 )
                 address = builder.gep(out_row, [target])
@@ -188,10 +166,7 @@ def _emit() -> Any:
                     new = builder.fadd(builder.load(address), new)
                 builder.store(new, address)
 
-        with builder.if_else(builder.icmp_signed("==", add, I64(0))) as (
-            overwrite,
-            accumulate,
-        ):
+        with builder.if_else(builder.icmp_signed("==", add, I64(0))) as (overwrite, accumulate):
             with overwrite:
                 loop(accumulate=False)
             with accumulate:

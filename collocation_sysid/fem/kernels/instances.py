@@ -35,10 +35,7 @@ def make_casadi_instance_evaluator(function: ca.Function) -> Instances:
         """Return the outputs (size, instances) at inputs (size, instances)."""
         count = inputs[0].shape[1]
         arguments = [np.ascontiguousarray(each.T, float) for each in inputs]
-        outputs = [
-            np.empty((count, function.nnz_out(k)))
-            for k in range(function.n_out())
-        ]
+        outputs = [np.empty((count, function.nnz_out(k))) for k in range(function.n_out())]
         for first in range(0, count, BLOCK):
             block = slice(first, min(count, first + BLOCK))
             size = block.stop - first
@@ -80,12 +77,7 @@ def compile_instance_evaluator(function: ca.Function) -> Instances:
     key = f"instances {lanes} {hashlib.sha256(function.serialize().encode()).hexdigest()}"
     signature = (ctypes.c_int64, *[ctypes.c_void_p] * arrays)
     run = compile_function(
-        NativeCode(
-            "instances",
-            key,
-            signature=signature,
-            build=lambda: _emit(function, lanes),
-        )
+        NativeCode("instances", key, signature=signature, build=lambda: _emit(function, lanes))
     )
 
     entry_counts = [function.nnz_out(k) for k in range(function.n_out())]
@@ -99,9 +91,7 @@ def compile_instance_evaluator(function: ca.Function) -> Instances:
             instance_indices = np.minimum(np.arange(padded_count), count - 1)
             inputs = [each[:, instance_indices] for each in inputs]
         arguments = [np.ascontiguousarray(each, float) for each in inputs]
-        outputs = [
-            np.empty((entries, padded_count)) for entries in entry_counts
-        ]
+        outputs = [np.empty((entries, padded_count)) for entries in entry_counts]
         run(padded_count, *map(address, [*arguments, *outputs]))
         return [each[:, :count] for each in outputs]
 
@@ -126,25 +116,19 @@ def _emit(function: ca.Function, lanes: int) -> Any:
     for place in places:
         place.add_attribute("noalias")
     b: Builder = ir.IRBuilder(run.append_basic_block("entry"))
-    with for_range(
-        b, I64(0), stop=b.udiv(count, I64(lanes)), name="block"
-    ) as block:
+    with for_range(b, I64(0), stop=b.udiv(count, I64(lanes)), name="block") as block:
         first = b.mul(block, I64(lanes))
 
         def pointer(array: int, entry: int) -> Value:
             """Return the pointer to an entry of an array at the instances of the block."""
-            place = b.gep(
-                places[array], [b.add(b.mul(I64(entry), count), first)]
-            )
+            place = b.gep(places[array], [b.add(b.mul(I64(entry), count), first)])
             return b.bitcast(place, vector.as_pointer())
 
         def read(array: int, entry: int) -> Value:
             """Load an entry of an input at the instances of the block."""
             return b.load(pointer(array, entry), align=8)
 
-        for output, entry, value in emit_function(
-            b, function, vector=vector, read=read
-        ):
+        for output, entry, value in emit_function(b, function, vector=vector, read=read):
             b.store(value, pointer(function.n_in() + output, entry), align=8)
     b.ret_void()
     return module

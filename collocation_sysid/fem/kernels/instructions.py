@@ -26,20 +26,13 @@ CENTRE = (
     (0.012229801, -0.329097515, 1.442710462, -2.118377725, 1.0),
 )
 # The same for larger |x|, in powers of √(−ln((1 − |x|)/2)).
-TAIL = (
-    (1.641345311, 3.429567803, -1.624906493, -1.970840454),
-    (1.637067800, 3.543889200, 1.0),
-)
+TAIL = ((1.641345311, 3.429567803, -1.624906493, -1.970840454), (1.637067800, 3.543889200, 1.0))
 
 
 def _inverse_error(x: ca.SX) -> ca.SX:
     """Return the inverse error function of x as an expression: ±∞ at ±1, NaN beyond."""
     away_from_zero = _ratio(TAIL, ca.sqrt(-ca.log((1 - ca.fabs(x)) / 2)))
-    y = ca.if_else(
-        ca.fabs(x) < 0.7,
-        x * _ratio(CENTRE, x**2),
-        ca.copysign(away_from_zero, x),
-    )
+    y = ca.if_else(ca.fabs(x) < 0.7, x * _ratio(CENTRE, x**2), ca.copysign(away_from_zero, x))
     for _ in range(2):
         slope = 2 / math.sqrt(math.pi) * ca.exp(-(y**2))
         y -= (ca.erf(y) - x) / slope
@@ -51,9 +44,7 @@ def _ratio(coefficients: tuple[tuple[float, ...], ...], z: ca.SX) -> ca.SX:
     """Return the ratio of two polynomials at z, given by the coefficients (numerator, denominator),
     the highest power first.
     """
-    numerator, denominator = (
-        ca.polyval(ca.SX(part), z) for part in coefficients
-    )
+    numerator, denominator = (ca.polyval(ca.SX(part), z) for part in coefficients)
     return numerator / denominator
 
 
@@ -103,15 +94,11 @@ def emit_function(
         if operation == ca.OP_INPUT:
             work[target[0]] = read(*source)
         elif operation == ca.OP_CONST:
-            work[target[0]] = _constant(
-                vector, function.instruction_constant(k)
-            )
+            work[target[0]] = _constant(vector, function.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
             yield target[0], target[1], work[source[0]]
         else:
-            work[target[0]] = OPERATIONS[operation](
-                builder, *(work[i] for i in source)
-            )
+            work[target[0]] = OPERATIONS[operation](builder, *(work[i] for i in source))
 
 
 def require_supported_operations(function: ca.Function) -> None:
@@ -119,9 +106,7 @@ def require_supported_operations(function: ca.Function) -> None:
     instructions.
     """
     known = {ca.OP_INPUT, ca.OP_CONST, ca.OP_OUTPUT, *OPERATIONS}
-    operations = {
-        function.instruction_id(k) for k in range(function.n_instructions())
-    }
+    operations = {function.instruction_id(k) for k in range(function.n_instructions())}
     if missing := sorted(operations - known):
         raise VectorCodeError(
             f"vector code has no CasADi operation {', '.join(map(operation_name, missing))}"
@@ -131,9 +116,7 @@ def require_supported_operations(function: ca.Function) -> None:
 def operation_name(operation: int) -> str:
     """Return the name of an operation in CasADi, such as "OP_ADD"."""
     names = (name for name, number in vars(ca).items() if number == operation)
-    return next(
-        (name for name in names if name.startswith("OP_")), str(operation)
-    )
+    return next((name for name in names if name.startswith("OP_")), str(operation))
 
 
 # Ways to emit one operation --------------------------------------------------------------------
@@ -151,10 +134,7 @@ def _emit_intrinsic(name: str) -> Emit:
         """Emit the call of the intrinsic."""
         vector = operands[0].type
         full_name = f"llvm.{name}.v{vector.count}f64"
-        return b.call(
-            _declare(b.module, full_name, kind=vector, operands=len(operands)),
-            operands,
-        )
+        return b.call(_declare(b.module, full_name, kind=vector, operands=len(operands)), operands)
 
     return emit
 
@@ -176,16 +156,12 @@ def _emit_library_call(name: str) -> Emit:
     return emit
 
 
-def _declare(
-    module: ir.Module, name: str, kind: ir.Type, operands: int
-) -> ir.Function:
+def _declare(module: ir.Module, name: str, kind: ir.Type, operands: int) -> ir.Function:
     """Return the function `name` of the module, declared with results and `operands` arguments of
     one kind if necessary.
     """
     declared = module.globals.get(name)
-    return declared or ir.Function(
-        module, ir.FunctionType(kind, [kind] * operands), name
-    )
+    return declared or ir.Function(module, ir.FunctionType(kind, [kind] * operands), name)
 
 
 def _emit_comparison(sign: str) -> Emit:
@@ -198,8 +174,8 @@ def _emit_comparison(sign: str) -> Emit:
 
 
 def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
-    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans; as in C, NaN
-    differs from everything, itself included.
+    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans; as in C,
+    NaN differs from everything, itself included.
     """
     return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
 
@@ -211,9 +187,7 @@ def _is_true(b: Builder, x: Value) -> Value:
 
 def _sign(b: Builder, x: Value) -> Value:
     """Emit the sign of x; zeros of either sign and NaN are unchanged."""
-    zero, one, minus_one = (
-        _constant(x.type, value) for value in (0.0, 1.0, -1.0)
-    )
+    zero, one, minus_one = (_constant(x.type, value) for value in (0.0, 1.0, -1.0))
     # Zeros of either sign and NaN are their own sign.
     positive = b.select(_comparison(b, ">", x, zero), one, x)
     return b.select(_comparison(b, "<", x, zero), minus_one, positive)
@@ -221,9 +195,7 @@ def _sign(b: Builder, x: Value) -> Value:
 
 def _erfinv(b: Builder, x: Value) -> Value:
     """Emit the inverse error function."""
-    ((_, _, value),) = emit_function(
-        b, ERFINV, vector=x.type, read=lambda *_: x
-    )
+    ((_, _, value),) = emit_function(b, ERFINV, vector=x.type, read=lambda *_: x)
     return value
 
 
@@ -273,28 +245,13 @@ OPERATIONS: dict[int, Emit] = {
     ca.OP_TWICE: lambda b, x: b.fadd(x, x, flags=FUSE),
     ca.OP_INV: lambda b, x: b.fdiv(_constant(x.type, 1.0), x, flags=FUSE),
     ca.OP_NOT: lambda b, x: b.uitofp(b.not_(_is_true(b, x)), x.type),
-    ca.OP_AND: lambda b, x, y: b.uitofp(
-        b.and_(_is_true(b, x), _is_true(b, y)), x.type
-    ),
-    ca.OP_OR: lambda b, x, y: b.uitofp(
-        b.or_(_is_true(b, x), _is_true(b, y)), x.type
-    ),
+    ca.OP_AND: lambda b, x, y: b.uitofp(b.and_(_is_true(b, x), _is_true(b, y)), x.type),
+    ca.OP_OR: lambda b, x, y: b.uitofp(b.or_(_is_true(b, x), _is_true(b, y)), x.type),
     # Not a product: the branch that is not taken may be infinite or NaN.
-    ca.OP_IF_ELSE_ZERO: lambda b, x, y: b.select(
-        _is_true(b, x), y, _constant(y.type, 0.0)
-    ),
+    ca.OP_IF_ELSE_ZERO: lambda b, x, y: b.select(_is_true(b, x), y, _constant(y.type, 0.0)),
     ca.OP_SIGN: _sign,
     ca.OP_ERFINV: _erfinv,
-    **{
-        operation: _emit_comparison(sign)
-        for operation, sign in COMPARISONS.items()
-    },
-    **{
-        operation: _emit_intrinsic(name)
-        for operation, name in INTRINSICS.items()
-    },
-    **{
-        operation: _emit_library_call(name)
-        for operation, name in LIBRARY.items()
-    },
+    **{operation: _emit_comparison(sign) for operation, sign in COMPARISONS.items()},
+    **{operation: _emit_intrinsic(name) for operation, name in INTRINSICS.items()},
+    **{operation: _emit_library_call(name) for operation, name in LIBRARY.items()},
 }

@@ -34,18 +34,14 @@ I32 = ir.IntType(32)
 I64 = ir.IntType(64)
 DOUBLES = DOUBLE.as_pointer()
 I32S = I32.as_pointer()
-Builder = Value = (
-    Any  # llvmlite is not annotated, and what is inferred of it is wrong
-)
+Builder = Value = Any  # llvmlite is not annotated, and what is inferred of it is wrong
 
 # Number of compiled functions kept in memory for further bodies.
 FUNCTIONS_IN_MEMORY = 128
 
 
 @contextmanager
-def for_range(
-    builder: Builder, start: Value, stop: Value, name: str
-) -> Iterator[Value]:
+def for_range(builder: Builder, start: Value, stop: Value, name: str) -> Iterator[Value]:
     """Emit a loop over start ≤ i < stop in steps of 1; the body of the context is that of the loop,
     and the context gives i. `name` appears in the LLVM code only.
     """
@@ -68,19 +64,7 @@ def for_range(
 
 # Scalar functions that compiled code calls, or that vector intrinsics fall back to; resolved from
 # the C library by name.
-LIBM = (
-    "exp",
-    "exp2",
-    "expm1",
-    "log",
-    "log1p",
-    "pow",
-    "ldexp",
-    "hypot",
-    "fmod",
-    "remainder",
-    "erf",
-)
+LIBM = ("exp", "exp2", "expm1", "log", "log1p", "pow", "ldexp", "hypot", "fmod", "remainder", "erf")
 LIBM += ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")
 LIBM += ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
 
@@ -92,14 +76,12 @@ def _initialise() -> None:
     llvm.initialize_native_asmprinter()
     library = ctypes.CDLL("ucrtbase" if os.name == "nt" else None)
     for name in LIBM:
-        llvm.add_symbol(
-            name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value
-        )
+        llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
 
 
 def _target_machine(quickly: bool) -> llvm.TargetMachine:
-    """Return a code generator for this CPU, without optimisation if `quickly`; the engine that uses it
-    owns and frees it.
+    """Return a code generator for this CPU, without optimisation if `quickly`; the engine that uses
+    it owns and frees it.
     """
     _initialise()
     return llvm.Target.from_default_triple().create_target_machine(
@@ -151,8 +133,8 @@ class NativeCode:
 
 @lru_cache(FUNCTIONS_IN_MEMORY)
 def compile_function(code: NativeCode) -> CompiledFunction:
-    """Return the compiled function; the latest 128 are kept, by name, key and signature, and shared by
-    all bodies.
+    """Return the compiled function; the latest 128 are kept, by name, key and signature, and shared
+    by all bodies.
 
     Raises
     ------
@@ -172,12 +154,8 @@ class CompiledFunction:
 
     def __init__(self, code: NativeCode) -> None:
         machine = _target_machine(code.is_unoptimised)
-        self._engine = llvm.create_mcjit_compiler(
-            llvm.parse_assembly(""), machine
-        )
-        self._engine.add_object_file(
-            llvm.ObjectFileRef.from_data(_object_code(code, machine))
-        )
+        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        self._engine.add_object_file(llvm.ObjectFileRef.from_data(_object_code(code, machine)))
         self._engine.finalize_object()
         address = self._engine.get_function_address(code.name)
         self._call = ctypes.CFUNCTYPE(None, *code.signature)(address)
@@ -199,16 +177,11 @@ def _object_code(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
     """Return the object code from the cache, or compile it for `machine` and store it."""
     host = f"{llvmlite_version} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} "
     host += llvm.get_host_cpu_features().flatten()
-    cache_key = (
-        f"{host}\n{_source_digest()}\n{code.key}"
-        + "\nquickly" * code.is_unoptimised
-    )
+    cache_key = f"{host}\n{_source_digest()}\n{code.key}" + "\nquickly" * code.is_unoptimised
     code_bytes = load_object(cache_key)
     if code_bytes is None:
         report_state(lambda: "compiling native code")
-        code_bytes = compile_module(
-            code.build(), machine, quickly=code.is_unoptimised
-        )
+        code_bytes = compile_module(code.build(), machine, quickly=code.is_unoptimised)
         store_object(cache_key, code_bytes)
         report_state(str)
     return code_bytes
@@ -225,11 +198,9 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-def compile_module(
-    module: ir.Module, machine: llvm.TargetMachine, quickly: bool
-) -> bytes:
-    """Return the object code of an LLVM module for a machine, without optimisation if `quickly`; the
-    target triple of the module is set.
+def compile_module(module: ir.Module, machine: llvm.TargetMachine, quickly: bool) -> bytes:
+    """Return the object code of an LLVM module for a machine, without optimisation if `quickly`;
+    the target triple of the module is set.
     """
     module.triple = machine.triple
     parsed = llvm.parse_assembly(str(module))
@@ -275,9 +246,7 @@ def store_object(key: str, code: bytes) -> None:
     """
     folder = cache_folder()
     with suppress(OSError):
-        for missing in [p for p in (folder, *folder.parents) if not p.exists()][
-            ::-1
-        ]:
+        for missing in [p for p in (folder, *folder.parents) if not p.exists()][::-1]:
             missing.mkdir(mode=0o700, exist_ok=True)
         if not _is_trusted(folder):
             return
@@ -294,9 +263,7 @@ def cache_fault() -> str | None:
     """
     folder = cache_folder()
     try:
-        for missing in [p for p in (folder, *folder.parents) if not p.exists()][
-            ::-1
-        ]:
+        for missing in [p for p in (folder, *folder.parents) if not p.exists()][::-1]:
             missing.mkdir(mode=0o700, exist_ok=True)
         if (fault := _folder_fault(folder.resolve())) is not None:
             return fault
@@ -317,21 +284,9 @@ def _digest(key: str, code: bytes) -> bytes:
 
 
 def _read_private_file(path: Path) -> bytes:
-    """Return the content of a plain file that belongs to the user alone; links are not followed.
-
-    Raises
-    ------
-    OSError
-        For any other file, or if there is none.
-    """
-    flags = (
-        os.O_RDONLY
-        | getattr(os, "O_NOFOLLOW", 0)
-        | getattr(os, "O_NONBLOCK", 0)
-    )
-    with os.fdopen(
-        os.open(path, flags | getattr(os, "O_BINARY", 0)), "rb"
-    ) as file:
+    """Return the content of a plain file that belongs to the user alone; links are not followed."""
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    with os.fdopen(os.open(path, flags | getattr(os, "O_BINARY", 0)), "rb") as file:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode) or _ownership_fault(status):
             raise OSError(f"{path} is not owned by this user alone")
@@ -365,24 +320,13 @@ def _folder_fault(folder: Path) -> str | None:
     for parent in folder.parents:
         status = parent.stat()
         # In a sticky folder, such as /tmp, nobody can move what is another's.
-        if (
-            fault := _ownership_fault(status, or_root=True)
-        ) and not status.st_mode & stat.S_ISVTX:
+        if (fault := _ownership_fault(status, or_root=True)) and not status.st_mode & stat.S_ISVTX:
             return f"{parent}, which {folder} is in, {fault}"
     return None
 
 
-def _ownership_fault(
-    status: os.stat_result, or_root: bool = False
-) -> str | None:
-    """Return why a file or folder is not the user's alone; None if it is.
-
-    Parameters
-    ----------
-    status : os.stat_result
-    or_root : bool
-        Whether it may belong to root, too.
-    """
+def _ownership_fault(status: os.stat_result, or_root: bool = False) -> str | None:
+    """Return why a file or folder is not the user's alone; None if it is."""
     if not hasattr(os, "getuid"):
         return None  # Windows: the profile's access list keeps others out
     owners = {os.getuid(), 0} if or_root else {os.getuid()}

@@ -71,43 +71,29 @@ class SimdEvaluator:
         geometry[count:, :, -1] = 0.0
         by_block = (blocks, lanes)
         self._geometry = np.ascontiguousarray(
-            np.moveaxis(
-                geometry.reshape(blocks, lanes, *geometry.shape[1:]), 1, -1
-            )
+            np.moveaxis(geometry.reshape(blocks, lanes, *geometry.shape[1:]), 1, -1)
         )
         self._nodes = _block_major(3 * batch.cells[lane_element], by_block)
-        self._destinations = _block_major(
-            batch.destinations[lane_element], by_block
-        )
+        self._destinations = _block_major(batch.destinations[lane_element], by_block)
         self._blocks = blocks
         self._width = batch.width
         self._points = batch.geometry.shape[1]
         self._fields = len(kernel.fields)
         self._point_data_columns = None
         if batch.data_columns is not None:
-            self._point_data_columns = _block_major(
-                batch.data_columns[lane_element], by_block
-            )
+            self._point_data_columns = _block_major(batch.data_columns[lane_element], by_block)
         tables = self._geometry, self._nodes, self._destinations
         self._tables = [address(table) for table in tables]
         key = f"{lanes} {self._points} {hashlib.sha256(kernel.serialized.encode()).hexdigest()}"
         # What points carry adds the length of its row, its places and itself.
-        signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (
-            self._fields + 5
-        )
+        signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (self._fields + 5)
         if kernel.count_point_data():
             signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
         points = self._points
         build = partial(_emit_kernel, kernel, points, lanes)
         quickly = count * points < OPTIMISED_FROM_POINTS
         self._run = compile_function(
-            NativeCode(
-                "run",
-                key,
-                signature=tuple(signature),
-                build=build,
-                is_unoptimised=quickly,
-            )
+            NativeCode("run", key, signature=tuple(signature), build=build, is_unoptimised=quickly)
         )
 
     def __call__(
@@ -144,9 +130,7 @@ def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:
     return _KernelEmitter(kernel, points, lanes=lanes).emit()
 
 
-def _block_major(
-    array: NDArray[np.int64], by_block: tuple[int, int]
-) -> NDArray[np.int32]:
+def _block_major(array: NDArray[np.int64], by_block: tuple[int, int]) -> NDArray[np.int32]:
     """Return an array (blocks · lanes, …) as contiguous 32-bit integers (blocks, k, lanes), where k
     is the number of entries of a row, for `by_block` = (blocks, lanes).
     """
@@ -170,20 +154,14 @@ class _PhaseLayout:
         size = 3 * phase.count_nodes()
         self.lengths = [self.sx.nnz_out(k) for k in range(self.sx.n_out())]
         self.pieces = np.cumsum([0, *self.lengths]).tolist()
-        contracted = {
-            "none": 1,
-            "nodes": size / 9,
-            "pairs": size * (size + 1) / 2 / 81,
-        }
+        contracted = {"none": 1, "nodes": size / 9, "pairs": size * (size + 1) / 2 / 81}
         outputs = [
             round(contracted[how] * length)
             for how, length in zip(self.contractions, self.lengths, strict=True)
         ]
         self.outputs = (first + np.cumsum([0, *outputs])).tolist()
 
-    def output_offsets(
-        self, first: int, how: Contraction, step: int
-    ) -> list[int]:
+    def output_offsets(self, first: int, how: Contraction, step: int) -> list[int]:
         """Return the offsets in the totals of outputs with a contraction, in steps of `step`
         entries.
 
@@ -230,24 +208,14 @@ class _KernelEmitter:
         self.last = _PhaseLayout(kernel.phases[-1], 0)
         self.previous_phases: list[_PhaseLayout] = []
         for phase in kernel.previous_phases:
-            before = (
-                self.previous_phases[-1] if self.previous_phases else self.last
-            )
+            before = self.previous_phases[-1] if self.previous_phases else self.last
             self.previous_phases.append(_PhaseLayout(phase, before.outputs[-1]))
         # What they hold for the coupling, and for later phases.
         self.own = len(kernel.contractions)
-        shared = [(phase, 0) for phase in self.previous_phases] + [
-            (self.last, self.own)
-        ]
-        self.sums = [
-            at
-            for phase, k in shared
-            for at in phase.output_offsets(k, "none", step=1)
-        ]
+        shared = [(phase, 0) for phase in self.previous_phases] + [(self.last, self.own)]
+        self.sums = [at for phase, k in shared for at in phase.output_offsets(k, "none", step=1)]
         self.vectors = [
-            at
-            for phase, k in shared
-            for at in phase.output_offsets(k, "nodes", step=self.size)
+            at for phase, k in shared for at in phase.output_offsets(k, "nodes", step=self.size)
         ]
         self.coupling = kernel.coupling
         self.module = ir.Module()
@@ -255,16 +223,12 @@ class _KernelEmitter:
         self.point_data_count = kernel.count_point_data()
         if self.point_data_count:
             constants += [I64, I32S, DOUBLES]
-        kind = ir.FunctionType(
-            ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants
-        )
+        kind = ir.FunctionType(ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants)
         self.run = ir.Function(self.module, kind, "run")
         for argument in self.run.args:
             if isinstance(argument.type, ir.PointerType):
                 argument.add_attribute("noalias")
-        self.builder: Builder = ir.IRBuilder(
-            self.run.append_basic_block("entry")
-        )
+        self.builder: Builder = ir.IRBuilder(self.run.append_basic_block("entry"))
 
     def emit(self) -> ir.Module:
         """Return the LLVM module with the function ``run``."""
@@ -272,90 +236,51 @@ class _KernelEmitter:
         args = self.run.args
         t0, t1, blocks, field_stride, out_stride, add = args[:6]
         field_rows = args[6 : 6 + self.fields]
-        geometry, nodes, destinations, theta, out, *memory = args[
-            6 + self.fields :
-        ]
-        gathered = [
-            self._buffer(self.size, f"field{k}") for k in range(self.fields)
-        ]
+        geometry, nodes, destinations, theta, out, *memory = args[6 + self.fields :]
+        gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
         phases = [*self.previous_phases, self.last]
         outputs = self.last.outputs[self.own]
         total = max(phase.outputs[-1] for phase in phases)
         totals = self._buffer(total, "totals")
-        pieces = self._buffer(
-            max(phase.pieces[-1] for phase in phases), "pieces"
-        )
+        pieces = self._buffer(max(phase.pieces[-1] for phase in phases), "pieces")
         half = self._buffer(27, "half")
         combined = self._buffer(len(self.vectors) * self.size, "combined")
-        geometry_size, theta_size = (
-            self.last.sx.nnz_in(self.fields + k) for k in range(2)
-        )
-        parameters = [
-            self._splat(b.load(b.gep(theta, [I64(k)])))
-            for k in range(theta_size)
-        ]
+        geometry_size, theta_size = (self.last.sx.nnz_in(self.fields + k) for k in range(2))
+        parameters = [self._splat(b.load(b.gep(theta, [I64(k)]))) for k in range(theta_size)]
         with for_range(b, t0, stop=t1, name="t") as t:
             rows = [b.gep(row, [b.mul(t, field_stride)]) for row in field_rows]
             out_row = b.gep(out, [b.mul(t, out_stride)])
             with b.if_then(b.icmp_signed("==", add, I64(0))):
                 self._clear(out_row, out_stride)
             with for_range(b, I64(0), stop=blocks, name="block") as block:
-                address = b.gep(
-                    nodes, [b.mul(block, I64(self.size // 3 * self.lanes))]
-                )
+                address = b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))])
                 self._gather(rows, address, gathered=gathered)
                 with for_range(b, I64(0), stop=I64(total), name="zero") as k:
                     self._store(self.vector(None), totals, entry=k)
                 first = b.mul(block, I64(self.points))
                 for phase in phases:
                     with for_range(
-                        b,
-                        first,
-                        stop=b.add(first, I64(self.points)),
-                        name="point",
+                        b, first, stop=b.add(first, I64(self.points)), name="point"
                     ) as point:
-                        address = b.gep(
-                            geometry,
-                            [b.mul(point, I64(geometry_size * self.lanes))],
-                        )
+                        address = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
                         point_data = (
-                            [self._load_point_data(memory, t, point=point)]
-                            if memory
-                            else []
+                            [self._load_point_data(memory, t, point=point)] if memory else []
                         )
                         self._evaluate_pieces(
                             phase,
-                            [
-                                *gathered,
-                                address,
-                                parameters,
-                                *point_data,
-                                totals,
-                            ],
+                            [*gathered, address, parameters, *point_data, totals],
                             pieces=pieces,
                         )
-                        self._contract(
-                            phase,
-                            pieces,
-                            geometry=address,
-                            half=half,
-                            totals=totals,
-                        )
+                        self._contract(phase, pieces, geometry=address, half=half, totals=totals)
                 if self.coupling:
                     self._couple(self.coupling, totals, combined=combined)
-                address = b.gep(
-                    geometry, [b.mul(first, I64(geometry_size * self.lanes))]
-                )
+                address = b.gep(geometry, [b.mul(first, I64(geometry_size * self.lanes))])
                 volume = self._load(address, I64(geometry_size - 1))
                 zero = self.vector(None)
                 # Not left to the product with the volume, which makes NaN of what is infinite.
                 is_element = b.fcmp_ordered("!=", volume, zero)
-                targets = b.gep(
-                    destinations, [b.mul(block, I64(outputs * self.lanes))]
-                )
-                with for_range(
-                    b, I64(0), stop=I64(outputs), name="output"
-                ) as k:
+                targets = b.gep(destinations, [b.mul(block, I64(outputs * self.lanes))])
+                with for_range(b, I64(0), stop=I64(outputs), name="output") as k:
                     value = b.select(is_element, self._load(totals, k), zero)
                     self._scatter(value, targets, k=k, row=out_row)
         b.ret_void()
@@ -365,9 +290,7 @@ class _KernelEmitter:
         """Allocate memory for `count` vectors in the entry of the function, aligned to 64 bytes and
         not initialised; `name` appears in the LLVM code only.
         """
-        buffer = self.builder.alloca(
-            DOUBLE, size=I64(count * self.lanes), name=name
-        )
+        buffer = self.builder.alloca(DOUBLE, size=I64(count * self.lanes), name=name)
         buffer.align = 64
         return buffer
 
@@ -379,10 +302,7 @@ class _KernelEmitter:
         bytes_ = ir.IntType(8).as_pointer()
         memset = self.module.declare_intrinsic("llvm.memset", (bytes_, I64))
         size = b.mul(length, I64(8))
-        b.call(
-            memset,
-            [b.bitcast(row, bytes_), ir.IntType(8)(0), size, ir.IntType(1)(0)],
-        )
+        b.call(memset, [b.bitcast(row, bytes_), ir.IntType(8)(0), size, ir.IntType(1)(0)])
 
     def _pointer(self, base: Value, entry: Value) -> Value:
         """Return the pointer to the vector with the index `entry` in a buffer that begins at
@@ -408,21 +328,9 @@ class _KernelEmitter:
         return value
 
     def _gather(self, rows: list, nodes: Value, gathered: list) -> None:
-        """Emit the load of the three coordinates of every node of W elements.
-
-        Parameters
-        ----------
-        rows : list of pointers
-            Node fields at one time step.
-        nodes : pointer
-            Offsets 3i of the nodes i of the block (nodes, W), as 32-bit integers.
-        gathered : list of pointers
-            Buffer of 3·nodes vectors for each field; overwritten.
-        """
+        """Emit the load of the three coordinates of every node of W elements."""
         b = self.builder
-        with for_range(
-            b, I64(0), stop=I64(self.size // 3), name="node"
-        ) as node:
+        with for_range(b, I64(0), stop=I64(self.size // 3), name="node") as node:
             first = b.mul(node, I64(self.lanes))
             lanes = [
                 b.sext(b.load(b.gep(nodes, [b.add(first, I64(lane))])), I64)
@@ -434,38 +342,18 @@ class _KernelEmitter:
                     for lane, entry in enumerate(lanes):
                         scalar = b.load(b.gep(row, [b.add(entry, I64(axis))]))
                         value = b.insert_element(value, scalar, I32(lane))
-                    self._store(
-                        value,
-                        buffer,
-                        entry=b.add(b.mul(node, I64(3)), I64(axis)),
-                    )
+                    self._store(value, buffer, entry=b.add(b.mul(node, I64(3)), I64(axis)))
 
-    def _scatter(
-        self, value: Value, targets: Value, k: Value, row: Value
-    ) -> None:
-        """Emit the addition of the W lanes of one output entry at the destinations of their elements.
-
-        Parameters
-        ----------
-        value : vector
-        targets : pointer
-            Destinations of the outputs of the block (outputs, W), as 32-bit integers.
-        k : integer
-            Index of the output entry.
-        row : pointer
-            Result row of the time step; added to.
+    def _scatter(self, value: Value, targets: Value, k: Value, row: Value) -> None:
+        """Emit the addition of the W lanes of one output entry at the destinations of their
+        elements.
         """
         b = self.builder
         first = b.mul(k, I64(self.lanes))
         for lane in range(self.lanes):
-            target = b.sext(
-                b.load(b.gep(targets, [b.add(first, I64(lane))])), I64
-            )
+            target = b.sext(b.load(b.gep(targets, [b.add(first, I64(lane))])), I64)
             address = b.gep(row, [target])
-            b.store(
-                b.fadd(b.load(address), b.extract_element(value, I32(lane))),
-                address,
-            )
+            b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
     def _load_point_data(self, memory: list, t: Value, point: Value) -> list:
         """Return the data of a quadrature point of W elements at time step t, a vector for each
@@ -482,28 +370,14 @@ class _KernelEmitter:
         for entry in range(self.point_data_count):
             value: Value = ir.Constant(self.vector, ir.Undefined)
             for lane in range(self.lanes):
-                position = b.gep(
-                    places, [b.add(first, I64(entry * self.lanes + lane))]
-                )
+                position = b.gep(places, [b.add(first, I64(entry * self.lanes + lane))])
                 scalar = b.load(b.gep(row, [b.sext(b.load(position), I64)]))
                 value = b.insert_element(value, scalar, I32(lane))
             values.append(value)
         return values
 
-    def _evaluate_pieces(
-        self, phase: _PhaseLayout, inputs: list, pieces: Value
-    ) -> None:
-        """Emit the evaluation of the pieces of one quadrature point, and store them.
-
-        Parameters
-        ----------
-        phase : _PhaseLayout
-        inputs : list
-            For each input of the phase a buffer, or a list of vectors; for phases after the first
-            one the totals come last, of which the uncontracted sums are read.
-        pieces : pointer
-            Buffer of the pieces, one after the other; overwritten.
-        """
+    def _evaluate_pieces(self, phase: _PhaseLayout, inputs: list, pieces: Value) -> None:
+        """Emit the evaluation of the pieces of one quadrature point, and store them."""
 
         def read(slot: int, entry: int) -> Value:
             """Return an entry of the input with the index `slot`."""
@@ -518,27 +392,10 @@ class _KernelEmitter:
             self._store(value, pieces, entry=I64(phase.pieces[piece] + entry))
 
     def _contract(
-        self,
-        phase: _PhaseLayout,
-        pieces: Value,
-        geometry: Value,
-        half: Value,
-        totals: Value,
+        self, phase: _PhaseLayout, pieces: Value, geometry: Value, half: Value, totals: Value
     ) -> None:
         """Emit the addition of the pieces of one quadrature point to the totals, contracted as in
         `kernel._contracted`.
-
-        Parameters
-        ----------
-        phase : _PhaseLayout
-        pieces : pointer
-            Pieces of the point.
-        geometry : pointer
-            Shape gradients of the point.
-        half : pointer
-            Work space of 27 vectors.
-        totals : pointer
-            Totals of all phases; added to.
         """
         b = self.builder
         for k, how in enumerate(phase.contractions):
@@ -546,38 +403,22 @@ class _KernelEmitter:
             output_base = self._offset_pointer(totals, phase.outputs[k])
             length = phase.lengths[k]
             if how == "none":
-                with for_range(
-                    b, I64(0), stop=I64(length), name="entry"
-                ) as entry:
-                    self._accumulate(
-                        self._load(piece_base, entry), output_base, entry=entry
-                    )
+                with for_range(b, I64(0), stop=I64(length), name="entry") as entry:
+                    self._accumulate(self._load(piece_base, entry), output_base, entry=entry)
             elif how == "nodes":
-                with for_range(
-                    b, I64(0), stop=I64(self.nodes), name="node"
-                ) as node:
-                    values = self._at_node(
-                        piece_base, length // 9, self._gradient(geometry, node)
-                    )
+                with for_range(b, I64(0), stop=I64(self.nodes), name="node") as node:
+                    values = self._at_node(piece_base, length // 9, self._gradient(geometry, node))
                     for column, row, value in values:
                         first = I64(column * self.size + row)
                         self._accumulate(
-                            value,
-                            output_base,
-                            entry=b.add(b.mul(node, I64(3)), first),
+                            value, output_base, entry=b.add(b.mul(node, I64(3)), first)
                         )
             else:
-                with for_range(
-                    b, I64(0), stop=I64(self.nodes), name="column"
-                ) as node:
+                with for_range(b, I64(0), stop=I64(self.nodes), name="column") as node:
                     gradient = self._gradient(geometry, node)
-                    for column, row, value in self._at_node(
-                        piece_base, 9, gradient
-                    ):
+                    for column, row, value in self._at_node(piece_base, 9, gradient):
                         self._store(value, half, I64(column + 9 * row))
-                    self._add_node_block(
-                        half, gradient, a=node, node=node, outputs=output_base
-                    )
+                    self._add_node_block(half, gradient, a=node, node=node, outputs=output_base)
                     with for_range(
                         b, b.add(node, I64(1)), stop=I64(self.nodes), name="row"
                     ) as other:
@@ -594,17 +435,6 @@ class _KernelEmitter:
     ) -> None:
         """Emit the addition of the rows of node `a` to the columns of `node` of a lower triangle;
         if both are the same, only entries on and below the diagonal.
-
-        Parameters
-        ----------
-        half : pointer
-            Piece (9, 3) contracted with the gradient of `node`.
-        gradient : list of 3 vectors
-            Shape gradient of node `a`.
-        a, node : integers
-            Indices of the nodes, a ≥ node.
-        outputs : pointer
-            Lower triangle, column after column.
         """
         b = self.builder
         for column, row, value in self._at_node(half, 3, gradient):
@@ -612,9 +442,7 @@ class _KernelEmitter:
                 continue
             c = b.add(b.mul(node, I64(3)), I64(column))
             r = b.add(b.mul(a, I64(3)), I64(row))
-            self._accumulate(
-                value, outputs, entry=b.add(self._column_start(c), r)
-            )
+            self._accumulate(value, outputs, entry=b.add(self._column_start(c), r))
 
     def _column_start(self, c: Value) -> Value:
         """Return c (2 size − c − 1) / 2, the offset of column c in a lower triangle, less its row
@@ -623,9 +451,7 @@ class _KernelEmitter:
         b = self.builder
         return b.lshr(b.mul(c, b.sub(I64(2 * self.size - 1), c)), I64(1))
 
-    def _couple(
-        self, coupling: ca.Function, totals: Value, combined: Value
-    ) -> None:
+    def _couple(self, coupling: ca.Function, totals: Value, combined: Value) -> None:
         """Emit the addition of the coupling of the node vectors to the outputs in `totals`, see
         `kernel`; `combined` is work space for the products with D.
         """
@@ -637,123 +463,58 @@ class _KernelEmitter:
                 self._combine(columns, totals, output_base, self._accumulate)
             elif how == "pairs":
                 self._combine(columns, totals, combined, self._store)
-                with for_range(
-                    b, I64(0), stop=I64(self.size), name="column"
-                ) as c:
+                with for_range(b, I64(0), stop=I64(self.size), name="column") as c:
                     factors = [
                         (
                             j * self.size,
-                            self._load(
-                                self._offset_pointer(totals, self.vectors[j]), c
-                            ),
+                            self._load(self._offset_pointer(totals, self.vectors[j]), c),
                         )
                         for j in columns
                     ]
-                    start = b.gep(
-                        output_base,
-                        [b.mul(self._column_start(c), I64(self.lanes))],
-                    )
+                    start = b.gep(output_base, [b.mul(self._column_start(c), I64(self.lanes))])
                     with for_range(b, c, stop=I64(self.size), name="row") as r:
                         self._accumulate(
-                            self._combination(factors, combined, entry=r),
-                            start,
-                            entry=r,
+                            self._combination(factors, combined, entry=r), start, entry=r
                         )
 
-    def _coefficients(
-        self, coupling: ca.Function, totals: Value
-    ) -> list[dict[int, list]]:
+    def _coefficients(self, coupling: ca.Function, totals: Value) -> list[dict[int, list]]:
         """Emit the evaluation of the coupling, and return for each output, by the index of the
         column, a list of pairs: offset of a node vector in `totals`, and its coefficient. Zero
         coefficients are left out.
         """
         outputs = [coupling.sparsity_out(k) for k in range(coupling.n_out())]
-        entries = [
-            list(zip(*output.get_triplet(), strict=True)) for output in outputs
-        ]
+        entries = [list(zip(*output.get_triplet(), strict=True)) for output in outputs]
         columns: list[dict[int, list]] = [{} for _ in outputs]
 
         def read(_: int, entry: int) -> Value:
             """Load an entry of the vector of all uncontracted sums."""
             return self._load(totals, I64(self.sums[entry]))
 
-        for k, entry, value in emit_function(
-            self.builder, coupling, vector=self.vector, read=read
-        ):
+        for k, entry, value in emit_function(self.builder, coupling, vector=self.vector, read=read):
             row, column = entries[k][entry]
             columns[k].setdefault(column, []).append((self.vectors[row], value))
         return columns
 
     def _combine(
-        self,
-        columns: dict[int, list],
-        totals: Value,
-        out: Value,
-        put: Callable[..., None],
+        self, columns: dict[int, list], totals: Value, out: Value, put: Callable[..., None]
     ) -> None:
-        """Emit combinations of node vectors as columns of a matrix (3·nodes, any).
-
-        Parameters
-        ----------
-        columns : dict of int to list
-            For each column the offsets of node vectors in `totals`, and their coefficients.
-        totals : pointer
-        out : pointer
-            Matrix, column after column.
-        put : callable
-            `_store` to overwrite or `_accumulate` to add.
-        """
+        """Emit combinations of node vectors as columns of a matrix (3·nodes, any)."""
         for column, factors in columns.items():
             column_base = self._offset_pointer(out, column * self.size)
-            with for_range(
-                self.builder, I64(0), stop=I64(self.size), name="entry"
-            ) as entry:
-                put(
-                    self._combination(factors, totals, entry=entry),
-                    column_base,
-                    entry,
-                )
+            with for_range(self.builder, I64(0), stop=I64(self.size), name="entry") as entry:
+                put(self._combination(factors, totals, entry=entry), column_base, entry)
 
     def _combination(self, factors: list, base: Value, entry: Value) -> Value:
-        """Return one entry of a linear combination of vectors.
-
-        Parameters
-        ----------
-        factors : list of (offset, factor)
-            Offset of each vector in `base`, and its factor.
-        base : Value
-        entry : Value
-            Index of the entry.
-        """
+        """Return one entry of a linear combination of vectors."""
         b = self.builder
         terms = [
-            b.fmul(
-                self._load(self._offset_pointer(base, place), entry),
-                factor,
-                flags=FUSE,
-            )
+            b.fmul(self._load(self._offset_pointer(base, place), entry), factor, flags=FUSE)
             for place, factor in factors
         ]
         return reduce(lambda x, y: b.fadd(x, y, flags=FUSE), terms)
 
-    def _at_node(
-        self, stress: Value, columns: int, gradient: list
-    ) -> Iterator[tuple]:
-        """Emit the product of a piece with the shape gradient of one node.
-
-        Parameters
-        ----------
-        stress : pointer
-            Piece (9, columns), conjugate to F, column after column.
-        columns : int
-        gradient : list of 3 vectors
-
-        Yields
-        ------
-        column, row : int
-            Index of the column of the piece, and of the axis.
-        value : vector
-        """
+    def _at_node(self, stress: Value, columns: int, gradient: list) -> Iterator[tuple]:
+        """Emit the product of a piece with the shape gradient of one node."""
         for column in range(columns):
             for row in range(3):
                 terms = [
@@ -765,19 +526,12 @@ class _KernelEmitter:
                     for axis in range(3)
                 ]
                 value = self.builder.fadd(terms[0], terms[1], flags=FUSE)
-                yield (
-                    column,
-                    row,
-                    self.builder.fadd(value, terms[2], flags=FUSE),
-                )
+                yield (column, row, self.builder.fadd(value, terms[2], flags=FUSE))
 
     def _gradient(self, geometry: Value, node: Value) -> list:
         """Load the shape gradient of a node, a list of 3 vectors, from the geometry of a point."""
         first = self.builder.mul(node, I64(3))
-        return [
-            self._load(geometry, self.builder.add(first, I64(axis)))
-            for axis in range(3)
-        ]
+        return [self._load(geometry, self.builder.add(first, I64(axis))) for axis in range(3)]
 
     def _offset_pointer(self, base: Value, entry: int) -> Value:
         """Return the pointer to the vector with the constant index `entry` of a buffer at
@@ -787,6 +541,4 @@ class _KernelEmitter:
 
     def _accumulate(self, value: Value, base: Value, entry: Value) -> None:
         """Add a vector to that at the index `entry` of a buffer that begins at `base`."""
-        self._store(
-            self.builder.fadd(self._load(base, entry), value), base, entry=entry
-        )
+        self._store(self.builder.fadd(self._load(base, entry), value), base, entry=entry)

@@ -71,9 +71,7 @@ class SkylineFactorisation:
         If LLVM cannot compile the code.
     """
 
-    def __init__(
-        self, size: int, rows: Index, columns: Index, source: Index
-    ) -> None:
+    def __init__(self, size: int, rows: Index, columns: Index, source: Index) -> None:
         low = np.minimum(rows, columns)
         high = np.maximum(rows, columns)
         reach = np.arange(size)
@@ -94,9 +92,7 @@ class SkylineFactorisation:
         self._signs = np.where(rows < columns, -1.0, 1.0)[order]
         (self._reached,) = _addresses(self._reach)
         self._fixed = _addresses(self._source, self._places, self._signs)
-        self._kernels = {
-            k: (_compile("fill", k), _compile("factorise", k)) for k in (1, 2)
-        }
+        self._kernels = {k: (_compile("fill", k), _compile("factorise", k)) for k in (1, 2)}
         self._solve = _compile("solve", 1)
 
     def allocate(self, sides: int) -> FactorMemory:
@@ -121,9 +117,7 @@ class SkylineFactorisation:
             np.zeros((2, size + width)),
         )
 
-    def factorise(
-        self, room: FactorMemory, symmetric: Array, skew: Array
-    ) -> tuple[Array, Array]:
+    def factorise(self, room: FactorMemory, symmetric: Array, skew: Array) -> tuple[Array, Array]:
         """Compute L and U without their unit diagonals in the given memory; only L for a symmetric
         matrix.
 
@@ -150,10 +144,7 @@ class SkylineFactorisation:
         room.sides[:count].fill(0)
         room.results.fill(0)
         fill, factorise = self._kernels[count]
-        parts = [
-            np.ascontiguousarray(part, dtype=float)
-            for part in (symmetric, skew)
-        ]
+        parts = [np.ascontiguousarray(part, dtype=float) for part in (symmetric, skew)]
         ends = room.ends[:1] * 2 if count == 1 else room.ends
         fill(len(self._source), *self._fixed, *_addresses(*parts), *ends)
         factorise(size, width, self._reached, *ends, *room.results_at)
@@ -163,10 +154,9 @@ class SkylineFactorisation:
                 growth = growth / symmetric[self._diagonal]
         return pivots, growth
 
-    def solve(
-        self, first: Array, pivots: Array, second: Array, right: Array
-    ) -> Array:
-        """Return the solutions of L D Uᵀ x = b for the rows b of `right`, (columns, n), in new memory.
+    def solve(self, first: Array, pivots: Array, second: Array, right: Array) -> Array:
+        """Return the solutions of L D Uᵀ x = b for the rows b of `right`, (columns, n), in new
+        memory.
 
         Exchange `first` and `second` to solve with the transposed matrix.
 
@@ -215,19 +205,14 @@ def _compile(name: str, sides: int) -> CompiledFunction:
     """Return one of the compiled functions "fill", "factorise" and "solve", for a symmetric matrix
     (1 of `sides`) or any other (2).
     """
-    emit: Callable[[_SkylineEmitter], ir.Module] = getattr(
-        _SkylineEmitter, name
-    )
+    emit: Callable[[_SkylineEmitter], ir.Module] = getattr(_SkylineEmitter, name)
     integers, *arrays = ARGUMENTS[name]
     lanes = vector_lanes()
     signature = (*[ctypes.c_int64] * integers, *[ctypes.c_void_p] * sum(arrays))
     key = f"skyline {name} {sides} {lanes}"
     return compile_function(
         NativeCode(
-            name,
-            key,
-            signature=signature,
-            build=lambda: emit(_SkylineEmitter(lanes, sides)),
+            name, key, signature=signature, build=lambda: emit(_SkylineEmitter(lanes, sides))
         )
     )
 
@@ -254,12 +239,8 @@ class _SkylineEmitter:
         its builder.
         """
         integers, maps, arrays = ARGUMENTS[name]
-        kinds = (
-            [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
-        )
-        function = ir.Function(
-            self.module, ir.FunctionType(ir.VoidType(), kinds), name
-        )
+        kinds = [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
+        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), name)
         self.b: Builder = ir.IRBuilder(function.append_basic_block("entry"))
         return function.args
 
@@ -267,14 +248,10 @@ class _SkylineEmitter:
         """Return the module of ``fill(entries, source, places, signs, symmetric, skew, lower,
         upper)``.
         """
-        count, source, places, signs, symmetric, skew, lower, upper = (
-            self._begin("fill")
-        )
+        count, source, places, signs, symmetric, skew, lower, upper = self._begin("fill")
         b = self.b
         with for_range(b, I64(0), stop=count, name="entry") as k:
-            origin, place = (
-                b.load(b.gep(array, [k])) for array in (source, places)
-            )
+            origin, place = (b.load(b.gep(array, [k])) for array in (source, places))
             value = b.load(b.gep(symmetric, [origin]))
             if self.count == 1:
                 b.store(value, b.gep(lower, [place]))
@@ -289,22 +266,16 @@ class _SkylineEmitter:
 
     def factorise(self) -> Any:
         """Return the module of ``factorise(n, width, reach, lower, upper, pivots, growth)``."""
-        size, self.width, self.reach, *sides, self.pivots, self.growth = (
-            self._begin("factorise")
-        )
+        size, self.width, self.reach, *sides, self.pivots, self.growth = self._begin("factorise")
         self.sides = sides[: self.count]
         kind = ir.FunctionType(self.vector, [self.vector])
-        self.absolute = ir.Function(
-            self.module, kind, f"llvm.fabs.v{self.lanes}f64"
-        )
+        self.absolute = ir.Function(self.module, kind, f"llvm.fabs.v{self.lanes}f64")
         b = self.b
         groups = b.sdiv(size, I64(PIVOTS))
         with for_range(b, I64(0), stop=groups, name="group") as group:
             first = b.mul(group, I64(PIVOTS))
             self._eliminate([b.add(first, I64(p)) for p in range(PIVOTS)])
-        with for_range(
-            b, b.mul(groups, I64(PIVOTS)), stop=size, name="rest"
-        ) as pivot:
+        with for_range(b, b.mul(groups, I64(PIVOTS)), stop=size, name="rest") as pivot:
             self._eliminate([pivot])
         b.ret_void()
         return self.module
@@ -320,9 +291,7 @@ class _SkylineEmitter:
             for later in pivots[p + 1 :]:
                 self._subtract([pivot], later, last=last)
         next_row = b.add(pivots[-1], I64(1))
-        with for_range(
-            b, next_row, stop=b.add(last, I64(1)), name="row"
-        ) as row:
+        with for_range(b, next_row, stop=b.add(last, I64(1)), name="row") as row:
             self._subtract(pivots, row, last=last)
 
     def _scale(self, pivot: Value, last: Value) -> None:
@@ -334,18 +303,12 @@ class _SkylineEmitter:
         diagonal = b.load(self._entry(self.sides[0], pivot, place=pivot))
         b.store(diagonal, b.gep(self.pivots, [pivot]))
         inverse = self._splat(b.fdiv(DOUBLE(1.0), diagonal))
-        lanes = ir.Constant(
-            ir.VectorType(I64, self.lanes), list(range(self.lanes))
-        )
+        lanes = ir.Constant(ir.VectorType(I64, self.lanes), list(range(self.lanes)))
         with self._vectors(pivot, last) as start:
             after = b.icmp_signed(">", lanes, self._splat(b.sub(pivot, start)))
-            places = [
-                self._entry(side, pivot, place=start) for side in self.sides
-            ]
+            places = [self._entry(side, pivot, place=start) for side in self.sides]
             nothing = ir.Constant(self.vector, [0.0] * self.lanes)
-            values = [
-                b.select(after, self._load(place), nothing) for place in places
-            ]
+            values = [b.select(after, self._load(place), nothing) for place in places]
             scaled = [b.fmul(value, inverse) for value in values]
             for place, value in zip(places, scaled, strict=True):
                 self._store(value, place)
@@ -354,9 +317,7 @@ class _SkylineEmitter:
                 change = b.call(self.absolute, [b.fmul(values[0], scaled[1])])
                 self._store(b.fadd(self._load(grown), change), grown)
 
-    def _subtract(
-        self, pivots: Sequence[Value], row: Value, last: Value
-    ) -> None:
+    def _subtract(self, pivots: Sequence[Value], row: Value, last: Value) -> None:
         """Emit the subtraction of the contribution of pivots from a row of each side, up to the
         position `last`.
         """
@@ -365,21 +326,16 @@ class _SkylineEmitter:
         for pivot in pivots:
             diagonal = b.load(b.gep(self.pivots, [pivot]))
             row_entries = [
-                b.load(self._entry(side, pivot, place=row))
-                for side in reversed(self.sides)
+                b.load(self._entry(side, pivot, place=row)) for side in reversed(self.sides)
             ]
-            scales.append(
-                [self._splat(b.fmul(diagonal, value)) for value in row_entries]
-            )
+            scales.append([self._splat(b.fmul(diagonal, value)) for value in row_entries])
         with self._vectors(row, last) as start:
             for k, side in enumerate(self.sides):
                 target = self._entry(side, row, place=start)
                 value = self._load(target)
                 for pivot, scale in zip(pivots, scales, strict=True):
                     value = self._multiply_subtract(
-                        value,
-                        self._load(self._entry(side, pivot, place=start)),
-                        y=scale[k],
+                        value, self._load(self._entry(side, pivot, place=start)), y=scale[k]
                     )
                 self._store(value, target)
 
@@ -387,22 +343,12 @@ class _SkylineEmitter:
         """Return the module of ``solve(n, width, columns, stride, reach, first, second, pivots,
         rows)``.
         """
-        (
-            size,
-            self.width,
-            columns,
-            stride,
-            reach,
-            first,
-            second,
-            pivots,
-            rows,
-        ) = self._begin("solve")
+        (size, self.width, columns, stride, reach, first, second, pivots, rows) = self._begin(
+            "solve"
+        )
         b = self.b
         kind = ir.FunctionType(DOUBLE, [DOUBLE, self.vector])
-        total = ir.Function(
-            self.module, kind, f"llvm.vector.reduce.fadd.v{self.lanes}f64"
-        )
+        total = ir.Function(self.module, kind, f"llvm.vector.reduce.fadd.v{self.lanes}f64")
         dot = b.alloca(self.vector)
         with for_range(b, I64(0), stop=size, name="forward") as k:
             last = b.load(b.gep(reach, [k]))
@@ -413,9 +359,7 @@ class _SkylineEmitter:
                     place = b.gep(right, [start])
                     factor = self._entry(first, k, place=start)
                     self._store(
-                        self._multiply_subtract(
-                            self._load(place), self._load(factor), y=loaded
-                        ),
+                        self._multiply_subtract(self._load(place), self._load(factor), y=loaded),
                         place,
                     )
         with for_range(b, I64(0), stop=size, name="backward") as done:
@@ -430,18 +374,13 @@ class _SkylineEmitter:
                     factor = self._entry(second, k, place=start)
                     b.store(
                         self._multiply_subtract(
-                            b.load(dot),
-                            self._load(loaded),
-                            y=self._load(factor),
+                            b.load(dot), self._load(loaded), y=self._load(factor)
                         ),
                         dot,
                     )
                 solution = b.gep(right, [k])
                 scaled = b.fdiv(b.load(solution), diagonal)
-                b.store(
-                    b.call(total, [scaled, b.load(dot)], fastmath=("reassoc",)),
-                    solution,
-                )
+                b.store(b.call(total, [scaled, b.load(dot)], fastmath=("reassoc",)), solution)
         b.ret_void()
         return self.module
 
@@ -463,15 +402,11 @@ class _SkylineEmitter:
 
     def _load(self, place: Value) -> Value:
         """Load a vector from a pointer."""
-        return self.b.load(
-            self.b.bitcast(place, self.vector.as_pointer()), align=8
-        )
+        return self.b.load(self.b.bitcast(place, self.vector.as_pointer()), align=8)
 
     def _store(self, value: Value, place: Value) -> None:
         """Store a vector at a pointer."""
-        self.b.store(
-            value, self.b.bitcast(place, self.vector.as_pointer()), align=8
-        )
+        self.b.store(value, self.b.bitcast(place, self.vector.as_pointer()), align=8)
 
     def _multiply_subtract(self, value: Value, x: Value, y: Value) -> Value:
         """Return value − x y."""
@@ -479,10 +414,6 @@ class _SkylineEmitter:
 
     def _splat(self, value: Value) -> Value:
         """Return a vector of equal numbers."""
-        nothing = ir.Constant(
-            ir.VectorType(value.type, self.lanes), ir.Undefined
-        )
+        nothing = ir.Constant(ir.VectorType(value.type, self.lanes), ir.Undefined)
         zeros = ir.Constant(ir.VectorType(I32, self.lanes), [0] * self.lanes)
-        return self.b.shuffle_vector(
-            self.b.insert_element(nothing, value, I32(0)), nothing, zeros
-        )
+        return self.b.shuffle_vector(self.b.insert_element(nothing, value, I32(0)), nothing, zeros)

@@ -38,23 +38,12 @@ def available_threads() -> int:
 
 @cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """Return the pool of threads of this process; a forked child must not wait for its parent's.
-
-    Parameters
-    ----------
-    process : int
-        Identifier of the process, the key of the cache.
-    threads : int
-        Number of threads.
-    """
+    """Return the pool of threads of this process; a forked child must not wait for its parent's."""
     return ThreadPoolExecutor(threads)
 
 
 def run_in_slices(
-    run: Callable[..., None],
-    count: int,
-    threads: int,
-    arguments: Sequence[Any] = (),
+    run: Callable[..., None], count: int, threads: int, arguments: Sequence[Any] = ()
 ) -> None:
     """Call ``run(start, stop, *arguments)`` on consecutive slices of ``range(count)``, one per
     thread, and wait for all.
@@ -75,17 +64,13 @@ def run_in_slices(
         return
     bounds = [count * k // threads for k in range(threads + 1)]
     pool = _pool(os.getpid(), threads)
-    others = [
-        pool.submit(run, a, b, *arguments) for a, b in pairwise(bounds[1:])
-    ]
+    others = [pool.submit(run, a, b, *arguments) for a, b in pairwise(bounds[1:])]
     run(bounds[0], bounds[1], *arguments)
     for other in others:
         other.result()
 
 
-def map_experiments(
-    run: Callable[..., R], *columns: Sequence[Any], threads: int
-) -> list[R]:
+def map_experiments(run: Callable[..., R], *columns: Sequence[Any], threads: int) -> list[R]:
     """Return ``run(*row)`` for every row of one entry of each column, in their order.
 
     The columns have the same length. Each row runs on one thread, see `concurrent_count`; context
@@ -112,13 +97,7 @@ def map_experiments(
 
     with ThreadPoolExecutor(count) as pool:
         try:
-            return list(
-                pool.map(
-                    lambda context, row: context.run(passed, row),
-                    contexts,
-                    rows,
-                )
-            )
+            return list(pool.map(lambda context, row: context.run(passed, row), contexts, rows))
         except BaseException:
             stop.set()  # only the main thread hears of Ctrl-C, and it waits for the others
             raise

@@ -84,9 +84,7 @@ class Constant:
         if not lower < upper or (self.scale == "log" and lower <= 0):
             zero = "0 < " if self.scale == "log" else ""
             remedy = (
-                ', or scale = "linear" for a constant that may be zero or negative'
-                if zero
-                else ""
+                ', or scale = "linear" for a constant that may be zero or negative' if zero else ""
             )
             raise InputError(
                 f"bounds of the constant {self.name!r} are {lower:g} and {upper:g}; expected "
@@ -96,9 +94,7 @@ class Constant:
 
 # Default bounds of a stiffness [Pa]: softer than any gel, stiffer than any rubber.
 STIFFNESS = (1.0, 1e9)
-LAMBDA = Constant(
-    "lambda_pa", "λ", meaning="first Lamé parameter", bounds=STIFFNESS
-)
+LAMBDA = Constant("lambda_pa", "λ", meaning="first Lamé parameter", bounds=STIFFNESS)
 MU = Constant("mu_pa", "μ", meaning="shear modulus", bounds=STIFFNESS)
 KAPPA = Constant("kappa_pa", "κ", meaning="bulk modulus", bounds=(1.0, 1e10))
 YOUNG = Constant("young_pa", "E", meaning="Young's modulus", bounds=STIFFNESS)
@@ -113,49 +109,16 @@ POISSON = Constant(
     below=0.5,
 )
 GAMMA_R = Constant(
-    "gamma_r_s",
-    "γ_r",
-    meaning="stiffness-proportional damping",
-    bounds=(1e-7, 10.0),
-    usual=3e-3,
+    "gamma_r_s", "γ_r", meaning="stiffness-proportional damping", bounds=(1e-7, 10.0), usual=3e-3
 )
 GAMMA_M = Constant(
-    "gamma_m_1_s",
-    "γ_m",
-    meaning="mass-proportional damping",
-    bounds=(1e-4, 1e4),
-    usual=0.3,
+    "gamma_m_1_s", "γ_m", meaning="mass-proportional damping", bounds=(1e-4, 1e4), usual=0.3
 )
-C10 = Constant(
-    "c10_pa",
-    "C₁₀",
-    meaning="half the shear modulus, or a part of it",
-    bounds=STIFFNESS,
-)
-C01 = Constant(
-    "c01_pa", "C₀₁", meaning="factor of the second invariant", bounds=STIFFNESS
-)
-C20 = Constant(
-    "c20_pa",
-    "C₂₀",
-    meaning="factor of (Ī₁ − 3)²",
-    bounds=(-1e9, 1e9),
-    scale="linear",
-)
-C30 = Constant(
-    "c30_pa",
-    "C₃₀",
-    meaning="factor of (Ī₁ − 3)³",
-    bounds=(-1e9, 1e9),
-    scale="linear",
-)
-GENT_LIMIT = Constant(
-    "gent_limit",
-    "J_m",
-    meaning="largest Ī₁ − 3",
-    bounds=(1e-2, 1e4),
-    usual=50.0,
-)
+C10 = Constant("c10_pa", "C₁₀", meaning="half the shear modulus, or a part of it", bounds=STIFFNESS)
+C01 = Constant("c01_pa", "C₀₁", meaning="factor of the second invariant", bounds=STIFFNESS)
+C20 = Constant("c20_pa", "C₂₀", meaning="factor of (Ī₁ − 3)²", bounds=(-1e9, 1e9), scale="linear")
+C30 = Constant("c30_pa", "C₃₀", meaning="factor of (Ī₁ − 3)³", bounds=(-1e9, 1e9), scale="linear")
+GENT_LIMIT = Constant("gent_limit", "J_m", meaning="largest Ī₁ − 3", bounds=(1e-2, 1e4), usual=50.0)
 CHAIN_STRETCH = Constant(
     "chain_stretch",
     "λ_m",
@@ -172,10 +135,7 @@ _SUBSCRIPTS = "₁₂₃₄"
 # as in Ogden's own constants of rubber.
 MU_TERMS = (
     Constant(
-        "mu_1_pa",
-        "μ₁",
-        meaning="factor of the first power of the stretches",
-        bounds=STIFFNESS,
+        "mu_1_pa", "μ₁", meaning="factor of the first power of the stretches", bounds=STIFFNESS
     ),
     *(
         Constant(
@@ -227,14 +187,10 @@ SHARE = Constant(
     "share", "g", meaning="stiffness that relaxes, relative to the long-term one",
     bounds=(0.0, 20.0), scale="linear", typical=0.1, usual=0.1, at_least=0.0,
 )  # fmt: skip
-TAU = Constant(
-    "tau_s", "τ", meaning="relaxation time", bounds=(1e-4, 1e3), usual=0.3
-)
+TAU = Constant("tau_s", "τ", meaning="relaxation time", bounds=(1e-4, 1e3), usual=0.3)
 DENSITY = Constant("density_kg_m3", "ρ", meaning="density", bounds=(1.0, 1e5))
 # Total mass, which replaces the densities of all parts; their ratios are kept.
-MASS = Constant(
-    "mass_kg", "m", meaning="mass of the whole body", bounds=(1e-6, 1e3)
-)
+MASS = Constant("mass_kg", "m", meaning="mass of the whole body", bounds=(1e-6, 1e3))
 # Friction coefficient of an obstacle, preceded by the obstacle's name: ``table_friction``.
 FRICTION = Constant(
     "friction",
@@ -266,9 +222,7 @@ CONTRAST = Constant(
     usual=1.0,
 )
 INSTANTANEOUS = Constant(
-    "instantaneous_young_pa",
-    "E₀",
-    meaning="instantaneous Young's modulus, before relaxation",
+    "instantaneous_young_pa", "E₀", meaning="instantaneous Young's modulus, before relaxation"
 )
 
 # The constants that have a symbol, by name: what tables and pictures look up.
@@ -309,9 +263,7 @@ def without_region(name: str) -> str:
 
 def unit_of(name: str) -> str:
     """Return the unit with which a name ends, as printed ("kg/m³"), or "" if it has none."""
-    return next(
-        (unit for ending, unit in _UNITS.items() if name.endswith(ending)), ""
-    )
+    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "")
 
 
 def symbol_of(name: str) -> str:
@@ -320,9 +272,7 @@ def symbol_of(name: str) -> str:
     """
     region, _, name_in_region = name.rpartition(".")
     symbol = (
-        KNOWN[name_in_region].symbol
-        if name_in_region in KNOWN
-        else without_unit(name_in_region)
+        KNOWN[name_in_region].symbol if name_in_region in KNOWN else without_unit(name_in_region)
     )
     return f"{symbol} {region}".strip()
 
@@ -340,9 +290,7 @@ def constant_named(name: str) -> Constant:
     """
     bare_name = without_region(name)
     if bare_name not in KNOWN and bare_name.endswith(f"_{FRICTION.name}"):
-        return replace(
-            FRICTION, name=bare_name, symbol=bare_name.replace("_", " ")
-        )
+        return replace(FRICTION, name=bare_name, symbol=bare_name.replace("_", " "))
     word, _, number = bare_name.rpartition("_")
     if word == FIELD_COEFFICIENT.name and number.isdigit():
         return replace(FIELD_COEFFICIENT, name=bare_name)
@@ -358,9 +306,7 @@ def is_known_constant(name: str) -> bool:
 
 def field_coefficient(number: int) -> Constant:
     """Return the constant for the coefficient of a shape of a field, by the shape's index."""
-    return replace(
-        FIELD_COEFFICIENT, name=f"{FIELD_COEFFICIENT.name}_{number + 1}"
-    )
+    return replace(FIELD_COEFFICIENT, name=f"{FIELD_COEFFICIENT.name}_{number + 1}")
 
 
 def is_modulus(name: str) -> bool:
@@ -378,9 +324,7 @@ def is_damping(name: str) -> bool:
     return without_region(name) in (GAMMA_R.name, GAMMA_M.name)
 
 
-def usual_value(
-    name: str, young_pa: float, poisson: float = 0.3
-) -> float | None:
+def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | None:
     """Return a plausible value of a constant in a material of given stiffness; None if unknown.
 
     A modulus that is not known by name gets the shear modulus. Other constants have their `usual`
@@ -404,16 +348,11 @@ def usual_value(
         "c01_pa": 0.1,
         "c20_pa": 0.0,
         "c30_pa": 0.0,
-        **{
-            term.name: share
-            for term, share in zip(MU_TERMS, USUAL_SHARES, strict=True)
-        },
+        **{term.name: share for term, share in zip(MU_TERMS, USUAL_SHARES, strict=True)},
     }
     return shear * shares.get(without_region(name), 1.0)
 
 
 def without_unit(name: str) -> str:
     """Return a name without the unit with which it ends; the name itself if it ends with none."""
-    return next(
-        (name.removesuffix(e) for e in _UNITS if name.endswith(e)), name
-    )
+    return next((name.removesuffix(e) for e in _UNITS if name.endswith(e)), name)

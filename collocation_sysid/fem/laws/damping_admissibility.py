@@ -46,9 +46,7 @@ def require_admissible_damping(damping: DampingLaw, material: Material) -> None:
     constants = [*material.constants, *damping.constants]
     theta = ca.SX.sym("theta", len(constants))
     stress = viscous_stress(damping, material, F=F, rate=rate, theta=theta)
-    function = ca.Function(
-        "stress", [rate, F, theta], [ca.densify(ca.vec(stress))]
-    )
+    function = ca.Function("stress", [rate, F, theta], [ca.densify(ca.vec(stress))])
     rng = np.random.default_rng(0)
     deformation = np.eye(3).ravel() + STRAIN * rng.uniform(-1, 1, 9)
     values = [_typical_value(constant) for constant in constants]
@@ -68,8 +66,8 @@ def require_admissible_damping(damping: DampingLaw, material: Material) -> None:
 
 
 def _require_own_names(damping: DampingLaw, material: Material) -> None:
-    """Raise an `InputError` if two constants of the law have the same name, or one has the name of a
-    constant of the material or the body.
+    """Raise an `InputError` if two constants of the law have the same name, or one has the name of
+    a constant of the material or the body.
     """
     taken = {
         *(constant.name for constant in material.constants),
@@ -86,11 +84,7 @@ def _require_own_names(damping: DampingLaw, material: Material) -> None:
 
 
 def viscous_stress(
-    damping: DampingLaw,
-    material: Material,
-    F: ca.SX,
-    rate: ca.SX,
-    theta: ca.SX,
+    damping: DampingLaw, material: Material, F: ca.SX, rate: ca.SX, theta: ca.SX
 ) -> ca.SX:
     """Return the viscous stress P_v (9,) of a law from its stress, its potential, or both.
 
@@ -110,18 +104,13 @@ def viscous_stress(
     """
     count = len(material.constants)
     psi = material.psi(ca.reshape(F, 3, 3), theta[:count])
-    values = {
-        constant.name: theta[count + k]
-        for k, constant in enumerate(damping.constants)
-    }
+    values = {constant.name: theta[count + k] for k, constant in enumerate(damping.constants)}
     stress = ca.SX(9, 1)
     if damping.potential is not None:
         try:
             density = ca.SX(damping.potential(psi, F, rate, **values))
         except Exception as error:
-            raise InputError(
-                _failure(damping, "potential", error=error)
-            ) from error
+            raise InputError(_failure(damping, "potential", error=error)) from error
         if density.shape != (1, 1):
             raise InputError(
                 f"the potential of the damping law {damping.name!r} returns an expression of the shape "
@@ -132,9 +121,7 @@ def viscous_stress(
         try:
             result = damping.stress(psi, F, rate, **values)
         except Exception as error:
-            raise InputError(
-                _failure(damping, "stress", error=error)
-            ) from error
+            raise InputError(_failure(damping, "stress", error=error)) from error
         results = result if isinstance(result, tuple | list) else [result]
         shapes = [getattr(each, "shape", type(each)) for each in results]
         if shapes != [(9, 1), (9, 9)]:

@@ -21,21 +21,17 @@ from .materials import MATERIALS, Material
 # Number of materials whose Hessian is kept in memory.
 CACHED_HESSIANS = 32
 # Linear elasticity depends on the rotation of the body; energies of users may be anisotropic.
-EXAMINED = tuple(
-    material for name, material in MATERIALS.items() if name != "linear"
-)
+EXAMINED = tuple(material for name, material in MATERIALS.items() if name != "linear")
 
 
 def is_examined(material: Material) -> bool:
-    """Return whether the criterion applies to a material: the built-in ones except linear elasticity.
-    Energies of users could be anisotropic.
+    """Return whether the criterion applies to a material: the built-in ones except linear
+    elasticity. Energies of users could be anisotropic.
     """
     return material in EXAMINED
 
 
-def stability_margins(
-    material: Material, constants: Array, stretches: Array
-) -> Array:
+def stability_margins(material: Material, constants: Array, stretches: Array) -> Array:
     """Return the smallest eigenvalue of ∂²ψ/∂ε∂ε [Pa] at principal stretches; negative if unstable.
 
     Parameters
@@ -107,9 +103,4 @@ def _log_strain_hessian(material: Material) -> ca.Function:
     values = ca.SX.sym("values", len(material.constants))
     psi = material.psi(ca.diag(ca.exp(strain)), values)
     hessian, _ = ca.hessian(psi, strain)
-    return ca.Function(
-        "hessian",
-        [strain, values],
-        [ca.densify(ca.vec(hessian))],
-        {"cse": True},
-    )
+    return ca.Function("hessian", [strain, values], [ca.densify(ca.vec(hessian))], {"cse": True})

@@ -63,9 +63,7 @@ class Material:
     constants: tuple[Constant, ...]
 
     @classmethod
-    def from_energy(
-        cls, energy: Energy, name: str = "", *constants: Constant
-    ) -> Material:
+    def from_energy(cls, energy: Energy, name: str = "", *constants: Constant) -> Material:
         """Return a material from an energy function; its arguments after F are the constants.
 
         Parameters
@@ -100,9 +98,7 @@ class Material:
         material = cls(
             name,
             energy,
-            constants=tuple(
-                definitions.get(a) or constant_named(a) for a in arguments
-            ),
+            constants=tuple(definitions.get(a) or constant_named(a) for a in arguments),
         )
         material._check_at_rest()
         return material
@@ -132,11 +128,7 @@ class Material:
         """Return the energy density as the symbol of a rule from `chain_rule` for the same F (3, 3)
         and constants (c,), if it has one, else as an expression in them.
         """
-        return (
-            rule.functions[0].symbol()
-            if rule.functions
-            else self.psi(F, values)
-        )
+        return rule.functions[0].symbol() if rule.functions else self.psi(F, values)
 
     def _named(self, values: ca.SX) -> dict[str, ca.SX]:
         """Return the constants by name, from a vector in their order."""
@@ -150,9 +142,7 @@ class Material:
         gradient = ca.reshape(F, 3, 3)
         rule = self.chain_rule(gradient, values)
         psi = self.psi_in(rule, gradient, values=values)
-        return ca.Function(
-            "lame", [values], [lame_constants(psi, F, rule=rule)]
-        )
+        return ca.Function("lame", [values], [lame_constants(psi, F, rule=rule)])
 
     def _check_at_rest(self) -> None:
         """Raise an `InputError` if the energy cannot be evaluated, or unless energy and stress
@@ -170,21 +160,13 @@ class Material:
             ) from error
         law = ca.Function("law", [F, values], [psi, stress, tangent])
         sample_values = [
-            float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1]))
-            for c in self.constants
+            float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1])) for c in self.constants
         ]
-        energy, force, stiffness = (
-            o.full() for o in law(np.eye(3).ravel(), sample_values)
-        )
+        energy, force, stiffness = (o.full() for o in law(np.eye(3).ravel(), sample_values))
         scale = np.abs(stiffness).max()
         for what, unit, residual, remedy in (
             ("energy", "J/m³", energy, "subtract this value"),
-            (
-                "stress",
-                "Pa",
-                force,
-                "correct the energy, such as by a term −μ ln J",
-            ),
+            ("stress", "Pa", force, "correct the energy, such as by a term −μ ln J"),
         ):
             worst = np.abs(residual).max()
             if not worst <= REST_TOLERANCE * scale:
@@ -195,15 +177,10 @@ class Material:
 
     def _describe_values(self, values: list[float]) -> str:
         """Return the constants with given values as text."""
-        return ", ".join(
-            f"{c.name} = {v:.3g}"
-            for c, v in zip(self.constants, values, strict=True)
-        )
+        return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
 
 
-def lame_constants(
-    psi: ca.SX, F: ca.SX, rule: ChainRule | None = None
-) -> ca.SX:
+def lame_constants(psi: ca.SX, F: ca.SX, rule: ChainRule | None = None) -> ca.SX:
     """Return the small-strain (λ, μ), C₁₁₂₂ and C₁₂₁₂ at F = I, of an energy density of F stacked
     (9,).
 
@@ -221,9 +198,7 @@ def lame_constants(
     else:
         tangent, _ = ca.hessian(psi, F)
     entries = ca.vertcat(tangent[0, 4], tangent[1, 1])
-    return ca.simplify(
-        ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel())))
-    )
+    return ca.simplify(ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel()))))
 
 
 def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
@@ -231,16 +206,12 @@ def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
     Wood 2008, eq. 6.27); NaN for J < 0.
     """
     log_j = ca.log(ca.det(F))
-    return (
-        0.5 * lambda_pa * log_j**2
-        - mu_pa * log_j
-        + 0.5 * mu_pa * (ca.sumsqr(F) - 3)
-    )
+    return 0.5 * lambda_pa * log_j**2 - mu_pa * log_j + 0.5 * mu_pa * (ca.sumsqr(F) - 3)
 
 
 def stable_neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """Return the stable neo-Hookean energy ψ = ½ μ (tr C − 3) − μ (J − 1) + ½ (λ + μ)(J − 1)² at F (3,
-    3).
+    """Return the stable neo-Hookean energy ψ = ½ μ (tr C − 3) − μ (J − 1) + ½ (λ + μ)(J − 1)² at F
+    (3, 3).
 
     It is finite for inverted elements, too (Smith, de Goes & Kim 2018, eq. 13, with λ + μ in place
     of λ, so that the small-strain limit is linear elasticity with (λ, μ)).
@@ -272,30 +243,22 @@ def linear_elastic(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
     return 0.5 * lambda_pa * ca.trace(strain) ** 2 + mu_pa * ca.sumsqr(strain)
 
 
-def mooney_rivlin(
-    F: ca.SX, c10_pa: ca.SX, c01_pa: ca.SX, kappa_pa: ca.SX
-) -> ca.SX:
+def mooney_rivlin(F: ca.SX, c10_pa: ca.SX, c01_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
     """Return the Mooney–Rivlin energy ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + U at F (3, 3), with U = ½ κ
     (J − 1)²; the shear modulus is μ = 2 (C₁₀ + C₀₁).
 
     See Bonet & Wood 2008, sec. 6.5.
     """
     first, second = isochoric_invariants(F)
-    return (
-        c10_pa * (first - 3) + c01_pa * (second - 3) + _volumetric(F, kappa_pa)
-    )
+    return c10_pa * (first - 3) + c01_pa * (second - 3) + _volumetric(F, kappa_pa)
 
 
-def yeoh(
-    F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX
-) -> ca.SX:
+def yeoh(F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
     """Return Yeoh's energy ψ = Σ_i C_i0 (Ī₁ − 3)^i + U, i = 1 … 3, at F (3, 3), with U = ½ κ (J −
     1)²; the shear modulus is μ = 2 C₁₀ (Yeoh 1993).
     """
     excess = isochoric_invariants(F)[0] - 3
-    return excess * (
-        c10_pa + excess * (c20_pa + excess * c30_pa)
-    ) + _volumetric(F, kappa_pa)
+    return excess * (c10_pa + excess * (c20_pa + excess * c30_pa)) + _volumetric(F, kappa_pa)
 
 
 def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
@@ -307,16 +270,12 @@ def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
     remaining = 1 - (isochoric_invariants(F)[0] - 3) / gent_limit
     # The square root makes the derivatives NaN beyond the limit, too; otherwise a solver that
     # evaluates forces alone could converge there.
-    return -mu_pa * gent_limit * ca.log(ca.sqrt(remaining)) + _volumetric(
-        F, kappa_pa
-    )
+    return -mu_pa * gent_limit * ca.log(ca.sqrt(remaining)) + _volumetric(F, kappa_pa)
 
 
-def arruda_boyce(
-    F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX
-) -> ca.SX:
-    """Return the Arruda–Boyce energy ψ = C Σ_i α_i λ_m^(2−2i) (Ī₁^i − 3^i) + U at F (3, 3), with λ_m =
-    `chain_stretch` and U = ½ κ (J − 1)².
+def arruda_boyce(F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX) -> ca.SX:
+    """Return the Arruda–Boyce energy ψ = C Σ_i α_i λ_m^(2−2i) (Ī₁^i − 3^i) + U at F (3, 3), with
+    λ_m = `chain_stretch` and U = ½ κ (J − 1)².
 
     Five terms of the inverse Langevin function; C is such that μ is the shear modulus at small
     strain (Arruda & Boyce 1993, eq. 22).
@@ -324,9 +283,7 @@ def arruda_boyce(
     first = isochoric_invariants(F)[0]
     series = ca.SX(0)
     slope = ca.SX(0)
-    for i, coefficient in enumerate(
-        (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750), start=1
-    ):
+    for i, coefficient in enumerate((1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750), start=1):
         weight = coefficient / chain_stretch ** (2 * i - 2)
         series += weight * (first**i - 3**i)
         slope += 2 * weight * i * 3 ** (i - 1)
@@ -346,9 +303,7 @@ def _arguments(energy: Energy) -> list[str]:
 # Built without `Material.from_energy`, whose check would slow down every start; the tests check
 # them.
 MATERIALS: dict[str, Material] = {
-    name: Material(
-        name, energy, constants=tuple(map(constant_named, _arguments(energy)))
-    )
+    name: Material(name, energy, constants=tuple(map(constant_named, _arguments(energy))))
     for name, energy in {
         "neo-hookean": neo_hookean,
         "stable-neo-hookean": stable_neo_hookean,
@@ -362,9 +317,7 @@ MATERIALS: dict[str, Material] = {
 }
 MATERIALS |= {
     f"{name}-{terms}": Material(
-        f"{name}-{terms}",
-        energy(terms),
-        constants=tuple(map(constant_named, energy(terms).names)),
+        f"{name}-{terms}", energy(terms), constants=tuple(map(constant_named, energy(terms).names))
     )
     for name, energy in (("ogden", ogden), ("hyperfoam", hyperfoam))
     for terms in range(1, MOST_TERMS + 1)
@@ -390,19 +343,9 @@ def as_material(material: str | Energy | Material) -> Material:
 
 
 def _look_up(kind: str, name: str, table: Mapping[str, T]) -> T:
-    """Return the entry of a table by name, or raise an `InputError` that lists the known names.
-
-    Parameters
-    ----------
-    kind : str
-        What the table holds, for the message.
-    name : str
-    table : mapping
-    """
+    """Return the entry of a table by name, or raise an `InputError` that lists the known names."""
     if name not in table:
-        raise InputError(
-            f"no {kind} {name!r}; available: {', '.join(table)}{hint_at(name, table)}"
-        )
+        raise InputError(f"no {kind} {name!r}; available: {', '.join(table)}{hint_at(name, table)}")
     return table[name]
 
 
@@ -464,9 +407,7 @@ class DampingLaw:
             )
 
 
-def kelvin_voigt(
-    psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX
-) -> tuple[ca.SX, ca.SX]:
+def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return the stress P_v (9,) of Kelvin–Voigt damping and ∂P_v/∂F (9, 9).
 
     P_v = F S_v with S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹ and the viscosities η = γ_r μ and ζ = γ_r λ.
@@ -494,16 +435,11 @@ def kelvin_voigt(
     P = (shear * (L + L.T) + lame * ca.trace(L) * one) @ inverse.T
     stress = ca.vec(P)
     # dF changes L as a rate −L dF would, and F⁻ᵀ by −F⁻ᵀ dFᵀ F⁻ᵀ.
-    slope = (
-        -ca.jacobian(stress, rate) @ ca.kron(one, L)
-        - ca.kron(inverse, P)[:, TRANSPOSED]
-    )
+    slope = -ca.jacobian(stress, rate) @ ca.kron(one, L) - ca.kron(inverse, P)[:, TRANSPOSED]
     return stress, slope
 
 
-def material_form(
-    psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX
-) -> tuple[ca.SX, ca.SX]:
+def material_form(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return the stress P_v (9,) of damping in material form and ∂P_v/∂F (9, 9).
 
     P_v = F S_v with S_v = γ_r (λ tr(Ė) I + 2μ Ė) and the rate Ė of the Green strain. S_v : Ė = γ_r
@@ -512,23 +448,20 @@ def material_form(
     Piola–Kirchhoff stress. See `kelvin_voigt` for the arguments and for linear materials.
     """
     stiffness, _ = ca.hessian(psi, F)
-    if not ca.depends_on(
-        stiffness, F
-    ):  # a linear material does not distinguish the shapes
+    if not ca.depends_on(stiffness, F):  # a linear material does not distinguish the shapes
         return gamma_r_s * from_lower_triangle(stiffness) @ rate, ca.SX(9, 9)
     lame, shear = ca.vertsplit(gamma_r_s * lame_constants(psi, F))
     deformation = ca.reshape(F, 3, 3)
     product = deformation.T @ ca.reshape(rate, 3, 3)
     strain_rate = (product + product.T) / 2
-    second_piola = (
-        lame * ca.trace(strain_rate) * ca.SX.eye(3) + 2 * shear * strain_rate
-    )
+    second_piola = lame * ca.trace(strain_rate) * ca.SX.eye(3) + 2 * shear * strain_rate
     stress = ca.vec(deformation @ second_piola)
     return stress, ca.jacobian(stress, F)
 
 
 def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
-    """Return Rayleigh damping as the potential γ_r ∂ψ/∂F:Ḟ, which gives the damping force −γ_r K(x) v.
+    """Return Rayleigh damping as the potential γ_r ∂ψ/∂F:Ḟ, which gives the damping force −γ_r K(x)
+    v.
 
     Parameters
     ----------
@@ -545,9 +478,7 @@ def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
 DAMPINGS: dict[str, DampingLaw] = {
     "kelvin-voigt": DampingLaw("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
     "material": DampingLaw("material", (GAMMA_R,), stress=material_form),
-    "rayleigh": DampingLaw(
-        "rayleigh", (GAMMA_R,), potential=rayleigh, accepts_symbols=True
-    ),
+    "rayleigh": DampingLaw("rayleigh", (GAMMA_R,), potential=rayleigh, accepts_symbols=True),
 }
 
 
@@ -560,9 +491,7 @@ def as_damping(damping: str | DampingLaw) -> DampingLaw:
         If there is no damping law of that name.
     """
     return (
-        damping
-        if isinstance(damping, DampingLaw)
-        else _look_up("damping", damping, table=DAMPINGS)
+        damping if isinstance(damping, DampingLaw) else _look_up("damping", damping, table=DAMPINGS)
     )
 
 
@@ -579,10 +508,7 @@ class Prony:
     name: str
 
     def __post_init__(self) -> None:
-        if (
-            not self.name
-            or not self.name.replace("_", "").replace("-", "").isalnum()
-        ):
+        if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
             raise InputError(
                 f"the branch's name is {self.name!r}; expected letters, digits, - and _, which "
                 "stand before the names of its parameters"
@@ -590,9 +516,7 @@ class Prony:
 
     def named_constants(self) -> tuple[Constant, Constant]:
         """Return the constants of the branch: its share g and its relaxation time τ."""
-        share, tau = (
-            replace(c, name=f"{self.name}.{c.name}") for c in (SHARE, TAU)
-        )
+        share, tau = (replace(c, name=f"{self.name}.{c.name}") for c in (SHARE, TAU))
         return share, tau
 
 
@@ -610,9 +534,7 @@ def as_branches(branches_or_names: Sequence[str | Prony]) -> tuple[Prony, ...]:
             f"prony is {branches_or_names!r}; expected a list of names of branches, such as "
             f"[{branches_or_names!r}]"
         )
-    branches = tuple(
-        b if isinstance(b, Prony) else Prony(b) for b in branches_or_names
-    )
+    branches = tuple(b if isinstance(b, Prony) else Prony(b) for b in branches_or_names)
     names = [branch.name for branch in branches]
     for name in names:
         if names.count(name) > 1:

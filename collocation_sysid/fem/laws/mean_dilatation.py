@@ -46,9 +46,7 @@ from ..kernel import (
 )
 
 
-def averaging_kernel(
-    name: str, point: QuadraturePoint, outputs: Outputs
-) -> ElementKernel:
+def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> ElementKernel:
     """Return the kernel of derivatives of scalars that depend on `QuadraturePoint.stretches`.
 
     Parameters
@@ -64,45 +62,30 @@ def averaging_kernel(
     order = max(len(term.by) for terms in outputs.values() for term in terms)
     output_pieces: Pieces = {}
     for key, terms in outputs.items():
-        summands = [
-            term.select_part(chains[id(term.scalar)].piece(term.by))
-            for term in terms
-        ]
-        output_pieces[key] = (
-            terms[0].choose_contraction(),
-            sum(summands[1:], summands[0]),
-        )
+        summands = [term.select_part(chains[id(term.scalar)].piece(term.by)) for term in terms]
+        output_pieces[key] = (terms[0].choose_contraction(), sum(summands[1:], summands[0]))
     slopes: Pieces = {}
     if order:
-        slopes = {
-            chain.sum_name("slopes"): ("none", chain.by_stretch)
-            for chain in chains.values()
-        }
+        slopes = {chain.sum_name("slopes"): ("none", chain.by_stretch) for chain in chains.values()}
     sums = ca.vertcat(shape.volume, shape.volumes)
     previous_phases = [point.make_phase("volumes", shape.volume_pieces(order))]
     coupled = slopes
     if order > 1:
-        previous_phases.append(
-            point.make_phase("slopes", shape.with_stretches(slopes), sums=sums)
-        )
+        previous_phases.append(point.make_phase("slopes", shape.with_stretches(slopes), sums=sums))
         sums = ca.vertcat(sums, *(chain.slopes for chain in chains.values()))
         coupled = {
             key: p
             for chain in chains.values()
             for key, p in chain.second_derivative_pieces().items()
         }
-    last = point.make_phase(
-        name, shape.with_stretches(output_pieces | coupled), sums=sums
-    )
+    last = point.make_phase(name, shape.with_stretches(output_pieces | coupled), sums=sums)
     return ElementKernel(
         last.pieces,
         tuple(point.fields),
         contractions={key: last.contractions[key] for key in output_pieces},
         previous_phases=tuple(previous_phases),
         coupled={key: last.contractions[key] for key in coupled},
-        coupling=_coupling(shape, chains, outputs=outputs, order=order)
-        if order
-        else None,
+        coupling=_coupling(shape, chains, outputs=outputs, order=order) if order else None,
     )
 
 
@@ -156,14 +139,10 @@ class _VolumeSums:
         """
         m = _volume_logarithms(self.volumes, self.volume)
         m -= _volume_logarithms(self.own_volumes, self.point.mesh_volume)
-        expanded = self.point.rule.eliminate(
-            [piece for _, piece in pieces.values()]
-        )
+        expanded = self.point.rule.eliminate([piece for _, piece in pieces.values()])
         return {
             key: (how, ca.substitute(piece, self.stack_stretches(), m))
-            for (key, (how, _)), piece in zip(
-                pieces.items(), expanded, strict=True
-            )
+            for (key, (how, _)), piece in zip(pieces.items(), expanded, strict=True)
         }
 
     def volume_pieces(self, order: int) -> Pieces:
@@ -192,9 +171,7 @@ class _VolumeSums:
         if field == "x":
             return ca.SX.eye(self.count)
         # Every second one is the rate of the one before.
-        rates = [ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (
-            self.count // 2
-        )
+        rates = [ca.SX(ca.sparsify(ca.DM([[0, 0], [1, 0]])))] * (self.count // 2)
         return ca.diagcat(*rates)
 
 
@@ -228,9 +205,7 @@ class _ScalarDerivatives:
     @cached_property
     def by_stretch(self) -> ca.SX:
         """Derivatives ∂g/∂m by the stretches."""
-        return self.shape.point.gradient(
-            self.scalar, self.shape.stack_stretches()
-        )
+        return self.shape.point.gradient(self.scalar, self.shape.stack_stretches())
 
     def second_derivative_pieces(self) -> Pieces:
         """Return the pieces whose sums couple in second derivatives: ∂²g by (m, m), (m, θ), (field,
@@ -239,23 +214,14 @@ class _ScalarDerivatives:
         point = self.shape.point
         by_m = point.jacobian(self.by_stretch, self.shape.stack_stretches())
         pieces: Pieces = {
-            self.sum_name("second"): (
-                "none",
-                ca.vec(from_lower_triangle(by_m)),
-            ),
+            self.sum_name("second"): ("none", ca.vec(from_lower_triangle(by_m))),
             self.sum_name("slopes_by_theta"): (
                 "none",
-                ca.vec(
-                    point.jacobian(
-                        self.by_stretch, point.stack_differentiated_constants()
-                    )
-                ),
+                ca.vec(point.jacobian(self.by_stretch, point.stack_differentiated_constants())),
             ),
         }
         for field in self.fields:
-            slopes = (self._with_stretch(field).T @ self._hessian(field, "x"))[
-                :, 9:
-            ]
+            slopes = (self._with_stretch(field).T @ self._hessian(field, "x"))[:, 9:]
             pieces[self.sum_name(f"slopes_by_{field}")] = "nodes", slopes
         return pieces
 
@@ -270,51 +236,35 @@ class _ScalarDerivatives:
             return point.derivative(self.scalar, by)
         if len(nodal) == 1:
             gradient = point.gradient(self.scalar, point.gradients[nodal[0]])
-            gradient += (
-                (self._with_stretch(nodal[0])[9:, :]).T @ self.by_stretch
-            )
+            gradient += (self._with_stretch(nodal[0])[9:, :]).T @ self.by_stretch
             return (
                 gradient
                 if len(by) == 1
-                else point.jacobian(
-                    gradient, point.stack_differentiated_constants()
-                )
+                else point.jacobian(gradient, point.stack_differentiated_constants())
             )
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
-        by_s, _ = _logarithm_derivatives(
-            shape.volumes, shape.volume, weights=self.slopes
-        )
+        by_s, _ = _logarithm_derivatives(shape.volumes, shape.volume, weights=self.slopes)
         by_own, second_by_own = _logarithm_derivatives(
             shape.own_volumes, point.mesh_volume, weights=self.by_stretch
         )
         second_volumes = ca.jacobian(
-            ca.gradient(
-                ca.dot(weights, shape.own_volumes), point.gradients[alpha]
-            ),
+            ca.gradient(ca.dot(weights, shape.own_volumes), point.gradients[alpha]),
             point.gradients[beta],
         )
         weight_values = by_s.T @ self.slopes - by_own.T @ self.by_stretch
         return (
-            self._with_stretch(alpha).T
-            @ self._hessian(alpha, beta)
-            @ self._with_stretch(beta)
-            - shape.volume_derivative(alpha).T
-            @ second_by_own
-            @ shape.volume_derivative(beta)
+            self._with_stretch(alpha).T @ self._hessian(alpha, beta) @ self._with_stretch(beta)
+            - shape.volume_derivative(alpha).T @ second_by_own @ shape.volume_derivative(beta)
             + ca.substitute(second_volumes, weights, weight_values)
         )
 
     def _with_stretch(self, field: str) -> ca.SX:
         """Return ∂(F, m)/∂F at fixed s, or the same for the gradient of another field."""
         by_own, _ = _logarithm_derivatives(
-            self.shape.own_volumes,
-            self.shape.point.mesh_volume,
-            weights=self.by_stretch,
+            self.shape.own_volumes, self.shape.point.mesh_volume, weights=self.by_stretch
         )
-        return ca.vertcat(
-            ca.SX.eye(9), -by_own @ self.shape.volume_derivative(field)
-        )
+        return ca.vertcat(ca.SX.eye(9), -by_own @ self.shape.volume_derivative(field))
 
     def _hessian(self, alpha: str, beta: str) -> ca.SX:
         """Return the second derivatives of g by (gradient, m) of two fields."""
@@ -327,18 +277,14 @@ class _ScalarDerivatives:
         return from_lower_triangle(hessian) if alpha == beta else hessian
 
 
-def _scalar_derivatives(
-    shape: _VolumeSums, outputs: Outputs
-) -> dict[int, _ScalarDerivatives]:
+def _scalar_derivatives(shape: _VolumeSums, outputs: Outputs) -> dict[int, _ScalarDerivatives]:
     """Return the chain rule of each scalar in the outputs, by the identity of the scalar."""
     terms = [term for those in outputs.values() for term in those]
     chains: dict[int, _ScalarDerivatives] = {}
     for term in terms:
         if id(term.scalar) not in chains:
             number = len(chains)
-            parts = {
-                other.part for other in terms if other.scalar is term.scalar
-            }
+            parts = {other.part for other in terms if other.scalar is term.scalar}
             # Where all is symmetric, what is by v is among what is by x.
             fields = ("x",) if parts == {"whole"} else ("x", "v")
             slopes = ca.SX.sym(f"slopes_{number}", shape.count)
@@ -349,21 +295,14 @@ def _scalar_derivatives(
 
 
 def _coupling(
-    shape: _VolumeSums,
-    chains: dict[int, _ScalarDerivatives],
-    outputs: Outputs,
-    order: int,
+    shape: _VolumeSums, chains: dict[int, _ScalarDerivatives], outputs: Outputs, order: int
 ) -> ca.Function:
     """Return the coupling of each output as a function of all sums over the points: C of order 1 or
     D of order 2, see `kernel`.
     """
     count = shape.count
     constants = shape.point.stack_differentiated_constants().numel()
-    sums = [
-        shape.volume,
-        shape.volumes,
-        *(chain.slopes for chain in chains.values()),
-    ]
+    sums = [shape.volume, shape.volumes, *(chain.slopes for chain in chains.values())]
     blocks = {"volumes": slice(0, count)}
     seconds = {}
     by_thetas = {}
@@ -381,10 +320,7 @@ def _coupling(
         total = ca.SX(0, 0)
         if terms[0].choose_contraction() != "none":
             width = constants if "theta" in terms[0].by else 1
-            total = ca.SX(
-                size,
-                size if terms[0].choose_contraction() == "pairs" else width,
-            )
+            total = ca.SX(size, size if terms[0].choose_contraction() == "pairs" else width)
         for term in terms:
             chain = chains[id(term.scalar)]
             by_s, second_of_logarithm = _logarithm_derivatives(
@@ -392,30 +328,15 @@ def _coupling(
             )
             if term.choose_contraction() == "nodes":
                 relation = shape.relation_to_x(term.by[0])
-                slopes = (
-                    by_thetas[id(term.scalar)]
-                    if "theta" in term.by
-                    else chain.slopes
-                )
+                slopes = by_thetas[id(term.scalar)] if "theta" in term.by else chain.slopes
                 total[:count, :] += (by_s @ relation).T @ slopes
             elif term.choose_contraction() == "pairs":
-                second = (
-                    by_s.T @ seconds[id(term.scalar)] @ by_s
-                    + second_of_logarithm
-                )
+                second = by_s.T @ seconds[id(term.scalar)] @ by_s + second_of_logarithm
                 total += _pair_coupling(
-                    shape,
-                    chain,
-                    blocks=blocks,
-                    size=size,
-                    term=term,
-                    by_s=by_s,
-                    second=second,
+                    shape, chain, blocks=blocks, size=size, term=term, by_s=by_s, second=second
                 )
         couplings.append(total)
-    return ca.Function(
-        "coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs)
-    )
+    return ca.Function("coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs))
 
 
 def _pair_coupling(
@@ -427,22 +348,7 @@ def _pair_coupling(
     by_s: ca.SX,
     second: ca.SX,
 ) -> ca.SX:
-    """Return D of a second derivative by two fields, or of its symmetric or skew part.
-
-    Parameters
-    ----------
-    shape : _VolumeSums
-    chain : _ScalarDerivatives
-    blocks : dict
-        Slices of the coupled node vectors, by their names.
-    size : int
-        Number of coupled node vectors.
-    term : Derivative
-    by_s : SX
-        Derivative ∂n/∂s.
-    second : SX
-        Coupling of ∂s/∂α with ∂s/∂β.
-    """
+    """Return D of a second derivative by two fields, or of its symmetric or skew part."""
     alpha, beta = term.by
     of_alpha = shape.relation_to_x(alpha)
     of_beta = shape.relation_to_x(beta)
@@ -451,32 +357,17 @@ def _pair_coupling(
     coupling[volume_block, volume_block] = of_alpha.T @ second @ of_beta
     coupling[blocks[chain.sum_name(alpha)], volume_block] = by_s @ of_beta
     if beta in chain.fields:
-        coupling[volume_block, blocks[chain.sum_name(beta)]] = (
-            of_alpha.T @ by_s.T
-        )
+        coupling[volume_block, blocks[chain.sum_name(beta)]] = of_alpha.T @ by_s.T
     else:
-        coupling[volume_block, blocks[chain.sum_name(alpha)]] = (
-            of_beta.T @ by_s.T
-        )
+        coupling[volume_block, blocks[chain.sum_name(alpha)]] = of_beta.T @ by_s.T
     if term.part == "whole":
         return coupling
-    return (
-        coupling + coupling.T
-        if term.part == "symmetric"
-        else coupling - coupling.T
-    ) / 2
+    return (coupling + coupling.T if term.part == "symmetric" else coupling - coupling.T) / 2
 
 
 def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
     """Return n: ⅓ ln(v/V), its derivative along the velocities, and the derivatives of both along
     w.
-
-    Parameters
-    ----------
-    volumes : (1, 2 or 4,) SX
-        Deformed volume v [m³], and its derivatives in the same order; as many entries are returned.
-    volume : SX
-        Undeformed volume V [m³].
     """
     s = ca.SX.sym("s", volumes.numel())
     n = ca.log(s[0] / volume) / 3
@@ -486,9 +377,7 @@ def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
     return ca.substitute(n, s, volumes)
 
 
-def _logarithm_derivatives(
-    volumes: ca.SX, volume: ca.SX, weights: ca.SX
-) -> tuple[ca.SX, ca.SX]:
+def _logarithm_derivatives(volumes: ca.SX, volume: ca.SX, weights: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return ∂n/∂s and Σ_k weights_k ∂²n_k/∂s² of the function n of `_volume_logarithms`, with s =
     `volumes`, at the undeformed `volume`.
     """

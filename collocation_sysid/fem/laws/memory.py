@@ -65,11 +65,7 @@ class MemoryInput:
             Index of the part.
         """
         values = self.stiffening[:, part]
-        starts = [
-            0,
-            *(np.flatnonzero(np.diff(values)) + 1).tolist(),
-            len(values),
-        ]
+        starts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
         for start, stop in itertools.pairwise(starts):
             if stop > start:
                 yield slice(start, stop), float(values[start])
@@ -123,10 +119,7 @@ class MemoryLayout:
         """First column of each part in the row, then the length of the row; a part without memory
         has no columns.
         """
-        sizes = [
-            6 * self.points_per_element * len(p.cells) if p.prony else 0
-            for p in self.parts
-        ]
+        sizes = [6 * self.points_per_element * len(p.cells) if p.prony else 0 for p in self.parts]
         return [0, *np.cumsum(sizes).tolist()]
 
     @property
@@ -147,11 +140,7 @@ class MemoryLayout:
         indices = np.arange(cells * self.points_per_element).reshape(
             cells, self.points_per_element, 1
         )
-        return (
-            self.starts[number]
-            + indices
-            + cells * self.points_per_element * np.arange(6)
-        )
+        return self.starts[number] + indices + cells * self.points_per_element * np.arange(6)
 
     @cached_property
     def branches(self) -> list[BranchIndices]:
@@ -176,8 +165,9 @@ class MemoryLayout:
         return branches
 
     def to_branches(self, values: Array) -> Array:
-        """Return values (…, all branches) from values (…, width) for each point: those of a part are
-        repeated for each of its branches. A view with a single branch; there must be at least one.
+        """Return values (…, all branches) from values (…, width) for each point: those of a part
+        are repeated for each of its branches. A view with a single branch; there must be at least
+        one.
         """
         parts = [values[..., branch.points] for branch in self.branches]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
@@ -204,22 +194,14 @@ class MemoryLayout:
         """
         if len(self.branches) == 1:
             return values[0][..., None]
-        sizes = [
-            branch.columns.stop - branch.columns.start
-            for branch in self.branches
-        ]
+        sizes = [branch.columns.stop - branch.columns.start for branch in self.branches]
         return np.moveaxis(np.repeat(values, sizes, axis=0), 0, -1)
 
     def sum_over_points(self, values: Array) -> Array:
         """Return the sums (branches, …) over all entries of values (…, all branches) of each
         branch.
         """
-        return np.stack(
-            [
-                values[..., branch.columns].sum(axis=-1)
-                for branch in self.branches
-            ]
-        )
+        return np.stack([values[..., branch.columns].sum(axis=-1) for branch in self.branches])
 
     def relaxed(self, states: int) -> MemoryInput:
         """Return the contribution of a memory that has relaxed, at a number of states: all zero,

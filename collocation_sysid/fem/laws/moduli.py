@@ -51,12 +51,8 @@ class ConstantSource:
         values : mapping
             Numbers or expressions by the names of the parameters; further ones are ignored.
         """
-        by_constant = {
-            own_values: values[name] for own_values, name in self.names.items()
-        }
-        missing = [
-            c.name for c in self.material.constants if c.name not in by_constant
-        ]
+        by_constant = {own_values: values[name] for own_values, name in self.names.items()}
+        missing = [c.name for c in self.material.constants if c.name not in by_constant]
         if not missing:
             return by_constant
         if "mu_pa" in by_constant:
@@ -65,9 +61,7 @@ class ConstantSource:
             mu = by_constant["young_pa"] / (2 * (1 + by_constant["poisson"]))
         else:
             # With κ = λ = 0 what is left of the shear modulus is the own constants'.
-            own_values = [
-                by_constant.get(c.name, 0.0) for c in self.material.constants
-            ]
+            own_values = [by_constant.get(c.name, 0.0) for c in self.material.constants]
             mu = self.material.lame(ca.vertcat(*own_values))[1]
         if "lambda_pa" in by_constant:
             lame = by_constant["lambda_pa"]
@@ -76,19 +70,11 @@ class ConstantSource:
         else:
             nu = by_constant["poisson"]
             lame = 2 * mu * nu / (1 - 2 * nu)
-        return {
-            **by_constant,
-            "mu_pa": mu,
-            "lambda_pa": lame,
-            "kappa_pa": lame + 2 / 3 * mu,
-        }
+        return {**by_constant, "mu_pa": mu, "lambda_pa": lame, "kappa_pa": lame + 2 / 3 * mu}
 
 
 def find_source(
-    region: str,
-    material: Material,
-    others: Iterable[Constant],
-    known: Sequence[str],
+    region: str, material: Material, others: Iterable[Constant], known: Sequence[str]
 ) -> ConstantSource:
     """Find the constants of a region among the names of the given parameters.
 
@@ -123,27 +109,18 @@ def find_source(
 
     material_constants = [c.name for c in material.constants]
     elastic = _elastic_choices(material_constants)
-    plain = [
-        own for own in material_constants if not (elastic and own in ELASTIC)
-    ]
+    plain = [own for own in material_constants if not (elastic and own in ELASTIC)]
     plain += [c.name for c in others]
     names = {own: name for own in plain if (name := name_of(own)) is not None}
     where = f"region '{region}'" if region else "the body"
     subject = f"the material {material.name} of {where}"
     if elastic:
-        specific = {
-            own for own in ELASTIC if region and f"{region}.{own}" in known
-        }
+        specific = {own for own in ELASTIC if region and f"{region}.{own}" in known}
         available = {own for own in ELASTIC if name_of(own) is not None}
-        fitting = [
-            c for c in elastic if set(c) <= available and specific <= set(c)
-        ]
+        fitting = [c for c in elastic if set(c) <= available and specific <= set(c)]
         if len(fitting) != 1:
             source_names = (
-                ", ".join(
-                    str(name_of(own)) for own in ELASTIC if own in available
-                )
-                or "none"
+                ", ".join(str(name_of(own)) for own in ELASTIC if own in available) or "none"
             )
             raise InputError(
                 f"the elastic parameters of {where} are {source_names}; {subject} expects "
@@ -178,15 +155,11 @@ def _elastic_choices(owns: Sequence[str]) -> tuple[tuple[str, ...], ...]:
 
 
 def elastic_names(material: Material) -> tuple[str, ...]:
-    """Return the names of elastic parameters that can state or replace a material's constants, without
-    repetitions; empty for a material without λ and κ.
+    """Return the names of elastic parameters that can state or replace a material's constants,
+    without repetitions; empty for a material without λ and κ.
     """
     owns = [c.name for c in material.constants]
-    return tuple(
-        dict.fromkeys(
-            name for choice in _elastic_choices(owns) for name in choice
-        )
-    )
+    return tuple(dict.fromkeys(name for choice in _elastic_choices(owns) for name in choice))
 
 
 def _alternatives(elastic: Sequence[Sequence[str]]) -> str:

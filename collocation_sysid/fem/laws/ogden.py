@@ -54,11 +54,7 @@ class PowerLawEnergy:
         """Return the energy density at a deformation gradient F (3, 3) as one expression."""
         first, second, ratio = ca.vertsplit(reduced_invariants(F))
         traces = PowerTraces(first, second)
-        return self.density(
-            ratio,
-            lambda alpha: traces.scaled_excess(alpha)(()),
-            constants,
-        )
+        return self.density(ratio, lambda alpha: traces.scaled_excess(alpha)(()), constants)
 
     def symbolic(self, F: ca.SX, values: ca.SX) -> SymbolicFunction:
         """Return the energy density as a function of the invariants of F and the constants.
@@ -74,9 +70,7 @@ class PowerLawEnergy:
         arguments = ca.vertcat(reduced_invariants(F), values)
         y = ca.SX.sym("y", arguments.numel())
         first, second, ratio = ca.vertsplit(y[:INVARIANTS])
-        constants = {
-            name: y[INVARIANTS + k] for k, name in enumerate(self.names)
-        }
+        constants = {name: y[INVARIANTS + k] for k, name in enumerate(self.names)}
         traces = PowerTraces(first, second)
         excesses: list[SymbolicFunction] = []
 
@@ -84,30 +78,23 @@ class PowerLawEnergy:
             """Return the symbol of the scaled excess for an exponent."""
             partial = traces.scaled_excess(alpha)
             excess = SymbolicFunction(
-                ca.vertcat(first, second, alpha),
-                lambda indices: list(map(partial, indices)),
+                ca.vertcat(first, second, alpha), lambda indices: list(map(partial, indices))
             )
             excesses.append(excess)
             return excess.symbol()
 
-        partials: dict[PartialIndex, ca.SX] = {
-            (): self.density(ratio, scaled_excess, constants)
-        }
+        partials: dict[PartialIndex, ca.SX] = {(): self.density(ratio, scaled_excess, constants)}
         rule = ChainRule(tuple(excesses))
 
         def partial(index: PartialIndex) -> ca.SX:
             """Return a partial derivative in y and the symbols of the traces."""
             if index not in partials:
-                partials[index] = rule.jacobian(
-                    partial(index[:-1]), y[index[-1]]
-                )
+                partials[index] = rule.jacobian(partial(index[:-1]), y[index[-1]])
             return partials[index]
 
         def evaluate(indices: Sequence[PartialIndex]) -> list[ca.SX]:
             """Return partial derivatives at the arguments."""
-            return ca.substitute(
-                rule.eliminate(list(map(partial, indices))), [y], [arguments]
-            )
+            return ca.substitute(rule.eliminate(list(map(partial, indices))), [y], [arguments])
 
         return SymbolicFunction(arguments, evaluate)
 
@@ -117,11 +104,7 @@ def ogden(terms: int) -> PowerLawEnergy:
 
     Its constants are ``mu_1_pa, alpha_1, mu_2_pa, …`` and, last, ``kappa_pa``.
     """
-    names = [
-        name
-        for p in range(1, terms + 1)
-        for name in (f"mu_{p}_pa", f"alpha_{p}")
-    ]
+    names = [name for p in range(1, terms + 1) for name in (f"mu_{p}_pa", f"alpha_{p}")]
     return PowerLawEnergy(_ogden_density, (*names, "kappa_pa"))
 
 
@@ -131,9 +114,7 @@ def hyperfoam(terms: int) -> PowerLawEnergy:
     Its constants are ``mu_1_pa, alpha_1, beta_1, mu_2_pa, …``.
     """
     names = [
-        name
-        for p in range(1, terms + 1)
-        for name in (f"mu_{p}_pa", f"alpha_{p}", f"beta_{p}")
+        name for p in range(1, terms + 1) for name in (f"mu_{p}_pa", f"alpha_{p}", f"beta_{p}")
     ]
     return PowerLawEnergy(_hyperfoam_density, tuple(names))
 
@@ -155,17 +136,7 @@ def term_numbers(names: Iterable[str]) -> range:
 def _ogden_density(
     ratio: ca.SX, scaled_excess: ScaledExcess, constants: Mapping[str, ca.SX]
 ) -> ca.SX:
-    """Return the energy density of Ogden's material.
-
-    Parameters
-    ----------
-    ratio : SX
-        J.
-    scaled_excess : callable
-        (tr C̄^(α/2) − 3)/α² as a function of α.
-    constants : mapping of str to SX
-        Constants by name, see `ogden`; their number determines the number of terms.
-    """
+    """Return the energy density of Ogden's material."""
     energy = 0.5 * constants["kappa_pa"] * (ratio - 1) ** 2
     for p in term_numbers(constants):
         alpha = constants[f"alpha_{p}"]

@@ -81,14 +81,10 @@ class PowerTraces:
         growth = (2 - 3 * t / (1 + t), 1 - 3 * t / (1 + t))
         self._reciprocal = 1 / (1 + self._linear(*self._slopes))
         # d ln z/du at the nodes.
-        self._rates = self._linear(
-            *(g * s for g, s in zip(growth, self._slopes, strict=True))
-        )
+        self._rates = self._linear(*(g * s for g, s in zip(growth, self._slopes, strict=True)))
         self._rates *= self._reciprocal
         self._series = _integer_power_traces(first_excess, second_excess)
-        self._opposite_series = _integer_power_traces(
-            second_excess, first_excess
-        )
+        self._opposite_series = _integer_power_traces(second_excess, first_excess)
         self.functions = cache(self._functions)
 
     def scaled_excess(self, alpha: ca.SX) -> Partials:
@@ -128,28 +124,14 @@ class PowerTraces:
             first = index.count(0)
             second = index.count(1)
             chosen = weights if first + second else value_weights
-            by_exponent = tuple(
-                argument for argument in index if argument == EXPONENT
-            )
-            return ca.dot(
-                chosen(by_exponent),
-                self.functions(parity, first, second_order=second),
-            )
+            by_exponent = tuple(argument for argument in index if argument == EXPONENT)
+            return ca.dot(chosen(by_exponent), self.functions(parity, first, second_order=second))
 
         return cache(partial)
 
-    def _functions(
-        self, parity: Parity, first_order: int = 0, second_order: int = 0
-    ) -> ca.SX:
+    def _functions(self, parity: Parity, first_order: int = 0, second_order: int = 0) -> ca.SX:
         """Return the functions (NODES + TAIL_TERMS,) that a sum consists of, at the nodes and for
         the series beyond them, or partial derivatives.
-
-        Parameters
-        ----------
-        parity : {"even", "odd"}
-        first_order, second_order : int
-            Orders of the derivative by Ī₁ − 3 and Ī₂ − 3. If both are zero, the functions are those
-            of the sum by parts.
         """
         sign = 1 if parity == "even" else -1
         order = first_order + second_order
@@ -165,17 +147,12 @@ class PowerTraces:
         beyond = self._series + sign * self._opposite_series
         for argument, count in enumerate((first_order, second_order)):
             for _ in range(count):
-                beyond = ca.densify(
-                    ca.jacobian(beyond, self.excesses[argument])
-                )
+                beyond = ca.densify(ca.jacobian(beyond, self.excesses[argument]))
         return ca.vertcat(at_nodes, beyond)
 
     def _linear(self, by_first: Array, by_second: Array) -> ca.SX:
         """Return a linear combination of the excesses with coefficients (2 NODES,)."""
-        return (
-            ca.DM(by_first) * self.excesses[0]
-            + ca.DM(by_second) * self.excesses[1]
-        )
+        return ca.DM(by_first) * self.excesses[0] + ca.DM(by_second) * self.excesses[1]
 
 
 def _nodes() -> Array:
@@ -189,11 +166,7 @@ def _weights(parity: Parity, alpha: ca.SX) -> ca.SX:
     beyond them, see `_exponentials`.
     """
     growing, decaying = _exponentials(alpha)
-    return (
-        (growing + decaying) / 2
-        if parity == "even"
-        else (growing - decaying) / 2
-    )
+    return (growing + decaying) / 2 if parity == "even" else (growing - decaying) / 2
 
 
 def _value_weights(parity: Parity, alpha: ca.SX) -> ca.SX:
@@ -205,9 +178,7 @@ def _value_weights(parity: Parity, alpha: ca.SX) -> ca.SX:
     """
     s = alpha / 2 ** (DOUBLINGS + 1)
     safe_alpha = ca.if_else(
-        ca.fabs(s) < SMALLEST_EXPONENT,
-        SMALLEST_EXPONENT * 2 ** (DOUBLINGS + 1),
-        alpha,
+        ca.fabs(s) < SMALLEST_EXPONENT, SMALLEST_EXPONENT * 2 ** (DOUBLINGS + 1), alpha
     )
     # By parts, a term of the series that decays like e^(−ku) has the factor k.
     factors = ca.DM([1.0] * NODES + list(range(1, TAIL_TERMS + 1)))
@@ -253,26 +224,13 @@ def _integer_power_traces(first_excess: ca.SX, second_excess: ca.SX) -> ca.SX:
     return ca.vertcat(*(trace - 3 for trace in traces[1 : TAIL_TERMS + 1]))
 
 
-def _doubled(
-    excess: Partials, opposite: Partials, square: Partials
-) -> Partials:
+def _doubled(excess: Partials, opposite: Partials, square: Partials) -> Partials:
     """Return the partial derivatives of the scaled excess (tr C̄^(2s) − 3)/(2s)².
 
     With x = tr C̄ˢ − 3 and y = tr C̄⁻ˢ − 3 the excess at 2s is 6x + x² − 2y.
-
-    Parameters
-    ----------
-    excess, opposite : functions of a PartialIndex
-        Partial derivatives of x/s² and y/s².
-    square : function of a PartialIndex
-        Partial derivatives of s².
     """
     product = _product(square, _product(excess, excess))
-    return cache(
-        lambda index: (
-            (6 * excess(index) + product(index) - 2 * opposite(index)) / 4
-        )
-    )
+    return cache(lambda index: (6 * excess(index) + product(index) - 2 * opposite(index)) / 4)
 
 
 def _product(first: Partials, second: Partials) -> Partials:
@@ -284,14 +242,9 @@ def _product(first: Partials, second: Partials) -> Partials:
         """Return the partial derivative of the product with an index."""
         counts = [index.count(argument) for argument in range(EXPONENT + 1)]
         total = ca.SX(0)
-        for orders in itertools.product(
-            *(range(count + 1) for count in counts)
-        ):
+        for orders in itertools.product(*(range(count + 1) for count in counts)):
             ways = math.prod(map(math.comb, counts, orders))
-            rest = [
-                count - order
-                for count, order in zip(counts, orders, strict=True)
-            ]
+            rest = [count - order for count, order in zip(counts, orders, strict=True)]
             total += ways * first(_index(orders)) * second(_index(rest))
         return total
 
@@ -300,9 +253,7 @@ def _product(first: Partials, second: Partials) -> Partials:
 
 def _index(orders: Sequence[int]) -> PartialIndex:
     """Return the index of a partial derivative from the order by each argument."""
-    return tuple(
-        argument for argument, order in enumerate(orders) for _ in range(order)
-    )
+    return tuple(argument for argument, order in enumerate(orders) for _ in range(order))
 
 
 def _exponent_partials(expression: ca.SX, alpha: ca.SX) -> Partials:

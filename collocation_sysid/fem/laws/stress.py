@@ -37,16 +37,14 @@ Expression = Callable[[QuadraturePoint, PointLaw], ca.SX]
 
 def _stress_by_theta(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂S by the material's constants and the logarithm of a field, column after column."""
-    slope = point.jacobian(
-        second_piola(point, law), point.stack_differentiated_constants()
-    )
+    slope = point.jacobian(second_piola(point, law), point.stack_differentiated_constants())
     of_field = slope[:, law.count_constants() :]
     return ca.vec(ca.horzcat(slope[:, : len(law.material.constants)], of_field))
 
 
 def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the entries (6,) of dS along velocities v, the second field of a point: dS = F⁻¹ (dP − dF
-    S).
+    """Return the entries (6,) of dS along velocities v, the second field of a point: dS = F⁻¹ (dP −
+    dF S).
     """
     F = point.gradients["x"]
     piola = first_piola(point, law)
@@ -61,8 +59,7 @@ def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 def _stress_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return (∂S/∂x)ᵀ σ of a point (9,), with the weights σ (6,) as its internal variables."""
     return point.gradient(
-        ca.dot(point.select_internal_variables(), second_piola(point, law)),
-        point.gradients["x"],
+        ca.dot(point.select_internal_variables(), second_piola(point, law)), point.gradients["x"]
     )
 
 
@@ -75,9 +72,7 @@ def _memory_force(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 def _memory_force_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return (∂f_H/∂H)ᵀ v (6,) of a point, for velocities v as its second field."""
-    power = ca.jtimes(
-        -memory_energy(point), point.gradients["x"], point.gradients["v"]
-    )
+    power = ca.jtimes(-memory_energy(point), point.gradients["x"], point.gradients["v"])
     return ca.gradient(power, point.select_internal_variables())
 
 
@@ -88,9 +83,7 @@ def _stress_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 def _memory_force_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂f_H/∂H (9, 6) of a point, to be contracted to nodes."""
-    return ca.jacobian(
-        _memory_force(point, law), point.select_internal_variables()
-    )
+    return ca.jacobian(_memory_force(point, law), point.select_internal_variables())
 
 
 # Expression, node fields, number of data of a point, and contraction of each kernel.
@@ -109,24 +102,18 @@ KERNELS: dict[str, tuple[Expression, tuple[str, ...], int, Contraction]] = {
 def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel that the line `name` of `KERNELS` states, for an element and a law."""
     expression, fields, has_internal_variables, contraction = KERNELS[name]
-    point = quadrature_point(
-        element, law, *fields, internal_variable_count=has_internal_variables
-    )
+    point = quadrature_point(element, law, *fields, internal_variable_count=has_internal_variables)
     piece = expression(point, law)
-    if not ca.depends_on(
-        piece, point.point_data
-    ):  # H has gone from what is linear in it
-        point = replace(
-            point, stretches=(), point_data=ca.SX(0, 1), scaled_indices=()
-        )
+    if not ca.depends_on(piece, point.point_data):  # H has gone from what is linear in it
+        point = replace(point, stretches=(), point_data=ca.SX(0, 1), scaled_indices=())
     phase = point.make_phase(name, {name: (contraction, piece)})
     return ElementKernel(phase.pieces, fields, contractions=phase.contractions)
 
 
 @dataclass(frozen=True, eq=False)
 class JacobianEntries:
-    """Point value and dof of each entry of `stress_jacobian` and `memory_force_jacobian`; entries of
-    the same place add up.
+    """Point value and dof of each entry of `stress_jacobian` and `memory_force_jacobian`; entries
+    of the same place add up.
 
     Attributes
     ----------
@@ -166,9 +153,7 @@ class StressEvaluator:
         """Return S (T, width) [Pa] at positions x (T, 3n) and constants θ."""
         return self._evaluate_at_points("stress", [x], theta=theta)
 
-    def stress_theta_derivatives(
-        self, x: Array, theta: Array, theta_q: Array
-    ) -> Array:
+    def stress_theta_derivatives(self, x: Array, theta: Array, theta_q: Array) -> Array:
         """Return the derivatives of S along directions in θ, ∂S/∂θ θ_q (T, q, width), at positions
         x (T, 3n) and θ (k,), for q directions θ_q (k, q).
         """
@@ -181,37 +166,19 @@ class StressEvaluator:
                 field = part.stress_field
                 out = np.zeros((len(x), (count + bool(field)) * places.size))
                 self._evaluate_part(
-                    "stress_by_theta",
-                    number,
-                    fields=[x],
-                    theta=theta,
-                    out=out,
-                    add=False,
+                    "stress_by_theta", number, fields=[x], theta=theta, out=out, add=False
                 )
                 first = body.starts[number]
-                part_columns = slice(
-                    places[0, 0, 0], places[0, 0, 0] + places.size
-                )
+                part_columns = slice(places[0, 0, 0], places[0, 0, 0] + places.size)
                 by_constant = out.reshape(len(x), -1, places.size)
-                for k, j in zip(
-                    *np.nonzero(theta_q[first : first + count]), strict=True
-                ):
-                    derivatives[:, j, part_columns] += (
-                        theta_q[first + k, j] * by_constant[:, k]
-                    )
+                for k, j in zip(*np.nonzero(theta_q[first : first + count]), strict=True):
+                    derivatives[:, j, part_columns] += theta_q[first + k, j] * by_constant[:, k]
                 if field:
                     field_columns = body.field_slices[number]
-                    logs = (
-                        field.jacobian(theta[field_columns])
-                        @ theta_q[field_columns]
-                    )
+                    logs = field.jacobian(theta[field_columns]) @ theta_q[field_columns]
                     for j in np.flatnonzero(logs.any(axis=0)):
-                        point_values = np.tile(
-                            np.repeat(logs[:, j], body.geometry.shape[1]), 6
-                        )
-                        derivatives[:, j, part_columns] += (
-                            point_values * by_constant[:, count]
-                        )
+                        point_values = np.tile(np.repeat(logs[:, j], body.geometry.shape[1]), 6)
+                        derivatives[:, j, part_columns] += point_values * by_constant[:, count]
         return derivatives
 
     def stress_jvp(
@@ -221,31 +188,23 @@ class StressEvaluator:
 
         With `out` (T, width) the result is added to it in place, and `out` is returned.
         """
-        return self._evaluate_at_points(
-            "stress_along", [x, direction], theta=theta, out=out
-        )
+        return self._evaluate_at_points("stress_along", [x, direction], theta=theta, out=out)
 
     def stress_vjp(self, x: Array, weights: Array, theta: Array) -> Array:
-        """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width) of the entries of S, at positions x
-        (T, 3n) and θ (k,).
+        """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width) of the entries of S, at positions
+        x (T, 3n) and θ (k,).
         """
-        return self._evaluate_at_nodes(
-            "pulled", [x], theta=theta, point_data=weights
-        )
+        return self._evaluate_at_nodes("pulled", [x], theta=theta, point_data=weights)
 
     def memory_force(self, x: Array, overstress: Array, theta: Array) -> Array:
         """Return f_H (T, 3n) [N] at positions x (T, 3n): linear in H (`overstress`, (T, width)
         [Pa]).
         """
-        return self._evaluate_at_nodes(
-            "carried_force", [x], theta=theta, point_data=overstress
-        )
+        return self._evaluate_at_nodes("carried_force", [x], theta=theta, point_data=overstress)
 
-    def memory_force_vjp(
-        self, x: Array, direction: Array, theta: Array
-    ) -> Array:
-        """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n) in the space of forces, at
-        positions x (T, 3n).
+    def memory_force_vjp(self, x: Array, direction: Array, theta: Array) -> Array:
+        """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n) in the space of forces,
+        at positions x (T, 3n).
         """
         return self._evaluate_at_points("against", [x, direction], theta=theta)
 
@@ -259,12 +218,8 @@ class StressEvaluator:
                 part_columns = self.body.memory.part_columns(number)
                 of_cells = dofs_of(self.body.cells[part.cells])
                 shape = (*part_columns.shape, of_cells.shape[1])
-                points.append(
-                    np.broadcast_to(part_columns[..., None], shape).ravel()
-                )
-                dofs.append(
-                    np.broadcast_to(of_cells[:, None, None], shape).ravel()
-                )
+                points.append(np.broadcast_to(part_columns[..., None], shape).ravel())
+                dofs.append(np.broadcast_to(of_cells[:, None, None], shape).ravel())
         return JacobianEntries(np.concatenate(points), np.concatenate(dofs))
 
     def stress_jacobian(self, x: Array, theta: Array) -> Array:
@@ -287,48 +242,18 @@ class StressEvaluator:
         return self._evaluate_all_parts(name, [x], theta=theta, out=out)
 
     def _evaluate_at_points(
-        self,
-        name: str,
-        fields: list[Array],
-        theta: Array,
-        out: Array | None = None,
+        self, name: str, fields: list[Array], theta: Array, out: Array | None = None
     ) -> Array:
-        """Return values at points (T, width) of a kernel, added to `out` in place if it is given.
-
-        Parameters
-        ----------
-        name : str
-            Kernel in `KERNELS`.
-        fields : list of (T, 3n)
-            Node fields.
-        theta : (k,)
-        out : (T, width), optional
-            Array to add to; zeros by default.
-        """
+        """Return values at points (T, width) of a kernel, added to `out` in place if it is given."""
         out = np.zeros((len(fields[0]), self.width)) if out is None else out
         return self._evaluate_all_parts(name, fields, theta=theta, out=out)
 
     def _evaluate_at_nodes(
         self, name: str, fields: list[Array], theta: Array, point_data: Array
     ) -> Array:
-        """Return node values (T, 3n) of a kernel.
-
-        Parameters
-        ----------
-        name : str
-            Kernel in `KERNELS`.
-        fields : list of (T, 3n)
-            Node fields.
-        theta : (k,)
-        point_data : (T, width)
-            Data of the points: H or weights.
-        """
+        """Return node values (T, 3n) of a kernel."""
         return self._evaluate_all_parts(
-            name,
-            fields,
-            theta=theta,
-            out=np.zeros_like(fields[0]),
-            point_data=point_data,
+            name, fields, theta=theta, out=np.zeros_like(fields[0]), point_data=point_data
         )
 
     def _evaluate_all_parts(
@@ -339,21 +264,7 @@ class StressEvaluator:
         out: Array,
         point_data: Array | None = None,
     ) -> Array:
-        """Add the results of a kernel for all parts with memory to `out`, in place, and return it.
-
-        Parameters
-        ----------
-        name : str
-            Kernel in `KERNELS`.
-        fields : list of (T, 3n)
-            Node fields: positions, and further vectors if the kernel has them.
-        theta : (k,)
-            Constants θ of the complete body.
-        out : (T, values of the kernel)
-            Array to add to; parts without memory do not change it.
-        point_data : (T, width), optional
-            Data of the points: H or weights. None for kernels that read none.
-        """
+        """Add the results of a kernel for all parts with memory to `out`, in place, and return it."""
         for number, part in enumerate(self.body.parts):
             if part.prony:
                 self._evaluate_part(
@@ -379,38 +290,15 @@ class StressEvaluator:
     ) -> None:
         """Evaluate a kernel for one part; its evaluator is built at the first use. Up to
         `SINGLE_THREAD_STATES` states run on one thread.
-
-        Parameters
-        ----------
-        name : str
-            Kernel in `KERNELS`.
-        number : int
-            Index of the part.
-        fields : list of (T, 3n)
-            Node fields.
-        theta : (k,)
-            Constants of the complete body.
-        out : array
-            Result; overwritten, or added to if `add`.
-        add : bool
-        point_data : (T, width), optional
-            Data of the points: H or weights; None for kernels that read none.
         """
         body = self.body
         key = (name, number)
         with COMPILING:
             if key not in self._evaluators:
-                self._evaluators[key] = body.make_evaluator(
-                    self._batch(name, number)
-                )
+                self._evaluators[key] = body.make_evaluator(self._batch(name, number))
         first = body.starts[number]
-        values = np.array(
-            theta[first : first + body.parts[number].law_constant_count],
-            dtype=float,
-        )
-        part_point_data = body.point_data(
-            number, theta, internal_variables=point_data
-        )
+        values = np.array(theta[first : first + body.parts[number].law_constant_count], dtype=float)
+        part_point_data = body.point_data(number, theta, internal_variables=point_data)
         threads = body.threads if len(out) > SINGLE_THREAD_STATES else 1
         self._evaluators[key](
             [np.ascontiguousarray(field) for field in fields],
@@ -439,9 +327,7 @@ class StressEvaluator:
             # 3n for each of what the points carry, part after part.
             per_number = dofs_of(cells).shape[1]
             length = len(self.jacobian_entries.points)
-            point_offsets = np.arange(per_number * places.size).reshape(
-                len(cells), -1
-            )
+            point_offsets = np.arange(per_number * places.size).reshape(len(cells), -1)
             destinations = per_number * places[0, 0, 0] + point_offsets
         elif "nodes" in kernel.contractions.values():
             destinations = dofs_of(cells)
@@ -449,22 +335,18 @@ class StressEvaluator:
         elif name == "stress_by_theta":
             count = len(part.material.constants) + bool(part.stress_field)
             columns = places.size * np.arange(count)
-            destinations = (
-                columns[:, None] + point_columns - places[0, 0, 0]
-            ).reshape(len(cells), -1)
+            destinations = (columns[:, None] + point_columns - places[0, 0, 0]).reshape(
+                len(cells), -1
+            )
             length = places.size * len(columns)
         else:
             destinations = point_columns.reshape(len(cells), 6)
             length = self.width
-        internal_columns = (
-            point_columns if KERNELS[name][2] else point_columns[..., :0]
-        )
+        internal_columns = point_columns if KERNELS[name][2] else point_columns[..., :0]
         if part.stress_field:
             width = self.width if KERNELS[name][2] else 0
             logs = width + np.repeat(np.arange(len(part.cells)), points)
-            internal_columns = np.concatenate(
-                [internal_columns, logs[:, None, None]], axis=-1
-            )
+            internal_columns = np.concatenate([internal_columns, logs[:, None, None]], axis=-1)
         internal_columns = (
             internal_columns[..., : kernel.count_point_data()]
             if kernel.count_point_data()

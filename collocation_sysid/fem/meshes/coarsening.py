@@ -18,12 +18,7 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
 from .mesh import TetMesh, boundary_of
-from .mesh_checks import (
-    edge_lengths,
-    mean_ratios,
-    signed_volumes,
-    unique_edges,
-)
+from .mesh_checks import edge_lengths, mean_ratios, signed_volumes, unique_edges
 
 # Smallest mean ratio of a new element; where the old ones are worse, they must not deteriorate.
 LEAST_QUALITY = 0.15
@@ -68,10 +63,7 @@ class CoarseMesh:
 
 
 def coarsen_mesh(
-    mesh: TetMesh,
-    node_count: int,
-    node_labels: Index,
-    cell_groups: Index,
+    mesh: TetMesh, node_count: int, node_labels: Index, cell_groups: Index
 ) -> CoarseMesh:
     """Return a mesh of the same body with about the given number of nodes.
 
@@ -94,9 +86,7 @@ def coarsen_mesh(
     InputError
         If the coarse mesh is invalid.
     """
-    lengths_m = np.linalg.norm(
-        np.diff(mesh.points_m[mesh.edges], axis=1), axis=2
-    )
+    lengths_m = np.linalg.norm(np.diff(mesh.points_m[mesh.edges], axis=1), axis=2)
     ratio = len(mesh.points_m) / max(node_count, 4)
     coarse_edge_m = float(lengths_m.mean()) * ratio ** (1 / 3)
     state = _CollapseState(mesh, node_labels, cell_groups, coarse_edge_m)
@@ -148,11 +138,7 @@ class _CollapseState:
     """
 
     def __init__(
-        self,
-        mesh: TetMesh,
-        node_labels: Index,
-        cell_groups: Index,
-        coarse_edge_m: float,
+        self, mesh: TetMesh, node_labels: Index, cell_groups: Index, coarse_edge_m: float
     ) -> None:
         self.points = mesh.points_m - mesh.points_m.mean(axis=0)
         self.cells = np.array(mesh.tetrahedra)
@@ -188,11 +174,7 @@ class _CollapseState:
         coarse_index = np.full(len(self.points), -1)
         coarse_index[kept] = np.arange(len(kept))
         return CoarseMesh(
-            TetMesh(
-                mesh.points_m[kept],
-                coarse_index[self.cells],
-                is_generated=mesh.is_generated,
-            ),
+            TetMesh(mesh.points_m[kept], coarse_index[self.cells], is_generated=mesh.is_generated),
             kept_nodes=kept,
             coarse_nodes=coarse_index[self.moved_to],
             source_cells=self.sources,
@@ -203,10 +185,7 @@ class _CollapseState:
         corners.
         """
         groups = self.groups[self.sources]
-        faces = [
-            boundary_of(self.cells[groups == group])[0]
-            for group in np.unique(groups)
-        ]
+        faces = [boundary_of(self.cells[groups == group])[0] for group in np.unique(groups)]
         return np.unique(np.sort(np.concatenate(faces), axis=1), axis=0)
 
     def _set_quadrics(self) -> None:
@@ -237,9 +216,7 @@ class _CollapseState:
         on_surface[faces] = True
         pairs = np.concatenate([edges, edges[:, ::-1]])
         removed, kept = pairs.T
-        lengths = np.linalg.norm(
-            self.points[removed] - self.points[kept], axis=1
-        )
+        lengths = np.linalg.norm(self.points[removed] - self.points[kept], axis=1)
         is_allowed = (
             (self.labels[removed] == self.labels[kept])
             & (lengths <= LONGEST_EDGE * self.coarse_edge_m)
@@ -249,8 +226,7 @@ class _CollapseState:
         pairs = pairs[is_allowed]
         lengths = lengths[is_allowed]
         is_near_surface = (
-            self._surface_distances(*pairs.T)
-            <= SURFACE_TOLERANCE * self.coarse_edge_m
+            self._surface_distances(*pairs.T) <= SURFACE_TOLERANCE * self.coarse_edge_m
         )
         pairs = pairs[is_near_surface]
         order = np.lexsort((lengths[is_near_surface], pairs[:, 0]))
@@ -258,9 +234,7 @@ class _CollapseState:
         rank = np.arange(len(removed)) - np.searchsorted(removed, removed)
         return _Collapses(removed, kept).subset(rank < NEIGHBOURS)
 
-    def _stays_in_groups(
-        self, removed: Index, kept: Index
-    ) -> NDArray[np.bool_]:
+    def _stays_in_groups(self, removed: Index, kept: Index) -> NDArray[np.bool_]:
         """Return whether each kept node (k,) has elements of all groups of the removed one."""
         groups = self.groups[self.sources]
         in_group = np.zeros((len(self.points), int(groups.max()) + 1), bool)
@@ -275,9 +249,7 @@ class _CollapseState:
         at = np.column_stack([self.points[kept], np.ones(len(kept))])
         squares = np.einsum("ki,kij,kj->k", at, self.quadrics[removed], at)
         areas = self.areas[removed]
-        mean = np.divide(
-            squares, areas, out=np.zeros_like(squares), where=areas > 0
-        )
+        mean = np.divide(squares, areas, out=np.zeros_like(squares), where=areas > 0)
         return np.sqrt(np.maximum(mean, 0.0))
 
     def _costs(self, collapses: _Collapses) -> Array:
@@ -288,9 +260,7 @@ class _CollapseState:
         starts = incidence.indptr[collapses.removed]
         counts = incidence.indptr[collapses.removed + 1] - starts
         of_collapse = np.repeat(np.arange(len(counts)), counts)
-        offsets = np.arange(counts.sum()) - np.repeat(
-            np.cumsum(counts) - counts, counts
-        )
+        offsets = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         elements = incidence.indices[np.repeat(starts, counts) + offsets]
         corners = self.cells[elements]
         removed = collapses.removed[of_collapse, None]
@@ -304,9 +274,7 @@ class _CollapseState:
         np.minimum.at(limit, of_collapse, own_quality[elements[stays]])
         quality = np.full(len(counts), np.inf)
         np.minimum.at(quality, of_collapse, self._qualities(after))
-        return np.where(
-            (quality >= limit) & np.isfinite(quality), -quality, np.inf
-        )
+        return np.where((quality >= limit) & np.isfinite(quality), -quality, np.inf)
 
     def _qualities(self, cells: Index) -> Array:
         """Return the mean ratios (k,) of elements (k, 4) as of `mean_ratios`; −1 if an element is
@@ -350,9 +318,7 @@ class _CollapseState:
         """Do collapses whose removed nodes share no element, in place."""
         target = np.arange(len(self.points))
         target[collapses.removed] = collapses.kept
-        np.add.at(
-            self.quadrics, collapses.kept, self.quadrics[collapses.removed]
-        )
+        np.add.at(self.quadrics, collapses.kept, self.quadrics[collapses.removed])
         np.add.at(self.areas, collapses.kept, self.areas[collapses.removed])
         cells = target[self.cells]
         repeated = np.diff(np.sort(cells, axis=1), axis=1) == 0
@@ -367,15 +333,6 @@ def _is_smooth(edges: Index, faces: Index, n: int) -> NDArray[np.bool_]:
     """Return whether each edge (m, 2) belongs to the surface of triangles (F, 3), and its collapse
     leaves the surface without folds: both ends then have no other common neighbours on the surface
     than the third corners of the triangles at the edge (link condition).
-
-    Parameters
-    ----------
-    edges : (m, 2) int
-        Edges, the lower node first.
-    faces : (F, 3) int
-        Triangles with sorted corners, each once.
-    n : int
-        Number of nodes.
     """
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [0, 2]], faces[:, 1:]])
     codes, triangles = np.unique(sides @ [n, 1], return_counts=True)

@@ -30,12 +30,7 @@ from .mesh_checks import (
     signed_volumes,
     unique_edges,
 )
-from .mesh_files import (
-    length_in_metres,
-    read_tetrahedra,
-    read_triangles,
-    write_tetrahedra,
-)
+from .mesh_files import length_in_metres, read_tetrahedra, read_triangles, write_tetrahedra
 from .surface import tetrahedralize_surface
 
 
@@ -112,9 +107,7 @@ class TetMesh:
     ) -> None:
         raw_points = checked_points(points_m)
         elements = checked_tetrahedra(tetrahedra, len(raw_points))
-        arrays = checked_arrays(
-            point_arrays or {}, len(raw_points), kind="point", of="nodes"
-        )
+        arrays = checked_arrays(point_arrays or {}, len(raw_points), kind="point", of="nodes")
         element_arrays = checked_arrays(
             cell_arrays or {}, len(elements), kind="cell", of="elements"
         )
@@ -129,17 +122,9 @@ class TetMesh:
         self._set(
             points_m=_read_only(cleaned.points_m),
             tetrahedra=_read_only(cleaned.tetrahedra),
-            point_arrays={
-                name: _read_only(values[used])
-                for name, values in arrays.items()
-            },
-            cell_arrays={
-                name: _read_only(values)
-                for name, values in element_arrays.items()
-            },
-            face_sets={
-                name: _read_only(corners) for name, corners in faces.items()
-            },
+            point_arrays={name: _read_only(values[used]) for name, values in arrays.items()},
+            cell_arrays={name: _read_only(values) for name, values in element_arrays.items()},
+            face_sets={name: _read_only(corners) for name, corners in faces.items()},
             file_index=_read_only(used),
             file_node_count=len(raw_points),
             notes=cleaned.notes,
@@ -230,10 +215,7 @@ class TetMesh:
         try:
             return cls(
                 *tetrahedralize_surface(
-                    points,
-                    triangles,
-                    edge_length_m=edge_length_m,
-                    cache_dir=cache,
+                    points, triangles, edge_length_m=edge_length_m, cache_dir=cache
                 )
             )
         except InputError as error:
@@ -327,18 +309,14 @@ class TetMesh:
     @cached_property
     def sha256(self) -> str:
         """Hash of the points and tetrahedra alone, in their order, as 64 hexadecimal digits."""
-        digest = hashlib.sha256(
-            f"{self.points_m.shape} {self.tetrahedra.shape}".encode()
-        )
+        digest = hashlib.sha256(f"{self.points_m.shape} {self.tetrahedra.shape}".encode())
         digest.update(self.points_m.astype("<f8").tobytes())
         digest.update(self.tetrahedra.astype("<i8").tobytes())
         return digest.hexdigest()
 
     def quality(self) -> MeshQuality:
         """Return edge lengths and mean ratios of the elements."""
-        lengths = np.linalg.norm(
-            np.diff(self.points_m[self.edges], axis=1), axis=2
-        )
+        lengths = np.linalg.norm(np.diff(self.points_m[self.edges], axis=1), axis=2)
         ratios = mean_ratios(self.points_m, self.tetrahedra)
         return MeshQuality(
             edge_min_m=float(lengths.min()),
@@ -363,8 +341,8 @@ def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
-    """Return a contiguous array that cannot be modified; an argument that is contiguous is itself made
-    read-only and returned.
+    """Return a contiguous array that cannot be modified; an argument that is contiguous is itself
+    made read-only and returned.
     """
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
@@ -396,10 +374,7 @@ class ElementNodes:
     def corners(cls, mesh: TetMesh) -> ElementNodes:
         """Return the nodes of the mesh only."""
         return cls(
-            mesh,
-            mesh.points_m,
-            cells=mesh.tetrahedra,
-            ends=np.empty((0, 2), dtype=np.int64),
+            mesh, mesh.points_m, cells=mesh.tetrahedra, ends=np.empty((0, 2), dtype=np.int64)
         )
 
     @classmethod
@@ -407,16 +382,9 @@ class ElementNodes:
         """Return the nodes of a kind of element: corners, and mid nodes if it has any."""
         if not element.edges:
             return cls.corners(mesh)
-        points = _read_only(
-            np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)])
-        )
+        points = _read_only(np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)]))
         middles = mesh.mid_node_indices(mesh.tetrahedra[:, element.edges])
-        return cls(
-            mesh,
-            points,
-            cells=np.hstack([mesh.tetrahedra, middles]),
-            ends=mesh.edges,
-        )
+        return cls(mesh, points, cells=np.hstack([mesh.tetrahedra, middles]), ends=mesh.edges)
 
     def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Extend a mask of mesh nodes (corners,) to all nodes (n,): a mid node is selected if both

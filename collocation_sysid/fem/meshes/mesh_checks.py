@@ -72,13 +72,9 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
             "from 0"
         ) from None
     if array.ndim != 2 or array.shape[1] != 4 or not len(array):
-        raise InputError(
-            f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}"
-        )
+        raise InputError(f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}")
     if array.dtype.kind not in "iu":
-        raise InputError(
-            f"tetrahedra must hold integer node indices from 0, not {array.dtype}"
-        )
+        raise InputError(f"tetrahedra must hold integer node indices from 0, not {array.dtype}")
     require_known_nodes(array, node_count)
     return array.astype(np.int64)
 
@@ -187,9 +183,7 @@ def clean_mesh(points_m: np.ndarray, tetrahedra: np.ndarray) -> CleanedMesh:
     _require_no_duplicates(tetrahedra)
     _require_not_degenerate(points_m, tetrahedra)
     used_points = points_m[used]
-    oriented, reversed_elements = orient_elements(
-        used_points, renumbered.reshape(-1, 4)
-    )
+    oriented, reversed_elements = orient_elements(used_points, renumbered.reshape(-1, 4))
     notes = []
     dropped = np.setdiff1d(np.arange(len(points_m)), used)
     if len(dropped):
@@ -206,11 +200,9 @@ def clean_mesh(points_m: np.ndarray, tetrahedra: np.ndarray) -> CleanedMesh:
     return CleanedMesh(used_points, oriented, used=used, notes=tuple(notes))
 
 
-def orient_elements(
-    points_m: np.ndarray, tetrahedra: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a copy of the tetrahedra (E, 4) in which no volume is negative, and the indices of those
-    whose last two nodes were exchanged for it.
+def orient_elements(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a copy of the tetrahedra (E, 4) in which no volume is negative, and the indices of
+    those whose last two nodes were exchanged for it.
     """
     reversed_elements = np.flatnonzero(signed_volumes(points_m, tetrahedra) < 0)
     oriented = tetrahedra.copy()
@@ -232,9 +224,7 @@ def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
     """Return the pairs of nodes that share an element, (m, 2), each once, the lower index first,
     sorted.
     """
-    return np.unique(
-        np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0
-    )
+    return np.unique(np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0)
 
 
 @dataclass(frozen=True)
@@ -288,10 +278,7 @@ def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
 def _require_no_duplicates(tetrahedra: np.ndarray) -> None:
     """Raise an `InputError` if two elements have the same nodes."""
     _, first, inverse = np.unique(
-        np.sort(tetrahedra, axis=1),
-        axis=0,
-        return_index=True,
-        return_inverse=True,
+        np.sort(tetrahedra, axis=1), axis=0, return_index=True, return_inverse=True
     )
     twin = first[inverse.ravel()]
     again = np.flatnonzero(twin != np.arange(len(tetrahedra)))
@@ -336,14 +323,11 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
         else ""
     )
     return (
-        f"The mesh consists of {parts} unconnected parts (the largest have {sizes} "
-        f"nodes){hint}.",
+        f"The mesh consists of {parts} unconnected parts (the largest have {sizes} nodes){hint}.",
     )
 
 
-def straightening_notes(
-    points_m: np.ndarray, cells: np.ndarray
-) -> tuple[str, ...]:
+def straightening_notes(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
     """Return notes on curved sides that are lost when quadratic tetrahedra are reduced to corners.
 
     Parameters

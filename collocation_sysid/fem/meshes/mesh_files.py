@@ -38,9 +38,7 @@ def length_in_metres(length_unit: str) -> float:
     """
     if length_unit not in METRES_PER_UNIT:
         known = ", ".join(f'"{unit}"' for unit in METRES_PER_UNIT)
-        raise InputError(
-            f"length unit {length_unit!r} is unknown; use one of {known}"
-        )
+        raise InputError(f"length unit {length_unit!r} is unknown; use one of {known}")
     return METRES_PER_UNIT[length_unit]
 
 
@@ -77,9 +75,7 @@ class TetrahedraContent:
     notes: tuple[str, ...]
 
 
-def read_tetrahedra(
-    path: str | Path, length_unit: str = "m"
-) -> TetrahedraContent:
+def read_tetrahedra(path: str | Path, length_unit: str = "m") -> TetrahedraContent:
     """Read the tetrahedra of a file, quadratic ones by their corners; other cells are omitted.
 
     The mesh is not checked beyond its sides, see `mesh_checks`.
@@ -103,26 +99,10 @@ def read_tetrahedra(
 
 
 def _tetrahedra(data: MeshContent, metres: float) -> TetrahedraContent:
-    """Return the same as `read_tetrahedra` from the data of meshio.
-
-    Parameters
-    ----------
-    data : MeshContent
-    metres : float
-        Factor from the file's unit to metres.
-
-    Raises
-    ------
-    InputError
-        If there are no tetrahedra.
-    """
+    """Return the same as `read_tetrahedra` from the data of meshio."""
     counts = _cell_counts(data)
     points_m = np.asarray(data.points, dtype=float) * metres
-    blocks = [
-        block
-        for block in data.cells
-        if block.type in _TETRAHEDRA and len(block.data)
-    ]
+    blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
     if not blocks:
         filled = (
             "; a closed surface can be filled with tetrahedra: state it as surface, with "
@@ -139,9 +119,7 @@ def _tetrahedra(data: MeshContent, metres: float) -> TetrahedraContent:
         notes += straightening_notes(points_m, np.concatenate(quadratic))
     # Where a cell is in several groups, the sets of a .msh file tell all, its tags only the first.
     groups = {**_physical_groups(data), **_cell_sets(data)}
-    nodes = {
-        name: _nodes_of(data, per_block) for name, per_block in groups.items()
-    }
+    nodes = {name: _nodes_of(data, per_block) for name, per_block in groups.items()}
     cell_arrays = {**groups, **data.cell_data}
     return TetrahedraContent(
         points_m,
@@ -153,9 +131,7 @@ def _tetrahedra(data: MeshContent, metres: float) -> TetrahedraContent:
     )
 
 
-def read_triangles(
-    path: str | Path, length_unit: str = "m"
-) -> tuple[np.ndarray, np.ndarray]:
+def read_triangles(path: str | Path, length_unit: str = "m") -> tuple[np.ndarray, np.ndarray]:
     """Read the vertices (p, 3) in metres and triangles (F, 3) of a surface file.
 
     Quadrilaterals and polygons are split into triangles, as fans about their first corner; other
@@ -182,9 +158,7 @@ def read_triangles(
         ]
         # A face of fewer than three corners, of which there is nothing to join, is a damaged file.
         fans = [
-            np.concatenate(
-                [face[:, [0, k, k + 1]] for k in range(1, face.shape[1] - 1)]
-            )
+            np.concatenate([face[:, [0, k, k + 1]] for k in range(1, face.shape[1] - 1)])
             for face in faces
         ]
         if not fans:
@@ -193,9 +167,7 @@ def read_triangles(
                 "triangles, quadrilaterals or polygons"
             )
         # An OBJ vertex may carry a colour after its coordinates.
-        return np.asarray(data.points, dtype=float)[
-            :, :3
-        ] * metres, np.concatenate(fans)
+        return np.asarray(data.points, dtype=float)[:, :3] * metres, np.concatenate(fans)
 
 
 def write_tetrahedra(
@@ -226,12 +198,8 @@ def write_tetrahedra(
     """
     import meshio  # slow to import
 
-    point_data: dict[str, Any] = {
-        n: _without_booleans(v) for n, v in (point_arrays or {}).items()
-    }
-    cell_data: dict[str, Any] = {
-        n: [_without_booleans(v)] for n, v in (cell_arrays or {}).items()
-    }
+    point_data: dict[str, Any] = {n: _without_booleans(v) for n, v in (point_arrays or {}).items()}
+    cell_data: dict[str, Any] = {n: [_without_booleans(v)] for n, v in (cell_arrays or {}).items()}
     mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], point_data, cell_data)
     with _as_input_error(path, "written"):
         meshio.write(path, mesh)
@@ -247,11 +215,6 @@ def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
     """Context that gives the content of a file.
 
     Errors in the body of the context are reported as damage of the file.
-
-    Raises
-    ------
-    InputError
-        If the file does not exist, is not a regular file, or cannot be read.
     """
     if not Path(path).is_file():
         raise InputError("there is no such file", path)
@@ -270,12 +233,6 @@ def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
     prints nothing.
 
     An `OSError` while writing is raised unchanged.
-
-    Parameters
-    ----------
-    path : str or Path
-    done : {"read", "written"}
-        What is done with the file, for the message.
     """
     captured = io.StringIO()
     try:
@@ -289,27 +246,14 @@ def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
     except InputError as error:
         raise error.located(path) from None
     except (Exception, SystemExit) as error:
-        if (
-            isinstance(error, OSError) and done == "written"
-        ):  # it tells its file itself
+        if isinstance(error, OSError) and done == "written":  # it tells its file itself
             raise
-        reason = (
-            " ".join(captured.getvalue().split())
-            or f"{type(error).__name__}: {error}"
-        )
+        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
         raise _unreadable_error(done, reason, path=path) from error
 
 
 def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
-    """Return the error for a file that cannot be read or written as a mesh.
-
-    Parameters
-    ----------
-    done : {"read", "written"}
-        What is done with the file.
-    reason : str
-    path : str or Path
-    """
+    """Return the error for a file that cannot be read or written as a mesh."""
     return InputError(
         f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, .mesh "
         "and .inp are known, recognised by the file's ending",
@@ -330,13 +274,9 @@ def _cell_sets(data: MeshContent) -> dict[str, list[np.ndarray]]:
     """Return the cell sets of a file as boolean arrays, block by block."""
     sets = {}
     for name, per_block in (data.cell_sets or {}).items():
-        if (
-            name == "gmsh:bounding_entities"
-        ):  # numbers of entities, not of cells
+        if name == "gmsh:bounding_entities":  # numbers of entities, not of cells
             continue
-        sets[name] = [
-            np.zeros(len(block.data), dtype=bool) for block in data.cells
-        ]
+        sets[name] = [np.zeros(len(block.data), dtype=bool) for block in data.cells]
         for mask, cells in zip(sets[name], per_block, strict=False):
             if cells is not None:
                 mask[np.asarray(cells, dtype=np.int64)] = True
@@ -349,33 +289,21 @@ def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
     A group without a name is "physical_<tag>", followed by its dimension if other dimensions use
     the tag.
     """
-    tags = [
-        np.asarray(block).ravel()
-        for block in data.cell_data.get("gmsh:physical", ())
-    ]
+    tags = [np.asarray(block).ravel() for block in data.cell_data.get("gmsh:physical", ())]
     if not tags:
         return {}
-    names = {
-        tuple(map(int, key)): name
-        for name, key in (data.field_data or {}).items()
-    }
+    names = {tuple(map(int, key)): name for name, key in (data.field_data or {}).items()}
     masks: dict[tuple[int, int], list[np.ndarray]] = {}
     for dimension in range(4):
         tags_of_dimension = [
-            np.where(b.dim == dimension, t, 0)
-            for b, t in zip(data.cells, tags, strict=True)
+            np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)
         ]
         for tag in np.unique(np.concatenate(tags_of_dimension)):
             if tag > 0:
-                masks[int(tag), dimension] = [
-                    block == tag for block in tags_of_dimension
-                ]
-    nameless = Counter(
-        tag for tag, dimension in masks if (tag, dimension) not in names
-    )
+                masks[int(tag), dimension] = [block == tag for block in tags_of_dimension]
+    nameless = Counter(tag for tag, dimension in masks if (tag, dimension) not in names)
     return {
-        names.get(key) or _group_name(*key, nameless[key[0]] > 1): m
-        for key, m in masks.items()
+        names.get(key) or _group_name(*key, nameless[key[0]] > 1): m for key, m in masks.items()
     }
 
 
@@ -388,8 +316,8 @@ def _group_name(tag: int, dimension: int, ambiguous: bool) -> str:
 
 
 def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
-    """Return the mask (n,) of the nodes of cells that are selected by one mask for each block of the
-    file.
+    """Return the mask (n,) of the nodes of cells that are selected by one mask for each block of
+    the file.
     """
     chosen = np.zeros(len(data.points), dtype=bool)
     for block, mask in zip(data.cells, masks, strict=True):
@@ -397,17 +325,12 @@ def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
     return chosen
 
 
-def _of_tetrahedra(
-    data: MeshContent, arrays: Mapping[str, Any]
-) -> dict[str, np.ndarray]:
+def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return the values (E, …) on tetrahedra of arrays given block by block, by name.
 
     Masks without a true value are omitted.
     """
-    tetrahedra = [
-        block.type in _TETRAHEDRA and len(block.data) > 0
-        for block in data.cells
-    ]
+    tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
     selected = {}
     for name, per_block in arrays.items():
         parts = [
@@ -425,19 +348,12 @@ def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
     """Return for each name the corners (k, 3) of the triangles on which an array given block by
     block is 1. Arrays with other values than 0 and 1, or without a 1, are omitted.
     """
-    blocks = [
-        k for k, block in enumerate(data.cells) if block.type in _TRIANGLES
-    ]
+    blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
     sets = {}
     for name, per_block in arrays.items():
         masks = [np.asarray(per_block[k]) for k in blocks]
-        if masks and all(
-            m.ndim == 1 and np.isin(m, (0, 1)).all() for m in masks
-        ):
-            chosen = [
-                data.cells[k].data[m == 1, :3]
-                for k, m in zip(blocks, masks, strict=True)
-            ]
+        if masks and all(m.ndim == 1 and np.isin(m, (0, 1)).all() for m in masks):
+            chosen = [data.cells[k].data[m == 1, :3] for k, m in zip(blocks, masks, strict=True)]
             if any(map(len, chosen)):
                 sets[name] = np.concatenate(chosen)
     return sets
@@ -455,27 +371,14 @@ def _listed(counts: Mapping[str, int]) -> str:
     """Return numbers of cells by type as text, such as "12 tetra, 3 line"; "no cells at all" if
     empty.
     """
-    return (
-        ", ".join(f"{count} {name}" for name, count in counts.items())
-        or "no cells at all"
-    )
+    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 
 def _note_omitted_cells(counts: Mapping[str, int]) -> tuple[str, ...]:
     """Return a note on cells other than tetrahedra, which are omitted; empty if there are none."""
-    others = {
-        name: count
-        for name, count in counts.items()
-        if name not in _TETRAHEDRA and count
-    }
+    others = {name: count for name, count in counts.items() if name not in _TETRAHEDRA and count}
     if not others:
         return ()
     solid = any(name.startswith(_SOLID_CELLS) for name in others)
-    warning = (
-        ": this part of the body is missing. Mesh it with tetrahedra"
-        if solid
-        else ""
-    )
-    return (
-        f"Cells other than tetrahedra were left out ({_listed(others)}){warning}.",
-    )
+    warning = ": this part of the body is missing. Mesh it with tetrahedra" if solid else ""
+    return (f"Cells other than tetrahedra were left out ({_listed(others)}){warning}.",)

@@ -120,25 +120,17 @@ def read_content(path: str | Path) -> MeshContent:
         return _read_in_process(path)
     try:
         absolute = str(Path(path).resolve())
-        arrays = run_isolated(
-            WORKER, absolute, limits=ProcessLimits.for_file(path)
-        )
+        arrays = run_isolated(WORKER, absolute, limits=ProcessLimits.for_file(path))
     except Failed as error:
         raise InputError(str(error)) from error
     head = json.loads(arrays["head"].tobytes())
     return MeshContent(
         points=arrays["points"],
-        cells=[
-            CellBlock(kind, dim, data=arrays[key])
-            for kind, dim, key in head["cells"]
-        ],
+        cells=[CellBlock(kind, dim, data=arrays[key]) for kind, dim, key in head["cells"]],
         point_data={name: arrays[key] for name, key in head["point_data"]},
         field_data={name: arrays[key] for name, key in head["field_data"]},
         point_sets={name: arrays[key] for name, key in head["point_sets"]},
-        cell_data={
-            name: [arrays[key] for key in keys]
-            for name, keys in head["cell_data"]
-        },
+        cell_data={name: [arrays[key] for key in keys] for name, keys in head["cell_data"]},
         cell_sets={
             name: [None if key is None else arrays[key] for key in keys]
             for name, keys in head["cell_sets"]
@@ -154,19 +146,11 @@ def _is_small_and_safe(path: Path) -> bool:
         return False
     content = path.read_bytes()
     has_entities = b"<!" in content.replace(b"<!--", b"")
-    return (
-        b"<VTKFile" in content and b"LZMA" not in content and not has_entities
-    )
+    return b"<VTKFile" in content and b"LZMA" not in content and not has_entities
 
 
 def _read_in_process(path: str | Path) -> MeshContent:
-    """Return the content of a file read in this process; nothing is printed.
-
-    Raises
-    ------
-    InputError
-        With the reason, if meshio cannot read the file.
-    """
+    """Return the content of a file read in this process; nothing is printed."""
     import meshio  # slow to import
 
     captured = io.StringIO()
@@ -179,17 +163,11 @@ def _read_in_process(path: str | Path) -> MeshContent:
             warnings.simplefilter("ignore")
             mesh: Any = meshio.read(path)
     except (Exception, SystemExit) as error:
-        reason = (
-            " ".join(captured.getvalue().split())
-            or f"{type(error).__name__}: {error}"
-        )
+        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
         raise InputError(reason[:LONGEST_REASON]) from error
     return MeshContent(
         points=np.asarray(mesh.points),
-        cells=[
-            CellBlock(block.type, block.dim, data=block.data)
-            for block in mesh.cells
-        ],
+        cells=[CellBlock(block.type, block.dim, data=block.data) for block in mesh.cells],
         point_data=mesh.point_data,
         field_data=mesh.field_data,
         point_sets=mesh.point_sets,

@@ -44,41 +44,20 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
     points = finer.points_m
     nodes = finer.cells
     across = points[nodes[:, _DIAGONALS]]  # (E, 3, 2, 3)
-    shortest = (
-        np.linalg.norm(across[:, :, 1] - across[:, :, 0], axis=2)
-        .round(12)
-        .argmin(axis=1)
-    )
+    shortest = np.linalg.norm(across[:, :, 1] - across[:, :, 0], axis=2).round(12).argmin(axis=1)
     ring = _RINGS[shortest]
     axis = _DIAGONALS[shortest]  # (E, 4), (E, 2)
-    middle = [
-        np.column_stack([axis, ring[:, k], ring[:, k - 1]]) for k in range(4)
-    ]
-    local = [
-        np.broadcast_to(corner, (len(nodes), 4)) for corner in _AT_CORNERS
-    ] + middle
-    children = np.take_along_axis(
-        nodes[:, None], np.stack(local, axis=1), axis=2
-    )
-    masks = {
-        n: a
-        for n, a in mesh.point_arrays.items()
-        if a.ndim == 1 and np.isin(a, (0, 1)).all()
-    }
+    middle = [np.column_stack([axis, ring[:, k], ring[:, k - 1]]) for k in range(4)]
+    local = [np.broadcast_to(corner, (len(nodes), 4)) for corner in _AT_CORNERS] + middle
+    children = np.take_along_axis(nodes[:, None], np.stack(local, axis=1), axis=2)
+    masks = {n: a for n, a in mesh.point_arrays.items() if a.ndim == 1 and np.isin(a, (0, 1)).all()}
     return TetMesh(
         points,
         orient_elements(points, children.reshape(-1, 4))[0],
-        point_arrays={
-            name: np.concatenate([a, a[ends].min(axis=1)])
-            for name, a in masks.items()
-        },
-        cell_arrays={
-            name: np.repeat(a, 8, axis=0)
-            for name, a in mesh.cell_arrays.items()
-        },
+        point_arrays={name: np.concatenate([a, a[ends].min(axis=1)]) for name, a in masks.items()},
+        cell_arrays={name: np.repeat(a, 8, axis=0) for name, a in mesh.cell_arrays.items()},
         face_sets={
-            name: split_faces_in_four(faces, mesh)
-            for name, faces in mesh.face_sets.items()
+            name: split_faces_in_four(faces, mesh) for name, faces in mesh.face_sets.items()
         },
         is_generated=mesh.is_generated,
     )
@@ -86,9 +65,7 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
 
 def split_faces_in_four(faces: Index, mesh: TetMesh) -> Index:
     """Return faces (k, 3) of a mesh split into four each, with the nodes of `split_in_eight`."""
-    nodes = ElementNodes.for_element(mesh, ELEMENTS["tet10"]).nodes_of_faces(
-        faces
-    )
+    nodes = ElementNodes.for_element(mesh, ELEMENTS["tet10"]).nodes_of_faces(faces)
     return nodes[:, [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]].reshape(-1, 3)
 
 
@@ -113,9 +90,7 @@ def refine_body(body: Body) -> Body:
         if part.name
     ]
     # A region without a density has that of the body, even if regions claim all cells.
-    rest = next(
-        (part for part in body.parts if not part.has_own_density), body.parts[0]
-    )
+    rest = next((part for part in body.parts if not part.has_own_density), body.parts[0])
     mesh = split_in_eight(body.mesh)
     finer = type(body)(
         mesh,
@@ -125,30 +100,21 @@ def refine_body(body: Body) -> Body:
         damping=rest.damping,
         regions=regions,
         prony=rest.prony,
-        forces=[
-            _refined_force(placed, mesh, body=body)
-            for placed in body.placed_forces
-        ],
+        forces=[_refined_force(placed, mesh, body=body) for placed in body.placed_forces],
         rest_shape=_refined_rest_shape(body, mesh),
         evaluator=body.evaluator,
         threads=body.threads,
     )
     finer.has_declared_mass = body.has_declared_mass
-    finer = finer.with_free_densities(
-        [part.name for part in body.parts if part.has_free_density]
-    )
+    finer = finer.with_free_densities([part.name for part in body.parts if part.has_free_density])
     if not body.collect_field_lengths_m():
         return finer
     fields = [part.field and part.field.split_in_eight() for part in body.parts]
     parts = zip(finer.parts, fields, strict=True)
-    return finer.with_parts(
-        tuple(replace(part, field=field) for part, field in parts)
-    )
+    return finer.with_parts(tuple(replace(part, field=field) for part, field in parts))
 
 
-def _refined_rest_shape(
-    body: Body, mesh: TetMesh
-) -> UnderGravity | Literal["stress_free"] | None:
+def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
     """Return the statement about the rest shape for the refined body: None if `body` has none,
     "stress_free", or the scan conditions with the held nodes of the refined `mesh`.
 
@@ -160,32 +126,15 @@ def _refined_rest_shape(
     if isinstance(body.scan_conditions.nodes, (Box, Ball)):
         return body.scan_conditions
     corners = len(body.mesh.points_m)
-    is_prescribed = np.isin(
-        np.arange(corners), body.scan_conditions.grasped_nodes(body.nodes)
-    )
-    chosen = np.concatenate(
-        [is_prescribed, is_prescribed[body.mesh.edges].all(axis=1)]
-    )
-    return replace(
-        body.scan_conditions, nodes=Indices(np.flatnonzero(chosen).tolist())
-    )
+    is_prescribed = np.isin(np.arange(corners), body.scan_conditions.grasped_nodes(body.nodes))
+    chosen = np.concatenate([is_prescribed, is_prescribed[body.mesh.edges].all(axis=1)])
+    return replace(body.scan_conditions, nodes=Indices(np.flatnonzero(chosen).tolist()))
 
 
-def _refined_force(
-    placed: LocatedForce, mesh: TetMesh, body: Body
-) -> NodeForce:
+def _refined_force(placed: LocatedForce, mesh: TetMesh, body: Body) -> NodeForce:
     """Return a custom force for the refined body, at the corresponding nodes.
 
     The middle of an edge is among them if both ends are.
-
-    Parameters
-    ----------
-    placed : LocatedForce
-        Force on the nodes or faces of `body`.
-    mesh : TetMesh
-        Refined mesh.
-    body : Body
-        Body before the refinement.
     """
     chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
     nodes = chosen[: len(body.mesh.points_m)]
@@ -195,9 +144,7 @@ def _refined_force(
     return placed.force.on_refined_body(np.flatnonzero(chosen))
 
 
-def refine_nodes(
-    nodes: Index, selection: Selection | None, body: Body, finer: Body
-) -> Index:
+def refine_nodes(nodes: Index, selection: Selection | None, body: Body, finer: Body) -> Index:
     """Return the nodes of the refined body that correspond to nodes of the original one, sorted.
 
     Boxes and balls select anew. Otherwise the middle of an edge is selected if both ends are.

@@ -39,10 +39,7 @@ class _PositionSelection:
         """
         hint = self._nearest_hint(nodes.points_m)
         return _indices_or_error(
-            self._contains(nodes.points_m),
-            nodes.mesh,
-            what=str(self),
-            of="nodes" + hint,
+            self._contains(nodes.points_m), nodes.mesh, what=str(self), of="nodes" + hint
         )
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
@@ -53,9 +50,7 @@ class _PositionSelection:
         InputError
             If no cell is selected.
         """
-        return _indices_or_error(
-            self._contains(mesh.centres_m), mesh, what=str(self), of=OF_CELLS
-        )
+        return _indices_or_error(self._contains(mesh.centres_m), mesh, what=str(self), of=OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the rows of `mesh.surface` whose three corners are inside, sorted int64.
@@ -65,9 +60,7 @@ class _PositionSelection:
         InputError
             If no face is selected.
         """
-        return _select_faces(
-            self._contains(mesh.points_m), mesh, what=str(self)
-        )
+        return _select_faces(self._contains(mesh.points_m), mesh, what=str(self))
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
         """Return the mask of the points inside."""
@@ -116,10 +109,7 @@ class Box(_PositionSelection):
         return np.all(above & below, axis=1)
 
     def __str__(self) -> str:
-        low, high = (
-            ", ".join(f"{x:g}" for x in corner)
-            for corner in (self.low_m, self.high_m)
-        )
+        low, high = (", ".join(f"{x:g}" for x in corner) for corner in (self.low_m, self.high_m))
         return f"the box from ({low}) to ({high}) m"
 
 
@@ -144,13 +134,9 @@ class Ball(_PositionSelection):
     radius_m: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "center_m", _vector(self.center_m, "ball: center_m")
-        )
+        object.__setattr__(self, "center_m", _vector(self.center_m, "ball: center_m"))
         if not _is_number(self.radius_m) or not self.radius_m > 0:
-            raise InputError(
-                f"ball: radius_m must be a positive number, not {self.radius_m!r}"
-            )
+            raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
 
     def _nearest_hint(self, points_m: np.ndarray) -> str:
         """Return the distance of the nearest node as a hint."""
@@ -163,9 +149,7 @@ class Ball(_PositionSelection):
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
         """Return the mask of the points inside, with a tolerance for rounding."""
-        return self._distance_m(points_m) <= self.radius_m + _tolerance_m(
-            points_m
-        )
+        return self._distance_m(points_m) <= self.radius_m + _tolerance_m(points_m)
 
     def __str__(self) -> str:
         center = ", ".join(f"{x:g}" for x in self.center_m)
@@ -209,10 +193,7 @@ class Face(_PositionSelection):
         points_m = nodes.points_m
         mask = self._contains(points_m)
         if self.name.startswith("side"):
-            mask &= ~(
-                Face("top")._contains(points_m)
-                | Face("bottom")._contains(points_m)
-            )
+            mask &= ~(Face("top")._contains(points_m) | Face("bottom")._contains(points_m))
         return _indices_or_error(mask, nodes.mesh, what=str(self))
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
@@ -225,16 +206,11 @@ class Face(_PositionSelection):
         """Return the mask (n,) of the points in the plane through the outermost point, within a
         tolerance relative to the diagonal of the points (n, 3).
         """
-        axis, sign = {
-            "top": (2, -1),
-            "bottom": (2, 1),
-            "side_x": (0, 1),
-            "side_y": (1, 1),
-        }[self.name]
+        axis, sign = {"top": (2, -1), "bottom": (2, 1), "side_x": (0, 1), "side_y": (1, 1)}[
+            self.name
+        ]
         inwards_m = sign * points_m[:, axis]
-        tolerance_m = FACE_TOLERANCE * float(
-            np.linalg.norm(np.ptp(points_m, axis=0))
-        )
+        tolerance_m = FACE_TOLERANCE * float(np.linalg.norm(np.ptp(points_m, axis=0)))
         return np.asarray(inwards_m <= inwards_m.min() + tolerance_m)
 
     def __str__(self) -> str:
@@ -264,9 +240,7 @@ class Indices:
 
     def __post_init__(self) -> None:
         indices = np.atleast_1d(np.asarray(self.indices))
-        if indices.ndim != 1 or (
-            indices.size and indices.dtype.kind not in "iu"
-        ):
+        if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "iu"):
             raise InputError(
                 f"indices must be a list of whole numbers from 0, not {self.indices!r}"
             )
@@ -284,9 +258,7 @@ class Indices:
         """
         mesh = nodes.mesh
         requested = np.unique(np.array(self.indices, dtype=np.int64))
-        outside = requested[
-            (requested < 0) | (requested >= mesh.file_node_count)
-        ]
+        outside = requested[(requested < 0) | (requested >= mesh.file_node_count)]
         if len(outside):
             raise InputError(
                 f"indices: node {outside[0]} does not exist; the mesh has "
@@ -318,9 +290,7 @@ class Indices:
                 f"numbered 0 to {count - 1}"
             )
         chosen = np.isin(np.arange(count), self.indices)
-        return _indices_or_error(
-            chosen, mesh, what="an empty list of indices", of=OF_CELLS
-        )
+        return _indices_or_error(chosen, mesh, what="an empty list of indices", of=OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the rows of `mesh.surface` whose corners are all selected, sorted.
@@ -363,12 +333,8 @@ class Named:
             none is true.
         """
         what = f'point array "{self.name}"'
-        mask = self._mask(
-            nodes.mesh.point_arrays, len(nodes.mesh.points_m), what=what
-        )
-        return _indices_or_error(
-            nodes.with_mid_nodes(mask), nodes.mesh, what=what
-        )
+        mask = self._mask(nodes.mesh.point_arrays, len(nodes.mesh.points_m), what=what)
+        return _indices_or_error(nodes.with_mid_nodes(mask), nodes.mesh, what=what)
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the cells whose value in the cell array is 1, sorted.
@@ -397,9 +363,7 @@ class Named:
         if self.name not in mesh.face_sets:
             what = f'point array "{self.name}"'
             count = len(mesh.points_m)
-            mask = self._mask(
-                mesh.point_arrays, count, what=what, lacking="group of faces"
-            )
+            mask = self._mask(mesh.point_arrays, count, what=what, lacking="group of faces")
             return _select_faces(mask, mesh, what=what)
         faces = np.unique(np.sort(mesh.face_sets[self.name], axis=1), axis=0)
         rows = rows_of_faces(faces, mesh.surface)
@@ -411,29 +375,12 @@ class Named:
         return np.sort(rows)
 
     def _mask(
-        self,
-        arrays: Mapping[str, np.ndarray],
-        count: int,
-        what: str,
-        lacking: str = "",
+        self, arrays: Mapping[str, np.ndarray], count: int, what: str, lacking: str = ""
     ) -> np.ndarray:
-        """Return an array of the mesh as a mask, or raise an `InputError` if it cannot be one.
-
-        Parameters
-        ----------
-        arrays : mapping of name to array
-        count : int
-            Required length.
-        what : str
-            Description of the array for messages, beginning with "point" or "cell".
-        lacking : str
-            What is missing if there is no such array, for the message.
-        """
+        """Return an array of the mesh as a mask, or raise an `InputError` if it cannot be one."""
         kind = what.split(" ", 1)[0]
         if self.name not in arrays:
-            names = ", ".join(
-                f'"{name}"' for name in arrays if not name.startswith("gmsh:")
-            )
+            names = ", ".join(f'"{name}"' for name in arrays if not name.startswith("gmsh:"))
             available = f"it has {names}" if names else "it has none"
             hint = hint_at(self.name, arrays)
             raise InputError(
@@ -463,56 +410,23 @@ def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
     """Return for each of the faces (k, 3) the row of the surface (F, 3) with the same three nodes
     in any order, (k,); −1 if there is none.
     """
-    row_of_face = {
-        tuple(face): row
-        for row, face in enumerate(np.sort(surface, axis=1).tolist())
-    }
+    row_of_face = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
     sorted_faces = np.sort(faces, axis=1).tolist()
-    return np.array(
-        [row_of_face.get(tuple(face), -1) for face in sorted_faces],
-        dtype=np.int64,
-    )
+    return np.array([row_of_face.get(tuple(face), -1) for face in sorted_faces], dtype=np.int64)
 
 
-def _select_faces(
-    chosen_nodes: np.ndarray, mesh: TetMesh, what: str
-) -> np.ndarray:
-    """Return the rows of `mesh.surface` whose corners are all in the mask `chosen_nodes` (n,).
-
-    Raises
-    ------
-    InputError
-        If there is none; the message names the selection by `what`.
-    """
+def _select_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
+    """Return the rows of `mesh.surface` whose corners are all in the mask `chosen_nodes` (n,)."""
     mask = np.asarray(chosen_nodes[mesh.surface].all(axis=1))
     return _indices_or_error(
-        mask,
-        mesh,
-        what=what,
-        missed="holds no face of the boundary with all its corners",
+        mask, mesh, what=what, missed="holds no face of the boundary with all its corners"
     )
 
 
 def _indices_or_error(
-    mask: np.ndarray,
-    mesh: TetMesh,
-    what: str,
-    of: str = "nodes",
-    missed: str = "",
+    mask: np.ndarray, mesh: TetMesh, what: str, of: str = "nodes", missed: str = ""
 ) -> np.ndarray:
-    """Return the indices of a mask, or raise an `InputError` if it is false everywhere.
-
-    Parameters
-    ----------
-    mask : (n,) bool
-    mesh : TetMesh
-    what : str
-        Description of the selection, for the message.
-    of : str
-        What is selected, for the message.
-    missed : str
-        Predicate of the message if nothing is selected.
-    """
+    """Return the indices of a mask, or raise an `InputError` if it is false everywhere."""
     if not mask.any():  # no mid node lies beyond the corners
         missed = missed or f"selects none of the {len(mask)} {of}"
         raise InputError(
@@ -526,9 +440,7 @@ def _describe_bounds(bounds_m: np.ndarray) -> str:
     coordinates (2, 3) [m].
     """
     axes = zip("xyz", *bounds_m, strict=True)
-    return ", ".join(
-        f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes
-    )
+    return ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes)
 
 
 def _tolerance_m(points_m: np.ndarray) -> float:
@@ -540,30 +452,15 @@ def _tolerance_m(points_m: np.ndarray) -> float:
 
 def _is_number(value: object) -> bool:
     """Return whether a value is a number and not a boolean."""
-    return isinstance(value, (int, float, np.number)) and not isinstance(
-        value, bool
-    )
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
 
 
 def _vector(values: Iterable[float], what: str) -> tuple[float, float, float]:
-    """Return three numbers as a tuple of floats: a position (x, y, z).
-
-    Raises
-    ------
-    InputError
-        If `values` is not a sequence of three numbers, or one of them is NaN; infinite ones are
-        allowed. The message begins with `what`.
-    """
+    """Return three numbers as a tuple of floats: a position (x, y, z)."""
     components = (
-        list(values)
-        if isinstance(values, Iterable) and not isinstance(values, str)
-        else []
+        list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
     )
-    if len(components) != 3 or not all(
-        _is_number(x) and not np.isnan(x) for x in components
-    ):
-        raise InputError(
-            f"{what} must be three numbers [x, y, z] in metres, not {values!r}"
-        )
+    if len(components) != 3 or not all(_is_number(x) and not np.isnan(x) for x in components):
+        raise InputError(f"{what} must be three numbers [x, y, z] in metres, not {values!r}")
     x, y, z = (float(value) for value in components)
     return x, y, z

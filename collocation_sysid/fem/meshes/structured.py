@@ -36,13 +36,11 @@ def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
 
 
 def cylinder_of_edge(
-    diameter_m: float,
-    height_m: float,
-    edge_length_m: float,
-    quarter: bool = False,
+    diameter_m: float, height_m: float, edge_length_m: float, quarter: bool = False
 ) -> TetMesh:
-    """Mesh an upright cylinder with edges of about this length: axis z, base at z = 0, volume exactly
-    that of the round cylinder, so that the nodes of the rim are slightly outside the radius.
+    """Mesh an upright cylinder with edges of about this length: axis z, base at z = 0, volume
+    exactly that of the round cylinder, so that the nodes of the rim are slightly outside the
+    radius.
 
     Parameters
     ----------
@@ -55,42 +53,28 @@ def cylinder_of_edge(
     InputError
         If a length is not positive, or if this takes more than a million elements.
     """
-    rings, layers = _divisions(
-        np.array([diameter_m / 2, height_m]), edge_length_m
-    )
+    rings, layers = _divisions(np.array([diameter_m / 2, height_m]), edge_length_m)
     _require_element_limit(3 * _SECTORS * float(rings**2 * layers))
     corners = _SECTORS * rings
     radius_m = diameter_m / 2 * sqrt(2 * pi / corners / sin(2 * pi / corners))
     full_cylinder = cylinder_mesh(
-        radius_m,
-        height_m,
-        rings=int(rings),
-        layers=int(layers),
-        sectors=_SECTORS,
+        radius_m, height_m, rings=int(rings), layers=int(layers), sectors=_SECTORS
     )
     if not quarter:
         return full_cylinder
     points_m = np.where(
-        np.abs(full_cylinder.points_m) < 1e-12 * diameter_m,
-        0.0,
-        full_cylinder.points_m,
+        np.abs(full_cylinder.points_m) < 1e-12 * diameter_m, 0.0, full_cylinder.points_m
     )
-    is_in_quarter = (points_m[full_cylinder.tetrahedra][..., :2] >= 0).all(
-        axis=(1, 2)
-    )
+    is_in_quarter = (points_m[full_cylinder.tetrahedra][..., :2] >= 0).all(axis=(1, 2))
     quarter_corners, tetrahedra = np.unique(
         full_cylinder.tetrahedra[is_in_quarter], return_inverse=True
     )
-    return TetMesh(
-        points_m[quarter_corners], tetrahedra.reshape(-1, 4), is_generated=True
-    )
+    return TetMesh(points_m[quarter_corners], tetrahedra.reshape(-1, 4), is_generated=True)
 
 
-def count_box_elements(
-    size_m: ArrayLike, edge_length_m: float
-) -> tuple[int, int]:
-    """Return the numbers of nodes and elements, in this order, of `box_of_edge` without creating the
-    mesh; sizes are not checked.
+def count_box_elements(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
+    """Return the numbers of nodes and elements, in this order, of `box_of_edge` without creating
+    the mesh; sizes are not checked.
 
     Raises
     ------
@@ -104,22 +88,18 @@ def count_box_elements(
 
 
 def count_cylinder_elements(
-    diameter_m: float,
-    height_m: float,
-    edge_length_m: float,
-    quarter: bool = False,
+    diameter_m: float, height_m: float, edge_length_m: float, quarter: bool = False
 ) -> tuple[int, int]:
-    """Return the numbers of nodes and elements, in this order, of `cylinder_of_edge` without creating
-    the mesh; that of a quarter's nodes is approximate. Diameter and height are not checked.
+    """Return the numbers of nodes and elements, in this order, of `cylinder_of_edge` without
+    creating the mesh; that of a quarter's nodes is approximate. Diameter and height are not
+    checked.
 
     Raises
     ------
     InputError
         For an edge length that is not positive, or more than a million elements.
     """
-    rings, layers = _divisions(
-        np.array([diameter_m / 2, height_m]), edge_length_m
-    )
+    rings, layers = _divisions(np.array([diameter_m / 2, height_m]), edge_length_m)
     sectors = _SECTORS / 4 if quarter else _SECTORS
     nodes = (1 + sectors * rings * (rings + 1) / 2) * (layers + 1)
     elements = 3 * sectors * rings**2 * layers
@@ -130,11 +110,6 @@ def count_cylinder_elements(
 def _divisions(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
     """Return the numbers of elements along lengths, as floats: rounded to the nearest whole number,
     at least 1.
-
-    Raises
-    ------
-    InputError
-        If the edge length is not positive.
     """
     if not edge_length_m > 0:
         raise InputError(
@@ -157,9 +132,7 @@ def _require_element_limit(elements: float) -> None:
 
 
 def box_mesh(
-    size_m: ArrayLike,
-    divisions: ArrayLike,
-    origin_m: ArrayLike = (0.0, 0.0, 0.0),
+    size_m: ArrayLike, divisions: ArrayLike, origin_m: ArrayLike = (0.0, 0.0, 0.0)
 ) -> TetMesh:
     """Mesh a box; each of its cells is split into the six tetrahedra around its main diagonal.
 
@@ -190,33 +163,18 @@ def box_mesh(
             f"found size_m = {size_m!r} and origin_m = {origin_m!r}; expected three positive "
             "lengths and three coordinates in metres"
         )
-    if (
-        cells.shape != (3,)
-        or cells.dtype.kind not in "iu"
-        or not (cells > 0).all()
-    ):
-        raise InputError(
-            f"a box needs three positive whole divisions, not {divisions!r}"
-        )
+    if cells.shape != (3,) or cells.dtype.kind not in "iu" or not (cells > 0).all():
+        raise InputError(f"a box needs three positive whole divisions, not {divisions!r}")
     ticks = [np.linspace(0, 1, n + 1) for n in cells]
-    points = (
-        np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-        * size
-        + origin
-    )
+    points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) * size + origin
 
     stride = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
-    corner = (
-        np.stack(np.meshgrid(*map(np.arange, cells), indexing="ij"), axis=-1)
-        @ stride
-    )
+    corner = np.stack(np.meshgrid(*map(np.arange, cells), indexing="ij"), axis=-1) @ stride
     # A path along the cell's edges from its lowest to its highest corner, for each order of axes.
     orders = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
     paths = np.array([[0, *np.cumsum(stride[list(order)])] for order in orders])
     tetrahedra = (corner.reshape(-1, 1, 1) + paths).reshape(-1, 4)
-    return TetMesh(
-        points, orient_elements(points, tetrahedra)[0], is_generated=True
-    )
+    return TetMesh(points, orient_elements(points, tetrahedra)[0], is_generated=True)
 
 
 def cylinder_mesh(
@@ -250,14 +208,10 @@ def cylinder_mesh(
     """
     for name, value in (("radius_m", radius_m), ("height_m", height_m)):
         if not 0 < value < np.inf:
-            raise InputError(
-                f"a cylinder needs a positive {name}, not {value!r}"
-            )
+            raise InputError(f"a cylinder needs a positive {name}, not {value!r}")
     for name, value in (("rings", rings), ("layers", layers)):
         if not isinstance(value, (int, np.integer)) or value < 1:
-            raise InputError(
-                f"a cylinder needs a whole number of {name}, 1 or more, not {value!r}"
-            )
+            raise InputError(f"a cylinder needs a whole number of {name}, 1 or more, not {value!r}")
     disc, triangles = _disc(rings, sectors)
     points = np.concatenate(
         [
@@ -269,13 +223,9 @@ def cylinder_mesh(
     # neighbours agree. Alternating the order from layer to layer keeps the mesh from being twisted.
     up = np.sort(triangles, axis=1)
     tetrahedra = [
-        np.concatenate(
-            [np.c_[a, b, c, c_], np.c_[a, b, b_, c_], np.c_[a, a_, b_, c_]]
-        )
+        np.concatenate([np.c_[a, b, c, c_], np.c_[a, b, b_, c_], np.c_[a, a_, b_, c_]])
         for layer in range(layers)
-        for a, b, c in [
-            (up if layer % 2 == 0 else up[:, ::-1]).T + layer * len(disc)
-        ]
+        for a, b, c in [(up if layer % 2 == 0 else up[:, ::-1]).T + layer * len(disc)]
         for a_, b_, c_ in [(a + len(disc), b + len(disc), c + len(disc))]
     ]
     cells = orient_elements(points, np.concatenate(tetrahedra))[0]
@@ -283,8 +233,8 @@ def cylinder_mesh(
 
 
 def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (1 + sectors · rings (rings + 1)/2, 2) and triangles (sectors · rings², 3) of the
-    unit disc: its centre first, then ring by ring.
+    """Return nodes (1 + sectors · rings (rings + 1)/2, 2) and triangles (sectors · rings², 3) of
+    the unit disc: its centre first, then ring by ring.
     """
     counts = [sectors * k for k in range(1, rings + 1)]
     angles = [2 * np.pi * np.arange(count) / count for count in counts]
@@ -309,7 +259,5 @@ def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
                 rim_node = node(k, s, i + 1)
                 triangles.append((node(k - 1, s, i), node(k, s, i), rim_node))
                 if i < k - 1:
-                    triangles.append(
-                        (node(k - 1, s, i), rim_node, node(k - 1, s, i + 1))
-                    )
+                    triangles.append((node(k - 1, s, i), rim_node, node(k - 1, s, i + 1)))
     return np.concatenate([np.zeros((1, 2)), *circles]), np.array(triangles)

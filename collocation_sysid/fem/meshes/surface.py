@@ -82,29 +82,19 @@ def tetrahedralize_surface(
     mesher = _pytetwild_version()
     if cache_dir is None:
         return run_ftetwild(points, faces, edge_length_m=edge_length_m)
-    digest = hashlib.sha256(
-        f"{mesher} {_RECIPE} {float(edge_length_m)!r} {points.shape}".encode()
-    )
-    digest.update(
-        points.astype("<f8").tobytes() + faces.astype("<i8").tobytes()
-    )
+    digest = hashlib.sha256(f"{mesher} {_RECIPE} {float(edge_length_m)!r} {points.shape}".encode())
+    digest.update(points.astype("<f8").tobytes() + faces.astype("<i8").tobytes())
     cached = Path(cache_dir) / f"mesh-{digest.hexdigest()[:16]}.vtu"
     if not cached.exists():
         with replaced_file(cached) as draft:
             # A mesh that is refused must not be kept.
-            cleaned = clean_mesh(
-                *run_ftetwild(points, faces, edge_length_m=edge_length_m)
-            )
-            write_tetrahedra(
-                draft, cleaned.points_m, tetrahedra=cleaned.tetrahedra
-            )
+            cleaned = clean_mesh(*run_ftetwild(points, faces, edge_length_m=edge_length_m))
+            write_tetrahedra(draft, cleaned.points_m, tetrahedra=cleaned.tetrahedra)
     content = read_tetrahedra(cached)
     return content.points_m, content.tetrahedra
 
 
-def merge_coincident(
-    points: np.ndarray, triangles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (p', 3) and triangles (F', 3) with vertices merged that coincide in single
     precision (10⁻⁶ of the diagonal), and without the triangles that become degenerate.
 
@@ -113,9 +103,7 @@ def merge_coincident(
     """
     tolerance = 1e-6 * np.linalg.norm(np.ptp(points, axis=0))
     pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
-    links = coo_array(
-        (np.ones(len(pairs)), pairs.T), shape=(len(points), len(points))
-    )
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
     label = connected_components(links, directed=False)[1]
     _, first = np.unique(label, return_index=True)
     merged = label[triangles].astype(np.int64)
@@ -123,17 +111,11 @@ def merge_coincident(
     return points[first], merged[~is_degenerate]
 
 
-def _checked_surface(
-    points_m: ArrayLike, triangles: ArrayLike
-) -> tuple[np.ndarray, np.ndarray]:
+def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles as arrays, or raise an `InputError` if they are invalid."""
     points = np.asarray(points_m, dtype=float)
     faces = np.asarray(triangles)
-    if (
-        points.ndim != 2
-        or points.shape[1] != 3
-        or not np.isfinite(points).all()
-    ):
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         fault = (
             f"are an array {points.shape}"
             if points.ndim != 2 or points.shape[1] != 3
@@ -142,12 +124,7 @@ def _checked_surface(
         raise InputError(
             f"the vertices of the surface {fault}; expected finite coordinates, an array (p, 3)"
         )
-    if (
-        faces.ndim != 2
-        or faces.shape[1] != 3
-        or not len(faces)
-        or faces.dtype.kind not in "iu"
-    ):
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.dtype.kind not in "iu":
         raise InputError(
             f"the triangles are an array {faces.shape} of {faces.dtype}; expected indices of "
             "vertices, an integer array (F, 3) with F > 0"
@@ -161,12 +138,10 @@ def _checked_surface(
 
 
 def _require_closed(triangles: np.ndarray) -> None:
-    """Raise an `InputError` unless every edge belongs to exactly two triangles (F, 3), or if there is
-    no triangle.
+    """Raise an `InputError` unless every edge belongs to exactly two triangles (F, 3), or if there
+    is no triangle.
     """
-    edges = np.sort(
-        triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
-    )
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, count = np.unique(edges, axis=0, return_counts=True)
     open_edges = int((count == 1).sum())
     crowded = int((count > 2).sum())
@@ -196,9 +171,7 @@ def _require_suitable_edge_length(
             f"the edge length {edge_length_m:g} m is more than half the diagonal of the surface; "
             f"{remedy}"
         )
-    volume = (
-        abs(np.linalg.det(points[triangles] - points.mean(axis=0)).sum()) / 6
-    )
+    volume = abs(np.linalg.det(points[triangles] - points.mean(axis=0)).sum()) / 6
     elements = 6 * np.sqrt(2) * volume / edge_length_m**3
     if elements > MOST_ELEMENTS:
         raise InputError(
@@ -230,15 +203,10 @@ def run_ftetwild(
         If it fails or is not installed.
     """
     diagonal = np.linalg.norm(np.ptp(points, axis=0))
-    lengths = (
-        ASKED_LENGTH * edge_length_m,
-        TOLERANCE * edge_length_m / diagonal,
-    )
+    lengths = (ASKED_LENGTH * edge_length_m, TOLERANCE * edge_length_m / diagonal)
     words = [repr(float(length)) for length in lengths]
     try:
-        mesh = run_isolated(
-            WORKER, *words, points_m=points, triangles=triangles.astype("i4")
-        )
+        mesh = run_isolated(WORKER, *words, points_m=points, triangles=triangles.astype("i4"))
     except Failed as error:
         raise InputError(
             f"pytetwild could not fill the surface ({error}); repair the surface in a mesh editor, "

@@ -79,22 +79,12 @@ class CasadiSolver(MethodOptions):
     casadi: Mapping[str, object] = field(default_factory=dict)
 
     def __call__(
-        self,
-        collocation: Collocation,
-        watch: Watch | None = None,
-        start: Array | None = None,
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
         """Solve the NLP from `start`, by default from a simulation at the guess; `watch` is called
         with every entry of the history. See `Method`.
-
-        Raises
-        ------
-        InputError
-            For an option that the plugin does not know.
         """
-        recorder = Recorder(
-            self.name, collocation, watch=watch, max_time_s=self.max_time_s
-        )
+        recorder = Recorder(self.name, collocation, watch=watch, max_time_s=self.max_time_s)
         plugin = self.name.removeprefix(PREFIX)
         with recorder.stopwatch.building():
             program = with_lifted_variables(collocation)
@@ -114,15 +104,10 @@ class CasadiSolver(MethodOptions):
         (`casadi`) replace those of the method, and mappings are merged. The functions of the cache
         are new, and are added to `functions`.
         """
-        cache = {
-            n: functions.function(n, *o.split())
-            for n, o in self.functions.items()
-        }
+        cache = {n: functions.function(n, *o.split()) for n, o in self.functions.items()}
         settings = {"cache": cache, **self._plugin_settings()}
         for name, value in self.casadi.items():
-            are_mappings = isinstance(value, Mapping) and isinstance(
-                settings.get(name), Mapping
-            )
+            are_mappings = isinstance(value, Mapping) and isinstance(settings.get(name), Mapping)
             settings[name] = settings[name] | value if are_mappings else value
         return settings
 
@@ -201,9 +186,7 @@ class Sleqp(CasadiSolver):
 
 PLUGINS = {kind.name.removeprefix(PREFIX): kind for kind in (SqpMethod, Sleqp)}
 
-_LIBRARY = (
-    "it needs a library, and usually a licence, that are not part of CasADi"
-)
+_LIBRARY = "it needs a library, and usually a licence, that are not part of CasADi"
 REFUSED: dict[str, str] = {
     "ipopt": 'IPOPT is available as the method "interior-point"',
     "alpaqa": "it derives an augmented Lagrangian from expressions, and the NLP has only callbacks",
@@ -218,9 +201,7 @@ REFUSED: dict[str, str] = {
     "bonmin": 'without integers it is IPOPT, whose method is "interior-point"; its progress '
     "cannot be shown, and it cannot be interrupted",
     "ampl": "it starts an external AMPL solver, which does not support callbacks",
-    **dict.fromkeys(
-        ("ccopt", "conopt", "knitro", "madnlp", "snopt", "worhp"), _LIBRARY
-    ),
+    **dict.fromkeys(("ccopt", "conopt", "knitro", "madnlp", "snopt", "worhp"), _LIBRARY),
 }
 
 
@@ -241,25 +222,12 @@ def refusal_reason(name: str) -> str | None:
     return f"found {name!r}, which CasADi does not have; {hint}expected one of {offered}"
 
 
-def _judge(
-    collocation: Collocation, status: Status, z: Array, multipliers: Array
-) -> Status:
+def _judge(collocation: Collocation, status: Status, z: Array, multipliers: Array) -> Status:
     """Return the status of a solution after a check of its constraints and optimality at z.
 
     A converged one that violates constraints by more than `FEASIBLE` is infeasible; one that
     stalled or failed numerically is acceptable if the optimality conditions hold within
     `ACCEPTABLE`; other statuses are returned unchanged.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Given problem.
-    status : Status
-        Status by the solver.
-    z : (variables,) array
-        Variables of the given problem.
-    multipliers : (constraints,) array
-        Multipliers of its constraints, in the scaling of the NLP.
     """
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)
@@ -270,29 +238,16 @@ def _judge(
     return status
 
 
-def _hessian_values(
-    collocation: Collocation, hessian: Hessian
-) -> HessianValues:
+def _hessian_values(collocation: Collocation, hessian: Hessian) -> HessianValues:
     """Return the function (z, weight, multipliers, out) that overwrites `out` with the values of
     the upper triangle of the Hessian of weight · f + multipliers · g at z, in the order of
     `hessian_structure`.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Program that is passed to the solver.
-    hessian : {"gauss-newton", "exact"}
-        For "gauss-newton" the values are those of weight · f in the Gauss–Newton approximation, and
-        the multipliers are not used.
     """
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
         """Write the Hessian's values of weight · f + multipliers · g at z to `out`, in place."""
         collocation.hessian_values(
-            z,
-            weight,
-            multipliers=multipliers if hessian == "exact" else None,
-            out=out,
+            z, weight, multipliers=multipliers if hessian == "exact" else None, out=out
         )
 
     return values

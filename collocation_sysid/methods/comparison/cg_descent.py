@@ -59,9 +59,7 @@ class CgDescentOptions:
     max_trials: int = 60
 
 
-Ending = Literal[
-    "converged", "iteration-limit", "stopped", "line-search", "not-finite"
-]
+Ending = Literal["converged", "iteration-limit", "stopped", "line-search", "not-finite"]
 
 # First step size over the size of the start (ψ0).
 FIRST = 0.01
@@ -178,12 +176,7 @@ def minimise_cg_descent(
         iterations.
         """
         return CgResult(
-            x,
-            f,
-            gradient=g,
-            iterations=iterations,
-            evaluations=counted.evaluations,
-            ending=ending,
+            x, f, gradient=g, iterations=iterations, evaluations=counted.evaluations, ending=ending
         )
 
     if not (np.isfinite(f) and np.isfinite(g).all()):
@@ -216,9 +209,7 @@ def minimise_cg_descent(
         average.add(f)
         line = line_search_in(d)
         first_step = (
-            _initial_step(x, f, g=g)
-            if k == 0
-            else _initial_step_after(line, step, change=change)
+            _initial_step(x, f, g=g) if k == 0 else _initial_step_after(line, step, change=change)
         )
         trial = line.search(first_step)
         is_deflected = line.slope > -float(g @ g) * (1 - 1e-12)
@@ -240,13 +231,7 @@ def minimise_cg_descent(
         last_direction = d
         d = _next_direction(d, before, g=g, y=y, truncation=options.truncation)
         state = CgState(
-            k + 1,
-            x,
-            value=f,
-            gradient=g,
-            direction=last_direction,
-            slope=slope,
-            step=step,
+            k + 1, x, value=f, gradient=g, direction=last_direction, slope=slope, step=step
         )
         if callback is not None and callback(state):
             return result("stopped", k + 1)
@@ -255,30 +240,15 @@ def minimise_cg_descent(
     return result("iteration-limit", options.max_iterations)
 
 
-def _next_direction(
-    d: Array, previous: Array, g: Array, y: Array, truncation: float
-) -> Array:
+def _next_direction(d: Array, previous: Array, g: Array, y: Array, truncation: float) -> Array:
     """Return the next direction of descent (n,); the steepest descent after a step without positive
     curvature.
-
-    Parameters
-    ----------
-    d : (n,) array
-        Direction of the last step.
-    previous, g : (n,) arrays
-        Gradient before and after that step.
-    y : (n,) array
-        Their difference.
-    truncation : float
-        Limit of the conjugacy parameter, relative to the gradient.
     """
     curvature = float(d @ y)
     if curvature <= 0:
         return -g
     beta = float((y - 2 * d * (float(y @ y) / curvature)) @ g) / curvature
-    size = float(np.linalg.norm(d)) * min(
-        truncation, float(np.linalg.norm(previous))
-    )
+    size = float(np.linalg.norm(d)) * min(truncation, float(np.linalg.norm(previous)))
     return -g + max(beta, -1 / size) * d
 
 
@@ -296,15 +266,6 @@ def _initial_step(x: Array, f: float, g: Array) -> float:
 def _initial_step_after(line: _LineSearch, last: float, change: float) -> float:
     """Return the initial step size of a later line search: I1 (parabola through a sample of the
     value, which is evaluated) or I2.
-
-    Parameters
-    ----------
-    line : _LineSearch
-        The new search.
-    last : float
-        Step size of the last one.
-    change : float
-        Magnitude of the change of the value by the last one.
     """
     if change > SMALL_CHANGE * abs(line.value):
         sample_step = SAMPLED * last
@@ -327,9 +288,7 @@ class _CountedFunction:
     """
 
     def __init__(
-        self,
-        fun_and_grad: ValueAndGradient,
-        value: Callable[[Array], float] | None,
+        self, fun_and_grad: ValueAndGradient, value: Callable[[Array], float] | None
     ) -> None:
         self._fun_and_grad = fun_and_grad
         self._value = value
@@ -471,27 +430,15 @@ class _LineSearch:
     def _try(self, step: float) -> _LineTrial:
         """Return the trial at a step size, and count it; where the function is not finite its value
         is infinite and its slope NaN.
-
-        Raises
-        ------
-        _TrialAccepted
-            If the trial satisfies the Wolfe conditions.
-        _TrialsExhausted
-            After too many trials.
         """
         if self.trials >= self.options.max_trials:
             raise _TrialsExhausted
         self.trials += 1
         value, gradient = self.function(self.x + step * self.direction)
         # Out of the domain the slope is not a number: neither up nor down, and the value is high.
-        slope = (
-            float(gradient @ self.direction) if np.isfinite(value) else np.nan
-        )
+        slope = float(gradient @ self.direction) if np.isfinite(value) else np.nan
         trial = _LineTrial(
-            step,
-            value if np.isfinite(slope) else np.inf,
-            slope=slope,
-            gradient=gradient,
+            step, value if np.isfinite(slope) else np.inf, slope=slope, gradient=gradient
         )
         if self._satisfies_wolfe(trial):
             raise _TrialAccepted(trial)
@@ -507,13 +454,9 @@ class _LineSearch:
         curvature = self.options.curvature
         if not trial.slope >= curvature * self.slope:
             return False
-        if (
-            2 * decrease - 1
-        ) * self.slope >= trial.slope and trial.value <= self.limit:
+        if (2 * decrease - 1) * self.slope >= trial.slope and trial.value <= self.limit:
             return True
-        is_decreased = (
-            trial.value - self.value <= decrease * trial.step * self.slope
-        )
+        is_decreased = trial.value - self.value <= decrease * trial.step * self.slope
         return is_decreased and not self.approximate
 
     def _bracket(self, step: float) -> tuple[_LineTrial, _LineTrial]:
@@ -532,9 +475,7 @@ class _LineSearch:
             low = trial
             step = EXPANSION * step
 
-    def _update(
-        self, a: _LineTrial, b: _LineTrial, step: float
-    ) -> tuple[_LineTrial, _LineTrial]:
+    def _update(self, a: _LineTrial, b: _LineTrial, step: float) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval within (a, b) with the trial at `step` as one of its ends, rules U0 …
         U3; (a, b) itself if `step` is outside or NaN.
 
@@ -549,9 +490,7 @@ class _LineSearch:
             return trial, b
         return self._cut(a, trial)
 
-    def _cut(
-        self, a: _LineTrial, b: _LineTrial
-    ) -> tuple[_LineTrial, _LineTrial]:
+    def _cut(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval within (a, b) with an ascending end, from a descending trial a with a
         value up to `limit` and a trial b above it, by bisection, rule U3.
 
@@ -566,9 +505,7 @@ class _LineSearch:
             else:
                 b = trial
 
-    def _double_secant(
-        self, a: _LineTrial, b: _LineTrial
-    ) -> tuple[_LineTrial, _LineTrial]:
+    def _double_secant(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval within (a, b) after up to two secant steps, rules S1 … S4; (a, b)
         itself if the secant step is outside or NaN.
 

@@ -18,9 +18,7 @@ from scipy.optimize import minimize as scipy_minimise
 from ...common.array_types import Array
 from .cg_descent import CgDescentOptions
 from .cg_descent import minimise_cg_descent as cg_descent
-from .levenberg_marquardt import (
-    minimise_levenberg_marquardt as levenberg_marquardt,
-)
+from .levenberg_marquardt import minimise_levenberg_marquardt as levenberg_marquardt
 from .merit import MeritFunction
 
 Report = Callable[[Array, float, Array], None]
@@ -75,11 +73,7 @@ def minimise_merit(
     """
     if inner == "levenberg-marquardt":
         return levenberg_marquardt(
-            merit,
-            z,
-            tolerance=tolerance,
-            max_iterations=max_iterations,
-            report=report,
+            merit, z, tolerance=tolerance, max_iterations=max_iterations, report=report
         )
     scaled = _ScaledMerit(merit, z, smooth=inner != "l-bfgs-b")
     follow = _ConvergenceCheck(scaled, tolerance, report=report)
@@ -153,9 +147,7 @@ class _ConvergenceCheck:
         Whether the last iterate was within the tolerance.
     """
 
-    def __init__(
-        self, scaled: _ScaledMerit, tolerance: float, report: Report
-    ) -> None:
+    def __init__(self, scaled: _ScaledMerit, tolerance: float, report: Report) -> None:
         self.scaled = scaled
         self.tolerance = tolerance
         self.report = report
@@ -170,13 +162,9 @@ class _ConvergenceCheck:
         """
         point = self.scaled.evaluate_at(s)
         self.scaled.replacement_value = STEEP * abs(point.value) + 1e-300
-        projected = self.scaled.project_gradient(
-            s, point.z, gradient=point.gradient
-        )
+        projected = self.scaled.project_gradient(s, point.z, gradient=point.gradient)
         self.report(point.z, point.value, projected)
-        self.converged = bool(
-            np.abs(projected).max(initial=0.0) <= self.tolerance
-        )
+        self.converged = bool(np.abs(projected).max(initial=0.0) <= self.tolerance)
         return self.converged
 
 
@@ -225,15 +213,8 @@ class _ScaledMerit:
         self.unit = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
         lower = problem.lower[self.free]
         upper = problem.upper[self.free]
-        self.bounds = Bounds(
-            (lower - z[self.free]) / self.unit,
-            (upper - z[self.free]) / self.unit,
-        )
-        self.mapped = (
-            np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
-            if smooth
-            else []
-        )
+        self.bounds = Bounds((lower - z[self.free]) / self.unit, (upper - z[self.free]) / self.unit)
+        self.mapped = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper)) if smooth else []
         at = z[self.free][self.mapped]
         low = np.maximum(lower[self.mapped], at - LARGEST_OPEN_DISTANCE)
         high = np.minimum(upper[self.mapped], at + LARGEST_OPEN_DISTANCE)
@@ -252,17 +233,13 @@ class _ScaledMerit:
         """
         z = self.z.copy()
         free_values = z[self.free] + self.unit * s
-        free_values[self.mapped] = self.middle + self.half * np.sin(
-            self._angles(s)
-        )
+        free_values[self.mapped] = self.middle + self.half * np.sin(self._angles(s))
         z[self.free] = free_values
         return z
 
     def _angles(self, s: Array) -> Array:
         """Return the angles of the sine map of the mapped variables at s (free,)."""
-        return self.angle + (self.unit * s)[self.mapped] / (
-            self.half * np.cos(self.angle)
-        )
+        return self.angle + (self.unit * s)[self.mapped] / (self.half * np.cos(self.angle))
 
     def _slopes(self, s: Array) -> Array:
         """Return the derivatives (free,) of the free variables by unit · s: those of the sine map
@@ -304,9 +281,7 @@ class _ScaledMerit:
         """
         value, gradient = self.value_and_gradient(s)
         return (
-            (value, gradient)
-            if np.isfinite(value)
-            else (self.replacement_value, np.zeros(len(s)))
+            (value, gradient) if np.isfinite(value) else (self.replacement_value, np.zeros(len(s)))
         )
 
     def project_gradient(self, s: Array, z: Array, gradient: Array) -> Array:

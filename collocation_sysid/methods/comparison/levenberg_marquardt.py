@@ -97,22 +97,15 @@ def minimise_levenberg_marquardt(
         while True:
             step = system.step(damping)
             if step is None and system.exact:
-                system = _quadratic_model(
-                    merit, point, exact=False, order=order
-                )
+                system = _quadratic_model(merit, point, exact=False, order=order)
                 continue
             if step is not None:
                 predicted = system.predicted_decrease(step)
-                trial = np.clip(
-                    point.z + step, merit.problem.lower, merit.problem.upper
-                )
+                trial = np.clip(point.z + step, merit.problem.lower, merit.problem.upper)
                 if predicted <= ROUNDING * abs(point.value):
                     # Values cannot judge this step any more; gradients can.
                     after = _MeritPoint.evaluate(merit, trial)
-                    if (
-                        not after.compute_gradient_norm()
-                        <= point.compute_gradient_norm() / 2
-                    ):
+                    if not after.compute_gradient_norm() <= point.compute_gradient_norm() / 2:
                         return False
                     ratio = 1.0
                     break
@@ -125,15 +118,8 @@ def minimise_levenberg_marquardt(
             growth = 2 * growth
             if damping > MOST_DAMPING:
                 return False
-        damping = max(
-            damping * max(1 / 5, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING
-        )
-        is_local = (
-            float(
-                np.abs(step[merit.problem.parameter_indices]).max(initial=0.0)
-            )
-            <= LOCAL
-        )
+        damping = max(damping * max(1 / 5, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
+        is_local = float(np.abs(step[merit.problem.parameter_indices]).max(initial=0.0)) <= LOCAL
         growth = 2.0
         point = after
     return False
@@ -199,25 +185,8 @@ class _MeritPoint:
 def _quadratic_model(
     merit: MeritFunction, point: _MeritPoint, exact: bool, order: list[Index]
 ) -> _QuadraticModel:
-    """Return the quadratic model at a point.
-
-    Parameters
-    ----------
-    merit : MeritFunction
-        Merit function.
-    point : _MeritPoint
-        Point with its derivatives, evaluated last: its Jacobian is used, not copied.
-    exact : bool
-        Whether the Hessian is that of the Lagrangian, else that of the loss.
-    order : list
-        Order of the band's columns, shared by all models of a minimisation: empty at first; the
-        first step of a model computes and appends it.
-    """
-    weights = (
-        merit.multiplier_estimate(point.rows)
-        if exact
-        else np.zeros_like(point.rows)
-    )
+    """Return the quadratic model at a point."""
+    weights = merit.multiplier_estimate(point.rows) if exact else np.zeros_like(point.rows)
     with merit.problem.stopwatch.evaluating():
         hessian = merit.problem.nlp.hessian(point.z, 1.0, multipliers=weights)
     return _QuadraticModel(
@@ -306,21 +275,13 @@ class _QuadraticModel:
         right = np.column_stack([self._mixed_block, self.gradient[positions]])
         (order,) = self.order
         solved = np.empty_like(right)
-        solved[order] = _pbtrs(band, right[order], lower=1)[0].reshape(
-            right.shape
-        )
+        solved[order] = _pbtrs(band, right[order], lower=1)[0].reshape(right.shape)
         by_p = solved[:, :-1]
         position_step = solved[:, -1]
-        schur = (
-            self._parameter_block
-            - self._mixed_block.T @ by_p
-            + damping * np.eye(len(border))
-        )
+        schur = self._parameter_block - self._mixed_block.T @ by_p + damping * np.eye(len(border))
         step = np.zeros(len(self.z))
         if len(border):
-            reduced_gradient = (
-                self.gradient[border] - self._mixed_block.T @ position_step
-            )
+            reduced_gradient = self.gradient[border] - self._mixed_block.T @ position_step
             of_p = self._bounded_step((schur + schur.T) / 2, reduced_gradient)
             if of_p is None:
                 return None
@@ -334,13 +295,6 @@ class _QuadraticModel:
 
         Each step stays within the bounds of its parameter, and is at most `REACH` times its entry
         of `compute_reach_p`.
-
-        Parameters
-        ----------
-        schur : (parameters, parameters) array
-            S, symmetric and finite.
-        slope : (parameters,) array
-            s.
         """
         try:
             factor = cholesky(schur, lower=True)
@@ -349,27 +303,13 @@ class _QuadraticModel:
         border = self.problem.parameter_indices
         problem = self.problem
         reach = problem.nlp.compute_reach_p()
-        places = np.where(
-            border < problem.nlp.nq, border, border - len(self.z) + len(reach)
-        )
+        places = np.where(border < problem.nlp.nq, border, border - len(self.z) + len(reach))
         reach = REACH * reach[places]
         # Rounding may leave a parameter on its bound by a hair.
-        low = (
-            np.minimum(
-                np.maximum(problem.lower[border] - self.z[border], -reach), 0
-            )
-            - 1e-15
-        )
-        high = (
-            np.maximum(
-                np.minimum(problem.upper[border] - self.z[border], reach), 0
-            )
-            + 1e-15
-        )
+        low = np.minimum(np.maximum(problem.lower[border] - self.z[border], -reach), 0) - 1e-15
+        high = np.maximum(np.minimum(problem.upper[border] - self.z[border], reach), 0) + 1e-15
         right = solve_triangular(factor, slope, lower=True)
-        return SquareRootInformation(
-            np.column_stack([factor.T, right])
-        ).minimiser(low, high)
+        return SquareRootInformation(np.column_stack([factor.T, right])).minimiser(low, high)
 
     # The bordered matrix ----------------------------------------------------------------------
 
@@ -391,19 +331,14 @@ class _QuadraticModel:
         """Dense block (free positions, parameters) of the matrix, without damping."""
         of_x, of_p = self._jacobian_blocks
         rows = sp.csr_array(self.hessian)[self._positions]
-        return (
-            self.rho * (of_x.T @ of_p)
-            + rows[:, self.problem.parameter_indices].toarray()
-        )
+        return self.rho * (of_x.T @ of_p) + rows[:, self.problem.parameter_indices].toarray()
 
     @cached_property
     def _parameter_block(self) -> Array:
         """Dense block (parameters, parameters) of the matrix, without damping."""
         of_p = self._jacobian_blocks[1]
         border = self.problem.parameter_indices
-        return (
-            self.rho * of_p.T @ of_p + self.hessian[border][:, border].toarray()
-        )
+        return self.rho * of_p.T @ of_p + self.hessian[border][:, border].toarray()
 
     @cached_property
     def _position_block(self) -> sp.coo_array:
@@ -421,11 +356,6 @@ class _QuadraticModel:
         the order that is the entry of `order`.
 
         The order is computed and appended to `order` if that is empty.
-
-        Raises
-        ------
-        InputError
-            If it needs more memory than `MOST_MEMORY`.
         """
         with self.problem.stopwatch.solving():
             square = self._position_block
@@ -456,14 +386,9 @@ def _narrow_order(square: sp.coo_array) -> Index:
     """Return an order (n,) of the rows and columns that makes the band of a symmetric sparse matrix
     (n, n) narrower, as indices of the columns in the new order; the identity if none is found.
     """
-    order = reverse_cuthill_mckee(
-        sp.csr_array(square), symmetric_mode=True
-    ).astype(np.int64)
+    order = reverse_cuthill_mckee(sp.csr_array(square), symmetric_mode=True).astype(np.int64)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     rows, columns = square.coords
-    narrower = (
-        np.abs(place[rows] - place[columns]).max()
-        < np.abs(rows - columns).max()
-    )
+    narrower = np.abs(place[rows] - place[columns]).max() < np.abs(rows - columns).max()
     return order if narrower else np.arange(len(order))

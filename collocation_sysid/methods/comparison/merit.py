@@ -4,8 +4,8 @@
 
 with loss and constraints in the scaling of the NLP and y = 0 for a penalty. Positions of grasped
 nodes, history variables of materials with memory and lifted measurements are variables with
-constraints of their own (see `program.lifted.lifting`). Variables with equal bounds, such as a given
-start, are constant.
+constraints of their own (see `program.lifted.lifting`). Variables with equal bounds, such as a
+given start, are constant.
 """
 
 from __future__ import annotations
@@ -48,9 +48,7 @@ class PenaltyProblem:
         Stopwatch that measures evaluations.
     """
 
-    def __init__(
-        self, collocation: Collocation, stopwatch: Stopwatch | None = None
-    ) -> None:
+    def __init__(self, collocation: Collocation, stopwatch: Stopwatch | None = None) -> None:
         self.original = collocation
         self.stopwatch = stopwatch or Stopwatch()
         with self.stopwatch.building():
@@ -64,9 +62,7 @@ class PenaltyProblem:
             indptr, indices = self.nlp.jacobian_structure
             shape = (self.nlp.constraint_count, self.nlp.variable_count)
             self._entries = np.zeros(len(indices))
-            self._jacobian = sp.csc_array(
-                (self._entries, indices, indptr), shape=shape
-            )
+            self._jacobian = sp.csc_array((self._entries, indices, indptr), shape=shape)
         self.evaluations = 0
         self.lower, self.upper = self.nlp.bounds()
         self.is_free = self.lower != self.upper
@@ -100,8 +96,8 @@ class PenaltyProblem:
             return False
         with self.stopwatch.evaluating():
             for part in self.nlp.iterates(z):
-                states, _ = part.segment.dynamics.evaluation_states(part.x)
-                if not part.segment.body.volume_ratios(states).min() > 0:
+                states, _ = part.transcription.dynamics.evaluation_states(part.x)
+                if not part.transcription.body.volume_ratios(states).min() > 0:
                     return False
         return True
 
@@ -134,15 +130,13 @@ class PenaltyProblem:
         Grasped nodes stay where they are if that would invert elements.
         """
         positions = [
-            part.segment.with_prescribed_positions(part.x, part.phi)
+            part.transcription.with_prescribed_positions(part.x, part.phi)
             for part in self.nlp.iterates(z)
         ]
         prescribed = self.nlp.pack(self.nlp.parameters_from(z), positions)
         prescribed[~self.is_free] = z[~self.is_free]
         return convert_variables(
-            prescribed if self.has_valid_elements(prescribed) else z,
-            self.nlp,
-            target=self.original,
+            prescribed if self.has_valid_elements(prescribed) else z, self.nlp, target=self.original
         )
 
     def to_original_multipliers(self, multipliers: Array) -> Array:
@@ -150,17 +144,13 @@ class PenaltyProblem:
         (constraints,); those of prescribed displacements are left out if the given problem has no
         such constraints.
         """
-        pairs = zip(
-            self.original.transcriptions, self.nlp.transcriptions, strict=True
-        )
+        pairs = zip(self.original.transcriptions, self.nlp.transcriptions, strict=True)
         rows = ((block, s, multipliers[s.rows]) for block, s in pairs)
         return np.concatenate(
             [
                 each
                 if values.constraints_per_time == s.constraints_per_time
-                else each.reshape(-1, s.dof_count)[
-                    :, values.constrained_dofs
-                ].ravel()
+                else each.reshape(-1, s.dof_count)[:, values.constrained_dofs].ravel()
                 for values, s, each in rows
             ]
         )
@@ -209,17 +199,13 @@ class MeritFunction:
         if not self.problem.has_valid_elements(z):
             return np.inf, np.full(len(z), np.nan)
         rows, jacobian = self.problem.constraints_and_jacobian(z)
-        return self.value_from_constraints(z, rows), self.gradient(
-            z, rows, jacobian=jacobian
-        )
+        return self.value_from_constraints(z, rows), self.gradient(z, rows, jacobian=jacobian)
 
     def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:
         """Return ∇m (variables,) at z from the constraints g (`rows`) and `jacobian`, ∂g/∂z, there;
         zero for constant variables.
         """
-        slope = self.problem.nlp.gradient(
-            z
-        ) + jacobian.T @ self.multiplier_estimate(rows)
+        slope = self.problem.nlp.gradient(z) + jacobian.T @ self.multiplier_estimate(rows)
         return np.where(self.problem.is_free, slope, 0.0)
 
     def multiplier_estimate(self, rows: Array) -> Array:

@@ -151,28 +151,17 @@ class PenaltyOptions(MethodOptions):
             )
 
     def __call__(
-        self,
-        collocation: Collocation,
-        watch: Watch | None = None,
-        start: Array | None = None,
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
         """Solve the NLP from `start`, by default from a simulation at the guess; see `Method`.
         Entries of the history, with which `watch` is called, count inner iterations.
 
         Grasped nodes of the solution have their prescribed positions, where its violation is
         evaluated.
-
-        Raises
-        ------
-        InputError
-            For a start with inverted elements, or if the factor of the inner solver
-            "levenberg-marquardt" needs too much memory.
         """
         climb = _PenaltySolve(
             self,
-            Recorder(
-                self.name, collocation, watch=watch, max_time_s=self.max_time_s
-            ),
+            Recorder(self.name, collocation, watch=watch, max_time_s=self.max_time_s),
             start=start,
         )
         try:
@@ -191,9 +180,7 @@ class PenaltyOptions(MethodOptions):
         """Tolerance of the first stage: largest entry of the merit's projected gradient."""
         return self.tolerance
 
-    def next_stage(
-        self, stage: Stage, previous_violation: ConstraintViolation, z: Array
-    ) -> Stage:
+    def next_stage(self, stage: Stage, previous_violation: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage.
 
         Parameters
@@ -237,9 +224,7 @@ class Penalty(PenaltyOptions):
         """Largest ρ of the solve: `rho` for a constant schedule, else `rho_max`."""
         return self.rho if self.schedule == "constant" else self.rho_max
 
-    def next_stage(
-        self, stage: Stage, previous_violation: ConstraintViolation, z: Array
-    ) -> Stage:
+    def next_stage(self, stage: Stage, previous_violation: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage, with a larger ρ if an increase is due by the schedule, or the
         stage reached its minimum; see `PenaltyOptions.next_stage` for the arguments.
 
@@ -286,9 +271,7 @@ class AugmentedLagrangian(PenaltyOptions):
         """Tolerance of the first stage: `FIRST_GRADIENT`, or that of the last if it is larger."""
         return max(FIRST_GRADIENT, self.tolerance)
 
-    def next_stage(
-        self, stage: Stage, previous_violation: ConstraintViolation, z: Array
-    ) -> Stage:
+    def next_stage(self, stage: Stage, previous_violation: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage with updated multipliers, and a larger ρ if much violation remains;
         see `PenaltyOptions.next_stage` for the arguments.
 
@@ -322,15 +305,8 @@ class AugmentedLagrangian(PenaltyOptions):
         if not is_feasible and slack.scaled > FALL * previous_violation.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
         rows = stage.merit.problem.constraint_values(z)
-        merit = replace(
-            stage.merit,
-            rho=rho,
-            multipliers=stage.merit.multiplier_estimate(rows),
-        )
-        return Stage(
-            merit,
-            max(0.0 if is_feasible else TIGHTER * tolerance, self.tolerance),
-        )
+        merit = replace(stage.merit, rho=rho, multipliers=stage.merit.multiplier_estimate(rows))
+        return Stage(merit, max(0.0 if is_feasible else TIGHTER * tolerance, self.tolerance))
 
 
 class _PenaltySolve:
@@ -361,9 +337,7 @@ class _PenaltySolve:
         If elements are inverted at the start.
     """
 
-    def __init__(
-        self, options: PenaltyOptions, recorder: Recorder, start: Array | None
-    ) -> None:
+    def __init__(self, options: PenaltyOptions, recorder: Recorder, start: Array | None) -> None:
         self.options = options
         self.recorder = recorder
         self.problem = PenaltyProblem(recorder.collocation, recorder.stopwatch)
@@ -371,21 +345,15 @@ class _PenaltySolve:
         began = self.problem.from_original(recorder.initial_variables(start))
         self.variables = np.clip(began, self.problem.lower, self.problem.upper)
         if not self.problem.has_valid_elements(self.variables):
-            raise InputError(
-                "elements are inverted at the initial point; give another guess"
-            )
+            raise InputError("elements are inverted at the initial point; give another guess")
         no_weights = np.zeros(nlp.constraint_count)
         merit = MeritFunction(self.problem, options.rho, multipliers=no_weights)
         self.stage = Stage(merit, options.first_gradient)
         self.iterations = 0
         self.gradient = np.inf
-        curvature = nlp.hessian(
-            self.variables, 1.0, multipliers=no_weights
-        ).diagonal()
+        curvature = nlp.hessian(self.variables, 1.0, multipliers=no_weights).diagonal()
         self._curvature = float(curvature.max(initial=0.0))
-        self._every = (
-            EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
-        )
+        self._every = EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
 
     def run(self) -> tuple[Status, str]:
         """Solve one stage after the other; return status and message.
@@ -415,9 +383,7 @@ class _PenaltySolve:
                     "their tolerances."
                 )
                 return Status.CONVERGED, message
-            self.stage = options.next_stage(
-                ended_stage, previous_violation, z=self.variables
-            )
+            self.stage = options.next_stage(ended_stage, previous_violation, z=self.variables)
             previous_violation = ended_stage.violation
 
     def solution(self, status: Status, reason: str) -> Solution:
@@ -426,9 +392,7 @@ class _PenaltySolve:
         evaluated and counted.
         """
         merit = self.stage.merit
-        estimate = merit.multiplier_estimate(
-            self.problem.constraint_values(self.variables)
-        )
+        estimate = merit.multiplier_estimate(self.problem.constraint_values(self.variables))
         return self.recorder.solution(
             status,
             f"{reason} Remaining violation of the equations of motion at ρ = {merit.rho:.3g}: "
@@ -447,20 +411,11 @@ class _PenaltySolve:
         gets an entry now and then, and one for the last iterate. The tolerance is larger where ρ or
         the curvature of the loss makes rounding dominate. A stage that reaches `inner_iterations`
         ends without an error; its `is_minimum` is False.
-
-        Raises
-        ------
-        SearchEnded
-            If the limit of the iterations of all stages, or that of the time, is reached.
-        InputError, SimulationError
-            As in `minimise_merit`.
         """
         stage = self.stage
         options = self.options
         recorder = self.recorder
-        tolerance = max(
-            stage.tolerance, ROUNDING * (stage.merit.rho + self._curvature)
-        )
+        tolerance = max(stage.tolerance, ROUNDING * (stage.merit.rho + self._curvature))
         before = self.iterations
         done = 0
 
@@ -476,10 +431,7 @@ class _PenaltySolve:
                 self._record()
             if recorder.is_late():
                 raise SearchEnded(Status.TIME_LIMIT)
-            if (
-                self.iterations >= options.max_iterations
-                and self.gradient > tolerance
-            ):
+            if self.iterations >= options.max_iterations and self.gradient > tolerance:
                 raise SearchEnded(Status.ITERATION_LIMIT)
             done += 1
 
@@ -495,10 +447,7 @@ class _PenaltySolve:
         if recorder.history[-1].number < self.iterations:
             self._record()
         return replace(
-            stage,
-            gradient=self.gradient,
-            is_minimum=reached,
-            violation=self._violation(),
+            stage, gradient=self.gradient, is_minimum=reached, violation=self._violation()
         )
 
     def _record(self) -> None:
@@ -507,9 +456,7 @@ class _PenaltySolve:
         """
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
-        self.recorder.add_variables(
-            self.iterations, z, loss=nlp.objective(z) / nlp.loss_scale
-        )
+        self.recorder.add_variables(self.iterations, z, loss=nlp.objective(z) / nlp.loss_scale)
 
     def _violation(self) -> ConstraintViolation:
         """Return the violation at the last iterate: residuals [N] with grasped nodes at their
@@ -517,13 +464,9 @@ class _PenaltySolve:
         """
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
-        newtons = max(
-            float(np.abs(r).max(initial=0.0)) for r in nlp.residuals_n(z)
-        )
+        newtons = max(float(np.abs(r).max(initial=0.0)) for r in nlp.residuals_n(z))
         rows = self.problem.constraint_values(self.variables)
         scaled = float(np.abs(rows).max(initial=0.0))
         return ConstraintViolation(
-            newtons,
-            newtons / max(nlp.largest_force_n(z), 1e-300),
-            scaled=scaled,
+            newtons, newtons / max(nlp.largest_force_n(z), 1e-300), scaled=scaled
         )

@@ -70,10 +70,7 @@ class Shooting(MethodOptions):
     max_time_s: Positive = 1e6
 
     def __call__(
-        self,
-        collocation: Collocation,
-        watch: Watch | None = None,
-        start: Array | None = None,
+        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
         """Solve the NLP, see `Method`; entries of the history, with which `watch` is called, are
         simulations better than all before.
@@ -81,9 +78,7 @@ class Shooting(MethodOptions):
         Only the parameters of `start` are used, by default the guess. If their simulation fails,
         the status says so and the positions are those of a rigid motion with the grasp.
         """
-        recorder = Recorder(
-            self.name, collocation, watch=watch, max_time_s=self.max_time_s
-        )
+        recorder = Recorder(self.name, collocation, watch=watch, max_time_s=self.max_time_s)
         search = _ShootingSearch(self, recorder, start=start)
         try:
             status, message = search.run()
@@ -99,16 +94,9 @@ class Shooting(MethodOptions):
             multipliers = None
         if best is not None and search.failures:
             failed = f"{search.failures} of {shots} simulations failed"
-            recorder.notes.append(
-                f"{failed}; each time the search continued with a shorter step"
-            )
+            recorder.notes.append(f"{failed}; each time the search continued with a shorter step")
         return recorder.solution(
-            status,
-            message,
-            z=z,
-            multipliers=multipliers,
-            iterations=shots,
-            evaluations=shots,
+            status, message, z=z, multipliers=multipliers, iterations=shots, evaluations=shots
         )
 
 
@@ -131,9 +119,7 @@ def simulate_variables(
     SimulationError
         If a simulation fails; it names the time step.
     """
-    positions, failure = simulate_trajectories(
-        collocation, p, stopwatch=stopwatch
-    )
+    positions, failure = simulate_trajectories(collocation, p, stopwatch=stopwatch)
     if failure is not None:
         raise failure
     return collocation.pack(p, positions)
@@ -213,30 +199,20 @@ class _ShootingSearch:
         Linearised problem; None with adjoint gradients.
     """
 
-    def __init__(
-        self, options: Shooting, recorder: Recorder, start: Array | None
-    ) -> None:
+    def __init__(self, options: Shooting, recorder: Recorder, start: Array | None) -> None:
         self.options = options
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
         self.lower, self.upper = collocation.compute_parameter_bounds()
-        first = (
-            collocation.guess_p
-            if start is None
-            else collocation.parameters_from(start)
-        )
+        first = collocation.guess_p if start is None else collocation.parameters_from(start)
         self.first = np.clip(first, self.lower, self.upper)
         self.simulations = self.failures = 0
         self.last: _SimulatedPoint | None = None
         self.best: _SimulatedPoint | None = None
         self.horizon = None
         if options.gradient == "forward":
-            rows = [
-                segment.grid_times for segment in collocation.transcriptions
-            ]
-            self.horizon = Horizon(
-                collocation, rows, stopwatch=recorder.stopwatch
-            )
+            rows = [transcription.grid_times for transcription in collocation.transcriptions]
+            self.horizon = Horizon(collocation, rows, stopwatch=recorder.stopwatch)
 
     def run(self) -> tuple[Status, str]:
         """Search, and return the status and a sentence with SciPy's message; the result is `best`.
@@ -272,9 +248,7 @@ class _ShootingSearch:
             ftol=ROUNDING,
             gtol=self.options.tolerance,
         )
-        status = (
-            Status.ITERATION_LIMIT if result.status == 0 else Status.CONVERGED
-        )
+        status = Status.ITERATION_LIMIT if result.status == 0 else Status.CONVERGED
         return status, f"{status.sentence} (SciPy: {result.message})"
 
     def _residual(self, step: Array) -> Array:
@@ -283,11 +257,7 @@ class _ShootingSearch:
         """
         shot = self._try(self.first + step)
         assert self.best is not None
-        return (
-            np.full(len(self.best.residual), np.inf)
-            if shot is None
-            else shot.residual
-        )
+        return np.full(len(self.best.residual), np.inf) if shot is None else shot.residual
 
     def _residual_slope(self, step: Array) -> Array:
         """Return the derivatives (m, np) of the residuals after a step (np,) from the first
@@ -314,8 +284,7 @@ class _ShootingSearch:
                 "gtol": self.options.tolerance,
                 "ftol": ROUNDING,
                 "maxcor": MEMORY,
-                "maxiter": 10 * self.options.max_iterations
-                + 10,  # shots are counted here
+                "maxiter": 10 * self.options.max_iterations + 10,  # shots are counted here
                 "maxfun": 10 * self.options.max_iterations + 10,
             },
         )
@@ -355,11 +324,6 @@ class _ShootingSearch:
         fails or its objective is not finite.
 
         `last`, `best`, `simulations` and `failures` are updated.
-
-        Raises
-        ------
-        SearchEnded
-            If a simulation fails as close to the best as the tolerance, or a limit is reached.
         """
         if self.last is not None and np.array_equal(p, self.last.p):
             return self.last
@@ -380,13 +344,6 @@ class _ShootingSearch:
         """Return the simulation at p (np,) with derivatives, and count it, also if it fails. If its
         objective is the smallest, it becomes the best one and part of the history; exceptions of
         the recorder's `watch` are not caught.
-
-        Raises
-        ------
-        SearchEnded
-            If a limit of simulations or time is reached; not at the first simulation.
-        SimulationError
-            If the simulation fails, or a time step is singular in the sweep for the derivatives.
         """
         if self.simulations and self.simulations >= self.options.max_iterations:
             raise SearchEnded(Status.ITERATION_LIMIT)
@@ -394,35 +351,21 @@ class _ShootingSearch:
             raise SearchEnded(Status.TIME_LIMIT)
         self.simulations += 1
         collocation = self.collocation
-        z = simulate_variables(
-            collocation, p, stopwatch=self.recorder.stopwatch
-        )
+        z = simulate_variables(collocation, p, stopwatch=self.recorder.stopwatch)
         if self.horizon is not None:
             point = self.horizon.evaluate(p, collocation.unpack(z)[1])
             value = point.loss * collocation.loss_scale
             shot = _SimulatedPoint(
-                p.copy(),
-                z,
-                objective=value,
-                residual=point.fit.residual,
-                slope=point.fit.jacobian,
+                p.copy(), z, objective=value, residual=point.fit.residual, slope=point.fit.jacobian
             )
         else:
-            slope = adjoint_gradient(
-                collocation, z, stopwatch=self.recorder.stopwatch
-            )
+            slope = adjoint_gradient(collocation, z, stopwatch=self.recorder.stopwatch)
             shot = _SimulatedPoint(
-                p.copy(),
-                z,
-                objective=collocation.objective(z),
-                residual=np.zeros(0),
-                slope=slope,
+                p.copy(), z, objective=collocation.objective(z), residual=np.zeros(0), slope=slope
             )
         if self.best is None or shot.objective < self.best.objective:
             self.best = shot
             self.recorder.add_variables(
-                self.simulations,
-                z,
-                loss=shot.objective / collocation.loss_scale,
+                self.simulations, z, loss=shot.objective / collocation.loss_scale
             )
         return shot

@@ -82,13 +82,9 @@ class Contact(ComplementarityForce):
         """Whether few points have a pressure: all have one if the contact is complementarity."""
         return not self.is_complementarity
 
-    def local_force(
-        self, theta: Array, pattern: SymmetricPattern
-    ) -> LocalForce:
+    def local_force(self, theta: Array, pattern: SymmetricPattern) -> LocalForce:
         """Return the contact in one time step, see `ForceTerm.local_force`."""
-        return StepContact(
-            self.law_of_contact, theta, pattern=pattern, step_s=self.step_s
-        )
+        return StepContact(self.law_of_contact, theta, pattern=pattern, step_s=self.step_s)
 
     @property
     def pressure_unit_m(self) -> float:  # type: ignore[override]
@@ -100,12 +96,8 @@ class Contact(ComplementarityForce):
         gaps there: without an average over the step, and without a given b.
         """
         gaps = self.law_of_contact.gaps(self.points.vectors(xi))
-        data = np.broadcast_to(
-            self.law_of_contact.data[:, None], (DATA_COUNT, *gaps.shape)
-        )
-        return self.law_of_contact.scaled_pressure_function.evaluate(
-            gaps[None], data
-        )
+        data = np.broadcast_to(self.law_of_contact.data[:, None], (DATA_COUNT, *gaps.shape))
+        return self.law_of_contact.scaled_pressure_function.evaluate(gaps[None], data)
 
     def rigid_limit_n(self, states: States) -> Array:
         """Return the change (T, 3n) [N] of the forces if contact were rigid, to first order.
@@ -123,9 +115,7 @@ class Contact(ComplementarityForce):
         y = evaluated.u[evaluated.y]
         gap, normal = self.law_of_contact.gaps_with_slopes(y)
         _, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
-        change = np.einsum(
-            "vkti,kti->vti", slopes[evaluated.y, :3], normal[:3] * gap
-        )
+        change = np.einsum("vkti,kti->vti", slopes[evaluated.y, :3], normal[:3] * gap)
         return self.factor * self.points.assemble(change, evaluated.chosen)
 
     def friction_sums(self, states: States) -> Array:
@@ -136,9 +126,9 @@ class Contact(ComplementarityForce):
         would have another length.
         """
         evaluated = self._inputs_at(states)
-        return self.law_of_contact.friction_function.evaluate(
-            evaluated.u, evaluated.data
-        ).sum(axis=2)
+        return self.law_of_contact.friction_function.evaluate(evaluated.u, evaluated.data).sum(
+            axis=2
+        )
 
     @property
     def is_nonlinear_in_velocity(self) -> bool:
@@ -171,12 +161,8 @@ class Contact(ComplementarityForce):
         y = self.points.vectors(states.xi)
         if self.is_complementarity:
             return None, y
-        is_active = np.any(
-            self._least_gaps(states, y) < self.law_of_contact.widths_m, axis=0
-        )
-        is_active[
-            np.flatnonzero(~is_active)[: -is_active.sum() % POINT_BATCH]
-        ] = True
+        is_active = np.any(self._least_gaps(states, y) < self.law_of_contact.widths_m, axis=0)
+        is_active[np.flatnonzero(~is_active)[: -is_active.sum() % POINT_BATCH]] = True
         chosen = np.flatnonzero(is_active)
         return chosen, y[..., chosen]
 
@@ -189,8 +175,7 @@ class Contact(ComplementarityForce):
             return self.law_of_contact.gaps(y)
         half_step = half_s * self.points.vectors(states.nu)
         return np.minimum(
-            self.law_of_contact.gaps(y - half_step),
-            self.law_of_contact.gaps(y + half_step),
+            self.law_of_contact.gaps(y - half_step), self.law_of_contact.gaps(y + half_step)
         )
 
     def separate_bodies(self, places: Array, shape: Array) -> Array:
@@ -202,17 +187,18 @@ class Contact(ComplementarityForce):
         return moved
 
     def deepest_point(self, x: Array) -> tuple[float, Array]:
-        """Return the penetration δ − g [m] of the point with the smallest gap at positions x (3n,) [m],
-        and the gradient of its gap (3,) in the axes of the world, the obstacle's outward normal.
+        """Return the penetration δ − g [m] of the point with the smallest gap at positions x (3n,)
+        [m], and the gradient of its gap (3,) in the axes of the world, the obstacle's outward
+        normal.
 
         The penetration is negative if no point has a pressure.
         """
         y = self.points.vectors(x[None])
         gap, slopes = self.law_of_contact.gaps_with_slopes(y)
         deepest = int(gap[0].argmin())
-        return self.law_of_contact.widths_m[deepest] - float(
-            gap[0, deepest]
-        ), slopes[:3, 0, deepest]
+        return self.law_of_contact.widths_m[deepest] - float(gap[0, deepest]), slopes[
+            :3, 0, deepest
+        ]
 
     def constants(self, states: States) -> Array:
         """Return the constants (c, 1) on which stiffness and friction depend."""
@@ -228,9 +214,7 @@ class Contact(ComplementarityForce):
         return self.law_of_contact.data_of(points, self.step_s)[:, None]
 
 
-def contact_terms(
-    experiment: Experiment, step_s: float = 0.0
-) -> tuple[Contact, ...]:
+def contact_terms(experiment: Experiment, step_s: float = 0.0) -> tuple[Contact, ...]:
     """Return the contact terms of an experiment's obstacles.
 
     Parameters
@@ -243,11 +227,6 @@ def contact_terms(
     terms = []
     for obstacle in experiment.obstacles:
         averaged = step_s > 0 and obstacle.relaxed is None
-        law = contact_law(
-            experiment.body,
-            obstacle,
-            static=experiment.is_static,
-            averaged=averaged,
-        )
+        law = contact_law(experiment.body, obstacle, static=experiment.is_static, averaged=averaged)
         terms.append(Contact(law, step_s=step_s if averaged else 0.0))
     return tuple(terms)

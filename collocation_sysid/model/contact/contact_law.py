@@ -162,9 +162,7 @@ class ContactLaw:
             return np.full(len(self.edges_m), self.obstacle.width_m)
         if self.obstacle.relaxed is not None:
             return RELAXED_WIDTH * self.edges_m
-        return (
-            FRICTION_WIDTH if self.obstacle.has_friction else WIDTH
-        ) * self.edges_m
+        return (FRICTION_WIDTH if self.obstacle.has_friction else WIDTH) * self.edges_m
 
     @property
     def largest_width_m(self) -> float:
@@ -185,10 +183,7 @@ class ContactLaw:
         columns = []
         if self.obstacle.stiffness_pa_m is None:
             offset = self.body.starts[part]
-            columns = [
-                offset + k
-                for k in range(len(self.body.parts[part].material.constants))
-            ]
+            columns = [offset + k for k in range(len(self.body.parts[part].material.constants))]
         if (friction := self.obstacle.friction_constant) is not None:
             columns.append(list(self.body.constants).index(friction.name))
         return np.array(columns, dtype=np.int64)
@@ -209,9 +204,7 @@ class ContactLaw:
 
     def stiffness_at(self, theta: Array) -> Array:
         """Return κ (i,) at each point of a body with constants θ (k,) [Pa/m]."""
-        stiffness = float(
-            ca.evalf(self.stiffness(ca.SX(ca.DM(theta[self.constant_columns]))))
-        )
+        stiffness = float(ca.evalf(self.stiffness(ca.SX(ca.DM(theta[self.constant_columns])))))
         return stiffness * self.data[3]
 
     def friction_coefficient(self, constants: ca.SX) -> ca.SX:
@@ -219,11 +212,7 @@ class ContactLaw:
         the law's constants (c,) if it is a parameter.
         """
         coefficient = self.obstacle.friction
-        return (
-            constants[-1]
-            if isinstance(coefficient, str)
-            else ca.SX(coefficient)
-        )
+        return constants[-1] if isinstance(coefficient, str) else ca.SX(coefficient)
 
     def to_obstacle_frame(self, y: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Express a contact point in the axes of its obstacle.
@@ -247,9 +236,7 @@ class ContactLaw:
     @property
     def _frame_size_m(self) -> float:
         """Length of the axes of the obstacle's frame before it moves [m]."""
-        return float(
-            self.body.frame_nodes_m[1, 0] - self.body.frame_nodes_m[0, 0]
-        )
+        return float(self.body.frame_nodes_m[1, 0] - self.body.frame_nodes_m[0, 0])
 
     def gap_at(self, point_m: ca.SX) -> ca.SX:
         """Return the signed gap g [m] at a point in obstacle axes; negative inside the obstacle.
@@ -259,9 +246,7 @@ class ContactLaw:
         point_m : (3,) SX
             Point relative to the origin of the frame, see `to_obstacle_frame` [m].
         """
-        return self.obstacle.shape.signed_distance(
-            point_m + ca.DM(self.body.frame_nodes_m[0])
-        )
+        return self.obstacle.shape.signed_distance(point_m + ca.DM(self.body.frame_nodes_m[0]))
 
     def scaled_pressure(self, gap: ca.SX, data: ca.SX) -> ca.SX:
         """Return b, the pressure divided by κ [m], at a gap.
@@ -281,13 +266,9 @@ class ContactLaw:
             reach = ca.fmax(width_m - gap, 0)
             overlap = ca.fmax(-gap, 0)
             return (reach**2 - overlap**2) / width_m
-        return data[1] / ca.fmax(
-            gap, data[1] / (LARGEST_SCALED_PRESSURE * width_m)
-        )
+        return data[1] / ca.fmax(gap, data[1] / (LARGEST_SCALED_PRESSURE * width_m))
 
-    def mean_scaled_pressure(
-        self, gaps: tuple[ca.SX, ca.SX], data: ca.SX
-    ) -> ca.SX:
+    def mean_scaled_pressure(self, gaps: tuple[ca.SX, ca.SX], data: ca.SX) -> ca.SX:
         """Return the mean of b [m] over a step in which the gap changes linearly from the first to
         the second of `gaps` [m]; `data` (5,) are those of the point. Relaxed contact has no such
         mean.
@@ -305,13 +286,9 @@ class ContactLaw:
         """
         relaxed = (self.obstacle.relaxed or 0.0) * self.widths_m**2
         has_stiffness = self.obstacle.stiffness_pa_m is not None
-        per_unit = (
-            np.ones_like(self.edges_m) if has_stiffness else 1 / self.edges_m
-        )
+        per_unit = np.ones_like(self.edges_m) if has_stiffness else 1 / self.edges_m
         step_s = np.zeros_like(self.edges_m)
-        return np.array(
-            [self.surface.area_m2, relaxed, self.widths_m, per_unit, step_s]
-        )
+        return np.array([self.surface.area_m2, relaxed, self.widths_m, per_unit, step_s])
 
     def data_of(self, points: Index | slice, step_s: float) -> Array:
         """Return the data (5, i) of some points, with the time step `step_s` [s]."""
@@ -365,22 +342,11 @@ class ContactLaw:
             moving_parts = ca.vertsplit(u, 3)
             frame = ca.vertsplit(data, [0, 9 * moving, data.numel()])
             frame_ends = ca.vertsplit(frame[0], 9)
-            y = [
-                part
-                for pair in zip(moving_parts, frame_ends, strict=True)
-                for part in pair
-            ]
+            y = [part for pair in zip(moving_parts, frame_ends, strict=True) for part in pair]
             constants, point_data = ca.vertsplit(
-                frame[1],
-                [
-                    0,
-                    len(self.constant_columns),
-                    len(self.constant_columns) + DATA_COUNT,
-                ],
+                frame[1], [0, len(self.constant_columns), len(self.constant_columns) + DATA_COUNT]
             )
-            return self.force_expression(ca.vertcat(*y, constants), point_data)[
-                :3
-            ]
+            return self.force_expression(ca.vertcat(*y, constants), point_data)[:3]
 
         return GeneratedFunction(
             force,
@@ -406,22 +372,11 @@ class ContactLaw:
         stacked (13,).
 
         The residual vanishes where b and the gap g are positive and b g = r δ².
-
-        Parameters
-        ----------
-        u : SX
-            Stacked inputs of `force_expression`, then the scaled pressure b [m].
-        data : (5,) SX
-            Data of the point, see `data`; entry 1 is r δ².
         """
         inputs, b = ca.vertsplit(u, [0, u.numel() - 1, u.numel()])
-        gap = self.gap_at(
-            self.to_obstacle_frame(inputs[: 3 * VECTORS_PER_POINT])[0]
-        )
+        gap = self.gap_at(self.to_obstacle_frame(inputs[: 3 * VECTORS_PER_POINT])[0])
         residual = b + gap - ca.sqrt((b - gap) ** 2 + 4 * data[1])
-        return ca.vertcat(
-            self.force_expression(inputs, data, scaled_pressure=b), residual
-        )
+        return ca.vertcat(self.force_expression(inputs, data, scaled_pressure=b), residual)
 
     @cached_property
     def scaled_pressure_function(self) -> GeneratedFunction:
@@ -446,9 +401,7 @@ class ContactLaw:
         contact = self._normal_contact(u, data, pressing=scaled_pressure)
         # The forces on the ends of the axes follow from the coordinates of the point in these axes.
         push = contact.force_n * contact.gap_gradient
-        force = ca.vertcat(
-            contact.axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m
-        )
+        force = ca.vertcat(contact.axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m)
         if not self.obstacle.has_friction:
             return force
         friction = self._friction(u, contact).force
@@ -456,21 +409,8 @@ class ContactLaw:
             friction, -ca.vec(friction @ (contact.point / self._frame_size_m).T)
         )
 
-    def _normal_contact(
-        self, u: ca.SX, data: ca.SX, pressing: ca.SX | None
-    ) -> NormalContact:
-        """Return the point in the axes of its obstacle, and its normal force.
-
-        Parameters
-        ----------
-        u : SX
-            Stacked (y, ẏ, c), or (y, c) if the force does not depend on velocities.
-        data : (5,) SX
-            Data of the point, see `data`.
-        pressing : SX or None
-            Given scaled pressure b; None for that of the gap, averaged over the step if
-            `is_averaged`.
-        """
+    def _normal_contact(self, u: ca.SX, data: ca.SX, pressing: ca.SX | None) -> NormalContact:
+        """Return the point in the axes of its obstacle, and its normal force."""
         place, axes = self.to_obstacle_frame(u[: 3 * VECTORS_PER_POINT])
         symbol = ca.SX.sym("place", 3)
         gap = self.gap_at(symbol)
@@ -479,17 +419,10 @@ class ContactLaw:
         if pressing is not None:
             scaled_pressure = pressing
         elif self.is_averaged:
-            scaled_pressure = self.mean_scaled_pressure(
-                self._end_gaps(u, half_s=data[4] / 2), data
-            )
+            scaled_pressure = self.mean_scaled_pressure(self._end_gaps(u, half_s=data[4] / 2), data)
         else:
             scaled_pressure = self.scaled_pressure(gap, data)
-        force_n = (
-            data[0]
-            * data[3]
-            * self.stiffness(self._constants(u))
-            * scaled_pressure
-        )
+        force_n = data[0] * data[3] * self.stiffness(self._constants(u)) * scaled_pressure
         return NormalContact(place, axes, gap_gradient=slope, force_n=force_n)
 
     def _end_gaps(self, u: ca.SX, half_s: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -499,8 +432,7 @@ class ContactLaw:
         y = u[: 3 * VECTORS_PER_POINT]
         v = u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT]
         before, after = (
-            self.gap_at(self.to_obstacle_frame(y + way * v)[0])
-            for way in (-half_s, half_s)
+            self.gap_at(self.to_obstacle_frame(y + way * v)[0]) for way in (-half_s, half_s)
         )
         return before, after
 
@@ -509,28 +441,16 @@ class ContactLaw:
         return u[u.numel() - len(self.constant_columns) :]
 
     def _friction(self, u: ca.SX, contact: NormalContact) -> FrictionAtPoint:
-        """Return the friction of a point with a normal force.
-
-        Parameters
-        ----------
-        u : SX
-            Stacked (y, ẏ, c).
-        contact : NormalContact
-            The point and its normal force.
-        """
+        """Return the friction of a point with a normal force."""
         slope = contact.axes @ contact.gap_gradient
-        relative, *ends = ca.vertsplit(
-            u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3
-        )
+        relative, *ends = ca.vertsplit(u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3)
         relative -= ca.horzcat(*ends) @ (contact.point / self._frame_size_m)
         normal = slope / ca.norm_2(slope)
         tangential = relative - normal * ca.dot(normal, relative)
         coefficient = self.friction_coefficient(self._constants(u))
         limit_n = coefficient * contact.force_n
         speed = ca.sqrt(ca.sumsqr(tangential) + self.slip**2)
-        return FrictionAtPoint(
-            limit_n, -limit_n / speed * tangential, velocity=tangential
-        )
+        return FrictionAtPoint(limit_n, -limit_n / speed * tangential, velocity=tangential)
 
     @cached_property
     def friction_function(self) -> GeneratedFunction:
@@ -554,9 +474,7 @@ class ContactLaw:
             )
 
         return GeneratedFunction(
-            friction_values,
-            self.force_function.input_size,
-            data_size=DATA_COUNT,
+            friction_values, self.force_function.input_size, data_size=DATA_COUNT
         )
 
 

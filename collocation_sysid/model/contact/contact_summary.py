@@ -55,8 +55,7 @@ def smallest_gaps(contact: Contact, x: Array) -> Array:
     """
     chunks = (x[first : first + AT_ONCE] for first in range(0, len(x), AT_ONCE))
     gaps = (
-        contact.law_of_contact.gaps(contact.points.vectors(chunk)).min(axis=0)
-        for chunk in chunks
+        contact.law_of_contact.gaps(contact.points.vectors(chunk)).min(axis=0) for chunk in chunks
     )
     return np.min([*gaps], axis=0)
 
@@ -89,9 +88,7 @@ def surface_gaps_and_pressures(
             here = rows, law.surface.faces
             gaps = law.gaps(contact.points.vectors(x[rows])).reshape(by_face)
             gaps_m[here] = np.fmin(gaps_m[here], gaps.min(axis=2))
-            pressures = (
-                law.stiffness_at(theta) * contact.scaled_pressures(x[rows])[0]
-            )
+            pressures = law.stiffness_at(theta) * contact.scaled_pressures(x[rows])[0]
             pressures_pa[here] += pressures.reshape(by_face).mean(axis=2)
     return gaps_m, pressures_pa
 
@@ -136,36 +133,25 @@ def friction_summaries(
     for contact in contact_terms(experiment):
         if not contact.is_nonlinear_in_velocity:
             continue
-        rows = (
-            States(a[None], v[None], theta=dynamics.theta)
-            for a, v in zip(xi, nu, strict=True)
-        )
-        sums = np.concatenate(
-            [contact.friction_sums(row) for row in rows], axis=1
-        )
+        rows = (States(a[None], v[None], theta=dynamics.theta) for a, v in zip(xi, nu, strict=True))
+        sums = np.concatenate([contact.friction_sums(row) for row in rows], axis=1)
         limit_n, slipping_n, *rub_n, power_w = sums
         # At times of little contact the ratio of both forces is meaningless.
         is_firm = limit_n > GRAZE * limit_n.max(initial=0.0)
         used = np.linalg.norm(rub_n, axis=0)[is_firm] / limit_n[is_firm]
         summaries[contact.law_of_contact.obstacle.name] = FrictionSummary(
             used=float(used.max(initial=0.0)),
-            slipping=float(
-                slipping_n.sum() / max(limit_n.sum(), np.finfo(float).tiny)
-            ),
+            slipping=float(slipping_n.sum() / max(limit_n.sum(), np.finfo(float).tiny)),
             dissipated_j=float(power_w.sum() * dynamics.step_s),
         )
     return summaries
 
 
-def contact_summaries(
-    experiment: Experiment, x: Array, t_s: Array
-) -> Iterator[ContactSummary]:
+def contact_summaries(experiment: Experiment, x: Array, t_s: Array) -> Iterator[ContactSummary]:
     """Yield the contact summary of each obstacle for positions x (T, 3n) [m] at times `t_s` (T,)
     [s].
     """
-    for contact, obstacle in zip(
-        contact_terms(experiment), experiment.obstacles, strict=True
-    ):
+    for contact, obstacle in zip(contact_terms(experiment), experiment.obstacles, strict=True):
         law = contact.law_of_contact
         smallest_gap_m = np.inf
         points = []
@@ -190,7 +176,6 @@ def contact_summaries(
             face_count=int(count.max()) / law.surface.points_per_face,
             # Edge of an equilateral triangle with this area.
             face_mm=1e3 * float(np.sqrt(4 / np.sqrt(3) * face_m2)),
-            is_initially_in_contact=bool(count[0])
-            and len(obstacle.poses.t_s) > 1,
+            is_initially_in_contact=bool(count[0]) and len(obstacle.poses.t_s) > 1,
             separation_s=float(t_s[ends[0]]) if len(ends) else None,
         )

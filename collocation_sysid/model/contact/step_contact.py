@@ -92,9 +92,7 @@ class ContactCandidates:
             ),
         )
 
-    def inputs(
-        self, xi: Array, nu: Array, constants: Array, step_s: float
-    ) -> LawInputs:
+    def inputs(self, xi: Array, nu: Array, constants: Array, step_s: float) -> LawInputs:
         """Return the inputs of the law at the candidates.
 
         Parameters
@@ -108,8 +106,7 @@ class ContactCandidates:
         """
         moving = (xi, nu) if self.law.depends_on_velocity else (xi,)
         nodes = np.concatenate(
-            [each.reshape(-1, 3).take(self._nodes, axis=0) for each in moving],
-            axis=1,
+            [each.reshape(-1, 3).take(self._nodes, axis=0) for each in moving], axis=1
         )
         frame = nodes[-VECTORS_PER_POINT:]
         return LawInputs(
@@ -122,21 +119,10 @@ class ContactCandidates:
         """Nodes (m + 4,) of the faces of all candidates, then those of the obstacle's frame."""
         return np.concatenate([self.points.all_nodes, self.law.obstacle.nodes])
 
-    def _data_with(
-        self, frame: Array, constants: Array, step_s: float
-    ) -> Array:
+    def _data_with(self, frame: Array, constants: Array, step_s: float) -> Array:
         """Return the data (d, i) of the law.
 
         The last data are stored, because the frame of the obstacle does not move within a step.
-
-        Parameters
-        ----------
-        frame : (4, 3) or (4, 6) array
-            Positions [m] and, if needed, velocities [m/s] of the nodes of the obstacle's frame.
-        constants : (c,) array
-            Constants of the law.
-        step_s : float
-            Length of the step [s].
         """
         key = step_s, constants.tobytes(), frame.tobytes()
         data = self._last_data.get(key)
@@ -183,11 +169,7 @@ class StepContact(LocalForce):
     """
 
     def __init__(
-        self,
-        law: ContactLaw,
-        theta: Array,
-        pattern: SymmetricPattern,
-        step_s: float,
+        self, law: ContactLaw, theta: Array, pattern: SymmetricPattern, step_s: float
     ) -> None:
         self.depends_on_velocity = law.depends_on_velocity
         self._law = law
@@ -204,11 +186,7 @@ class StepContact(LocalForce):
         contact.
         """
         last = self._last_evaluation
-        if (
-            last is not None
-            and np.array_equal(last.xi, xi)
-            and np.array_equal(last.nu, nu)
-        ):
+        if last is not None and np.array_equal(last.xi, xi) and np.array_equal(last.nu, nu):
             return last.points.assemble(xi.size)
         candidates = self._candidates(xi[0], nu[0])
         if candidates is None:
@@ -225,9 +203,7 @@ class StepContact(LocalForce):
         if candidates is None:
             return None
         inputs = self._inputs(candidates, xi, nu)
-        force, slopes = self._law.point_force_function.evaluate_with_jacobian(
-            inputs.u, inputs.data
-        )
+        force, slopes = self._law.point_force_function.evaluate_with_jacobian(inputs.u, inputs.data)
         (touching,) = np.nonzero(force.any(axis=0))
         points = ActivePoints(
             self._law,
@@ -240,13 +216,9 @@ class StepContact(LocalForce):
         self._last_evaluation = _Evaluation(xi, nu, points)
         return points
 
-    def _inputs(
-        self, candidates: ContactCandidates, xi: Array, nu: Array
-    ) -> LawInputs:
+    def _inputs(self, candidates: ContactCandidates, xi: Array, nu: Array) -> LawInputs:
         """Return the inputs of the law at candidates in the state ξ and ν, (1, 3n) each."""
-        return candidates.inputs(
-            xi[0], nu[0], constants=self._constants, step_s=self._step_s
-        )
+        return candidates.inputs(xi[0], nu[0], constants=self._constants, step_s=self._step_s)
 
     def _candidates(self, xi: Array, nu: Array) -> ContactCandidates | None:
         """Return the candidates at ξ and ν, (3n,) each; None if no point may touch.
@@ -277,6 +249,4 @@ class StepContact(LocalForce):
         (chosen,) = np.nonzero(is_near)
         if not len(chosen):
             return None
-        return ContactCandidates.from_indices(
-            law, self._pattern, chosen=chosen.tobytes()
-        )
+        return ContactCandidates.from_indices(law, self._pattern, chosen=chosen.tobytes())

@@ -33,7 +33,8 @@ REACH = 0.35
 CELLS_OF_REACH = 12
 # Largest number of its cells; larger grids take longer than exact searches.
 MOST_CELLS = 300_000
-# Number of nearest points of each point of the cloud, itself included, among which that grid searches.
+# Number of nearest points of each point of the cloud, itself included, among which that grid
+# searches.
 NEIGHBOURS = 8
 # Weight of the complete distance relative to that along the normal: points may slide.
 SLIDING = 0.2
@@ -125,9 +126,7 @@ class GriddedCloud:
         point = np.full(self._last + 1, -1)
         point[tuple(cells.T)] = np.arange(len(points_m))
         occupied = np.asarray(
-            distance_transform_edt(
-                point < 0, return_distances=False, return_indices=True
-            )
+            distance_transform_edt(point < 0, return_distances=False, return_indices=True)
         )
         self._nearest = point[tuple(occupied)]
         count = min(NEIGHBOURS, len(points_m))
@@ -135,9 +134,7 @@ class GriddedCloud:
         self._neighbours = np.reshape(neighbours, (len(points_m), count))
 
     @classmethod
-    def is_possible(
-        cls, points_m: Array, cell_m: float, margin_m: float
-    ) -> bool:
+    def is_possible(cls, points_m: Array, cell_m: float, margin_m: float) -> bool:
         """Return whether the grid has at most `MOST_CELLS` cells; arguments as for the class."""
         sides_m = np.ptp(points_m, axis=0) + 2 * margin_m
         return bool(np.prod(sides_m / cell_m + 2) <= MOST_CELLS)
@@ -191,10 +188,7 @@ def thinned(cloud: Array) -> Array:
 
 
 def align_camera(
-    camera: DepthCameraModel,
-    surface: VisibleSurface,
-    x: Array,
-    image: int,
+    camera: DepthCameraModel, surface: VisibleSurface, x: Array, image: int
 ) -> tuple[Array, Array]:
     """Return the rotation vector (3,) [rad] and translation (3,) [m] of the camera error that align
     the points of an image with a shape, see `DepthCameraModel.with_pose`.
@@ -217,23 +211,13 @@ def align_camera(
         Index of the image, which must have points.
     """
     rotations, translations = camera.poses
-    corners = ((x - translations[image]) @ rotations[image])[
-        surface.plane_triangles
-    ]
-    sides = np.cross(
-        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    )
+    corners = ((x - translations[image]) @ rotations[image])[surface.plane_triangles]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(sides, axis=1)
-    selected_area = area * np.repeat(
-        surface.is_selected, len(area) // len(surface.faces)
-    )
+    selected_area = area * np.repeat(surface.is_selected, len(area) // len(surface.faces))
     rng = np.random.default_rng(0)
-    chosen = rng.choice(
-        len(area), SAMPLES, p=selected_area / selected_area.sum()
-    )
-    places = np.einsum(
-        "pc,pci->pi", rng.dirichlet(np.ones(3), SAMPLES), corners[chosen]
-    )
+    chosen = rng.choice(len(area), SAMPLES, p=selected_area / selected_area.sum())
+    places = np.einsum("pc,pci->pi", rng.dirichlet(np.ones(3), SAMPLES), corners[chosen])
     normals = sides[chosen] / area[chosen, None]
     size_m = float(np.linalg.norm(np.ptp(x, axis=0)))
     if image not in camera.alignment_clouds:
@@ -243,12 +227,8 @@ def align_camera(
     clouds = camera.alignment_clouds[image]
     gates = np.geomspace(REACH * size_m, camera.depth.gate_m, ITERATIONS)
     wide_gates, narrow_gates = np.array_split(gates, 2)
-    iterate = partial(
-        iterate_alignments, camera, places=places, normals=normals
-    )
-    candidates = _first_candidates(
-        clouds.narrow.points_m, places, gate_m=float(gates[0])
-    )
+    iterate = partial(iterate_alignments, camera, places=places, normals=normals)
+    candidates = _first_candidates(clouds.narrow.points_m, places, gate_m=float(gates[0]))
     for some_gates in np.array_split(wide_gates, CHOICES):
         candidates = distinct_poses(
             iterate(cloud=clouds.wide, gates=some_gates, starts=candidates),
@@ -256,34 +236,17 @@ def align_camera(
             same_m=SAME_POSE * some_gates[-1],
         )
     best = min(
-        iterate(
-            cloud=clouds.narrow,
-            gates=narrow_gates,
-            starts=candidates[:CONTINUED_STARTS],
-        ),
+        iterate(cloud=clouds.narrow, gates=narrow_gates, starts=candidates[:CONTINUED_STARTS]),
         key=lambda each: each.mismatch,
     )
     return best.rotation.as_rotvec(), best.translation_m
 
 
-def _first_candidates(
-    cloud_m: Array, places: Array, gate_m: float
-) -> list[AlignedPose]:
+def _first_candidates(cloud_m: Array, places: Array, gate_m: float) -> list[AlignedPose]:
     """Return the poses from which an alignment starts: the stated one and the one that puts the
     cloud at the middle of the shape, each also rotated in both directions about each axis.
-
-    Parameters
-    ----------
-    cloud_m : (P, 3) array
-        Points of the cloud in the camera's frame [m].
-    places : (k, 3) array
-        Points of the surface in the camera's stated frame [m].
-    gate_m : float
-        Points of the cloud farther than this from all places do not count for its middle [m].
     """
-    rotation_vectors = np.vstack(
-        [np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)]
-    )
+    rotation_vectors = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
     is_near = KDTree(places).query(cloud_m)[0] < gate_m
     shifts = [np.zeros(3), np.zeros(3)]
     if is_near.any():
@@ -295,9 +258,7 @@ def _first_candidates(
     ]
 
 
-def distinct_poses(
-    poses: Sequence[AlignedPose], size_m: float, same_m: float
-) -> list[AlignedPose]:
+def distinct_poses(poses: Sequence[AlignedPose], size_m: float, same_m: float) -> list[AlignedPose]:
     """Return the poses in ascending order of their mismatch, without those that hardly differ from
     an earlier one.
 
@@ -316,9 +277,9 @@ def distinct_poses(
     translations_m = np.array([each.translation_m for each in ranked])
     kept: list[int] = []
     for k in range(len(ranked)):
-        apart_m = size_m * np.linalg.norm(
-            rotations[kept] - rotations[k], axis=1
-        ) + np.linalg.norm(translations_m[kept] - translations_m[k], axis=1)
+        apart_m = size_m * np.linalg.norm(rotations[kept] - rotations[k], axis=1) + np.linalg.norm(
+            translations_m[kept] - translations_m[k], axis=1
+        )
         if not len(kept) or apart_m.min() >= same_m:
             kept.append(k)
     return [ranked[k] for k in kept]
@@ -354,9 +315,7 @@ def iterate_alignments(
     """
     rotations = Rotation.concatenate([each.rotation for each in starts])
     translations_m = np.array([each.translation_m for each in starts])
-    prior = np.concatenate(
-        [camera.prior_weights(row) for row in (DEPTH_TURN, DEPTH_SHIFT)]
-    )
+    prior = np.concatenate([camera.prior_weights(row) for row in (DEPTH_TURN, DEPTH_SHIFT)])
     mismatches = np.ones(len(starts))
     for gate in gates:
         matched = _match_surface(
@@ -370,16 +329,12 @@ def iterate_alignments(
         squares = np.sum(matched.distances_m**2, axis=2)
         counts = matched.is_facing.sum(axis=1)
         limited = np.minimum(squares / gate**2, 1.0) * matched.is_facing
-        mismatches = np.where(
-            counts > 0, limited.sum(axis=1) / np.maximum(counts, 1), 1.0
-        )
+        mismatches = np.where(counts > 0, limited.sum(axis=1) / np.maximum(counts, 1), 1.0)
         weights = np.sqrt(INDEPENDENT / np.maximum(counts, 1))[:, None]
         weights = weights * matched.is_facing / gate
         weights /= 1 + squares / (gate / 2) ** 2
         errors = np.hstack([rotations.as_rotvec(), translations_m])
-        steps = _alignment_steps(
-            matched, normals, weights=weights, prior=prior, errors=errors
-        )
+        steps = _alignment_steps(matched, normals, weights=weights, prior=prior, errors=errors)
         rotations = Rotation.from_rotvec(steps[:, :3]) * rotations
         translations_m = translations_m + steps[:, 3:]
     return [
@@ -432,36 +387,18 @@ def _match_surface(
 
 
 def _alignment_steps(
-    matched: _MatchedSurface,
-    normals: Array,
-    weights: Array,
-    prior: Array,
-    errors: Array,
+    matched: _MatchedSurface, normals: Array, weights: Array, prior: Array, errors: Array
 ) -> Array:
     """Return the Gauss–Newton steps (B, 6) of rotation vectors [rad] and translations [m].
 
     They minimise Σ w² ((n · e)² + `SLIDING`² |e|²) over the distances e after the step, and the
     squares of the errors over the prior. The 6 × 6 normal equations are solved for all B at once,
     scaled by their diagonals.
-
-    Parameters
-    ----------
-    matched : _MatchedSurface
-        Distances before the step.
-    normals : (P, 3) array
-        Normals n.
-    weights : (B, P) array
-        Weights w [1/m].
-    prior : (6,) array
-        One over the prior standard deviations.
-    errors : (B, 6) array
-        Rotation vectors and translations before the step.
     """
     arms_m = matched.arms_m
     distances_m = matched.distances_m
     along = np.concatenate(
-        [np.cross(arms_m, normals), np.broadcast_to(normals, arms_m.shape)],
-        axis=2,
+        [np.cross(arms_m, normals), np.broadcast_to(normals, arms_m.shape)], axis=2
     )
     along *= weights[..., None]
     offsets = weights * np.sum(normals * distances_m, axis=2)
@@ -484,15 +421,11 @@ def _alignment_steps(
     slopes += prior**2 * errors
     scales = np.sqrt(np.einsum("bii->bi", matrices))
     scaled = matrices / (scales[:, :, None] * scales[:, None])
-    return (
-        -np.linalg.solve(scaled, (slopes / scales)[..., None])[..., 0] / scales
-    )
+    return -np.linalg.solve(scaled, (slopes / scales)[..., None])[..., 0] / scales
 
 
 def _cross_product_matrices(vectors: Array) -> Array:
     """Return the skew matrices (P, 3, 3) with M w = v × w for vectors v (P, 3)."""
     x, y, z = vectors.T
     none = np.zeros_like(x)
-    return np.stack([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(
-        2, 0, 1
-    )
+    return np.stack([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)

@@ -27,14 +27,7 @@ from ...recording.nuisance import (
 )
 
 # Kinds of nuisance parameters of a depth camera.
-OF_CAMERA = (
-    DEPTH_TURN,
-    DEPTH_SHIFT,
-    DEPTH_BIAS,
-    DEPTH_SCALE,
-    DEPTH_TIME,
-    DEPTH_EDGE,
-)
+OF_CAMERA = (DEPTH_TURN, DEPTH_SHIFT, DEPTH_BIAS, DEPTH_SCALE, DEPTH_TIME, DEPTH_EDGE)
 # One over the prior standard deviation of a pose error that is not estimated [1/rad, 1/m].
 EXACT = 1e6
 
@@ -73,17 +66,9 @@ class DepthCameraModel:
         """
         depth = experiment.depths[camera_index]
         rotations, translations = depth.camera.pose_at(depth.sample_times_s[:1])
-        pivot_m = (
-            experiment.body.nodes_m.mean(axis=0) - translations[0]
-        ) @ rotations[0]
+        pivot_m = (experiment.body.nodes_m.mean(axis=0) - translations[0]) @ rotations[0]
         size_m = float(np.linalg.norm(np.ptp(experiment.body.nodes_m, axis=0)))
-        return cls(
-            depth,
-            camera_index,
-            nuisance=nuisance,
-            pivot_m=pivot_m,
-            size_m=size_m,
-        )
+        return cls(depth, camera_index, nuisance=nuisance, pivot_m=pivot_m, size_m=size_m)
 
     @cached_property
     def depth_expressions(self) -> dict[tuple[int, int], Any]:
@@ -114,9 +99,7 @@ class DepthCameraModel:
         """Indices in φ of the camera's nuisance parameters, of all kinds in `OF_CAMERA`; empty if
         none is estimated.
         """
-        return self.nuisance.indices_of_rows(
-            *OF_CAMERA, component=self.camera_index
-        )
+        return self.nuisance.indices_of_rows(*OF_CAMERA, component=self.camera_index)
 
     @cached_property
     def poses(self) -> tuple[Array, Array]:
@@ -135,8 +118,8 @@ class DepthCameraModel:
         return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in clouds]
 
     def share_alignment_clouds(self, other: DepthCameraModel) -> None:
-        """Use the points for alignments of another model of the camera from now on, if both have the
-        same measured points.
+        """Use the points for alignments of another model of the camera from now on, if both have
+        the same measured points.
         """
         if self.depth is other.depth:
             vars(self)["alignment_clouds"] = other.alignment_clouds
@@ -159,14 +142,10 @@ class DepthCameraModel:
         values : mapping of NuisanceRow to SX
             Errors in physical units; missing ones are zero.
         """
-        point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(
-            DEPTH_BIAS, 0
-        ) * ray
+        point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(DEPTH_BIAS, 0) * ray
         if DEPTH_TURN in values:
             pivot = ca.DM(self.pivot_m)
-            point = (
-                cayley_rotation(values[DEPTH_TURN]) @ (point - pivot) + pivot
-            )
+            point = cayley_rotation(values[DEPTH_TURN]) @ (point - pivot) + pivot
         return point + values.get(DEPTH_SHIFT, 0)
 
     @cached_property
@@ -179,9 +158,7 @@ class DepthCameraModel:
             values = self.nuisance.values_by_row(own, self.parameter_indices)
             return self.corrected_expression(data[:3], data[3:], values=values)
 
-        return GeneratedFunction(
-            expression, len(self.parameter_indices), data_size=6
-        )
+        return GeneratedFunction(expression, len(self.parameter_indices), data_size=6)
 
     def world_points(self, phi: Array, image: int) -> Array:
         """Return the measured points (P, 3) of an image in the world [m], corrected at φ.
@@ -193,13 +170,9 @@ class DepthCameraModel:
         image : int
             Index of the image.
         """
-        return self.to_world(
-            phi, self.depth.points_m[image], rays=self.rays[image], image=image
-        )
+        return self.to_world(phi, self.depth.points_m[image], rays=self.rays[image], image=image)
 
-    def to_world(
-        self, phi: Array, points: Array, rays: Array, image: int
-    ) -> Array:
+    def to_world(self, phi: Array, points: Array, rays: Array, image: int) -> Array:
         """Return points (P, 3) of the camera's frame in the world [m], corrected at φ (k,).
 
         Parameters
@@ -215,9 +188,7 @@ class DepthCameraModel:
         """
         # The correction is affine: its values at seven points determine it for all.
         basis = np.eye(6, 7, k=1)
-        origin, *axes = self._correction.evaluate(
-            phi[self.parameter_indices], basis
-        ).T
+        origin, *axes = self._correction.evaluate(phi[self.parameter_indices], basis).T
         rotations, translations = self.poses
         turn = rotations[image].T
         slopes = (np.stack(axes) - origin) @ turn
@@ -240,27 +211,20 @@ class DepthCameraModel:
         `sample` [m]: the inverse of `to_world` without bias of the depth, but with its scale.
         """
         basis = np.vstack([np.zeros(3), np.eye(3)])
-        corner, *axes = self.to_world(
-            phi, basis, rays=np.zeros((4, 3)), image=sample
-        )
+        corner, *axes = self.to_world(phi, basis, rays=np.zeros((4, 3)), image=sample)
         return np.linalg.solve((axes - corner).T, (points_m - corner).T).T
 
     def parameter_values(self, phi: Array) -> dict[str, float]:
         """Return the camera's nuisance parameters in physical units by label, from φ (k,)."""
         entries = self.nuisance.entries
         values = phi * self.nuisance.scales
-        return {
-            entries[k].label: float(values[k]) for k in self.parameter_indices
-        }
+        return {entries[k].label: float(values[k]) for k in self.parameter_indices}
 
     def parameters_from(self, physical_values: Mapping[str, float]) -> Array:
         """Return φ (k,) of the experiment with the given values in physical units by label; entries
         without a value are zero, and unknown labels are ignored.
         """
-        values = [
-            physical_values.get(entry.label, 0.0)
-            for entry in self.nuisance.entries
-        ]
+        values = [physical_values.get(entry.label, 0.0) for entry in self.nuisance.entries]
         return np.array(values) / self.nuisance.scales
 
     def eye_m(self, phi: Array, sample: int) -> Array | None:
@@ -269,46 +233,30 @@ class DepthCameraModel:
         """
         if self.depth.camera.matrix is None:
             return None
-        return self.to_world(
-            phi, np.zeros((1, 3)), rays=np.zeros((1, 3)), image=sample
-        )[0]
+        return self.to_world(phi, np.zeros((1, 3)), rays=np.zeros((1, 3)), image=sample)[0]
 
     def prior_weights(self, row: NuisanceRow) -> Array:
         """Return one over the prior standard deviations (3,) of the camera's rotation [1/rad] or
         translation [1/m], for `row` DEPTH_TURN or DEPTH_SHIFT; `EXACT` if it is not estimated.
         """
         places = self.nuisance.indices_of_rows(row, component=self.camera_index)
-        return (
-            1 / self.nuisance.scales[places]
-            if len(places)
-            else np.full(3, EXACT)
-        )
+        return 1 / self.nuisance.scales[places] if len(places) else np.full(3, EXACT)
 
     def clock_shift_s(self, phi: Array) -> float:
         """Return by how much images are taken later than stated [s] at φ (k,); 0 if it is not
         estimated.
         """
-        places = self.nuisance.indices_of_rows(
-            DEPTH_TIME, component=self.camera_index
-        )
+        places = self.nuisance.indices_of_rows(DEPTH_TIME, component=self.camera_index)
         return float((phi * self.nuisance.scales)[places].sum())
 
-    def with_pose(
-        self, phi: Array, rotation_vector: Array, shift_m: Array
-    ) -> Array:
+    def with_pose(self, phi: Array, rotation_vector: Array, shift_m: Array) -> Array:
         """Return a copy of φ (k,) with another rotation error `rotation_vector` (3,) [rad] and
         translation error `shift_m` (3,) of the camera; an error that is not estimated is ignored.
         """
         updated = phi.copy()
         angle = np.linalg.norm(rotation_vector)
-        cayley = rotation_vector * (
-            2 * np.tan(angle / 2) / angle if angle else 1.0
-        )
+        cayley = rotation_vector * (2 * np.tan(angle / 2) / angle if angle else 1.0)
         for row, values in ((DEPTH_TURN, cayley), (DEPTH_SHIFT, shift_m)):
-            places = self.nuisance.indices_of_rows(
-                row, component=self.camera_index
-            )
-            updated[places] = (
-                values[: len(places)] / self.nuisance.scales[places]
-            )
+            places = self.nuisance.indices_of_rows(row, component=self.camera_index)
+            updated[places] = values[: len(places)] / self.nuisance.scales[places]
         return updated

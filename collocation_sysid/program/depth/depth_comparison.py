@@ -134,8 +134,7 @@ class SurfaceComparison:
             Nuisance parameters.
         """
         shapes_m = residual.surface_shapes(
-            _positions_at_observable(residual, t_s, positions_m=positions_m),
-            phi,
+            _positions_at_observable(residual, t_s, positions_m=positions_m), phi
         )
         view = residual.correspondences.camera
         body = residual.correspondences.body
@@ -158,9 +157,7 @@ class SurfaceComparison:
     def error(self) -> DepthError:
         """Distances summarised as numbers, see `DepthError`."""
         depth = self.correspondences.camera.depth
-        distances_m = np.abs(
-            self.signed_distances_m[np.isfinite(self.signed_distances_m)]
-        )
+        distances_m = np.abs(self.signed_distances_m[np.isfinite(self.signed_distances_m)])
         within_m = distances_m[distances_m <= depth.gate_m]
         sigmas = distances_m / depth.sigma_m
         shortened = np.where(sigmas > HUBER, HUBER * sigmas, sigmas**2)
@@ -170,18 +167,14 @@ class SurfaceComparison:
             rms_m=root_mean(distances_m**2) if len(distances_m) else None,
             reach_m=max(self.correspondences.gate_m, depth.gate_m),
             gate_m=depth.gate_m,
-            share_beyond_gate=1 - len(within_m) / len(distances_m)
-            if len(distances_m)
-            else 0.0,
+            share_beyond_gate=1 - len(within_m) / len(distances_m) if len(distances_m) else 0.0,
             rms_within_gate_m=root_mean(within_m**2) if len(within_m) else None,
             sigmas=root_mean(sigmas**2) if len(distances_m) else 0.0,
             tame_sigmas=root_mean(shortened) if len(distances_m) else 0.0,
         )
 
 
-def _positions_at_observable(
-    residual: DepthResidual, t_s: Array, positions_m: Array
-) -> Array:
+def _positions_at_observable(residual: DepthResidual, t_s: Array, positions_m: Array) -> Array:
     """Return positions (R, 3n) at the times of a measurement's observable, interpolated from
     positions `positions_m` (T, …) at times `t_s` (T,) by a cubic spline, or by lines between fewer
     than `FEWEST_FOR_SPLINE`; outside these times the end positions.
@@ -200,14 +193,11 @@ def camera_residuals(transcription: Transcription) -> list[DepthResidual]:
     return [
         each
         for each in transcription.residuals
-        if isinstance(each, DepthResidual)
-        and not isinstance(each, OutlineResidual)
+        if isinstance(each, DepthResidual) and not isinstance(each, OutlineResidual)
     ]
 
 
-def depth_residuals(
-    iterate: ExperimentIterate,
-) -> list[tuple[DepthResidual, Array]]:
+def depth_residuals(iterate: ExperimentIterate) -> list[tuple[DepthResidual, Array]]:
     """Return the measurement models of the depth cameras, each with the values (n, e, 3) of its
     observable: positions of the surface nodes [m].
     """
@@ -218,23 +208,15 @@ def depth_residuals(
     ]
 
 
-def surface_residuals(
-    iterate: ExperimentIterate,
-) -> list[tuple[DepthResidual, Array]]:
+def surface_residuals(iterate: ExperimentIterate) -> list[tuple[DepthResidual, Array]]:
     """Return the measurement models of the depth cameras, then of the outlines, each with the
     values (n, e, 3) of its observable.
     """
-    pairs = zip(iterate.segment.residuals, iterate.observables, strict=True)
-    return [
-        (residual, values)
-        for residual, values in pairs
-        if isinstance(residual, DepthResidual)
-    ]
+    pairs = zip(iterate.transcription.residuals, iterate.observables, strict=True)
+    return [(residual, values) for residual, values in pairs if isinstance(residual, DepthResidual)]
 
 
-def outline_distances_px(
-    iterate: ExperimentIterate,
-) -> list[tuple[OutlineResidual, Array]]:
+def outline_distances_px(iterate: ExperimentIterate) -> list[tuple[OutlineResidual, Array]]:
     """Return the measurement models of the outlines, each with the signed distances (n,) of outline
     points from their edges [pixels]; points without an edge are left out.
     """
@@ -242,7 +224,5 @@ def outline_distances_px(
     for residual, values in surface_residuals(iterate):
         if isinstance(residual, OutlineResidual):
             distances_px = residual.signed_distances_px(values, iterate.phi)
-            distances.append(
-                (residual, distances_px[np.isfinite(distances_px)])
-            )
+            distances.append((residual, distances_px[np.isfinite(distances_px)]))
     return distances

@@ -122,37 +122,22 @@ class Outline:
         corners = surface.faces.shape[1]
         edges = []
         for sample, shape_m in enumerate(shapes_m):
-            image_m = (
-                camera.depth.images_m[sample]
-                if len(camera.depth.images_m)
-                else None
-            )
+            image_m = camera.depth.images_m[sample] if len(camera.depth.images_m) else None
             points = None
             if image_m is not None:
-                points = _outline_points(
-                    camera, surface, shape_m=shape_m, phi=phi, sample=sample
-                )
+                points = _outline_points(camera, surface, shape_m=shape_m, phi=phi, sample=sample)
             if image_m is None or points is None:
                 edges.append(_no_edges(corners))
                 continue
             edges.append(
-                _edges(
-                    camera,
-                    points,
-                    image_m=image_m,
-                    phi=phi,
-                    gate_m=gate_m,
-                    sample=sample,
-                )
+                _edges(camera, points, image_m=image_m, phi=phi, gate_m=gate_m, sample=sample)
             )
         most = max(1, *(len(each["is_compared"]) for each in edges))
 
         def together(name: str) -> NDArray:
             return np.stack([_padded(each[name], most) for each in edges])
 
-        of_points = {
-            name: together(name) for name in edges[0] if name not in ("faces",)
-        }
+        of_points = {name: together(name) for name in edges[0] if name not in ("faces",)}
         faces = together("faces")
         nodes = surface.faces[faces]
         rest_m = body.nodes_m[surface.nodes][nodes]
@@ -209,9 +194,7 @@ class _OutlinePoints:
 
 def _padded(values: NDArray, count: int) -> NDArray:
     """Return values (k, …) padded with zeros to a length of `count`."""
-    return np.pad(
-        values, [(0, count - len(values)), *[(0, 0)] * (values.ndim - 1)]
-    )
+    return np.pad(values, [(0, count - len(values)), *[(0, 0)] * (values.ndim - 1)])
 
 
 def _no_edges(corners: int) -> dict[str, NDArray]:
@@ -251,19 +234,11 @@ def no_depth_is_empty(
     # The middle of the body as stated, which may move with the camera: a coarse measure suffices.
     middle_m = float(camera.body_middle_m(sample)[2])
     background = np.count_nonzero(image_m > middle_m + size_m)
-    return bool(
-        background
-        < LEAST_BACKGROUND_SHARE * np.count_nonzero(np.isnan(image_m))
-    )
+    return bool(background < LEAST_BACKGROUND_SHARE * np.count_nonzero(np.isnan(image_m)))
 
 
 def _outline_points(
-    camera_in: DepthCameraModel,
-    surface: VisibleSurface,
-    shape_m: Array,
-    *,
-    phi: Array,
-    sample: int,
+    camera_in: DepthCameraModel, surface: VisibleSurface, shape_m: Array, *, phi: Array, sample: int
 ) -> _OutlinePoints | None:
     """Return the points where a shape (n, 3) [m] ends in the view of a camera, at φ and the image
     with index `sample`; None if there are none, for a point cloud, or if the body is partly behind
@@ -284,8 +259,7 @@ def _outline_points(
     front_triangle = np.where(is_front[:, 0], first, second)
     parts = len(surface.plane_triangles) // len(surface.faces)
     outline_edges = np.flatnonzero(
-        (is_front[:, 0] != is_front[:, 1])
-        & surface.is_selected[front_triangle // parts]
+        (is_front[:, 0] != is_front[:, 1]) & surface.is_selected[front_triangle // parts]
     )
     if not len(outline_edges):
         return None
@@ -293,13 +267,9 @@ def _outline_points(
     front_triangle = front_triangle[outline_edges]
     corners = surface.plane_triangles[front_triangle]
     lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
-    counts = np.maximum(
-        1, np.ceil(lengths_m / camera_in.depth.spacing_m).astype(int)
-    )
+    counts = np.maximum(1, np.ceil(lengths_m / camera_in.depth.spacing_m).astype(int))
     edge = np.repeat(np.arange(len(outline_edges)), counts)
-    number = np.arange(len(edge)) - np.repeat(
-        np.cumsum(counts) - counts, counts
-    )
+    number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (number + 0.5) / counts[edge]
     # Barycentric coordinates in the triangle that faces the camera.
     at_first = corners[edge] == ends[edge, :1]
@@ -343,9 +313,7 @@ def _first_of_each_cube(points_m: Array, edge_m: float) -> Index:
     """Return the indices, ascending, of the first of the points (P, 3) in each cube of a grid with
     edges of `edge_m` [m].
     """
-    _, first = np.unique(
-        np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True
-    )
+    _, first = np.unique(np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True)
     return np.sort(first)
 
 
@@ -359,12 +327,8 @@ def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
     middles = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - middles[:, None], axis=2).max()
     candidates = KDTree(middles).query_ball_point(points, reach)
-    point = np.repeat(
-        np.arange(len(points)), [len(each) for each in candidates]
-    )
-    a, b, c = triangles[
-        np.concatenate([*candidates, []]).astype(int)
-    ].transpose(1, 0, 2)
+    point = np.repeat(np.arange(len(points)), [len(each) for each in candidates])
+    a, b, c = triangles[np.concatenate([*candidates, []]).astype(int)].transpose(1, 0, 2)
 
     def side(start: Array, end: Array) -> Array:
         way = end - start
@@ -387,35 +351,14 @@ def _edges(
 ) -> dict[str, NDArray]:
     """Return the planes through the edges in an image that belong to points of an outline, by
     attribute name of `Outline`, with "faces" (P,) in place of "nodes".
-
-    Parameters
-    ----------
-    camera_in : DepthCameraModel
-        Model of the camera.
-    points : _OutlinePoints
-        The P points of the outline.
-    image_m : (rows, columns) array
-        Depths [m]; NaN where missing.
-    phi : (k,) array
-        Nuisance parameters.
-    gate_m : float
-        Largest difference of depth at which a pixel shows the body [m].
-    sample : int
-        Index of the image.
     """
     camera = camera_in.depth.camera
-    empty = no_depth_is_empty(
-        camera_in, image_m, sample=sample, size_m=camera_in.size_m
-    )
+    empty = no_depth_is_empty(camera_in, image_m, sample=sample, size_m=camera_in.size_m)
 
     def shown_at(pixels: Array) -> NDArray[np.int64]:
         """Return the classes (…, P) of pixels (…, P, 2) beside the points of the outline."""
         return _classify_pixels(
-            image_m,
-            pixels,
-            depth_m=points.depth_m,
-            gate_m=gate_m,
-            is_missing_empty=empty,
+            image_m, pixels, depth_m=points.depth_m, gate_m=gate_m, is_missing_empty=empty
         )
 
     offsets = np.arange(-SEARCH_PX, SEARCH_PX + STEP_PX / 2, STEP_PX)
@@ -442,9 +385,7 @@ def _edges(
     edges = points.pixels + mean_offsets[:, None] * outwards
     is_beyond = ~has_edge & (shown_at(points.pixels) == EMPTY)
     if is_beyond.any():
-        is_nothing = (image_m > points.depth_m.max() + gate_m) | (
-            np.isnan(image_m) & empty
-        )
+        is_nothing = (image_m > points.depth_m.max() + gate_m) | (np.isnan(image_m) & empty)
         nearest_edges = _nearest_edges(is_nothing, points.pixels[is_beyond])
         edges[is_beyond] = nearest_edges.edges
         outwards[is_beyond] = nearest_edges.outwards
@@ -475,19 +416,6 @@ def _nearest_ends(
 ) -> Array:
     """Return the offsets (P,) along the normals of an outline at which the image of the body ends
     [pixels]; NaN where it does not end.
-
-    Parameters
-    ----------
-    points : _OutlinePoints
-        The P points of the outline.
-    offsets : (k,) array
-        Offsets at which the image is examined, ascending [pixels].
-    along_px : float
-        Distance of the lines from the points, along the outline [pixels].
-    shown_at : callable
-        Classes (k, P) of pixels (k, P, 2).
-    expected : (P,) array or float
-        Of several ends, the nearest to this offset counts [pixels].
     """
     tangents = np.column_stack([-points.outwards[:, 1], points.outwards[:, 0]])
     start = points.pixels + along_px * tangents
@@ -500,38 +428,15 @@ def _nearest_ends(
 
 
 def _classify_pixels(
-    image_m: Array,
-    pixels: Array,
-    depth_m: Array,
-    *,
-    gate_m: float,
-    is_missing_empty: bool,
+    image_m: Array, pixels: Array, depth_m: Array, *, gate_m: float, is_missing_empty: bool
 ) -> NDArray[np.int64]:
     """Classify pixels of an image beside a body as BODY, UNKNOWN or EMPTY.
 
     A pixel whose depth differs by at most `gate_m` shows the body, a farther one is empty, a nearer
     one unknown. Pixels outside the image are unknown.
-
-    Parameters
-    ----------
-    image_m : (rows, columns) array
-        Depths [m]; NaN where missing.
-    pixels : (…, 2) array
-        Pixels u, v; rounded.
-    depth_m : array
-        Depths of the body there [m], of a shape that broadcasts to that of the pixels.
-    gate_m : float
-        Largest difference of depth [m].
-    is_missing_empty : bool
-        Whether a missing depth means that nothing is there; otherwise it is unknown.
     """
     column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
-    inside = (
-        (column >= 0)
-        & (column < image_m.shape[1])
-        & (row >= 0)
-        & (row < image_m.shape[0])
-    )
+    inside = (column >= 0) & (column < image_m.shape[1]) & (row >= 0) & (row < image_m.shape[0])
     depths_m = image_m[np.where(inside, row, 0), np.where(inside, column, 0)]
     behind_m = depths_m - depth_m
     shown = np.full(depths_m.shape, UNKNOWN)
@@ -542,25 +447,11 @@ def _classify_pixels(
 
 
 def _nearest_edges(nothing: NDArray[np.bool_], pixels: Array) -> _NearestEdges:
-    """Return the edges nearest to pixels (P, 2).
-
-    Parameters
-    ----------
-    nothing : (rows, columns) array of bool
-        Pixels of the image that show nothing, among them `pixels`.
-    pixels : (P, 2) array
-        Pixels u, v.
-    """
+    """Return the edges nearest to pixels (P, 2)."""
     if nothing.all():
-        return _NearestEdges(
-            pixels,
-            np.ones_like(pixels),
-            exists=np.zeros(len(pixels), dtype=bool),
-        )
+        return _NearestEdges(pixels, np.ones_like(pixels), exists=np.zeros(len(pixels), dtype=bool))
     places: Array = np.asarray(
-        distance_transform_edt(
-            nothing, return_distances=False, return_indices=True
-        )
+        distance_transform_edt(nothing, return_distances=False, return_indices=True)
     )
     column, row = np.round(pixels).astype(np.int64).T
     nearest = places[::-1, row, column].T.astype(float)
@@ -582,48 +473,17 @@ def _planes(
     phi: Array,
     sample: int,
 ) -> dict[str, NDArray]:
-    """Return planes through the camera and edges in its image, by attribute name of `Outline`.
-
-    Parameters
-    ----------
-    camera_in, camera : DepthCameraModel, DepthCamera
-        Model of the camera, and its stated properties.
-    edges : (P, 2) array
-        Pixels u, v of the edges.
-    outwards : (P, 2) array
-        Unit vectors in the image away from the body, which give the sign of the normals.
-    depth_m : (P,) array
-        Depths [m] that determine how wide a pixel is, and where the point of each plane is chosen.
-    phi : (k,) array
-        Nuisance parameters.
-    sample : int
-        Index of the image.
-
-    Returns
-    -------
-    dict
-        "normals" (P, 3), unit vectors in the world, away from the body; "points" (P, 3), points of
-        the planes in the camera's frame [m]; and "pixel_m" (P,), the width of a pixel along the
-        normal at the stated depth [m].
-    """
+    """Return planes through the camera and edges in its image, by attribute name of `Outline`."""
     tangents_px = np.column_stack([-outwards[:, 1], outwards[:, 0]])
     at, before, after, outside = _concatenated_rays(
-        camera,
-        [edges, edges - tangents_px, edges + tangents_px, edges + outwards],
+        camera, [edges, edges - tangents_px, edges + tangents_px, edges + outwards]
     )
     normals = np.cross(before, after)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     pixel = np.sum(normals * (outside - at), axis=1)
     normals *= np.sign(pixel)[:, None]
-    corner = camera_in.to_world(
-        phi, np.zeros((1, 3)), rays=np.zeros((1, 3)), image=sample
-    )
-    ways = (
-        camera_in.to_world(
-            phi, normals, rays=np.zeros_like(normals), image=sample
-        )
-        - corner
-    )
+    corner = camera_in.to_world(phi, np.zeros((1, 3)), rays=np.zeros((1, 3)), image=sample)
+    ways = camera_in.to_world(phi, normals, rays=np.zeros_like(normals), image=sample) - corner
     return {
         "normals": ways / np.linalg.norm(ways, axis=1)[:, None],
         "points": depth_m[:, None] * at,
@@ -631,12 +491,8 @@ def _planes(
     }
 
 
-def _concatenated_rays(
-    camera: DepthCamera, pixels: Sequence[Array]
-) -> list[Array]:
+def _concatenated_rays(camera: DepthCamera, pixels: Sequence[Array]) -> list[Array]:
     """Return the points (P, 3) at depth one on the rays of several sets of pixels (P, 2), one array
     per set, computed in one call.
     """
-    return np.split(
-        camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels)
-    )
+    return np.split(camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels))

@@ -49,9 +49,7 @@ PATCHES = 60
 GROWING = 1.2
 
 
-def _surface_positions(
-    correspondences: SurfaceCorrespondences, times: int
-) -> PointPositions:
+def _surface_positions(correspondences: SurfaceCorrespondences, times: int) -> PointPositions:
     """Return the surface nodes of the body at a number of times as an observable, which is stored
     with the camera's model, because it is the same for all correspondences.
     """
@@ -68,9 +66,7 @@ def _surface_positions(
         )
         stored[times] = PointPositions(
             np.arange(times),
-            MarkerAssociation.from_exact_places(
-                body, placement, points_m=body.nodes_m[nodes]
-            ),
+            MarkerAssociation.from_exact_places(body, placement, points_m=body.nodes_m[nodes]),
             coordinate_parameters=np.full((count, 3), -1),
         )
     return stored[times]
@@ -160,8 +156,7 @@ class DepthResidual(CorrespondenceResidual):
         """
         nearest = np.abs(self.observable_s - self.t_s[:, None]).argmin(axis=1)
         is_off_grid = (
-            np.abs(self.observable_s[nearest] - self.t_s).max(initial=0.0)
-            > TIME_TOLERANCE_S
+            np.abs(self.observable_s[nearest] - self.t_s).max(initial=0.0) > TIME_TOLERANCE_S
         )
         clock = self.nuisance.indices_of_rows(
             DEPTH_TIME, component=self.correspondences.camera.camera_index
@@ -169,9 +164,7 @@ class DepthResidual(CorrespondenceResidual):
         if not (is_off_grid or len(clock)) or len(self.observable_s) < 2:
             return nearest[:, None]
         used = min(NEIGHBOURS, len(self.observable_s))
-        return neighbouring_times(
-            self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used
-        )
+        return neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used)
 
     @cached_property
     def _stencil(self) -> RowStencil:
@@ -186,9 +179,7 @@ class DepthResidual(CorrespondenceResidual):
         samples, points = pairs.is_compared.shape
         rotations, translations = self.correspondences.camera.poses
         in_camera = np.einsum("sji,sej->sei", rotations, pairs.normals)
-        normal_motion = np.einsum("sei,si->se", pairs.normals, translations)[
-            ..., None
-        ]
+        normal_motion = np.einsum("sei,si->se", pairs.normals, translations)[..., None]
         offsets_s = np.broadcast_to(
             (self.observable_s[times] - self.t_s[:, None])[:, None],
             (samples, points, times.shape[1]),
@@ -202,13 +193,9 @@ class DepthResidual(CorrespondenceResidual):
             pairs.points,
             pairs.rays,
         ]
-        places = (
-            times[:, None, :, None] * self.observable.vector_count
-            + pairs.nodes[:, :, None]
-        )
+        places = times[:, None, :, None] * self.observable.vector_count + pairs.nodes[:, :, None]
         return RowStencil(
-            places.reshape(samples, points, -1),
-            np.moveaxis(np.concatenate(parts, axis=2), 2, 0),
+            places.reshape(samples, points, -1), np.moveaxis(np.concatenate(parts, axis=2), 2, 0)
         )
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -216,9 +203,7 @@ class DepthResidual(CorrespondenceResidual):
         observable; φ is not used.
         """
         samples = int(np.count_nonzero(self._neighbour_times[:, -1] < known))
-        return RowStencil(
-            self._stencil.indices[:samples], self._stencil.data[:, :samples]
-        )
+        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     @property
     def first_row(self) -> int:
@@ -231,15 +216,11 @@ class DepthResidual(CorrespondenceResidual):
         """
         return self.correspondences.updated(self.surface_shapes(x, phi), phi)
 
-    def correspondences_of(
-        self, measured: Depth, x: Array, phi: Array
-    ) -> SurfaceCorrespondences:
+    def correspondences_of(self, measured: Depth, x: Array, phi: Array) -> SurfaceCorrespondences:
         """Return the correspondences of other points of the same camera and images with the motion
         x (N, 3n) [m], see `SurfaceCorrespondences.with_depth`.
         """
-        return self.correspondences.with_depth(
-            measured, self.surface_shapes(x, phi), phi=phi
-        )
+        return self.correspondences.with_depth(measured, self.surface_shapes(x, phi), phi=phi)
 
     def aligned_correspondences(
         self, x: Array, phi: Array, only_pose: bool = False
@@ -265,18 +246,13 @@ class DepthResidual(CorrespondenceResidual):
         shapes = self.surface_shapes(x, phi)
         if not len(shapes):
             shapes = x[-1:].reshape(1, -1, 3)[:, correspondences.surface.nodes]
-        all_shapes = np.concatenate(
-            [shapes, correspondences.shapes_m[len(shapes) :]]
-        )
+        all_shapes = np.concatenate([shapes, correspondences.shapes_m[len(shapes) :]])
         if correspondences.is_aligned_with(all_shapes, phi):
             return correspondences
         if only_pose:
             return correspondences.with_aligned_pose(all_shapes, phi)
         return SurfaceCorrespondences.from_alignment(
-            correspondences.camera,
-            correspondences.body,
-            shapes_m=all_shapes,
-            phi=phi,
+            correspondences.camera, correspondences.body, shapes_m=all_shapes, phi=phi
         )
 
     @property
@@ -302,23 +278,15 @@ class DepthResidual(CorrespondenceResidual):
         """
         view = self.correspondences.camera
         nodes = self.correspondences_in_use.nodes.shape[2]
-        sizes = np.cumsum(
-            [0, self._neighbour_times.shape[1], nodes, 3, 3, 1, 3, 3]
-        ).tolist()
-        offsets, weights, normal, in_camera, normal_motion, point, ray = (
-            ca.vertsplit(data, sizes)
-        )
+        sizes = np.cumsum([0, self._neighbour_times.shape[1], nodes, 3, 3, 1, 3, 3]).tolist()
+        offsets, weights, normal, in_camera, normal_motion, point, ray = ca.vertsplit(data, sizes)
         values = self.nuisance.values_by_row(phi, self.own_parameters[0])
         clock_shift = values.get(DEPTH_TIME, ca.SX(0))
         times = ca.vertsplit(offsets)
         in_time = ca.vertcat(*lagrange_weights(clock_shift, times))
         surface = values_in @ ca.kron(in_time, weights)
         corrected = view.corrected_expression(point, ray, values=values)
-        return (
-            ca.dot(normal, surface)
-            - ca.dot(in_camera, corrected)
-            - normal_motion
-        )
+        return ca.dot(normal, surface) - ca.dot(in_camera, corrected) - normal_motion
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
         """Return the distances from visible parts of the surface to the points of the first image
@@ -363,9 +331,7 @@ class DepthResidual(CorrespondenceResidual):
         places = pairs.places_m[pairs.is_compared]
         edge_m = 2 * self.correspondences.camera.depth.spacing_m
         while True:
-            cubes, number = np.unique(
-                np.floor(places / edge_m), axis=0, return_inverse=True
-            )
+            cubes, number = np.unique(np.floor(places / edge_m), axis=0, return_inverse=True)
             if len(cubes) <= PATCHES:
                 break
             edge_m *= GROWING
@@ -378,17 +344,15 @@ class DepthResidual(CorrespondenceResidual):
         counts (S, 3M) of points; the number of patches is rounded up to a multiple of three.
         """
         samples, points = self._patch_indices.shape
-        patches = GROUP * -(
-            -(int(self._patch_indices.max(initial=0)) + 1) // GROUP
-        )
+        patches = GROUP * -(-(int(self._patch_indices.max(initial=0)) + 1) // GROUP)
         sample, point = np.nonzero(self._patch_indices >= 0)
         row = sample * patches + self._patch_indices[sample, point]
         counts = np.bincount(row, minlength=samples * patches)
         share = 1 / np.sqrt(counts[row])
         shape = samples * patches, samples * points
-        return sp.csr_array(
-            (share, (row, sample * points + point)), shape=shape
-        ), counts.reshape(samples, patches)
+        return sp.csr_array((share, (row, sample * points + point)), shape=shape), counts.reshape(
+            samples, patches
+        )
 
     @cached_property
     def pooled_groups(self) -> PooledResiduals:
@@ -399,9 +363,7 @@ class DepthResidual(CorrespondenceResidual):
         name = self.names[0]
         count = counts.shape[1] // GROUP
         of_points = self.correspondences_in_use.places_m.reshape(-1, 3)
-        sums = (means @ of_points).reshape(*counts.shape, 3) * np.sqrt(counts)[
-            ..., None
-        ]
+        sums = (means @ of_points).reshape(*counts.shape, 3) * np.sqrt(counts)[..., None]
         places = sums.sum(axis=0) / np.maximum(counts.sum(axis=0), 1)[:, None]
         return PooledResiduals(
             tuple(f"{name} {k + 1}" for k in range(count)),
@@ -415,15 +377,11 @@ class DepthResidual(CorrespondenceResidual):
         √count so that white noise keeps its variance.
         """
         means, counts = self._pooling
-        columns = int(
-            np.prod(values.shape[3:])
-        )  # zero where nothing is estimated
+        columns = int(np.prod(values.shape[3:]))  # zero where nothing is estimated
         value_rows = means @ values.reshape(
             values.shape[0] * values.shape[1] * values.shape[2], columns
         )
-        return value_rows.reshape(
-            len(counts), counts.shape[1] // GROUP, GROUP, *values.shape[3:]
-        )
+        return value_rows.reshape(len(counts), counts.shape[1] // GROUP, GROUP, *values.shape[3:])
 
     # In pictures ------------------------------------------------------------------------------
 
@@ -440,9 +398,7 @@ class DepthResidual(CorrespondenceResidual):
         """
         distances = self.predict(values, phi)[..., 0]
         return np.where(
-            self.correspondences_in_use.is_compared[: len(distances)],
-            distances,
-            np.nan,
+            self.correspondences_in_use.is_compared[: len(distances)], distances, np.nan
         )
 
     def surface_shapes(self, x: Array, phi: Array) -> Array:
@@ -455,14 +411,10 @@ class DepthResidual(CorrespondenceResidual):
         return np.array(
             [
                 np.tensordot(
-                    lagrange_weights(
-                        t + clock_shift, self.observable_s[times].tolist()
-                    ),
+                    lagrange_weights(t + clock_shift, self.observable_s[times].tolist()),
                     nodes[times],
                     1,
                 )
-                for t, times in zip(
-                    self.t_s[:known], self._neighbour_times[:known], strict=True
-                )
+                for t, times in zip(self.t_s[:known], self._neighbour_times[:known], strict=True)
             ]
         ).reshape(known, *nodes.shape[1:])

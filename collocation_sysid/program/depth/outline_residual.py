@@ -77,9 +77,7 @@ class OutlineResidual(DepthResidual):
         """
         places, data = super()._stencil
         width_m = np.where(
-            self.correspondences_in_use.is_compared,
-            self.correspondences_in_use.pixel_m,
-            1.0,
+            self.correspondences_in_use.is_compared, self.correspondences_in_use.pixel_m, 1.0
         )
         return RowStencil(places, np.concatenate([data, width_m[None]]))
 
@@ -90,9 +88,7 @@ class OutlineResidual(DepthResidual):
         """
         count = data.numel() - 1
         outside_m = super().expression(values, phi, data=data[:count])
-        inside_px = self.nuisance.values_by_row(
-            phi, self.own_parameters[0]
-        ).get(DEPTH_EDGE, 0)
+        inside_px = self.nuisance.values_by_row(phi, self.own_parameters[0]).get(DEPTH_EDGE, 0)
         return outside_m / data[count] - inside_px
 
     def signed_distances_px(self, values: Array, phi: Array) -> Array:

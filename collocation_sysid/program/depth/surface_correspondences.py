@@ -40,14 +40,7 @@ SAME = 0.2
 # Largest alignment in standard deviations of its prior; more belongs to something else.
 FARTHEST = 4.0
 # Reasons for leaving points out, in the order in which they are tested.
-EXCLUSION_REASONS = (
-    "far",
-    "grazing",
-    "turned away",
-    "not chosen",
-    "hidden",
-    "crease",
-)
+EXCLUSION_REASONS = ("far", "grazing", "turned away", "not chosen", "hidden", "crease")
 # Distance from a crease within which points are left out, in standard deviations of the noise.
 CREASE_SIGMAS = 3.0
 # Share of the spacing of points by which a part must be in front to hide another; shapes that
@@ -170,14 +163,7 @@ class SurfaceCorrespondences(Correspondences):
         skin = surface or VisibleSurface.from_body(body, camera.depth)
         images = [
             _match_image(
-                camera,
-                skin,
-                body=body,
-                sample=k,
-                x=x,
-                phi=phi,
-                gate_m=gate_m,
-                settled=settled,
+                camera, skin, body=body, sample=k, x=x, phi=phi, gate_m=gate_m, settled=settled
             )
             for k, x in enumerate(shapes_m)
         ]
@@ -185,13 +171,7 @@ class SurfaceCorrespondences(Correspondences):
         arrays: dict[str, Any] = {
             name: np.stack(
                 [
-                    np.pad(
-                        s[name],
-                        [
-                            (0, most - len(s[name])),
-                            *[(0, 0)] * (s[name].ndim - 1),
-                        ],
-                    )
+                    np.pad(s[name], [(0, most - len(s[name])), *[(0, 0)] * (s[name].ndim - 1)])
                     for s in images
                 ]
             )
@@ -199,9 +179,7 @@ class SurfaceCorrespondences(Correspondences):
             if name != "reasons"
         }
         total = np.sum([each["reasons"] for each in images], axis=0).tolist()
-        own: dict[str, Any] = {
-            "excluded_counts": dict(zip(EXCLUSION_REASONS, total, strict=True))
-        }
+        own: dict[str, Any] = {"excluded_counts": dict(zip(EXCLUSION_REASONS, total, strict=True))}
         own |= {
             "start_values": camera.parameter_values(phi),
             "gate_m": gate_m,
@@ -237,31 +215,19 @@ class SurfaceCorrespondences(Correspondences):
         phi = _aligned_parameters(camera, body, shapes_m=shapes_m, phi=phi)
         gate_m = max(initial_gate_m(body.nodes_m), camera.depth.gate_m)
         clouds = tuple(map(thinned, camera.depth.clouds))
-        thinned_view = replace(
-            camera, depth=replace(camera.depth, clouds=clouds, images_m=())
-        )
+        thinned_view = replace(camera, depth=replace(camera.depth, clouds=clouds, images_m=()))
         gate_m = cls.from_shapes(
             thinned_view, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         ).next_gate_m(shapes_m, phi)
-        aligned = cls.from_shapes(
-            camera, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
-        )
+        aligned = cls.from_shapes(camera, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m)
         return replace(aligned, is_aligned=True)
 
-    def with_aligned_pose(
-        self, shapes_m: Array, phi: Array
-    ) -> SurfaceCorrespondences:
+    def with_aligned_pose(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
         """Return the same correspondences with the camera's parameters after an alignment with the
         shapes (S, n, 3) [m], see `from_alignment`, for comparisons that need the pose alone.
         """
-        phi = _aligned_parameters(
-            self.camera, self.body, shapes_m=shapes_m, phi=phi
-        )
-        return replace(
-            self,
-            start_values=self.camera.parameter_values(phi),
-            is_aligned=False,
-        )
+        phi = _aligned_parameters(self.camera, self.body, shapes_m=shapes_m, phi=phi)
+        return replace(self, start_values=self.camera.parameter_values(phi), is_aligned=False)
 
     def with_camera(self, camera: DepthCameraModel) -> SurfaceCorrespondences:
         """Return the same correspondences with another model of their camera, which uses the points
@@ -279,9 +245,7 @@ class SurfaceCorrespondences(Correspondences):
         before = view.parameters_from(self.start_values)
         others = np.setdiff1d(
             view.parameter_indices,
-            view.nuisance.indices_of_rows(
-                DEPTH_TURN, DEPTH_SHIFT, component=view.camera_index
-            ),
+            view.nuisance.indices_of_rows(DEPTH_TURN, DEPTH_SHIFT, component=view.camera_index),
         )
         moved_m = np.abs(shapes_m - self.shapes_m).max(initial=0.0)
         return (
@@ -312,17 +276,11 @@ class SurfaceCorrespondences(Correspondences):
         before = self.camera.parameters_from(self.start_values)
         moved_m = np.abs(shapes_m - self.shapes_m[:known]).max(initial=0.0)
         for k in range(known if moved_m < FRONT * depth.spacing_m else 0):
-            way = self.camera.world_points(phi, k) - self.camera.world_points(
-                before, k
-            )
+            way = self.camera.world_points(phi, k) - self.camera.world_points(before, k)
             moved_m = max(moved_m, np.abs(way).max(initial=0.0))
         gate_m = self.next_gate_m(all_shapes_m, phi)
         settled = moved_m < FRONT * depth.spacing_m
-        if (
-            moved_m < SAME * depth.sigma_m
-            and gate_m == self.gate_m
-            and self.has_converged
-        ):
+        if moved_m < SAME * depth.sigma_m and gate_m == self.gate_m and self.has_converged:
             return self
         return SurfaceCorrespondences.from_shapes(
             self.camera,
@@ -334,11 +292,9 @@ class SurfaceCorrespondences(Correspondences):
             surface=self.surface,
         )
 
-    def with_depth(
-        self, depth: Depth, shapes_m: Array, phi: Array
-    ) -> SurfaceCorrespondences:
-        """Return the correspondences of other measured points of the same camera and images, such as
-        all points in place of thinned ones, with the present gate.
+    def with_depth(self, depth: Depth, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
+        """Return the correspondences of other measured points of the same camera and images, such
+        as all points in place of thinned ones, with the present gate.
 
         Parameters
         ----------
@@ -366,9 +322,7 @@ class SurfaceCorrespondences(Correspondences):
         Distances are limited to `initial_gate_m` of the body.
         """
         view = self.camera
-        is_facing = self.surface.is_facing(
-            x, self.camera.eye_m(phi, 0), minimum_cosine=GRAZING
-        )
+        is_facing = self.surface.is_facing(x, self.camera.eye_m(phi, 0), minimum_cosine=GRAZING)
         middles = x[self.surface.plane_triangles[is_facing]].mean(axis=1)
         distances_m, _ = KDTree(view.world_points(phi, 0)).query(middles)
         return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
@@ -378,9 +332,7 @@ class SurfaceCorrespondences(Correspondences):
         points from the surfaces (S, n, 3) [m] at φ (k,), at least that of the problem, if this is
         smaller than the present one by the factor `NARROWER`; otherwise the present one.
         """
-        gate_m = max(
-            self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m
-        )
+        gate_m = max(self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m)
         return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
 
     def _expected_distance_m(self, shapes_m: Array, phi: Array) -> float:
@@ -389,11 +341,7 @@ class SurfaceCorrespondences(Correspondences):
         """
         distances_m = self.signed_distances_m(shapes_m, phi)
         all_of_them = np.abs(distances_m[np.isfinite(distances_m)])
-        return (
-            SPREAD * float(np.median(all_of_them))
-            if len(all_of_them)
-            else np.inf
-        )
+        return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
 
     def signed_distances_m(self, shapes_m: Array, phi: Array) -> Array:
         """Return how far points (S, E) are behind shapes (s, n, 3) of the first s ≤ S images, along
@@ -404,26 +352,20 @@ class SurfaceCorrespondences(Correspondences):
         distances_m = np.full(self.is_compared.shape, np.nan)
         for k, x in enumerate(shapes_m):
             surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
-            measured = self.camera.to_world(
-                phi, self.points[k], rays=self.rays[k], image=k
-            )
+            measured = self.camera.to_world(phi, self.points[k], rays=self.rays[k], image=k)
             behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
             distances_m[k] = np.where(self.is_compared[k], behind_m, np.nan)
         return distances_m
 
 
-def _aligned_parameters(
-    camera: DepthCameraModel, body: Body, shapes_m: Array, phi: Array
-) -> Array:
+def _aligned_parameters(camera: DepthCameraModel, body: Body, shapes_m: Array, phi: Array) -> Array:
     """Return φ (k,) with the pose of the camera that is aligned with the shape of the first image
     that has points; φ itself if the pose would differ from the stated one by more than `FARTHEST`
     prior standard deviations. The arguments are those of `SurfaceCorrespondences.from_alignment`.
     """
     first = camera.depth.find_first_sample_with_points()
     surface = VisibleSurface.from_body(body, camera.depth)
-    turn, shift_m = align_camera(
-        camera, surface, x=shapes_m[first], image=first
-    )
+    turn, shift_m = align_camera(camera, surface, x=shapes_m[first], image=first)
     moved = camera.with_pose(phi, turn, shift_m=shift_m)
     errors = np.abs(moved[camera.parameter_indices])
     return phi if errors.max(initial=0.0) > FARTHEST else moved
@@ -457,35 +399,7 @@ def _match_image(
     gate_m: float,
     settled: bool,
 ) -> dict[str, NDArray]:
-    """Find the correspondences of one image.
-
-    Parameters
-    ----------
-    camera : DepthCameraModel
-        Model of the camera.
-    surface : VisibleSurface
-        Surface of the body.
-    body : Body
-        The body.
-    sample : int
-        Index of the image.
-    x : (n, 3) array
-        Positions of the surface's nodes at the image [m].
-    phi : (k,) array
-        Nuisance parameters.
-    gate_m : float
-        Largest distance of a point from the surface [m].
-    settled : bool
-        Whether the search has nearly converged, so that points hidden behind other parts of the
-        body are left out.
-
-    Returns
-    -------
-    dict of arrays
-        Arrays of the points within the gate, by attribute name of `SurfaceCorrespondences`; and
-        "reasons", the numbers of points left out in the order of `EXCLUSION_REASONS`, each by the
-        first reason that applies.
-    """
+    """Find the correspondences of one image."""
     depth = camera.depth
     cloud = camera.depth.clouds[sample]
     world = camera.world_points(phi, sample)
@@ -498,33 +412,22 @@ def _match_image(
     feet = surface_points.points_m
     normals = surface_points.normals
     ways = normals if eye_m is None else eye_m - feet
-    is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(
-        ways, axis=1
-    )
+    is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
     offsets = world[indices] - feet
     distance = np.linalg.norm(offsets, axis=1)
-    lateral = np.linalg.norm(
-        offsets - np.sum(offsets * normals, axis=1)[:, None] * normals, axis=1
-    )
+    lateral = np.linalg.norm(offsets - np.sum(offsets * normals, axis=1)[:, None] * normals, axis=1)
     # The distance of a point beyond an edge of the visible surface is along the way to the edge.
     is_beyond_edge = lateral > LARGEST_LATERAL_SHARE * distance + depth.sigma_m
-    normals[is_beyond_edge] = (
-        offsets[is_beyond_edge] / distance[is_beyond_edge, None]
-    )
+    normals[is_beyond_edge] = offsets[is_beyond_edge] / distance[is_beyond_edge, None]
     is_any = np.ones(len(indices), dtype=bool)
     has_similar_normal = is_visible = is_on_one_face = is_any
     if cloud.shape[1] == 6:
         measured = cloud[indices, 3:] @ camera.poses[0][sample].T
         has_similar_normal = np.sum(normals * measured, axis=1) >= GRAZING
     if settled:
-        is_visible = ~surface.is_hidden(
-            x, eye_m, points_m=feet, front_m=FRONT * depth.spacing_m
-        )
+        is_visible = ~surface.is_hidden(x, eye_m, points_m=feet, front_m=FRONT * depth.spacing_m)
         is_on_one_face = ~surface.is_near_crease(
-            x,
-            eye_m,
-            points_m=world[indices],
-            reach_m=CREASE_SIGMAS * depth.sigma_m,
+            x, eye_m, points_m=world[indices], reach_m=CREASE_SIGMAS * depth.sigma_m
         )
     is_within_gate = distance <= gate_m
     remaining = np.cumprod(
@@ -541,9 +444,7 @@ def _match_image(
     )
     reasons = -np.diff(remaining.sum(axis=1))
     reasons[0] += len(cloud) - len(indices)
-    rest_m = np.einsum(
-        "pa,pai->pi", weights, body.nodes_m[surface.nodes][surface.faces[faces]]
-    )
+    rest_m = np.einsum("pa,pai->pi", weights, body.nodes_m[surface.nodes][surface.faces[faces]])
     of_points = {
         "nodes": surface.faces[faces],
         "weights": weights,
@@ -553,44 +454,21 @@ def _match_image(
         "places_m": rest_m,
         "is_compared": remaining[-1].astype(bool),
     }
-    return {name: each[is_within_gate] for name, each in of_points.items()} | {
-        "reasons": reasons
-    }
+    return {name: each[is_within_gate] for name, each in of_points.items()} | {"reasons": reasons}
 
 
 def _nearest_facing(
-    world: Array,
-    surface: VisibleSurface,
-    x: Array,
-    eye_m: Array | None,
-    gate_m: float,
+    world: Array, surface: VisibleSurface, x: Array, eye_m: Array | None, gate_m: float
 ) -> _NearestPoints:
     """Return the points near a shape, and the nearest points of faces towards the camera.
 
     There are none if no face is towards the camera.
-
-    Parameters
-    ----------
-    world : (P, 3) array
-        Points in the world [m].
-    surface : VisibleSurface
-        Surface of the body.
-    x : (n, 3) array
-        Surface nodes [m].
-    eye_m : (3,) array or None
-        Position of the camera; None for a point cloud.
-    gate_m : float
-        Points outside the bounding box of the shape by more are left out [m].
     """
     low = x.min(axis=0) - gate_m
     high = x.max(axis=0) + gate_m
     in_box = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
     facing = np.flatnonzero(surface.is_facing(x, eye_m))
     if not len(facing) or not len(in_box):
-        return _NearestPoints(
-            in_box[:0], in_box[:0], barycentric=np.zeros((0, 3))
-        )
-    faces, barycentric = surface.nearest_points(
-        x, world[in_box], candidates=facing
-    )
+        return _NearestPoints(in_box[:0], in_box[:0], barycentric=np.zeros((0, 3)))
+    faces, barycentric = surface.nearest_points(x, world[in_box], candidates=facing)
     return _NearestPoints(in_box, faces, barycentric=barycentric)

@@ -109,14 +109,10 @@ class VisibleSurface:
         if depth.faces is not None:
             chosen[:] = False
             chosen[depth.faces.resolve_faces(body.mesh)] = True
-        nodes, faces = np.unique(
-            body.nodes.nodes_of_faces(triangles), return_inverse=True
-        )
+        nodes, faces = np.unique(body.nodes.nodes_of_faces(triangles), return_inverse=True)
         return cls(nodes, faces.reshape(len(triangles), -1), is_selected=chosen)
 
-    def initial_positions_m(
-        self, experiment: Experiment, depth: Depth
-    ) -> Array:
+    def initial_positions_m(self, experiment: Experiment, depth: Depth) -> Array:
         """Return the node positions (n, 3) of the undeformed body in its grasps at the
         camera's first image with points [m].
         """
@@ -127,9 +123,7 @@ class VisibleSurface:
     @property
     def plane_triangles(self) -> Index:
         """Flat triangles (F·k, 3) as indices into `nodes`; those of a face are consecutive."""
-        return self.faces[:, TRIANGLES_OF_FACE[self.faces.shape[1]]].reshape(
-            -1, 3
-        )
+        return self.faces[:, TRIANGLES_OF_FACE[self.faces.shape[1]]].reshape(-1, 3)
 
     @cached_property
     def edges(self) -> tuple[Index, Index]:
@@ -137,24 +131,15 @@ class VisibleSurface:
         of these triangles; edges with another number of triangles are omitted.
         """
         triangles = self.plane_triangles
-        ends = np.sort(
-            triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1
-        )
-        unique, number, counts = np.unique(
-            ends, axis=0, return_inverse=True, return_counts=True
-        )
+        ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        unique, number, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
         order = np.argsort(number.ravel(), kind="stable")
         first = np.cumsum(counts) - counts
         paired = counts == 2
-        faces_of_edges = (
-            np.stack([order[first[paired]], order[first[paired] + 1]], axis=1)
-            // 3
-        )
+        faces_of_edges = np.stack([order[first[paired]], order[first[paired] + 1]], axis=1) // 3
         return unique[paired], faces_of_edges
 
-    def to_faces(
-        self, triangles: Index, barycentric: Array
-    ) -> tuple[Index, Array]:
+    def to_faces(self, triangles: Index, barycentric: Array) -> tuple[Index, Array]:
         """Return faces (P,), and barycentric coordinates (P, 3) on them, of points on flat
         triangles.
 
@@ -167,13 +152,9 @@ class VisibleSurface:
         """
         parts = TRIANGLES_OF_FACE[self.faces.shape[1]]
         corners = CORNERS[parts[triangles % len(parts)]]
-        return triangles // len(parts), np.einsum(
-            "pc,pci->pi", barycentric, corners
-        )
+        return triangles // len(parts), np.einsum("pc,pci->pi", barycentric, corners)
 
-    def evaluate(
-        self, x: Array, faces: Index, barycentric: Array
-    ) -> SurfacePoints:
+    def evaluate(self, x: Array, faces: Index, barycentric: Array) -> SurfacePoints:
         """Evaluate points on faces of a deformed surface.
 
         Parameters
@@ -190,19 +171,13 @@ class VisibleSurface:
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
         return SurfacePoints(at.weights, at.points_m, normals=normals)
 
-    def _evaluate_tangents(
-        self, x: Array, faces: Index, barycentric: Array
-    ) -> _SurfaceTangents:
+    def _evaluate_tangents(self, x: Array, faces: Index, barycentric: Array) -> _SurfaceTangents:
         """Return points on faces and tangents along the faces; arguments as in `evaluate`."""
         weights, slopes = face_shape_functions(barycentric, self.faces.shape[1])
         corners = x[self.faces[faces]]
-        tangents = np.einsum(
-            "pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners
-        )
+        tangents = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
         return _SurfaceTangents(
-            weights,
-            np.einsum("pa,pai->pi", weights, corners),
-            tangents=tangents,
+            weights, np.einsum("pa,pai->pi", weights, corners), tangents=tangents
         )
 
     def subdivided_triangles(self, x: Array, divisions: int = 4) -> Array:
@@ -214,16 +189,11 @@ class VisibleSurface:
         down = i + j < divisions - 1
         upward = np.stack([[i, j], [i + 1, j], [i, j + 1]])[..., up]
         downward = np.stack([[i + 1, j], [i + 1, j + 1], [i, j + 1]])[..., down]
-        of_b, of_c = (
-            np.concatenate([upward, downward], axis=2).transpose(1, 2, 0)
-            / divisions
-        )
+        of_b, of_c = np.concatenate([upward, downward], axis=2).transpose(1, 2, 0) / divisions
         places = np.stack([1 - of_b - of_c, of_b, of_c], axis=-1).reshape(-1, 3)
         faces = np.repeat(np.arange(len(self.faces)), len(places))
         barycentric = np.tile(places, (len(self.faces), 1))
-        return self.evaluate(
-            x, faces, barycentric=barycentric
-        ).points_m.reshape(-1, 3, 3)
+        return self.evaluate(x, faces, barycentric=barycentric).points_m.reshape(-1, 3, 3)
 
     def is_facing(
         self, x: Array, eye_m: Array | None, minimum_cosine: float = 0.0
@@ -275,16 +245,12 @@ class VisibleSurface:
         optical_axis *= np.sign(optical_axis @ (x.mean(axis=0) - eye_m))
         depths = (x - eye_m) @ optical_axis
         away = (points_m - eye_m) @ optical_axis
-        corners = self.plane_triangles[
-            self.is_facing(x, eye_m, minimum_cosine=0.0)
-        ]
+        corners = self.plane_triangles[self.is_facing(x, eye_m, minimum_cosine=0.0)]
         corners = corners[(depths[corners] > 0).all(axis=1)]
         places = ((x - eye_m) @ np.transpose(across) / depths[:, None])[corners]
         projected = (points_m - eye_m) @ np.transpose(across) / away[:, None]
         middles = places.mean(axis=1)
-        reach = np.linalg.norm(places - middles[:, None], axis=2).max(
-            initial=0.0
-        )
+        reach = np.linalg.norm(places - middles[:, None], axis=2).max(initial=0.0)
         pairs = KDTree(projected).sparse_distance_matrix(
             KDTree(middles), reach, output_type="ndarray"
         )
@@ -338,16 +304,12 @@ class VisibleSurface:
         normals = np.cross(b - a, c - a)
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
         cosines = np.sum(normals[triangles[:, 0]] * normals[triangles[:, 1]], 1)
-        is_crease = (cosines < CREASE_COSINE) & self.is_facing(x, eye_m)[
-            triangles
-        ].all(axis=1)
+        is_crease = (cosines < CREASE_COSINE) & self.is_facing(x, eye_m)[triangles].all(axis=1)
         start, end = x[ends[is_crease]].transpose(1, 0, 2)
         lengths_m = np.linalg.norm(end - start, axis=1)
         counts = 1 + np.ceil(lengths_m / (CREASE_STEP * reach_m)).astype(int)
         crease = np.repeat(np.arange(len(counts)), counts)
-        number = np.arange(len(crease)) - np.repeat(
-            np.cumsum(counts) - counts, counts
-        )
+        number = np.arange(len(crease)) - np.repeat(np.cumsum(counts) - counts, counts)
         share = (number / (counts[crease] - 1))[:, None]
         on_crease = (1 - share) * start[crease] + share * end[crease] - eye_m
         if not len(on_crease):
@@ -357,17 +319,13 @@ class VisibleSurface:
         rays /= np.linalg.norm(rays, axis=1)[:, None]
         # Beyond this bound, which is larger than any reach, the query finds nothing, in less time.
         bound = 1.001 * reach_m / away_m.min()
-        apart, nearest = KDTree(on_crease / away_m[:, None]).query(
-            rays, distance_upper_bound=bound
-        )
+        apart, nearest = KDTree(on_crease / away_m[:, None]).query(rays, distance_upper_bound=bound)
         is_within = np.isfinite(apart)
         away_m = np.take(away_m, nearest, mode="clip")
         near[is_within] = (apart * away_m)[is_within] <= reach_m
         return near
 
-    def nearest_points(
-        self, x: Array, points: Array, candidates: Index
-    ) -> tuple[Index, Array]:
+    def nearest_points(self, x: Array, points: Array, candidates: Index) -> tuple[Index, Array]:
         """Return the nearest points of some flat triangles, and of the curved faces they belong to.
 
         Triangles are searched among the `NEARBY` nearest by their middles; on curved faces the
@@ -391,36 +349,22 @@ class VisibleSurface:
         middles = corners.mean(axis=1)
         _, neighbours = KDTree(middles).query(points, min(NEARBY, len(corners)))
         triangles, in_triangles = _nearest_of_triangles(
-            points,
-            corners,
-            neighbours=np.reshape(neighbours, (len(points), -1)),
+            points, corners, neighbours=np.reshape(neighbours, (len(points), -1))
         )
         faces, places = self.to_faces(candidates[triangles], in_triangles)
         moving = np.arange(len(points) if self.faces.shape[1] > 3 else 0)
         for _ in range(SETTLING):
             # Faces are curved: the nearest point of a face is beside that of the flat triangle.
-            at = self._evaluate_tangents(
-                x, faces[moving], barycentric=places[moving]
-            )
+            at = self._evaluate_tangents(x, faces[moving], barycentric=places[moving])
             feet = at.points_m
             by_a, by_b = at.tangents.transpose(1, 0, 2)
             aa, ab, bb = (
-                np.sum(u * v, axis=1)
-                for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))
+                np.sum(u * v, axis=1) for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))
             )
-            to_a, to_b = (
-                np.sum(u * (points[moving] - feet), axis=1)
-                for u in (by_a, by_b)
-            )
-            step = np.column_stack(
-                [bb * to_a - ab * to_b, aa * to_b - ab * to_a]
-            )
+            to_a, to_b = (np.sum(u * (points[moving] - feet), axis=1) for u in (by_a, by_b))
+            step = np.column_stack([bb * to_a - ab * to_b, aa * to_b - ab * to_a])
             step /= (aa * bb - ab**2)[:, None]
-            settled = np.clip(
-                places[moving] + np.column_stack([step, -step.sum(axis=1)]),
-                0.0,
-                1.0,
-            )
+            settled = np.clip(places[moving] + np.column_stack([step, -step.sum(axis=1)]), 0.0, 1.0)
             settled /= settled.sum(axis=1, keepdims=True)
             has_moved = np.abs(settled - places[moving]).max(axis=1) > STILL
             places[moving] = settled
@@ -441,20 +385,6 @@ def _nearest_of_triangles(
     The distance from the plane of a triangle, and the distances in this plane from the lines of its
     sides, are lower bounds: only for triangles that these do not exclude is the distance from the
     sides themselves computed.
-
-    Parameters
-    ----------
-    points : (P, 3) array
-        Points [m].
-    triangles : (T, 3, 3) array
-        Corners of the triangles [m].
-    neighbours : (P, k) array
-        Indices of the triangles that are considered for each point, k ≥ 1.
-
-    Returns
-    -------
-    ((P,) array, (P, 3) array)
-        Indices of the triangles, and barycentric coordinates in them.
     """
     first = triangles[:, 0]
     sides = np.roll(triangles, -1, axis=1) - triangles
@@ -465,7 +395,8 @@ def _nearest_of_triangles(
     outwards = np.cross(sides, normals[:, None])
     lengths = np.linalg.norm(outwards, axis=2)
     outwards /= np.where(lengths > 0, lengths, 1.0)[:, :, None]
-    # Distances from the plane and, outwards, from the lines of the sides, as functions of the point.
+    # Distances from the plane and, outwards, from the lines of the sides, as functions of the
+    # point.
     functions = [normals, *outwards.transpose(1, 0, 2)]
     through = [first, *triangles.transpose(1, 0, 2)]
     height, *beyond = (
@@ -483,9 +414,7 @@ def _nearest_of_triangles(
     for is_next in (is_lowest, ~is_lowest):
         least = exact.min(axis=1, keepdims=True)
         point, rank = np.nonzero(is_next & (bounds <= (1 + TIE) * least))
-        on = nearest_points_of_triangles(
-            points[point], triangles[neighbours[point, rank]]
-        )
+        on = nearest_points_of_triangles(points[point], triangles[neighbours[point, rank]])
         exact[point, rank] = np.linalg.norm(on - points[point], axis=1)
     # Of equally near triangles the one with the nearest middle counts, not a rounding error.
     rows = np.arange(len(points))
@@ -494,15 +423,11 @@ def _nearest_of_triangles(
     nearest = neighbours[rows, rank]
     feet = points - height[rows, rank, None] * normals[nearest]
     (not_above,) = np.nonzero(~is_above[rows, rank])
-    feet[not_above] = nearest_points_of_triangles(
-        points[not_above], triangles[nearest[not_above]]
-    )
+    feet[not_above] = nearest_points_of_triangles(points[not_above], triangles[nearest[not_above]])
     return nearest, _barycentric(feet, triangles[nearest])
 
 
-def _affine_values(
-    slopes: Array, through: Array, points: Array, rows: Index
-) -> Array:
+def _affine_values(slopes: Array, through: Array, points: Array, rows: Index) -> Array:
     """Return the values s · (p − o) (P, k) at points p (P, 3), with the slopes s and the origins o
     `through` (T, 3) each, of those of the T functions that `rows` (P, k) states for each point.
     """

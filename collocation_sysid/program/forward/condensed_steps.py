@@ -74,12 +74,7 @@ class StepEquations(ABC):
         See the attributes.
     """
 
-    def __init__(
-        self,
-        local: LocalForces,
-        rates: tuple[float, float],
-        local_weight: float,
-    ) -> None:
+    def __init__(self, local: LocalForces, rates: tuple[float, float], local_weight: float) -> None:
         self.local = local
         self.rates = rates
         self.local_weight = local_weight
@@ -269,9 +264,7 @@ class _PointAssembly:
     pair_weights: Array
 
     @classmethod
-    def from_places(
-        cls, places: Index, weights: Array, size: int
-    ) -> _PointAssembly:
+    def from_places(cls, places: Index, weights: Array, size: int) -> _PointAssembly:
         """Return the assembly of points onto `size` dofs.
 
         Parameters
@@ -288,8 +281,7 @@ class _PointAssembly:
             places.ravel(),
             pair_places.ravel(),
             weights=weights,
-            pair_weights=weights[:, :, None, None, None]
-            * weights[:, None, None, :, None],
+            pair_weights=weights[:, :, None, None, None] * weights[:, None, None, :, None],
         )
 
 
@@ -310,9 +302,7 @@ class ActiveDofs:
     parts: Sequence[_PointAssembly]
 
     @classmethod
-    def from_points(
-        cls, points: Sequence[ActivePoints], number: Index
-    ) -> ActiveDofs:
+    def from_points(cls, points: Sequence[ActivePoints], number: Index) -> ActiveDofs:
         """Return the dofs of active points.
 
         Parameters
@@ -353,9 +343,7 @@ class ActiveDofs:
         total = np.zeros(count)
         for each, part in zip(points, self.parts, strict=True):
             on_nodes = part.weights[:, :, None] * each.force.T[:, None]
-            total += np.bincount(
-                part.places, weights=on_nodes.ravel(), minlength=count
-            )
+            total += np.bincount(part.places, weights=on_nodes.ravel(), minlength=count)
         return total[:-1]
 
     def assemble_stiffness(self, points: Sequence[ActivePoints]) -> Array:
@@ -421,9 +409,7 @@ class CondensedStiffness:
     factor: tuple[Array, Index]
 
     @classmethod
-    def from_matrices(
-        cls, compliance: ActiveCompliance, stiffness: Array
-    ) -> CondensedStiffness:
+    def from_matrices(cls, compliance: ActiveCompliance, stiffness: Array) -> CondensedStiffness:
         """Return the condensed matrices of a compliance and a stiffness (s, s) of local forces.
 
         Raises
@@ -459,11 +445,7 @@ class CondensedSteps:
     """
 
     def __init__(
-        self,
-        equations: StepEquations,
-        compliance: Compliance,
-        free: Index,
-        size_m: float,
+        self, equations: StepEquations, compliance: Compliance, free: Index, size_m: float
     ) -> None:
         self._equations = equations
         self._size_m = size_m
@@ -513,9 +495,7 @@ class CondensedSteps:
             forces = known - condensed.stiffness @ step_of_dofs
             step = without_change + forces @ condensed.compliance.columns
             now = self._forces_at(self._advanced(x, step))
-            if self._is_converged(
-                step, start, now=now, forces=forces, condensed=condensed
-            ):
+            if self._is_converged(step, start, now=now, forces=forces, condensed=condensed):
                 self._condensed = condensed
                 self._last = now
                 return step
@@ -531,30 +511,13 @@ class CondensedSteps:
         forces: Array,
         condensed: CondensedStiffness,
     ) -> bool:
-        """Whether the local forces at the end of a step are those of the step.
-
-        Parameters
-        ----------
-        step : (k,) array
-            Step [m].
-        start, now : ForcesOnActiveDofs
-            Local forces before and after the step.
-        forces : (s,) array
-            Change of the forces that the step contains [N].
-        condensed : CondensedStiffness
-            Matrices with which the step was computed.
-        """
+        """Whether the local forces at the end of a step are those of the step."""
         dofs = condensed.compliance.dofs
-        if now.active is not start.active and not (
-            np.isin(now.dofs, dofs).all()
-        ):
+        if now.active is not start.active and not (np.isin(now.dofs, dofs).all()):
             return False
         change = _spread(now, dofs) - _spread(start, dofs)
         error_m = condensed.compliance.matrix @ (change - forces)
-        limit_m = max(
-            LOCAL_ACCURACY * float(np.abs(step).max()),
-            ROUND_OFF * self._size_m,
-        )
+        limit_m = max(LOCAL_ACCURACY * float(np.abs(step).max()), ROUND_OFF * self._size_m)
         return bool(np.abs(error_m).max() <= limit_m)
 
     def _condensed_at(
@@ -562,30 +525,19 @@ class CondensedSteps:
     ) -> CondensedStiffness:
         """Return the condensed matrices at present forces and at the dofs that are active at the
         start of the step or now.
-
-        Raises
-        ------
-        CondensationError
-            If too many dofs are active, or the matrix is singular.
         """
         dofs = (
-            start.dofs
-            if np.array_equal(now.dofs, start.dofs)
-            else np.union1d(start.dofs, now.dofs)
+            start.dofs if np.array_equal(now.dofs, start.dofs) else np.union1d(start.dofs, now.dofs)
         )
         if len(dofs) > MAX_ACTIVE_DOFS:
             raise CondensationError
-        present = self._equations.local_weight * now.active.assemble_stiffness(
-            now.points
-        )
+        present = self._equations.local_weight * now.active.assemble_stiffness(now.points)
         stiffness = present
         if len(dofs) > len(now.dofs):
             stiffness = np.zeros((len(dofs), len(dofs)))
             places = np.searchsorted(dofs, now.dofs)
             stiffness[np.ix_(places, places)] = present
-        return CondensedStiffness.from_matrices(
-            self._compliance.at_dofs(dofs), stiffness
-        )
+        return CondensedStiffness.from_matrices(self._compliance.at_dofs(dofs), stiffness)
 
     def _advanced(self, x: Array, step: Array) -> Array:
         """Return positions x (3n,) after a step (k,) of the free dofs."""

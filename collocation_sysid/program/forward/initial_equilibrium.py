@@ -80,57 +80,25 @@ def _solve_equilibrium(
     start: Array | None,
     solver: NewtonSolver,
 ) -> Array:
-    """Return the equilibrium (3n,) [m] under given forces at the time `at_s`.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Its grasps, obstacles and start.
-    forces : Forces
-        Forces at that time.
-    goals_m : (3n,) array
-        Prescribed positions [m]; NaN where a dof is free.
-    at_s : float
-        Time [s].
-    start : (3n,) array or None
-        Guess [m]; None to start from the body carried by its grasps.
-    solver : NewtonSolver
-        Newton's method with the prescribed dofs of that time.
-
-    Raises
-    ------
-    SimulationError
-        If no stable equilibrium is found.
-    """
+    """Return the equilibrium (3n,) [m] under given forces at the time `at_s`."""
     shape = experiment.rigid_positions([at_s])[0]
     forces = with_start_memory(forces, experiment.loaded_since_s)
     separate = _with_separate_obstacles(forces, shape)
 
     guess = shape.ravel() if start is None and experiment.obstacles else start
-    path = SolutionPath(
-        separate.ravel(),
-        halvings=solver.options.max_halvings,
-        guess=guess,
-    )
+    path = SolutionPath(separate.ravel(), halvings=solver.options.max_halvings, guess=guess)
     while path.share < 1.0:
         x, share = path.next_guess()
-        residual, linearise = _static_equations(
-            scale_loads(forces, share), share, free=solver.free
-        )
+        residual, linearise = _static_equations(scale_loads(forces, share), share, free=solver.free)
         # Grasps that are off are there at the end: the way there may be any.
         goal = (
             goals_m
             if share == 1
-            else _partial_displacement(
-                experiment, separate, time_s=at_s, share=share
-            ).ravel()
+            else _partial_displacement(experiment, separate, time_s=at_s, share=share).ravel()
         )
         try:
             solution = solver.solve_equilibrium(
-                x,
-                residual,
-                linearise=linearise,
-                prescribed_m=goal[solver.is_prescribed],
+                x, residual, linearise=linearise, prescribed_m=goal[solver.is_prescribed]
             )
         except NewtonFailure as failure:
             if path.shorten():
@@ -147,20 +115,9 @@ def _solve_equilibrium(
     return path.x
 
 
-def _static_equations(
-    loaded: Forces, share: float, free: Index
-) -> tuple[Residual, Linearise]:
+def _static_equations(loaded: Forces, share: float, free: Index) -> tuple[Residual, Linearise]:
     """Return the force balance (3n,) [N] of a body at rest as a function of its positions (3n,)
     [m], and its linearisation, which also reports the state of the search.
-
-    Parameters
-    ----------
-    loaded : Forces
-        Forces with the share of the loads.
-    share : float
-        Share of loads and displacements, for the report.
-    free : (free,) array
-        Free dofs.
     """
     zero_velocity = np.zeros((1, loaded.pattern.size))
 
@@ -177,19 +134,9 @@ def _static_equations(
 
 
 def _describe_state(share: float, force_n: Array) -> str:
-    """Return the load step and the residual of the search for an equilibrium in words.
-
-    Parameters
-    ----------
-    share : float
-        Share of loads and displacements that are applied in the current load step.
-    force_n : (free,) array
-        Forces on the free dofs [N], which are zero in equilibrium.
-    """
+    """Return the load step and the residual of the search for an equilibrium in words."""
     residual_n = float(np.abs(force_n).max(initial=0.0))
-    return (
-        f"equilibrium at {share:.1%} of the load, residual {residual_n:.1e} N"
-    )
+    return f"equilibrium at {share:.1%} of the load, residual {residual_n:.1e} N"
 
 
 def _with_separate_obstacles(forces: Forces, shape: Array) -> Array:
@@ -214,17 +161,6 @@ def _partial_displacement(
     Each grasp rotates about the middle of its nodes, which moves along a line, so that no grasp is
     squeezed or sheared at large rotations. Obstacles have their final rotation already. Other nodes
     keep their positions.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    displaced_m : (n, 3) array
-        Positions of the carried body, at share 0 [m].
-    time_s : float
-        Time whose poses are reached at share 1 [s].
-    share : float
-        Share of the displacement, from 0 to 1.
     """
     positions = displaced_m.copy()
     for grasp in experiment.grasps:
@@ -237,13 +173,8 @@ def _partial_displacement(
         if isinstance(grasp, Obstacle):
             positions[nodes] = start + share * (goal - start)
             continue
-        turn = (
-            grasp.poses.at(time_s)[0][0]
-            @ experiment.rigid_motion(time_s)[0][0].T
-        )
-        part = Rotation.from_rotvec(
-            share * Rotation.from_matrix(turn).as_rotvec()
-        )
+        turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
+        part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
         middle = start.mean(axis=0)
         way = (goal - start).mean(axis=0)
         partial_m = middle + share * way + part.apply(start - middle)
@@ -283,11 +214,7 @@ def initial_state(
         If no stable equilibrium is found.
     """
     velocity = experiment.start_velocities_m_s
-    v0 = (
-        np.zeros(experiment.body.pattern.size)
-        if velocity is None
-        else np.ravel(velocity).copy()
-    )
+    v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
     if experiment.start == "equilibrium":
         at_s = float(experiment.t_s[0])
         prescribed_m = (
@@ -296,12 +223,7 @@ def initial_state(
             else prescribed_m
         )
         return _solve_equilibrium(
-            experiment,
-            forces,
-            goals_m=prescribed_m,
-            at_s=at_s,
-            start=guess,
-            solver=solver,
+            experiment, forces, goals_m=prescribed_m, at_s=at_s, start=guess, solver=solver
         ), v0
     if experiment.start_positions_m is not None:
         return experiment.start_positions_m.ravel().copy(), v0

@@ -116,20 +116,14 @@ def explain_failure(
     if error.state_m is None:
         return error
     if experiment.specimen is not None:
-        return SimulationError(
-            specimen_message(experiment, error.time_s), error.time_s
-        )
+        return SimulationError(specimen_message(experiment, error.time_s), error.time_s)
     try:
-        instability = find_stability_loss(
-            experiment, theta, x=error.state_m, time_s=error.time_s
-        )
+        instability = find_stability_loss(experiment, theta, x=error.state_m, time_s=error.time_s)
     except (ArpackError, RuntimeError, np.linalg.LinAlgError):
         return error
     if instability is None:
         return error
-    explained_error = SimulationError(
-        instability.describe(), error.time_s, element=error.element
-    )
+    explained_error = SimulationError(instability.describe(), error.time_s, element=error.element)
     explained_error.stability_loss = instability
     return explained_error
 
@@ -179,16 +173,11 @@ def find_stability_loss(
     is_prescribed = experiment.is_prescribed([time_s])[0].ravel()
     free = np.flatnonzero(~is_prescribed)
     reference, _ = _lowest(
-        forces,
-        experiment.rigid_positions([time_s])[0].ravel(),
-        free=free,
-        distance_1_s2=0.0,
+        forces, experiment.rigid_positions([time_s])[0].ravel(), free=free, distance_1_s2=0.0
     )
     if not reference > 0:
         return None
-    value, shape = _lowest(
-        forces, x, free=free, distance_1_s2=SHIFT * reference
-    )
+    value, shape = _lowest(forces, x, free=free, distance_1_s2=SHIFT * reference)
     if not value < LEAST_REDUCTION * reference:
         return None
     nodes = experiment.body.nodes
@@ -199,40 +188,20 @@ def find_stability_loss(
     mode = mode / np.linalg.norm(mode, axis=1).max()
     positions_m = x.reshape(-1, 3)[:own]
     return is_on_surface(
-        nodes.points_m,
-        positions_m,
-        mode=mode,
-        surface=experiment.body.mesh.surface,
+        nodes.points_m, positions_m, mode=mode, surface=experiment.body.mesh.surface
     )
 
 
-def _lowest(
-    forces: Forces, x: Array, free: Index, distance_1_s2: float
-) -> tuple[float, Array]:
+def _lowest(forces: Forces, x: Array, free: Index, distance_1_s2: float) -> tuple[float, Array]:
     """Return the eigenvalue λ [1/s²] of K φ = λ M φ that is nearest to a shift at or below zero,
     the lowest one near the end of a stable path, and φ (free,).
-
-    Parameters
-    ----------
-    forces : Forces
-        Forces at one time.
-    x : (3n,) array
-        Positions [m].
-    free : (free,) array of int
-        Free dofs.
-    distance_1_s2 : float
-        Distance of the shift below zero [1/s²].
     """
     state = x.reshape(1, -1)
     stiffness = -forces.linearise(state, np.zeros_like(state)).by_position[0]
     root = sp.diags_array(1 / np.sqrt(forces.mass.inertia_kg[0, free]))
-    matrix = sp.csc_array(
-        root @ forces.pattern.matrix(stiffness)[:, free][free] @ root
-    )
+    matrix = sp.csc_array(root @ forces.pattern.matrix(stiffness)[:, free][free] @ root)
     start = np.random.default_rng(0).normal(size=len(free))
-    values, vectors = eigsh(
-        matrix, 1, sigma=-distance_1_s2, which="LM", v0=start
-    )
+    values, vectors = eigsh(matrix, 1, sigma=-distance_1_s2, which="LM", v0=start)
     return float(values[0]), np.asarray(root @ vectors[:, 0])
 
 
@@ -253,9 +222,7 @@ def is_on_surface(
         Corners of the surface's triangles.
     """
     edges_m, moved_m, differences = (
-        np.stack(
-            [each[surface[:, k]] - each[surface[:, 0]] for k in (1, 2)], axis=1
-        )
+        np.stack([each[surface[:, k]] - each[surface[:, 0]] for k in (1, 2)], axis=1)
         for each in (points_m, positions_m, mode)
     )
     first = edges_m @ edges_m.swapaxes(1, 2)
@@ -274,9 +241,7 @@ def is_on_surface(
     power = 2 + np.log(large) / np.log(small) if small < 1 else np.inf
     critical = float(BIOT_RATIO ** (1 / power)) if 0 < power < np.inf else 0.0
     slopes2 = np.einsum("fij,fik,fjk->f", inverse, differences, differences)
-    share = (areas_m2 * amplitude2).sum() / max(
-        (areas_m2 * slopes2).sum(), np.finfo(float).tiny
-    )
+    share = (areas_m2 * amplitude2).sum() / max((areas_m2 * slopes2).sum(), np.finfo(float).tiny)
     return StabilityLoss(
         positions_m=positions_m,
         mode=mode,

@@ -137,19 +137,13 @@ def simulate_newmark(
     """
     stepper = _Stepper(experiment, theta, options=options)
     times = experiment.t_s
-    x, v = (
-        np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2)
-    )
+    x, v = (np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2))
     state = stepper.initial_state()
     x[0] = state.x
     v[0] = state.v
     step = experiment.timestep_s / steps_per_sample
-    reactions_and_positions = np.zeros(
-        (2, (len(times) - 1) * steps_per_sample + 1, len(sensed))
-    )
-    reactions_and_positions[:, 0] = stepper.reactions_and_positions(
-        state, sensed
-    )
+    reactions_and_positions = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
+    reactions_and_positions[:, 0] = stepper.reactions_and_positions(state, sensed)
     means_n = np.zeros_like(reactions_and_positions[0])
     if state.local_n is not None:
         means_n[0] = state.local_n[sensed]
@@ -157,9 +151,7 @@ def simulate_newmark(
         for j in range(1, steps_per_sample + 1):
             state = stepper.advance(state, float(times[k - 1] + j * step))
             row = (k - 1) * steps_per_sample + j
-            reactions_and_positions[:, row] = stepper.reactions_and_positions(
-                state, sensed
-            )
+            reactions_and_positions[:, row] = stepper.reactions_and_positions(state, sensed)
             if state.local_n is not None:
                 means_n[row] = state.local_n[sensed]
         x[k] = state.x
@@ -170,9 +162,7 @@ def simulate_newmark(
     reactions_and_positions[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
     reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
     reactions, positions = reactions_and_positions
-    return NewmarkMotion(
-        x, v, reactions=ReactionForces(reactions, position_m=positions)
-    )
+    return NewmarkMotion(x, v, reactions=ReactionForces(reactions, position_m=positions))
 
 
 class _NewmarkEquations(StepEquations):
@@ -206,9 +196,7 @@ class _NewmarkEquations(StepEquations):
         prescribed_dofs: Index,
         prescribed: _PrescribedMotion,
     ) -> None:
-        super().__init__(
-            forces.local_forces(), rates=(0.5, 1 / step_s), local_weight=2.0
-        )
+        super().__init__(forces.local_forces(), rates=(0.5, 1 / step_s), local_weight=2.0)
         self.mass_kg = forces.mass.inertia_kg[0]
         self._state = state
         self._step_s = step_s
@@ -232,9 +220,7 @@ class _NewmarkEquations(StepEquations):
         mass = self.mass_kg
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         if state.local_n is not None:
-            guess += (
-                0.5 * h * h * state.local_n / np.where(mass > 0, mass, np.inf)
-            )
+            guess += 0.5 * h * h * state.local_n / np.where(mass > 0, mass, np.inf)
         return self.with_prescribed_positions(guess)
 
     def with_prescribed_positions(self, x: Array) -> Array:
@@ -283,9 +269,7 @@ class _NewmarkEquations(StepEquations):
         skew = -at.by_position_skew[0]
         if at.by_velocity_skew.size:
             skew = skew - slope * at.by_velocity_skew[0]
-        return NewtonLinearisation(
-            at.force[0] - self.mass_kg * a, matrix, skew=skew
-        )
+        return NewtonLinearisation(at.force[0] - self.mass_kg * a, matrix, skew=skew)
 
 
 class _Stepper:
@@ -301,12 +285,7 @@ class _Stepper:
         Options of Newton's method; None means defaults.
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        theta: Array,
-        options: NewtonOptions | None,
-    ) -> None:
+    def __init__(self, experiment: Experiment, theta: Array, options: NewtonOptions | None) -> None:
         self.experiment = experiment
         self.theta = theta
         self.body = experiment.body
@@ -326,18 +305,9 @@ class _Stepper:
         solver = self._solver(time_s)
         x, v = initial_state(self.experiment, self._forces(time_s), solver)
         previous_histories = start_states(
-            self._forces(time_s),
-            x,
-            v=v,
-            loaded_s=self.experiment.loaded_since_s,
+            self._forces(time_s), x, v=v, loaded_s=self.experiment.loaded_since_s
         )
-        state = _State(
-            time_s,
-            x,
-            v=v,
-            a=np.zeros_like(x),
-            previous_histories=previous_histories,
-        )
+        state = _State(time_s, x, v=v, a=np.zeros_like(x), previous_histories=previous_histories)
         if self._forces(time_s).has_local_forces:
             state = replace(state, local_n=self._local_n(x, v, load_s=time_s))
         return self._balanced(state, time_s, dofs=solver.free)
@@ -359,34 +329,23 @@ class _Stepper:
         while target_s - state.t_s > 0.5 * smallest:
             solver = self._solver(target_s)
             try:
-                end_s = (
-                    target_s
-                    if step >= target_s - state.t_s
-                    else state.t_s + step
-                )
+                end_s = target_s if step >= target_s - state.t_s else state.t_s + step
                 state = self._step(solver, state, end_s=end_s, load_s=target_s)
             except NewtonFailure as failure:
                 step /= 2
                 if step < smallest:
                     raise simulation_error(
-                        solver,
-                        failure,
-                        time_s=state.t_s,
-                        what="a time step of the Newmark method",
+                        solver, failure, time_s=state.t_s, what="a time step of the Newmark method"
                     ) from failure
         return state
 
-    def reactions_and_positions(
-        self, state: _State, dofs: Index
-    ) -> tuple[Array, Array]:
+    def reactions_and_positions(self, state: _State, dofs: Index) -> tuple[Array, Array]:
         """Return the reaction forces without local ones on dofs (g,) [N], and their positions (g,)
         [m].
         """
         if not len(dofs):
             return np.zeros(0), np.zeros(0)
-        reaction = self._mass(state.t_s) * state.a - self._force(
-            state, state.t_s
-        )
+        reaction = self._mass(state.t_s) * state.a - self._force(state, state.t_s)
         return reaction[dofs], state.x[dofs]
 
     def _force(self, state: _State, load_s: float) -> Array:
@@ -399,16 +358,12 @@ class _Stepper:
         return forces.without_local_forces().total(state.x, state.v)[0]
 
     def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
-        """Return the forces under the loads at the time `load_s` [s]; local ones are averaged over a
-        step of `step_s` [s], or evaluated at the state if that is zero.
+        """Return the forces under the loads at the time `load_s` [s]; local ones are averaged over
+        a step of `step_s` [s], or evaluated at the state if that is zero.
         """
-        return Forces.from_experiment(
-            self.experiment, load_s, theta=self.theta, step_s=step_s
-        )
+        return Forces.from_experiment(self.experiment, load_s, theta=self.theta, step_s=step_s)
 
-    def _local_n(
-        self, x: Array, v: Array, load_s: float, step_s: float = 0.0
-    ) -> Array:
+    def _local_n(self, x: Array, v: Array, load_s: float, step_s: float = 0.0) -> Array:
         """Return the sum of the local forces (3n,) [N] at positions x and velocities v, (3n,) each,
         under the loads at the time `load_s`; averaged over a step of `step_s` [s] about this state,
         unless that is zero.
@@ -417,16 +372,12 @@ class _Stepper:
         total_n = np.zeros_like(x)
         for term in forces.external_terms:
             if term.is_local:
-                total_n += term.force(
-                    States(x[None], v[None], theta=self.theta)
-                )[0]
+                total_n += term.force(States(x[None], v[None], theta=self.theta))[0]
         return total_n
 
     def _solver(self, time_s: float) -> NewtonSolver:
         """Return the solver with the dofs that are prescribed at a time."""
-        return self.solvers.for_prescribed(
-            self.experiment.is_prescribed(time_s)[0]
-        )
+        return self.solvers.for_prescribed(self.experiment.is_prescribed(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
         """Return the masses (3n,) of all dofs at a time [kg]."""
@@ -444,48 +395,31 @@ class _Stepper:
         after = self._solver(goal_s)
         if before is after:
             return state
-        return self._balanced(
-            state, goal_s, dofs=np.setdiff1d(after.free, before.free)
-        )
+        return self._balanced(state, goal_s, dofs=np.setdiff1d(after.free, before.free))
 
-    def _balanced(
-        self, state: _State, load_s: float, dofs: NDArray[np.int64]
-    ) -> _State:
+    def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """Return the state with the accelerations of some dofs (indices) computed from the forces
-        on them, without local forces, under the loads at the time `load_s`; the other accelerations are
-        kept.
+        on them, without local forces, under the loads at the time `load_s`; the other accelerations
+        are kept.
         """
         acceleration = state.a.copy()
-        acceleration[dofs] = (
-            self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
-        )
+        acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
         return replace(state, a=acceleration)
 
-    def _step(
-        self, solver: NewtonSolver, state: _State, end_s: float, load_s: float
-    ) -> _State:
+    def _step(self, solver: NewtonSolver, state: _State, end_s: float, load_s: float) -> _State:
         """Return the state after one step to `end_s` [s], with loads and grasps of the time
         `load_s`.
-
-        Raises
-        ------
-        NewtonFailure
-            If Newton's method does not converge.
         """
         h = end_s - state.t_s
         forces = insert_previous_states(
-            self._forces(load_s, step_s=h),
-            state.previous_histories,
-            interval_s=h,
+            self._forces(load_s, step_s=h), state.previous_histories, interval_s=h
         )
         equations = _NewmarkEquations(
             state,
             h,
             forces=forces,
             prescribed_dofs=solver.is_prescribed,
-            prescribed=self._prescribed_motion(
-                solver, end_s, step_s=h, holding_s=load_s
-            ),
+            prescribed=self._prescribed_motion(solver, end_s, step_s=h, holding_s=load_s),
         )
         guess = equations.extrapolation()
         if not solver.has_no_inverted_element(guess):
@@ -499,27 +433,14 @@ class _Stepper:
             local_n = self._local_n(xi[0], nu[0], load_s=load_s, step_s=h)
             # Prescribed dofs have the acceleration of the grasp.
             free = solver.free
-            a[free] -= (
-                2 * local_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
-            )
+            a[free] -= 2 * local_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
         previous_histories = advance_states(
             forces, state.previous_histories, x=x, v=v, interval_s=h
         )
-        return _State(
-            end_s,
-            x,
-            v=v,
-            a=a,
-            previous_histories=previous_histories,
-            local_n=local_n,
-        )
+        return _State(end_s, x, v=v, a=a, previous_histories=previous_histories, local_n=local_n)
 
     def _prescribed_motion(
-        self,
-        solver: NewtonSolver,
-        time_s: float,
-        step_s: float,
-        holding_s: float,
+        self, solver: NewtonSolver, time_s: float, step_s: float, holding_s: float
     ) -> _PrescribedMotion:
         """Return the motion of the solver's prescribed dofs at `time_s`, by central differences
         over `step_s` [s]; grasps are those that hold at `holding_s`.
@@ -536,22 +457,14 @@ class _Stepper:
             # Its poses before it holds and after it has let go do not matter.
             first = max(grasp.from_s, float(experiment.t_s[0]))
             last = min(grasp.until_s, float(experiment.t_s[-1]))
-            times = np.clip(
-                [time_s - step_s, time_s, time_s + step_s], first, last
-            )
-            before, now, after = grasp.positions_at(nodes_m, times)[
-                ..., grasp.axis_indices
-            ]
+            times = np.clip([time_s - step_s, time_s, time_s + step_s], first, last)
+            before, now, after = grasp.positions_at(nodes_m, times)[..., grasp.axis_indices]
             velocity = (after - before) / (times[2] - times[0])
             is_central = times[2] - times[1] > 0.5 * step_s
             acceleration = (
-                (after - 2 * now + before) / step_s**2
-                if is_central
-                else np.zeros_like(now)
+                (after - 2 * now + before) / step_s**2 if is_central else np.zeros_like(now)
             )
             place = np.ix_(grasp.nodes, grasp.axis_indices)
             motion[:, *place] = now, velocity, acceleration
-        now, velocity, acceleration = motion.reshape(3, -1)[
-            :, solver.is_prescribed
-        ]
+        now, velocity, acceleration = motion.reshape(3, -1)[:, solver.is_prescribed]
         return _PrescribedMotion(now, velocity, accelerations_m_s2=acceleration)

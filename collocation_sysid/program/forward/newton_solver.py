@@ -22,12 +22,7 @@ from ..linear_algebra.reused_factor import (
     relative_cost,
 )
 from ..stopwatch import Stopwatch
-from .condensed_steps import (
-    Compliance,
-    CondensationError,
-    CondensedSteps,
-    StepEquations,
-)
+from .condensed_steps import Compliance, CondensationError, CondensedSteps, StepEquations
 from .newton_linearisation import NewtonLinearisation
 from .retraction import Retraction, add_increment
 
@@ -50,7 +45,8 @@ LARGEST_STATIC_CHORD_STEP_COUNT = 20
 # Cost of a factorisation, in solutions, above which a factor is reused for the matrices of later
 # time steps: some 3,000 nodes. Smaller bodies would gain a few percent.
 LEAST_COST_OF_FACTOR = 6.0
-# Relative accuracy of chord steps with such a factor: they shrink about as fast as with an exact one.
+# Relative accuracy of chord steps with such a factor: they shrink about as fast as with an exact
+# one.
 CHORD_ACCURACY = 1e-3
 # Chord steps towards an equilibrium end at this expected error, over the tolerance.
 STATIC_CHORD_SHARE = 1e-4
@@ -199,11 +195,7 @@ class NewtonSolver:
         self.definite_factor: Factor | None = None
 
     def solve_equilibrium(
-        self,
-        x: Array,
-        residual: Residual,
-        linearise: Linearise,
-        prescribed_m: Array | None = None,
+        self, x: Array, residual: Residual, linearise: Linearise, prescribed_m: Array | None = None
     ) -> Array:
         """Solve residual(x) = 0 for a stable equilibrium of the free dofs.
 
@@ -258,15 +250,11 @@ class NewtonSolver:
                 if chords.converged and not self.options.checks_stability:
                     return chords.x
                 try:
-                    iterate = self._iterate_at(
-                        chords.x, linearise, keep_definite=True
-                    )
+                    iterate = self._iterate_at(chords.x, linearise, keep_definite=True)
                     continue
                 except NewtonFailure:
                     pass
-            iterate = self._backtrack(
-                iterate, residual, linearise=linearise, keep_definite=True
-            )
+            iterate = self._backtrack(iterate, residual, linearise=linearise, keep_definite=True)
         raise self._iteration_failure(iterate)
 
     def solve_step(self, x: Array, equations: StepEquations) -> Array:
@@ -294,68 +282,39 @@ class NewtonSolver:
             If no method converges, or an element is inverted at the start.
         """
         if equations.local.has_forces and self.has_no_inverted_element(x):
-            improved, done = self._simplified_newton(
-                x, _CondensedIteration(self, equations)
-            )
+            improved, done = self._simplified_newton(x, _CondensedIteration(self, equations))
             if done:
                 return improved
         self._require_upright(x)
         # If they do not converge, the search begins at x: their last state may be far off.
-        improved, done = self._simplified_newton(
-            x, _CompleteIteration(self, equations)
-        )
+        improved, done = self._simplified_newton(x, _CompleteIteration(self, equations))
         if done:
             return improved
-        iterate = self._iterate_at(
-            x.copy(), equations.linearise, keep_definite=False
-        )
+        iterate = self._iterate_at(x.copy(), equations.linearise, keep_definite=False)
         for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
                 self.last_factor = iterate.factor
                 iterate.x[self.free] += iterate.step
                 return iterate.x
             iterate = self._backtrack(
-                iterate,
-                equations.residual,
-                linearise=equations.linearise,
-                keep_definite=False,
+                iterate, equations.residual, linearise=equations.linearise, keep_definite=False
             )
         raise self._iteration_failure(iterate)
 
     def _iteration_failure(self, iterate: _Iterate) -> NewtonFailure:
         """Return the failure of a search that has taken the largest number of iterations."""
         return NewtonFailure(
-            iterate.x,
-            f"Newton's method took more than {self.options.max_iterations} iterations",
+            iterate.x, f"Newton's method took more than {self.options.max_iterations} iterations"
         )
 
-    def _iterate_at(
-        self, x: Array, linearise: Linearise, keep_definite: bool
-    ) -> _Iterate:
-        """Return the iterate at x (3n,) [m], with its own factor and the step of Newton's method.
-
-        Parameters
-        ----------
-        x : (3n,) array
-            State; stored, not copied.
-        linearise : callable
-            `NewtonLinearisation` at a state.
-        keep_definite : bool
-            Whether a matrix that is not positive definite is a failure.
-
-        Raises
-        ------
-        NewtonFailure
-            If the matrix is singular or, with `keep_definite`, not positive definite.
-        """
+    def _iterate_at(self, x: Array, linearise: Linearise, keep_definite: bool) -> _Iterate:
+        """Return the iterate at x (3n,) [m], with its own factor and the step of Newton's method."""
         with self.stopwatch.evaluating():
             at = linearise(x)
         factor = self.factorise(at, x, keep_definite=keep_definite)
         return _Iterate(x, factor, step=self.step(factor, at.residual))
 
-    def _with_known_factor(
-        self, x: Array, residual: Residual
-    ) -> tuple[Array, bool]:
+    def _with_known_factor(self, x: Array, residual: Residual) -> tuple[Array, bool]:
         """Return a state nearer to an equilibrium by chord steps with `definite_factor`, and
         whether it is the equilibrium; x (3n,) [m] itself and false where they do not shrink fast,
         or without a factor.
@@ -369,19 +328,10 @@ class NewtonSolver:
         chords = self._static_chords(_Iterate(x, factor, step=step), residual)
         return (x, False) if chords is None else (chords.x, chords.converged)
 
-    def _static_chords(
-        self, iterate: _Iterate, residual: Residual
-    ) -> _Chords | None:
+    def _static_chords(self, iterate: _Iterate, residual: Residual) -> _Chords | None:
         """Return the state after chord steps from an iterate towards an equilibrium, as long as
         they shrink by `SLOWEST_CHORD_RATE` each; None if the first one does not, or inverts an
         element.
-
-        Parameters
-        ----------
-        iterate : _Iterate
-            State, factor and first step; not modified.
-        residual : callable
-            Residual (3n,) of a state (3n,).
         """
         goal_m = self.size_m * max(
             STATIC_CHORD_SHARE * self.options.tolerance, STATIC_CHORD_ROUNDING
@@ -412,19 +362,12 @@ class NewtonSolver:
                 return _Chords(x, converged=True)
         return _Chords(x, converged=False) if has_moved else None
 
-    def _simplified_newton(
-        self, x: Array, iteration: ChordIteration
-    ) -> tuple[Array, bool]:
+    def _simplified_newton(self, x: Array, iteration: ChordIteration) -> tuple[Array, bool]:
         """Iterate with few factorisations (simplified Newton method); the last factor is stored,
         and x is not modified.
 
         It ends without a solution when a new factor does not improve the state, or cannot be
         computed.
-
-        Returns
-        -------
-        ((3n,) array, bool)
-            Last state, and whether it is the solution.
         """
         is_own = False
         for _ in range(self.options.max_iterations):
@@ -442,17 +385,8 @@ class NewtonSolver:
                 break
         return x, False
 
-    def _chord_steps(
-        self, x: Array, iteration: ChordIteration
-    ) -> tuple[Array, bool]:
-        """Iterate with a given factor while steps shrink fast; x is not modified.
-
-        Returns
-        -------
-        ((3n,) array, bool)
-            Last state, which is x itself if steps grow or invert an element; and whether it is the
-            solution.
-        """
+    def _chord_steps(self, x: Array, iteration: ChordIteration) -> tuple[Array, bool]:
+        """Iterate with a given factor while steps shrink fast; x is not modified."""
         improved = x.copy()
         before = None
         done = False
@@ -467,23 +401,12 @@ class NewtonSolver:
             if done or (before and rate > FAST):
                 break
             before = length
-        return (
-            (improved, done)
-            if self.has_no_inverted_element(improved)
-            else (x, False)
-        )
+        return (improved, done) if self.has_no_inverted_element(improved) else (x, False)
 
-    def _with_prescribed(
-        self, x: Array, goal: Array, linearise: Linearise
-    ) -> Array:
+    def _with_prescribed(self, x: Array, goal: Array, linearise: Linearise) -> Array:
         """Return the state x (3n,) [m] with the prescribed dofs at `goal` (prescribed,), and the
         free dofs in equilibrium to first order; only the prescribed dofs change if they are there
         already, up to the tolerance.
-
-        Raises
-        ------
-        NewtonFailure
-            If the matrix at x is singular, or an element of x is inverted.
         """
         state = x.copy()
         way = np.zeros_like(x)
@@ -499,40 +422,18 @@ class NewtonSolver:
         return state
 
     def _backtrack(
-        self,
-        iterate: _Iterate,
-        residual: Residual,
-        linearise: Linearise,
-        keep_definite: bool,
+        self, iterate: _Iterate, residual: Residual, linearise: Linearise, keep_definite: bool
     ) -> _Iterate:
         """Return the next iterate, with the first of the halved steps that is acceptable.
 
         A step is acceptable when the next one, computed with the same factor, is shorter
         (Deuflhard's natural monotonicity test), and no element is inverted.
-
-        Parameters
-        ----------
-        iterate : _Iterate
-            Present iterate; not modified.
-        residual, linearise : callable
-            Functions of the state, see `solve_equilibrium`.
-        keep_definite : bool
-            Whether the matrix must be positive definite.
-
-        Raises
-        ------
-        NewtonFailure
-            If no step is acceptable.
         """
         x = iterate.x
         factor = iterate.factor
         length = np.linalg.norm(iterate.step)
         share = 1.0
-        update = (
-            self._retraction
-            if keep_definite and self._has_no_obstacle
-            else add_increment
-        )
+        update = self._retraction if keep_definite and self._has_no_obstacle else add_increment
         for _ in range(self.options.max_backtracks):
             increment = np.zeros_like(x)
             increment[self.free] = share * iterate.step
@@ -551,18 +452,12 @@ class NewtonSolver:
                         with self.stopwatch.evaluating():
                             at = linearise(trial)
                     try:
-                        own = self.factorise(
-                            at, trial, keep_definite=keep_definite
-                        )
-                        return _Iterate(
-                            trial, own, step=self.step(own, at.residual)
-                        )
+                        own = self.factorise(at, trial, keep_definite=keep_definite)
+                        return _Iterate(trial, own, step=self.step(own, at.residual))
                     except NewtonFailure:
                         pass
             share /= 2
-        raise NewtonFailure(
-            x, "no step along the Newton direction decreases the residual"
-        )
+        raise NewtonFailure(x, "no step along the Newton direction decreases the residual")
 
     @cached_property
     def _retraction(self) -> Retraction:
@@ -580,9 +475,7 @@ class NewtonSolver:
         tolerance = share * self.options.tolerance * self.size_m
         return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
-    def factorise(
-        self, at: NewtonLinearisation, x: Array, keep_definite: bool
-    ) -> Factor:
+    def factorise(self, at: NewtonLinearisation, x: Array, keep_definite: bool) -> Factor:
         """Return the factor of −∂residual/∂x on the free dofs.
 
         Parameters
@@ -606,9 +499,7 @@ class NewtonSolver:
                     at.symmetric, at.skew, is_single=not keep_definite
                 )
         except np.linalg.LinAlgError as error:
-            raise NewtonFailure(
-                x, f"the equations are singular: {error}"
-            ) from error
+            raise NewtonFailure(x, f"the equations are singular: {error}") from error
         if keep_definite and not factor.positive_definite:
             raise NewtonFailure(x, "the stiffness is not positive definite")
         return factor
@@ -642,9 +533,7 @@ class NewtonSolver:
         (3n,) [m].
         """
         if not self.has_no_inverted_element(x):
-            raise NewtonFailure(
-                x, "an element is inverted before the first iteration"
-            )
+            raise NewtonFailure(x, "an element is inverted before the first iteration")
 
     def worst_element(self, x: Array) -> int:
         """Return the index of the element with the smallest det F at any of its quadrature points
@@ -681,9 +570,9 @@ class _CompleteIteration:
     equations : StepEquations
         Equations of the step.
     has_factor : bool
-        Whether there is a factor of an earlier state. Where factors are reused for several matrices,
-        that of another time step does not count: a new matrix costs less than steps that shrink
-        more slowly.
+        Whether there is a factor of an earlier state. Where factors are reused for several
+        matrices, that of another time step does not count: a new matrix costs less than steps that
+        shrink more slowly.
     """
 
     solver: NewtonSolver
@@ -691,8 +580,7 @@ class _CompleteIteration:
 
     def __post_init__(self) -> None:
         self.has_factor = (
-            self.solver.last_factor is not None
-            and self.solver.factor_sequence is None
+            self.solver.last_factor is not None and self.solver.factor_sequence is None
         )
 
     def factorise_at(self, x: Array) -> None:
@@ -703,9 +591,7 @@ class _CompleteIteration:
             solver.factorise(at, x, keep_definite=False)
             if solver.factor_sequence is None
             else ReusedFactor(
-                solver.factor_sequence,
-                Matrix(at.symmetric, at.skew),
-                points_m=x.reshape(-1, 3),
+                solver.factor_sequence, Matrix(at.symmetric, at.skew), points_m=x.reshape(-1, 3)
             )
         )
         self.has_factor = True
@@ -714,15 +600,11 @@ class _CompleteIteration:
         solver = self.solver
         assert solver.last_factor is not None
         with solver.stopwatch.evaluating():
-            residual = self.equations.add_local_forces(
-                self.equations.residual_without_local(x), x
-            )
+            residual = self.equations.add_local_forces(self.equations.residual_without_local(x), x)
         try:
             return solver.step(solver.last_factor, residual)
         except np.linalg.LinAlgError as error:  # a factor that is reused
-            raise NewtonFailure(
-                x, f"the equations are singular: {error}"
-            ) from error
+            raise NewtonFailure(x, f"the equations are singular: {error}") from error
 
 
 class _CondensedIteration:
@@ -751,9 +633,7 @@ class _CondensedIteration:
             at = self._equations.linearise_without_local(x)
         symmetric = at._replace(skew=NO_SKEW_PART)
         factor = solver.factorise(symmetric, x, keep_definite=False)
-        solver.compliance = Compliance(
-            factor, solver.free, dof_count=solver.pattern.size
-        )
+        solver.compliance = Compliance(factor, solver.free, dof_count=solver.pattern.size)
         self._use_compliance()
 
     def step_from(self, x: Array) -> Array:
@@ -768,10 +648,7 @@ class _CondensedIteration:
             None
             if compliance is None
             else CondensedSteps(
-                self._equations,
-                compliance,
-                free=self._solver.free,
-                size_m=self._solver.size_m,
+                self._equations, compliance, free=self._solver.free, size_m=self._solver.size_m
             )
         )
 
@@ -801,9 +678,7 @@ class SolutionPath:
         is 0. By default the path begins at x(0).
     """
 
-    def __init__(
-        self, x: Array, halvings: int, guess: Array | None = None
-    ) -> None:
+    def __init__(self, x: Array, halvings: int, guess: Array | None = None) -> None:
         self.x = x
         self.share = 0.0
         self._halvings = halvings
@@ -875,12 +750,7 @@ class NewtonSolvers:
 
 
 def simulation_error(
-    solver: NewtonSolver,
-    failure: NewtonFailure,
-    time_s: float,
-    what: str,
-    *,
-    static: bool = False,
+    solver: NewtonSolver, failure: NewtonFailure, time_s: float, what: str, *, static: bool = False
 ) -> SimulationError:
     """Return the error for the user: what failed, when, at which element, and what to change.
 

@@ -64,14 +64,10 @@ class Retraction:
     def __init__(self, body: Body, prescribed: NDArray[np.bool_]) -> None:
         self._gradient = body.shape_gradients
         self._weights = np.tile(body.geometry[..., -1].ravel(), 3)
-        laplacian = (
-            self._gradient.T @ sp.diags_array(self._weights) @ self._gradient
-        )
+        laplacian = self._gradient.T @ sp.diags_array(self._weights) @ self._gradient
         size_m = float(np.linalg.norm(np.ptp(body.nodes_m, axis=0)))
         # Nodes of obstacle frames belong to no element: the anchor alone determines them.
-        anchor = np.full(
-            len(body.nodes_m), ANCHOR * float(self._weights.sum()) / size_m**2
-        )
+        anchor = np.full(len(body.nodes_m), ANCHOR * float(self._weights.sum()) / size_m**2)
         self._anchor = anchor
         normal = sp.csc_array(laplacian + sp.diags_array(anchor))
         known: dict[bytes, _Axis] = {}
@@ -86,9 +82,7 @@ class Retraction:
         neither of which is modified; the deformation gradients of x must be regular.
         """
         moved = (x + increment).reshape(-1, 3)
-        right = self._gradient.T @ (
-            self._weights[:, None] * self._target(x, increment)
-        )
+        right = self._gradient.T @ (self._weights[:, None] * self._target(x, increment))
         right += self._anchor[:, None] * moved
         for k, axis in enumerate(self._axes):
             known = axis.coupling @ moved[axis.prescribed, k]
@@ -105,9 +99,7 @@ class Retraction:
         relative = self._deformation(increment) @ np.linalg.inv(deformation)
         strain = (relative + relative.transpose(0, 2, 1)) / 2
         spin = (relative - relative.transpose(0, 2, 1)) / 2
-        vectors = np.stack(
-            [spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1
-        )
+        vectors = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
         rotation = Rotation.from_rotvec(vectors).as_matrix()
         target = rotation @ (np.eye(3) + strain) @ deformation
         return target.transpose(2, 0, 1).reshape(-1, 3)

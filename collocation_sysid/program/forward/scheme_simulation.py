@@ -14,11 +14,7 @@ from ...common.time_dependence import at_times, interpolate_in_time
 from ...errors import SimulationError
 from ...fem.rest_shape import RestShapeError
 from ...model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
-from ...model.internal_variables import (
-    PreviousState,
-    advance_states,
-    insert_previous_states,
-)
+from ...model.internal_variables import PreviousState, advance_states, insert_previous_states
 from ...recording.experiment import Experiment
 from ..linear_algebra.lapack import one_blas_thread
 from ..stopwatch import Stopwatch
@@ -120,9 +116,7 @@ def continue_simulation(
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
     v0 = np.zeros(x.shape[1])
     if known is None:
-        guess = (
-            None if approximate_solution is None else approximate_solution[0]
-        )
+        guess = None if approximate_solution is None else approximate_solution[0]
         try:
             x[0], v0 = initial_state(
                 experiment,
@@ -137,14 +131,10 @@ def continue_simulation(
     done = len(known)
     x[:done] = known
     # Total force at every evaluation so far.
-    forces, previous_histories = _forces_and_histories(
-        dynamics, x, row_count=done
-    )
+    forces, previous_histories = _forces_and_histories(dynamics, x, row_count=done)
     intervals = dynamics.compute_intervals_to_next_s()
     for t in range(done, dynamics.row_count):
-        row = RowEquations(
-            dynamics, x, forces=forces, t=t, previous=previous_histories
-        )
+        row = RowEquations(dynamics, x, forces=forces, t=t, previous=previous_histories)
         solver = solvers.for_prescribed(is_prescribed[t])
         goal = dynamics.prescribed_m[t, solver.is_prescribed]
         if not dynamics.is_static:
@@ -156,9 +146,7 @@ def continue_simulation(
             guess = approximate_solution[t] + x[t - 1]
             guess -= approximate_solution[t - 1]
         try:
-            x[t] = solve_row(
-                solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal
-            )
+            x[t] = solve_row(solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal)
         except NewtonFailure as failure:
             return x[:t], simulation_error(
                 solver,
@@ -172,11 +160,7 @@ def continue_simulation(
         if previous_histories:
             (xi_t,), (nu_t,) = row.states(x[t])
             previous_histories = advance_states(
-                row.forces,
-                previous_histories,
-                x=xi_t,
-                v=nu_t,
-                interval_s=intervals[t - 1],
+                row.forces, previous_histories, x=xi_t, v=nu_t, interval_s=intervals[t - 1]
             )
         if progress:
             progress(t / (dynamics.row_count - 1))
@@ -199,25 +183,7 @@ def _body_failure(dynamics: Dynamics) -> SimulationError | None:
 def _forces_and_histories(
     dynamics: Dynamics, x: Array, row_count: int
 ) -> tuple[Array, tuple[PreviousState, ...]]:
-    """Return the forces at the evaluations of known rows, and the history variables after them.
-
-    Parameters
-    ----------
-    dynamics : Dynamics
-        Equations of motion.
-    x : (N, 3n) array
-        Positions [m], of which the first `row_count` rows are known.
-    row_count : int
-        Number of known rows, at least one.
-
-    Returns
-    -------
-    (N, 3n) array
-        Total forces [N]; zero before the first equation of motion, in rows that are not known, and
-        at dofs while a grasp that holds for a part of the time prescribes them.
-    tuple of PreviousState
-        One entry for each history; empty without any.
-    """
+    """Return the forces at the evaluations of known rows, and the history variables after them."""
     forces = np.zeros_like(x)
     histories = dynamics.histories(x[:row_count])
     evaluations = row_count - dynamics.first_row
@@ -248,9 +214,7 @@ def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
         return x[-1]
     before = x[-1, prescribed] - x[-2, prescribed]
     way = goal - x[-1, prescribed]
-    share = float(before @ way) / max(
-        float(before @ before), np.finfo(float).tiny
-    )
+    share = float(before @ way) / max(float(before @ before), np.finfo(float).tiny)
     return x[-1] + share * (x[-1] - x[-2])
 
 
@@ -296,9 +260,7 @@ class RowEquations(StepEquations):
         )
         row = self.row
         super().__init__(
-            self.forces.local_forces(),
-            rates=(row.p[0], row.q[0]),
-            local_weight=row.w[0],
+            self.forces.local_forces(), rates=(row.p[0], row.q[0]), local_weight=row.w[0]
         )
         first = max(0, t - dynamics.largest_lag)
         shape = x.shape[1:]
@@ -307,9 +269,7 @@ class RowEquations(StepEquations):
         self.xi = weighted_sum_of_past(row.p, past, shape=shape)
         self.nu = weighted_sum_of_past(row.q, past, shape=shape)
         self.known = weighted_sum_of_past(row.w, past_forces, shape=shape)
-        self.known -= row.mass_kg * weighted_sum_of_past(
-            row.s, past, shape=shape
-        )
+        self.known -= row.mass_kg * weighted_sum_of_past(row.s, past, shape=shape)
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
     def with_load_step(self, share: float) -> RowEquations:
@@ -318,9 +278,7 @@ class RowEquations(StepEquations):
         """
         scaled = copy(self)
         if self.rest_before is not None and share < 1:
-            scaled.rest = interpolate_in_time(
-                self.rest_before, self.rest, share=share
-            )
+            scaled.rest = interpolate_in_time(self.rest_before, self.rest, share=share)
         return scaled
 
     def force(self, x: Array) -> Array:
@@ -329,15 +287,11 @@ class RowEquations(StepEquations):
         """
         states = self.states(x)
         rest = self.rest.total(*states)[0]
-        return (
-            rest + self.local.force(*states) if self.local.has_forces else rest
-        )
+        return rest + self.local.force(*states) if self.local.has_forces else rest
 
     def states(self, x: Array) -> tuple[Array, Array]:
         """Return ξ_t [m] and ν_t [m/s], each (1, 3n), from x_t (3n,)."""
-        return (self.xi + self.row.p[0] * x)[None], (
-            self.nu + self.row.q[0] * x
-        )[None]
+        return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
 
     def _residual_from(self, force: Array, x: Array) -> Array:
         """Return c_t (3n,) [N] from the force F_t (3n,) [N] and x_t (3n,) [m]."""
@@ -354,21 +308,13 @@ class RowEquations(StepEquations):
         """
         row = self.row
         at = self.rest.linearise(*self.states(x))
-        matrix = row.block(
-            at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern
-        )
+        matrix = row.block(at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern)
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
-        return NewtonLinearisation(
-            self._residual_from(at.force[0], x), matrix, skew=skew
-        )
+        return NewtonLinearisation(self._residual_from(at.force[0], x), matrix, skew=skew)
 
 
 def solve_row(
-    solver: NewtonSolver,
-    row: RowEquations,
-    guess: Array,
-    previous: Array,
-    prescribed_m: Array,
+    solver: NewtonSolver, row: RowEquations, guess: Array, previous: Array, prescribed_m: Array
 ) -> Array:
     """Return the solution x_t (3n,) [m] of one row; where Newton's method fails, the grasps'
     displacement (and a static load) is applied in smaller increments.
@@ -394,25 +340,16 @@ def solve_row(
         If an increment fails after all halvings.
     """
     origin = previous[solver.is_prescribed]
-    path = SolutionPath(
-        previous, halvings=solver.options.max_halvings, guess=guess
-    )
+    path = SolutionPath(previous, halvings=solver.options.max_halvings, guess=guess)
     while path.share < 1.0:
         start, share = path.next_guess()
         # Exact at the end, because bounds of the collocation program are.
-        goal = (
-            prescribed_m
-            if share == 1
-            else origin + share * (prescribed_m - origin)
-        )
+        goal = prescribed_m if share == 1 else origin + share * (prescribed_m - origin)
         equations = row.with_load_step(share)
         try:
             if row.dynamics.is_static:
                 solution = solver.solve_equilibrium(
-                    start,
-                    equations.residual,
-                    linearise=equations.linearise,
-                    prescribed_m=goal,
+                    start, equations.residual, linearise=equations.linearise, prescribed_m=goal
                 )
             else:
                 start = start.copy()

@@ -98,11 +98,7 @@ class ExpressionPattern:
         rows : PatternIndices, (m, …)
             Constraints.
         """
-        shapes = (
-            data.shape,
-            rows.indices.shape,
-            *(each.indices.shape for each in inputs),
-        )
+        shapes = (data.shape, rows.indices.shape, *(each.indices.shape for each in inputs))
         shape = np.broadcast_shapes(*(shape[1:] for shape in shapes))
 
         def one_dimensional(values: NDArray[T], length: int) -> NDArray[T]:
@@ -110,14 +106,8 @@ class ExpressionPattern:
             return broadcast.reshape(length, int(np.prod(shape)))
 
         def concatenated(parts: Sequence[PatternIndices]) -> PatternIndices:
-            places = [
-                one_dimensional(part.indices, len(part.indices))
-                for part in parts
-            ]
-            units = [
-                one_dimensional(np.asarray(part.unit), len(part.indices))
-                for part in parts
-            ]
+            places = [one_dimensional(part.indices, len(part.indices)) for part in parts]
+            units = [one_dimensional(np.asarray(part.unit), len(part.indices)) for part in parts]
             return PatternIndices(np.concatenate(places), np.concatenate(units))
 
         return cls(
@@ -186,9 +176,7 @@ class ExpressionPattern:
         """Return the contributions to the scaled constraints (count,) at z; those without values y
         are zero.
         """
-        return self._assemble(
-            self.expression.evaluate(self._input_values(z), self.data), count
-        )
+        return self._assemble(self.expression.evaluate(self._input_values(z), self.data), count)
 
     def _assemble(self, y: Array, count: int) -> Array:
         """Return the sums (count,) of values y (m, I) over the constraints to which they belong,
@@ -209,9 +197,7 @@ class ExpressionPattern:
         """Return the contributions to the scaled constraints (count,) at z, and the values of
         `jacobian_entries`, derivatives by scaled variables.
         """
-        value, slopes = self.expression.evaluate_with_jacobian(
-            self._input_values(z), self.data
-        )
+        value, slopes = self.expression.evaluate_with_jacobian(self._input_values(z), self.data)
         y, u = np.nonzero(self.expression.jacobian_pattern)
         slopes = slopes[y, u] * self.inputs.unit[u] / self.rows.unit[y]
         return self._assemble(value, count), slopes.ravel()
@@ -229,10 +215,7 @@ class ExpressionPattern:
         """
         pairs = self._hessian_pairs
         indices = self.inputs.indices
-        return (
-            indices[pairs.first][pairs.is_upper],
-            indices[pairs.second][pairs.is_upper],
-        )
+        return (indices[pairs.first][pairs.is_upper], indices[pairs.second][pairs.is_upper])
 
     def hessian_values(self, z: Array, multipliers: Array) -> Array:
         """Return the second derivatives of multipliers (count,) · constraints by the scaled
@@ -247,9 +230,7 @@ class ExpressionPattern:
         return (curvature[i, j] * unit[i] * unit[j])[is_upper]
 
 
-def _at_evaluations(
-    indices: PatternIndices, evaluations: Index
-) -> PatternIndices:
+def _at_evaluations(indices: PatternIndices, evaluations: Index) -> PatternIndices:
     """Return the indices (k, E, …) at other evaluations, given by their indices (E,); units must be
     the same at all evaluations.
     """

@@ -1,8 +1,9 @@
 """Program with lifted variables, for methods that need sparse exact matrices.
 
 `with_lifted_variables` returns the program in which history variables, measured reactions and
-pressures of obstacles are variables with equations of their own, see `lifted_variables`. The optimum and the
-multipliers of the other constraints are those of the program in which they are eliminated.
+pressures of obstacles are variables with equations of their own, see `lifted_variables`. The
+optimum and the multipliers of the other constraints are those of the program in which they are
+eliminated.
 """
 
 from __future__ import annotations
@@ -35,9 +36,7 @@ class LiftedCollocation(Collocation):
         return lift_variables(
             self.transcriptions,
             self.phi_columns.start,
-            offsets=LiftedOffsets(
-                self.phi_columns.stop, self.transcriptions[-1].next_offsets.row
-            ),
+            offsets=LiftedOffsets(self.phi_columns.stop, self.transcriptions[-1].next_offsets.row),
         )
 
     @property
@@ -60,19 +59,14 @@ class LiftedCollocation(Collocation):
         parameters.
         """
         parts = self.iterates_at(p, positions)
-        lifted = [
-            each.consistent_values(parts[each.segment_index])
-            for each in self.lifted
-        ]
+        lifted = [each.consistent_values(parts[each.segment_index]) for each in self.lifted]
         return np.concatenate([super().pack(p, positions), *lifted])
 
     def iterates(self, z: Array) -> list[ExperimentIterate]:
         """Return every fitted experiment at the variables z, with lifted variables taken from z."""
         parts = super().iterates(z)
         for each in self.lifted:
-            parts[each.segment_index] = each.with_lifted(
-                parts[each.segment_index], z
-            )
+            parts[each.segment_index] = each.with_lifted(parts[each.segment_index], z)
         return parts
 
     def bounds(self) -> tuple[Array, Array]:
@@ -86,13 +80,9 @@ class LiftedCollocation(Collocation):
             np.concatenate([upper, np.full(lifted_count(self), np.inf)]),
         )
 
-    def _additional_equations(
-        self, parts: Sequence[ExperimentIterate], z: Array
-    ) -> list[Array]:
+    def _additional_equations(self, parts: Sequence[ExperimentIterate], z: Array) -> list[Array]:
         """Return the equations of each group of lifted variables."""
-        return [
-            each.residuals(parts[each.segment_index], z) for each in self.lifted
-        ]
+        return [each.residuals(parts[each.segment_index], z) for each in self.lifted]
 
     def _additional_jacobian_entries(self) -> list[tuple[Index, Index]]:
         """Return the Jacobian's entries of each group of lifted variables."""
@@ -102,19 +92,11 @@ class LiftedCollocation(Collocation):
         self, parts: Sequence[ExperimentIterate], z: Array
     ) -> list[tuple[Array, Array]]:
         """Return equations and derivatives of each group of lifted variables."""
-        return [
-            each.jacobian_values(parts[each.segment_index], z)
-            for each in self.lifted
-        ]
+        return [each.jacobian_values(parts[each.segment_index], z) for each in self.lifted]
 
-    def _additional_gradients(
-        self, parts: Sequence[ExperimentIterate]
-    ) -> list[Array]:
+    def _additional_gradients(self, parts: Sequence[ExperimentIterate]) -> list[Array]:
         """Return the gradient of the loss by each group of lifted variables."""
-        return [
-            each.loss_gradient(parts[each.segment_index])
-            for each in self.lifted
-        ]
+        return [each.loss_gradient(parts[each.segment_index]) for each in self.lifted]
 
     def _additional_weights(
         self, number: int, part: ExperimentIterate, multipliers: Array
@@ -128,9 +110,7 @@ class LiftedCollocation(Collocation):
             for each in own
             if each.history_index is not None
         ]
-        of_rows = sum(
-            (each.residual_weights(multipliers) for each in own), start=0.0
-        )
+        of_rows = sum((each.residual_weights(multipliers) for each in own), start=0.0)
         return of_rows, histories
 
     def _additional_hessian_entries(self) -> list[tuple[Index, Index]]:
@@ -166,19 +146,13 @@ def with_lifted_variables(collocation: Collocation) -> Collocation:
     """
     has_sensors = any(len(s.sensed_dofs) for s in collocation.transcriptions)
     has_complementarity = any(
-        s.dynamics.forces.find_complementarity_terms()
-        for s in collocation.transcriptions
+        s.dynamics.forces.find_complementarity_terms() for s in collocation.transcriptions
     )
     if isinstance(collocation, LiftedCollocation) or not (
-        collocation.has_eliminated_histories
-        or has_sensors
-        or has_complementarity
+        collocation.has_eliminated_histories or has_sensors or has_complementarity
     ):
         return collocation
-    settings = {
-        field.name: getattr(collocation, field.name)
-        for field in fields(Collocation)
-    }
+    settings = {field.name: getattr(collocation, field.name) for field in fields(Collocation)}
     lifted = LiftedCollocation(**settings)
     # The same transcriptions, with the values that they have cached.
     vars(lifted)["transcriptions"] = collocation.transcriptions
@@ -187,9 +161,7 @@ def with_lifted_variables(collocation: Collocation) -> Collocation:
 
 def lifted_variables(collocation: Collocation) -> tuple[LiftedVariables, ...]:
     """Return the groups of lifted variables of a program; empty for one without."""
-    return (
-        collocation.lifted if isinstance(collocation, LiftedCollocation) else ()
-    )
+    return collocation.lifted if isinstance(collocation, LiftedCollocation) else ()
 
 
 def lifted_count(collocation: Collocation, kind: str | None = None) -> int:
@@ -203,11 +175,7 @@ def lifted_count(collocation: Collocation, kind: str | None = None) -> int:
     kind : {"memory", "force", "pressure", "reaction"}, optional
         Kind of lifted variables; None means all.
     """
-    return sum(
-        each.count
-        for each in lifted_variables(collocation)
-        if kind in (None, each.kind)
-    )
+    return sum(each.count for each in lifted_variables(collocation) if kind in (None, each.kind))
 
 
 def lifted_nonzeros(collocation: Collocation) -> tuple[int, int]:

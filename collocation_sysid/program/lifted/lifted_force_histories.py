@@ -55,7 +55,7 @@ class LiftedForceHistory(LiftedVariables):
     @property
     def unit_m(self) -> float:
         """Unit of the variables and of the equations [m]: the mean edge length ℓ."""
-        return self.segment.length_m
+        return self.transcription.length_m
 
     @property
     def history_index(self) -> int:
@@ -65,19 +65,13 @@ class LiftedForceHistory(LiftedVariables):
     @property
     def _points(self) -> ForcePoints:
         """Points of the body at which the force acts, in all I instances."""
-        return self.segment.dynamics.forces.pointwise_term(self.force_index)[
-            0
-        ].points
+        return self.transcription.dynamics.forces.pointwise_term(self.force_index)[0].points
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (n, N − 1, I): n numbers at N − 1 evaluations and I instances."""
-        term = self.segment.dynamics.forces.pointwise_term(self.force_index)[0]
-        return (
-            term.internal_variable_count,
-            self.segment.grid_times - 1,
-            self._points.count,
-        )
+        term = self.transcription.dynamics.forces.pointwise_term(self.force_index)[0]
+        return (term.internal_variable_count, self.transcription.grid_times - 1, self._points.count)
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
         """Return the scaled variables (count,) that satisfy the equations at the iterate's
@@ -85,39 +79,27 @@ class LiftedForceHistory(LiftedVariables):
         """
         return (
             self._history_of(iterate).previous_state.before[:, 1:].ravel()
-            / self.segment.length_m
+            / self.transcription.length_m
         )
 
-    def with_lifted(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> ExperimentIterate:
+    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
         """Return a copy of the iterate with the history variables b (n, N, I) [m] of this force
         taken from z; b is zero at evaluation 0.
         """
-        later = z[self.columns].reshape(self.shape) * self.segment.length_m
+        later = z[self.columns].reshape(self.shape) * self.transcription.length_m
         before = np.concatenate([np.zeros_like(later[:, :1]), later], axis=1)
         return replace(
-            iterate,
-            lifted_histories={
-                **iterate.lifted_histories,
-                self.history_index: before,
-            },
+            iterate, lifted_histories={**iterate.lifted_histories, self.history_index: before}
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations (count,): the variables in z minus their values by the
         recursion from those that the iterate contains.
         """
-        predicted = (
-            self._history_of(iterate)
-            .internal_variables(slice(self.shape[1]))
-            .ravel()
-        )
-        return z[self.columns] - predicted / self.segment.length_m
+        predicted = self._history_of(iterate).internal_variables(slice(self.shape[1])).ravel()
+        return z[self.columns] - predicted / self.transcription.length_m
 
-    def weighted_history(
-        self, iterate: ExperimentIterate, multipliers: Array
-    ) -> WeightedHistory:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
         Parameters
@@ -133,10 +115,8 @@ class LiftedForceHistory(LiftedVariables):
             The history, and μ such that multipliers · equations contains Σ μ_k h_k; zero at the
             last evaluation.
         """
-        mu = -multipliers[self.rows].reshape(self.shape) / self.segment.length_m
-        return self._history_of(iterate), np.concatenate(
-            [mu, np.zeros_like(mu[:, :1])], axis=1
-        )
+        mu = -multipliers[self.rows].reshape(self.shape) / self.transcription.length_m
+        return self._history_of(iterate), np.concatenate([mu, np.zeros_like(mu[:, :1])], axis=1)
 
     def _history_of(self, iterate: ExperimentIterate) -> ForceHistory:
         """Return the force history at an iterate."""
@@ -154,20 +134,11 @@ class LiftedForceHistory(LiftedVariables):
     @cached_property
     def _dynamic_columns(self) -> Index:
         """Columns (m,) in z of the parameters that change the motion."""
-        return self.segment.dynamic_columns(self.first_phi)
+        return self.transcription.dynamic_columns(self.first_phi)
 
-    def _position_lags(
-        self, first: int
-    ) -> Iterator[tuple[slice, Index, Array, Array]]:
-        """Iterate over the lags of the stencil, for N − 1 evaluations from `first` on.
-
-        Yields
-        ------
-        (slice, (T, P) array, (T, 1) array, (T, 1) array)
-            Slice of the T evaluations with this lag, the columns in z of their positions, P being
-            the `pairs` of the points, and the coefficients p and q.
-        """
-        dynamics = self.segment.dynamics
+    def _position_lags(self, first: int) -> Iterator[tuple[slice, Index, Array, Array]]:
+        """Iterate over the lags of the stencil, for N − 1 evaluations from `first` on."""
+        dynamics = self.transcription.dynamics
         times = np.arange(first, first + self.shape[1])
         q = dynamics.tables.q / dynamics.step_s
         for lag, (of_p, of_q) in enumerate(
@@ -178,15 +149,13 @@ class LiftedForceHistory(LiftedVariables):
                 here = slice(int(used.argmax()), len(used))
                 k = times[here, None]
                 x = (
-                    self.segment.offsets.position
-                    + (k - lag) * self.segment.dof_count
+                    self.transcription.offsets.position
+                    + (k - lag) * self.transcription.dof_count
                     + self._points.nonzero_weights[2]
                 )
                 yield here, x, of_p[k], of_q[k]
 
-    def _position_derivatives(
-        self, first: int, derivatives: LawDerivatives
-    ) -> Iterator[Array]:
+    def _position_derivatives(self, first: int, derivatives: LawDerivatives) -> Iterator[Array]:
         """Yield derivatives (a, T, P) by positions at each lag of `_position_lags`, from
         derivatives (a, …) by position and velocity at N − 1 evaluations from `first` on.
         """
@@ -198,9 +167,7 @@ class LiftedForceHistory(LiftedVariables):
             else 0.0
         )
         for here, _, p, q in self._position_lags(first):
-            yield by_y[:, here] * p + (
-                by_v[:, here] * q if isinstance(by_v, np.ndarray) else 0.0
-            )
+            yield by_y[:, here] * p + (by_v[:, here] * q if isinstance(by_v, np.ndarray) else 0.0)
 
     def _motion_entries(self) -> Iterator[tuple[Index, Index, Index, Array]]:
         """Iterate over the entries of equations of motion that contain b.
@@ -208,17 +175,16 @@ class LiftedForceHistory(LiftedVariables):
         Yields indices (K,) of the pairs of points, evaluations (T,), rows (T, K) in g, and the
         weights (T, K) of the force in them.
         """
-        dynamics = self.segment.dynamics
-        first_row = self.segment.dynamics.first_row
+        dynamics = self.transcription.dynamics
+        first_row = self.transcription.dynamics.first_row
         _, _, of_pairs, shares = self._points.nonzero_weights
-        for rows in motion_equations(self.segment, self.reactions):
+        for rows in motion_equations(self.transcription, self.reactions):
             pairs = np.flatnonzero(rows.row_of_dof[of_pairs] >= 0)
             dofs = of_pairs[pairs]
             for lag, weights in enumerate(dynamics.tables.w.T):
-                k = np.arange(
-                    max(self.first_evaluation, first_row),
-                    dynamics.row_count - lag,
-                )[:, None]
+                k = np.arange(max(self.first_evaluation, first_row), dynamics.row_count - lag)[
+                    :, None
+                ]
                 if not len(k) or not weights[lag:].any():
                     continue
                 row = (
@@ -232,7 +198,7 @@ class LiftedForceHistory(LiftedVariables):
                         dynamics.is_temporarily_prescribed[k, dofs]
                         | dynamics.is_temporarily_prescribed[k + lag, dofs]
                     ] = 0.0
-                yield pairs, k[:, 0], row, weight / self.segment.force_n
+                yield pairs, k[:, 0], row, weight / self.transcription.force_n
 
     def _jacobian_blocks(self) -> Iterator[EntryBlock]:
         """Yield the entries of the equations by b, by x and by the dynamic parameters, then
@@ -245,17 +211,10 @@ class LiftedForceHistory(LiftedVariables):
         yield EntryBlock([rows[:, None, 1:]], [columns[:, :-1]])
         for here, x, *_ in self._position_lags(0):
             yield EntryBlock([rows[:, here][..., instance]], [x])
-        yield EntryBlock(
-            [rows[:, None]], [self._dynamic_columns[:, None, None]]
-        )
+        yield EntryBlock([rows[:, None]], [self._dynamic_columns[:, None, None]])
         for pairs, k, row, _ in self._motion_entries():
             yield EntryBlock(
-                [row],
-                [
-                    columns[
-                        :, k[:, None] - self.first_evaluation, instance[pairs]
-                    ]
-                ],
+                [row], [columns[:, k[:, None] - self.first_evaluation, instance[pairs]]]
             )
 
     def _hessian_blocks(self) -> Iterator[EntryBlock]:
@@ -266,49 +225,35 @@ class LiftedForceHistory(LiftedVariables):
         i, j = np.triu_indices(self.shape[0])
         yield EntryBlock([columns[i]], [columns[j]])
         for here, x, *_ in self._position_lags(self.first_evaluation):
-            yield EntryBlock(
-                [x], [columns[:, here][..., self._points.nonzero_weights[0]]]
-            )
-        yield EntryBlock(
-            [self._dynamic_columns[:, None, None, None]], [columns]
-        )
+            yield EntryBlock([x], [columns[:, here][..., self._points.nonzero_weights[0]]])
+        yield EntryBlock([self._dynamic_columns[:, None, None, None]], [columns])
 
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
         values.
         """
-        return concatenated_entries(
-            each.indices() for each in self._jacobian_blocks()
-        )
+        return concatenated_entries(each.indices() for each in self._jacobian_blocks())
 
     def hessian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns of the additional entries of the Hessian, upper triangle."""
-        return concatenated_entries(
-            each.indices() for each in self._hessian_blocks()
-        )
+        return concatenated_entries(each.indices() for each in self._hessian_blocks())
 
-    def jacobian_values(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> tuple[Array, Array]:
+    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at an iterate and z, and the values of
         `jacobian_entries`.
         """
         history = self._history_of(iterate)
-        length_m = self.segment.length_m
+        length_m = self.transcription.length_m
         d = self._points.dofs
         slopes = history.derivatives(slice(None))
         places = history.find_input_columns()
         by = LawDerivatives(*(-each[d:, :, :-1] / length_m for each in slopes))
         blocks = [np.ones(self.count), length_m * by.b[:, :, 1:]]
-        blocks += [
-            length_m * each for each in self._position_derivatives(0, by)
-        ]
+        blocks += [length_m * each for each in self._position_derivatives(0, by)]
         of_inputs = iterate.equations.input_derivatives[:-1][:, places]
         blocks.append(np.einsum("acti,tcm->amti", by.c, of_inputs))
         blocks += self._motion_derivatives(slopes)
-        return self.residuals(iterate, z), np.concatenate(
-            [each.ravel() for each in blocks]
-        )
+        return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])
 
     def _motion_derivatives(self, slopes: LawDerivatives) -> Iterator[Array]:
         """Yield derivatives of the scaled equations of motion by the scaled b, in the order of
@@ -333,21 +278,14 @@ class LiftedForceHistory(LiftedVariables):
         """
         history, mu = self.weighted_history(iterate, multipliers)
         assert isinstance(history, ForceHistory)
-        length_m = self.segment.length_m
+        length_m = self.transcription.length_m
         places = history.find_input_columns()
-        second_derivatives = history.mixed_second_derivatives(
-            mu, weights.forces
-        )
+        second_derivatives = history.mixed_second_derivatives(mu, weights.forces)
         first = self.first_evaluation
-        by = LawDerivatives(
-            *(self.unit_m * each[:, :, first:] for each in second_derivatives)
-        )
+        by = LawDerivatives(*(self.unit_m * each[:, :, first:] for each in second_derivatives))
         blocks = [self.unit_m * by.b[np.triu_indices(self.shape[0])]]
         by_state = LawDerivatives(*(each.swapaxes(0, 1) for each in by))
-        blocks += [
-            length_m * each
-            for each in self._position_derivatives(first, by_state)
-        ]
+        blocks += [length_m * each for each in self._position_derivatives(first, by_state)]
         of_inputs = iterate.equations.input_derivatives[first:][:, places]
         blocks.append(np.einsum("cati,tcm->mati", by.c, of_inputs))
         return np.concatenate([each.ravel() for each in blocks])

@@ -112,7 +112,7 @@ class LiftedMemory(LiftedVariables):
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (N − 1, width): evaluations with a past, and history variables of all branches."""
-        return self.segment.grid_times - 1, self.segment.body.memory.branches[
+        return self.transcription.grid_times - 1, self.transcription.body.memory.branches[
             -1
         ].columns.stop
 
@@ -121,15 +121,14 @@ class LiftedMemory(LiftedVariables):
         """Unit (width,) of the history variables [Pa]: normal entries of dS/dε of a uniform stretch
         at the guess, averaged over the branch.
         """
-        segment = self.segment
-        body = self.segment.body
-        theta = segment.constants.theta(segment.parameters.guess_q)
+        transcription = self.transcription
+        body = self.transcription.body
+        theta = transcription.constants.theta(transcription.parameters.guess_q)
         rest = body.nodes_m.reshape(1, -1)
         memory = body.memory
         change = np.abs(body.stresses.stress_jvp(rest, rest, theta=theta)[0])
         normal = [
-            change[b.points][: (b.points.stop - b.points.start) // 2]
-            for b in memory.branches
+            change[b.points][: (b.points.stop - b.points.start) // 2] for b in memory.branches
         ]
         means = np.array([each.mean() for each in normal])
         return np.broadcast_to(memory.repeat_over_points(means), self.shape[1:])
@@ -140,37 +139,25 @@ class LiftedMemory(LiftedVariables):
         """Return the scaled variables (count,) that satisfy the recursion at the iterate's
         positions and parameters; the iterate must not have lifted ones.
         """
-        return (
-            _body_history(iterate).previous_variables[1:] / self.unit_pa
-        ).ravel()
+        return (_body_history(iterate).previous_variables[1:] / self.unit_pa).ravel()
 
-    def with_lifted(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> ExperimentIterate:
+    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
         """Return a copy of the iterate with the history variables (N, width) [Pa] of the body taken
         from z; those of the first evaluation are zero.
         """
         later = z[self.columns].reshape(self.shape) * self.unit_pa
         memory = np.concatenate([np.zeros((1, self.shape[1])), later])
         return replace(
-            iterate,
-            lifted_histories={
-                **iterate.lifted_histories,
-                self.history_index: memory,
-            },
+            iterate, lifted_histories={**iterate.lifted_histories, self.history_index: memory}
         )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations r (count,) at the history variables that the iterate
         contains; z is not used.
         """
-        return (
-            _body_history(iterate).compute_recursion_residuals() / self.unit_pa
-        ).ravel()
+        return (_body_history(iterate).compute_recursion_residuals() / self.unit_pa).ravel()
 
-    def weighted_history(
-        self, iterate: ExperimentIterate, multipliers: Array
-    ) -> WeightedHistory:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
         """Return the history and its weights in the Lagrangian.
 
         Parameters
@@ -198,26 +185,15 @@ class LiftedMemory(LiftedVariables):
     @cached_property
     def _stress_entries(self) -> _StressEntries:
         """Derivatives of the stresses of all branches, branch by branch."""
-        entries = self.segment.body.stresses.jacobian_entries
+        entries = self.transcription.body.stresses.jacobian_entries
         index_arrays = []
-        for number, branch in enumerate(self.segment.body.memory.branches):
+        for number, branch in enumerate(self.transcription.body.memory.branches):
             points = branch.points
-            in_branch = (entries.points >= points.start) & (
-                entries.points < points.stop
-            )
+            in_branch = (entries.points >= points.start) & (entries.points < points.stop)
             places = np.flatnonzero(in_branch)
             own = entries.points[places] - points.start + branch.columns.start
-            index_arrays.append(
-                (
-                    places,
-                    own,
-                    entries.dofs[places],
-                    np.full(len(places), number),
-                )
-            )
-        return _StressEntries(
-            *(np.concatenate(each) for each in zip(*index_arrays, strict=True))
-        )
+            index_arrays.append((places, own, entries.dofs[places], np.full(len(places), number)))
+        return _StressEntries(*(np.concatenate(each) for each in zip(*index_arrays, strict=True)))
 
     @cached_property
     def _motion_entries(self) -> list[_MotionEntries]:
@@ -226,27 +202,25 @@ class LiftedMemory(LiftedVariables):
         """
         entries = []
         dofs = self._stress_entries.dofs
-        for rows in motion_equations(self.segment, self.reactions):
+        for rows in motion_equations(self.transcription, self.reactions):
             slopes = np.flatnonzero(rows.row_of_dof[dofs] >= 0)
-            entries.append(
-                _MotionEntries(slopes, rows.row_of_dof[dofs[slopes]], rows=rows)
-            )
+            entries.append(_MotionEntries(slopes, rows.row_of_dof[dofs[slopes]], rows=rows))
         return entries
 
     @cached_property
     def _stress_lags(self) -> list[_Lag]:
         """Lags of S_k by x_{k−lag}; the last evaluation has no equation."""
         return self._nonzero_lags(
-            self.segment.dynamics.compute_state_weights(), 0, stop=self.shape[0]
+            self.transcription.dynamics.compute_state_weights(), 0, stop=self.shape[0]
         )
 
     @cached_property
     def _state_lags(self) -> list[_Lag]:
         """Lags of forces at evaluation k with a past by x_{k−lag}."""
         return self._nonzero_lags(
-            self.segment.dynamics.tables.p,
-            max(1, self.segment.dynamics.first_row),
-            stop=self.segment.grid_times,
+            self.transcription.dynamics.tables.p,
+            max(1, self.transcription.dynamics.first_row),
+            stop=self.transcription.grid_times,
         )
 
     @staticmethod
@@ -266,12 +240,12 @@ class LiftedMemory(LiftedVariables):
         """Lags j of c_{k+j} by the forces at evaluation k, for the evaluations k with a past whose
         row k + j exists.
         """
-        table = self.segment.dynamics.tables.w
-        count = self.segment.grid_times
+        table = self.transcription.dynamics.tables.w
+        count = self.transcription.grid_times
         lags = [
             _Lag(
                 j,
-                max(1, self.segment.dynamics.first_row),
+                max(1, self.transcription.dynamics.first_row),
                 stop=count - j,
                 factors=table[j:, j],
             )
@@ -283,19 +257,15 @@ class LiftedMemory(LiftedVariables):
         """Return arrays whose sum are the columns (T, K) in z of history variables m_{k−1} at the
         evaluations k of a lag, which are given by their indices (K,).
         """
-        return [
-            self.offsets.variable,
-            (lag.select_evaluations() - 1) * self.shape[1],
-            variables,
-        ]
+        return [self.offsets.variable, (lag.select_evaluations() - 1) * self.shape[1], variables]
 
     def _position_columns(self, lag: _Lag, dofs: Index) -> list[Index | int]:
         """Return arrays whose sum are the columns (T, K) in z of the positions of dofs (K,) at the
         times k − lag, for the evaluations k of a lag.
         """
         return [
-            self.segment.offsets.position,
-            (lag.select_evaluations() - lag.lag) * self.segment.dof_count,
+            self.transcription.offsets.position,
+            (lag.select_evaluations() - lag.lag) * self.transcription.dof_count,
             dofs,
         ]
 
@@ -305,29 +275,19 @@ class LiftedMemory(LiftedVariables):
         """
         own = self._stress_entries.variables
         dofs = self._stress_entries.dofs
-        equations, variables = (
-            np.arange(s.start, s.stop) for s in (self.rows, self.columns)
-        )
+        equations, variables = (np.arange(s.start, s.stop) for s in (self.rows, self.columns))
         blocks = [
-            EntryBlock([equations], [np.arange(self.segment.nq)[:, None]]),
+            EntryBlock([equations], [np.arange(self.transcription.nq)[:, None]]),
             EntryBlock([equations], [variables]),
-            EntryBlock(
-                [equations[self.shape[1] :]], [variables[: -self.shape[1]]]
-            ),
+            EntryBlock([equations[self.shape[1] :]], [variables[: -self.shape[1]]]),
         ]
         for each in self._stress_lags:
-            rows = [
-                self.offsets.row,
-                each.select_evaluations() * self.shape[1],
-                own,
-            ]
+            rows = [self.offsets.row, each.select_evaluations() * self.shape[1], own]
             blocks.append(EntryBlock(rows, self._position_columns(each, dofs)))
         for moved in self._motion_entries:
             for each in self._force_lags:
                 row_times = (
-                    each.select_evaluations()
-                    + each.lag
-                    - self.segment.dynamics.first_row
+                    each.select_evaluations() + each.lag - self.transcription.dynamics.first_row
                 )
                 rows = [
                     moved.rows.first_row,
@@ -335,29 +295,19 @@ class LiftedMemory(LiftedVariables):
                     moved.row_indices,
                 ]
                 blocks.append(
-                    EntryBlock(
-                        rows,
-                        self._memory_columns(
-                            each, own[moved.derivative_indices]
-                        ),
-                    )
+                    EntryBlock(rows, self._memory_columns(each, own[moved.derivative_indices]))
                 )
         return blocks
 
     def _hessian_blocks(self) -> list[EntryBlock]:
         """Return the Hessian's entries in the columns of m: by q, then by x."""
         variables = np.arange(self.columns.start, self.columns.stop)
-        blocks = [
-            EntryBlock([np.arange(self.segment.nq)[:, None]], [variables])
-        ]
+        blocks = [EntryBlock([np.arange(self.transcription.nq)[:, None]], [variables])]
         own = self._stress_entries.variables
         dofs = self._stress_entries.dofs
         for each in self._state_lags:
             blocks.append(
-                EntryBlock(
-                    self._position_columns(each, dofs),
-                    self._memory_columns(each, own),
-                )
+                EntryBlock(self._position_columns(each, dofs), self._memory_columns(each, own))
             )
         return blocks
 
@@ -365,17 +315,13 @@ class LiftedMemory(LiftedVariables):
         """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
         values.
         """
-        return concatenated_entries(
-            each.indices() for each in self._jacobian_blocks()
-        )
+        return concatenated_entries(each.indices() for each in self._jacobian_blocks())
 
     def hessian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns of the additional entries of the Lagrangian's Hessian,
         upper triangle.
         """
-        return concatenated_entries(
-            each.indices() for each in self._hessian_blocks()
-        )
+        return concatenated_entries(each.indices() for each in self._hessian_blocks())
 
     @property
     def entry_counts(self) -> tuple[int, int]:
@@ -385,18 +331,14 @@ class LiftedMemory(LiftedVariables):
             each.count_entries() for each in groups[1]
         )
 
-    def jacobian_values(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> tuple[Array, Array]:
+    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the scaled equations r (count,), and the values of `jacobian_entries`, at the
         history variables that the iterate contains; z is not used.
         """
         history = _body_history(iterate)
-        memory = iterate.segment.body.memory
+        memory = iterate.transcription.body.memory
         after = self.shape[0] - 1, self.shape[1]
-        fading = np.broadcast_to(
-            memory.repeat_over_points(-history.fading.d[:, 1:-1]), after
-        )
+        fading = np.broadcast_to(memory.repeat_over_points(-history.fading.d[:, 1:-1]), after)
         values = [
             self._parameter_derivatives(
                 history, iterate.equations.theta_p[:, : iterate.equations.nq]
@@ -410,9 +352,7 @@ class LiftedMemory(LiftedVariables):
         rows = (history.compute_recursion_residuals() / self.unit_pa).ravel()
         return rows, np.concatenate([each.ravel() for each in values])
 
-    def _parameter_derivatives(
-        self, history: MemoryHistory, theta_q: Array
-    ) -> Array:
+    def _parameter_derivatives(self, history: MemoryHistory, theta_q: Array) -> Array:
         """Return the derivatives (nq, N − 1, width) of the scaled equations r by q, from the
         derivatives `theta_q` (k, nq) of the k constants θ by q.
         """
@@ -427,9 +367,7 @@ class LiftedMemory(LiftedVariables):
             rows = slice(rows.start, min(rows.stop, self.shape[0]))
             change = d_q[:, rows] * history.previous_variables[rows]
             change += a_q[:, rows] * memory.to_branches(history.stress[rows])
-            by_modulus = np.moveaxis(
-                memory.to_branches(slopes[: rows.stop - rows.start]), 1, 0
-            )
+            by_modulus = np.moveaxis(memory.to_branches(slopes[: rows.stop - rows.start]), 1, 0)
             derivatives[:, rows] = -(change + a[rows] * by_modulus)
         return derivatives / self.unit_pa
 
@@ -438,34 +376,28 @@ class LiftedMemory(LiftedVariables):
         stress, one array (T, K) for each of `_stress_lags`, with K as in `_stress_entries`.
         """
         entries = self._stress_entries
-        scale = -self.segment.length_m / self.unit_pa[entries.variables]
+        scale = -self.transcription.length_m / self.unit_pa[entries.variables]
         a = history.fading.a.T
 
         def slopes(times: slice) -> Array:
-            derivatives = history.body.stresses.stress_jacobian(
-                history.xi[times], history.theta
-            )
+            derivatives = history.body.stresses.stress_jacobian(history.xi[times], history.theta)
             selected = derivatives[:, entries.positions]
             return selected * a[times, entries.branches] * scale
 
         return self._scaled_by_lag(self._stress_lags, slopes)
 
-    def _force_derivatives(
-        self, history: MemoryHistory, changes: _MotionEntries
-    ) -> list[Array]:
+    def _force_derivatives(self, history: MemoryHistory, changes: _MotionEntries) -> list[Array]:
         """Return the derivatives of scaled equations of motion by the scaled m, one array (T, K)
         for each of `_force_lags`, with K as in `changes`; zero in rows whose dof is prescribed.
         """
         positions, own, dofs, _ = (
             each[changes.derivative_indices] for each in self._stress_entries
         )
-        scale = self.unit_pa[own] / self.segment.force_n
-        is_prescribed = self.segment.dynamics.is_temporarily_prescribed
+        scale = self.unit_pa[own] / self.transcription.force_n
+        is_prescribed = self.transcription.dynamics.is_temporarily_prescribed
 
         def slopes(times: slice) -> Array:
-            scaled = history.body.stresses.memory_force_jacobian(
-                history.xi[times], history.theta
-            )
+            scaled = history.body.stresses.memory_force_jacobian(history.xi[times], history.theta)
             return np.where(
                 changes.rows.omits_prescribed & is_prescribed[times, dofs],
                 0.0,
@@ -474,9 +406,7 @@ class LiftedMemory(LiftedVariables):
 
         scaled = self._scaled_by_lag(self._force_lags, slopes)
         for each, values in zip(self._force_lags, scaled, strict=True):
-            is_prescribed_later = is_prescribed[
-                each.start + each.lag : each.stop + each.lag, dofs
-            ]
+            is_prescribed_later = is_prescribed[each.start + each.lag : each.stop + each.lag, dofs]
             values[changes.rows.omits_prescribed & is_prescribed_later] = 0.0
         return scaled
 
@@ -491,23 +421,19 @@ class LiftedMemory(LiftedVariables):
         """Return the values of `hessian_entries`; arguments as in
         `LiftedVariables.hessian_values`.
         """
-        segment = self.segment
+        transcription = self.transcription
         history = _body_history(iterate)
         theta_q = iterate.equations.theta_p[:, : iterate.equations.nq]
         d_q = history.body.memory.repeat_over_points(
-            np.moveaxis(
-                history.fading.jacobian_vector_product(theta_q)[0], 1, 0
-            )
+            np.moveaxis(history.fading.jacobian_vector_product(theta_q)[0], 1, 0)
         )
-        by_q = (
-            d_q[:, 1:] * self._history_weights(multipliers)[1:] * self.unit_pa
-        )
+        by_q = d_q[:, 1:] * self._history_weights(multipliers)[1:] * self.unit_pa
         entries = self._stress_entries
-        scale = segment.length_m * self.unit_pa[entries.variables]
+        scale = transcription.length_m * self.unit_pa[entries.variables]
 
         # f_H is linear in x and in H, so that its derivative by both is that by H at the weights.
         def slopes(times: slice) -> Array:
-            derivatives = segment.body.stresses.memory_force_jacobian(
+            derivatives = transcription.body.stresses.memory_force_jacobian(
                 weights.forces[times], history.theta
             )
             return derivatives[:, entries.positions] * scale
@@ -516,39 +442,22 @@ class LiftedMemory(LiftedVariables):
         return np.concatenate([each.ravel() for each in values])
 
     @staticmethod
-    def _scaled_by_lag(
-        lags: list[_Lag], derivatives: Callable[[slice], Array]
-    ) -> list[Array]:
-        """Return derivatives of evaluations times the stencil's factors, (T, K) for each lag.
-
-        Parameters
-        ----------
-        lags : list of _Lag
-            Lags.
-        derivatives : callable
-            Returns derivatives (T, K) of a slice of evaluations; called for a few evaluations at a
-            time to save memory.
-        """
+    def _scaled_by_lag(lags: list[_Lag], derivatives: Callable[[slice], Array]) -> list[Array]:
+        """Return derivatives of evaluations times the stencil's factors, (T, K) for each lag."""
         scaled: list[Array] = []
         first = min(each.start for each in lags)
         last = max(each.stop for each in lags)
         for start in range(first, last, EVALUATIONS_PER_CHUNK):
             stop = min(start + EVALUATIONS_PER_CHUNK, last)
             own = derivatives(slice(start, stop))
-            scaled = scaled or [
-                np.empty((e.stop - e.start, own.shape[1])) for e in lags
-            ]
+            scaled = scaled or [np.empty((e.stop - e.start, own.shape[1])) for e in lags]
             for each, values in zip(lags, scaled, strict=True):
                 low = max(start, each.start)
                 high = min(stop, each.stop)
                 if high > low:
                     here = slice(low - each.start, high - each.start)
                     factors = each.factors[low:high, None]
-                    np.multiply(
-                        own[low - start : high - start],
-                        factors,
-                        out=values[here],
-                    )
+                    np.multiply(own[low - start : high - start], factors, out=values[here])
         return scaled
 
 

@@ -37,7 +37,7 @@ class LiftedPressure(LiftedForceHistory):
         """Index of the evaluation that the first variables belong to: the first with an equation of
         motion.
         """
-        return self.segment.dynamics.first_row
+        return self.transcription.dynamics.first_row
 
     @property
     def unit_m(self) -> float:
@@ -46,7 +46,7 @@ class LiftedPressure(LiftedForceHistory):
 
     def _find_force(self) -> ComplementarityForce:
         """Return the force that has the pressures."""
-        term = self.segment.dynamics.forces.external_terms[self.force_index]
+        term = self.transcription.dynamics.forces.external_terms[self.force_index]
         assert isinstance(term, ComplementarityForce)
         return term
 
@@ -55,7 +55,7 @@ class LiftedPressure(LiftedForceHistory):
         """Shape (1, evaluations, I): evaluations with an equation
         of motion, and I points.
         """
-        return 1, self.segment.constraint_times, self._points.count
+        return 1, self.transcription.constraint_times, self._points.count
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
         """Return the scaled variables (count,) that satisfy the equations at the iterate's
@@ -64,43 +64,30 @@ class LiftedPressure(LiftedForceHistory):
         xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
         return self._find_force().scaled_pressures(xi).ravel() / self.unit_m
 
-    def with_lifted(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> ExperimentIterate:
+    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
         """Return a copy of the iterate with the scaled pressures b (1, N, I) [m] of this force
         taken from z; b is zero at a stated initial state.
         """
-        b = np.zeros((1, self.segment.grid_times, self._points.count))
-        b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(
-            self.shape
-        )
-        return replace(
-            iterate,
-            lifted_pressures={**iterate.lifted_pressures, self.force_index: b},
-        )
+        b = np.zeros((1, self.transcription.grid_times, self._points.count))
+        b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(self.shape)
+        return replace(iterate, lifted_pressures={**iterate.lifted_pressures, self.force_index: b})
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled complementarity equations (count,) at an iterate; z is not used,
         because the iterate contains b.
         """
         return (
-            self._history_of(iterate)
-            .internal_variables(slice(self.first_evaluation, None))
-            .ravel()
+            self._history_of(iterate).internal_variables(slice(self.first_evaluation, None)).ravel()
             / self.unit_m
         )
 
-    def weighted_history(
-        self, iterate: ExperimentIterate, multipliers: Array
-    ) -> WeightedHistory:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
         """Return the history and its weights μ (1, N, I) in the Lagrangian, such that multipliers ·
         equations = Σ μ_k h_k with the unscaled equations h_k of evaluation k; `multipliers` are
         those of all constraints g.
         """
-        mu = np.zeros((1, self.segment.grid_times, self._points.count))
-        mu[:, self.first_evaluation :] = (
-            multipliers[self.rows].reshape(self.shape) / self.unit_m
-        )
+        mu = np.zeros((1, self.transcription.grid_times, self._points.count))
+        mu[:, self.first_evaluation :] = multipliers[self.rows].reshape(self.shape) / self.unit_m
         return self._history_of(iterate), mu
 
     def _jacobian_blocks(self) -> Iterator[EntryBlock]:
@@ -113,35 +100,21 @@ class LiftedPressure(LiftedForceHistory):
             yield EntryBlock([rows[:, here][..., instance]], [x])
         for pairs, k, row, _ in self._motion_entries():
             yield EntryBlock(
-                [row],
-                [
-                    columns[
-                        :, k[:, None] - self.first_evaluation, instance[pairs]
-                    ]
-                ],
+                [row], [columns[:, k[:, None] - self.first_evaluation, instance[pairs]]]
             )
 
-    def jacobian_values(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> tuple[Array, Array]:
+    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at an iterate, and the values of `jacobian_entries`;
         z is not used.
         """
         history = self._history_of(iterate)
         d = self._points.dofs
         slopes = history.derivatives(slice(None))
-        by = type(slopes)(
-            *(
-                each[d:, :, self.first_evaluation :] / self.unit_m
-                for each in slopes
-            )
-        )
+        by = type(slopes)(*(each[d:, :, self.first_evaluation :] / self.unit_m for each in slopes))
         blocks = [self.unit_m * by.b]
         blocks += [
-            self.segment.length_m * each
+            self.transcription.length_m * each
             for each in self._position_derivatives(self.first_evaluation, by)
         ]
         blocks += self._motion_derivatives(slopes)
-        return self.residuals(iterate, z), np.concatenate(
-            [each.ravel() for each in blocks]
-        )
+        return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])

@@ -31,7 +31,7 @@ class LiftedReactions(LiftedVariables):
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (times, g): grid times with equations of motion, and dofs."""
-        return self.segment.constraint_times, len(self.segment.sensed_dofs)
+        return self.transcription.constraint_times, len(self.transcription.sensed_dofs)
 
     def columns_of(self, times: Index, dofs: Index) -> Index:
         """Return the columns (T, k) in z of reaction forces.
@@ -43,31 +43,23 @@ class LiftedReactions(LiftedVariables):
         dofs : (k,) array
             Indices into `sensed_dofs`.
         """
-        first = self.segment.dynamics.first_row
-        return (
-            self.offsets.variable
-            + (times[:, None] - first) * self.shape[1]
-            + dofs
-        )
+        first = self.transcription.dynamics.first_row
+        return self.offsets.variable + (times[:, None] - first) * self.shape[1] + dofs
 
     def reactions_n(self, z: Array) -> Array:
         """Return the reaction forces R (N, g) [N] from z; zero before the first equation of
         motion.
         """
-        forces_n = np.zeros((self.segment.grid_times, self.shape[1]))
+        forces_n = np.zeros((self.transcription.grid_times, self.shape[1]))
         own = z[self.columns].reshape(self.shape)
-        forces_n[self.segment.dynamics.first_row :] = own * self.segment.force_n
+        forces_n[self.transcription.dynamics.first_row :] = own * self.transcription.force_n
         return forces_n
 
     def residual_weights(self, multipliers: Array) -> Array:
         """Return the derivative (N, 3n) of multipliers · g by the residual c in newtons [1/N]."""
-        weights = np.zeros((self.segment.grid_times, self.segment.dof_count))
-        by_row = (
-            multipliers[self.rows].reshape(self.shape) / self.segment.force_n
-        )
-        weights[self.segment.dynamics.first_row :, self.segment.sensed_dofs] = (
-            by_row
-        )
+        weights = np.zeros((self.transcription.grid_times, self.transcription.dof_count))
+        by_row = multipliers[self.rows].reshape(self.shape) / self.transcription.force_n
+        weights[self.transcription.dynamics.first_row :, self.transcription.sensed_dofs] = by_row
         return weights
 
     @cached_property
@@ -75,20 +67,17 @@ class LiftedReactions(LiftedVariables):
         """Structure of ∂c/∂x at the sensed dofs, including forces on dofs while a grasp prescribes
         them.
         """
-        segment = self.segment
-        dynamics = self.segment.dynamics
+        transcription = self.transcription
+        dynamics = self.transcription.dynamics
         untaken = replace(
-            dynamics,
-            is_temporarily_prescribed=np.zeros_like(
-                dynamics.is_temporarily_prescribed
-            ),
+            dynamics, is_temporarily_prescribed=np.zeros_like(dynamics.is_temporarily_prescribed)
         )
         return MotionJacobian(
             untaken,
-            self.segment.sensed_dofs,
-            free_dofs=self.segment.sensed_dofs,
-            length_m=segment.length_m,
-            force_n=segment.force_n,
+            self.transcription.sensed_dofs,
+            free_dofs=self.transcription.sensed_dofs,
+            length_m=transcription.length_m,
+            force_n=transcription.force_n,
         )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
@@ -101,10 +90,7 @@ class LiftedReactions(LiftedVariables):
         """Return forces (N, …) [N] as scaled values, without the rows before the first
         equation of motion.
         """
-        return (
-            newtons[self.segment.dynamics.first_row :].ravel()
-            / self.segment.force_n
-        )
+        return newtons[self.transcription.dynamics.first_row :].ravel() / self.transcription.force_n
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations (count,): the variables in z minus the reaction forces that
@@ -116,29 +102,19 @@ class LiftedReactions(LiftedVariables):
         """Return rows in g and columns in z of the entries by x, by R, and by the parameters that
         change the motion.
         """
-        segment = self.segment
+        transcription = self.transcription
         band = self._motion_jacobian.structure
         equations = np.arange(self.rows.start, self.rows.stop)
-        of_x = np.repeat(
-            np.arange(segment.variable_count), np.diff(band.indptr)
-        )
-        of_p = segment.dynamic_columns(self.first_phi)
+        of_x = np.repeat(np.arange(transcription.variable_count), np.diff(band.indptr))
+        of_p = transcription.dynamic_columns(self.first_phi)
         columns = [
-            segment.offsets.position + of_x,
+            transcription.offsets.position + of_x,
             np.arange(self.columns.start, self.columns.stop),
         ]
-        rows = [
-            self.offsets.row + band.indices,
-            equations,
-            np.repeat(equations, len(of_p)),
-        ]
-        return np.concatenate(rows), np.concatenate(
-            [*columns, np.tile(of_p, self.count)]
-        )
+        rows = [self.offsets.row + band.indices, equations, np.repeat(equations, len(of_p))]
+        return np.concatenate(rows), np.concatenate([*columns, np.tile(of_p, self.count)])
 
-    def jacobian_values(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> tuple[Array, Array]:
+    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at an iterate and z, and the values of
         `jacobian_entries`.
         """
@@ -153,35 +129,21 @@ class LiftedReactions(LiftedVariables):
             dynamics=dynamics,
             has_variable_mass=setting.mass_depends_on_parameters,
         )
-        by_p = np.zeros(
-            (
-                len(iterate.x),
-                self.shape[1],
-                len(self.segment.dynamic_parameters),
-            )
-        )
-        slopes = setting.force_derivatives(
-            slice(first, None), iterate.forces.by_theta
-        )
-        by_p[first:] = slopes[:, self.segment.sensed_dofs]
+        by_p = np.zeros((len(iterate.x), self.shape[1], len(self.transcription.dynamic_parameters)))
+        slopes = setting.force_derivatives(slice(first, None), iterate.forces.by_theta)
+        by_p[first:] = slopes[:, self.transcription.sensed_dofs]
         by_p = dynamics.combine(dynamics.tables.w, by_p)
-        acceleration = dynamics.acceleration(iterate.x)[
-            :, self.segment.sensed_dofs
-        ]
+        acceleration = dynamics.acceleration(iterate.x)[:, self.transcription.sensed_dofs]
         by_p -= setting.inertia_derivatives(
-            slice(None), acceleration, dofs=self.segment.sensed_dofs
+            slice(None), acceleration, dofs=self.transcription.sensed_dofs
         )
         force = np.zeros(acceleration.shape)
-        force[first:] = iterate.forces.force[:, self.segment.sensed_dofs]
-        mass_kg = dynamics.mass.inertia_kg[:, self.segment.sensed_dofs]
+        force[first:] = iterate.forces.force[:, self.transcription.sensed_dofs]
+        mass_kg = dynamics.mass.inertia_kg[:, self.transcription.sensed_dofs]
         rows = z[self.columns] - self._scaled(
-            reaction_forces(
-                dynamics, mass_kg, force=force, acceleration=acceleration
-            )
+            reaction_forces(dynamics, mass_kg, force=force, acceleration=acceleration)
         )
-        return rows, np.concatenate(
-            [by_x, np.ones(self.count), self._scaled(by_p)]
-        )
+        return rows, np.concatenate([by_x, np.ones(self.count), self._scaled(by_p)])
 
 
 class MotionEquations(NamedTuple):
@@ -224,7 +186,7 @@ def motion_equations(
         )
     ]
     if reactions is not None:
-        sensed = reactions.segment.sensed_dofs
+        sensed = reactions.transcription.sensed_dofs
         row_of_dof = np.full(transcription.dof_count, -1)
         row_of_dof[sensed] = np.arange(len(sensed))
         equations.append(

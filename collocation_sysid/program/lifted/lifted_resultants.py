@@ -39,7 +39,7 @@ class LiftedResultant(LiftedVariables):
     Attributes
     ----------
     residual_index : int
-        Index of the measurement among those of the segment.
+        Index of the measurement among those of the transcription.
     residual : MeasurementResidual
         The measurement.
     reactions : LiftedReactions
@@ -64,11 +64,7 @@ class LiftedResultant(LiftedVariables):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (1 or 2, times, 6): W and, with a low-pass, Y; grid times; forces and moments."""
-        return (
-            1 + len(self.observable.low_pass_parameters),
-            self.observable.count,
-            6,
-        )
+        return (1 + len(self.observable.low_pass_parameters), self.observable.count, 6)
 
     @cached_property
     def _unit(self) -> Array:
@@ -77,11 +73,7 @@ class LiftedResultant(LiftedVariables):
         """
         count = max(1, int(self.residual.is_compared.sum()))
         sigmas = self.residual.observable_sigmas
-        return np.where(
-            np.isfinite(sigmas),
-            np.sqrt(count) * sigmas,
-            self._compute_reaction_unit(),
-        )
+        return np.where(np.isfinite(sigmas), np.sqrt(count) * sigmas, self._compute_reaction_unit())
 
     @cached_property
     def _row_unit(self) -> Array:
@@ -92,13 +84,11 @@ class LiftedResultant(LiftedVariables):
 
     def _compute_reaction_unit(self) -> Array:
         """Return the unit (6,) of reaction forces and their moments [N, N m]."""
-        return self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
+        return self.transcription.force_n * np.repeat([1.0, self.transcription.length_m], 3)
 
-    def with_lifted(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> ExperimentIterate:
-        """Return a copy of the iterate with the measured resultant Y (times, 2, 3) [N, N m] taken from
-        z, W without a low-pass.
+    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
+        """Return a copy of the iterate with the measured resultant Y (times, 2, 3) [N, N m] taken
+        from z, W without a low-pass.
         """
         resultant = z[self._observable_columns].reshape(-1, 6) * self._unit
         return replace(
@@ -112,17 +102,13 @@ class LiftedResultant(LiftedVariables):
     @property
     def _observable_columns(self) -> slice:
         """Slice of Y in z, of W without a low-pass."""
-        return slice(
-            self.columns.stop - self._resultant_size, self.columns.stop
-        )
+        return slice(self.columns.stop - self._resultant_size, self.columns.stop)
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
         """Return the scaled W and, with a low-pass, Y (count,) that follow from the iterate's
         motion.
         """
-        own = [
-            self.observable.evaluate_unfiltered(iterate.reactions, iterate.phi)
-        ]
+        own = [self.observable.evaluate_unfiltered(iterate.reactions, iterate.phi)]
         if evolution := self.observable.filter_resultant(own[0], iterate.phi):
             own += [*evolution.states]
         return (np.stack(own) / self._unit).ravel()
@@ -141,57 +127,37 @@ class LiftedResultant(LiftedVariables):
         own = PatternIndices(of_resultant, -minus)
         terms = [
             ExpressionPattern.from_arrays(
-                ITSELF,
-                np.zeros((0, 1)),
-                inputs=[PatternIndices(resultant, unit)],
-                rows=own,
+                ITSELF, np.zeros((0, 1)), inputs=[PatternIndices(resultant, unit)], rows=own
             )
         ]
         reaction_columns = self.reactions.columns_of(
-            channel.known_rows + channel.reaction_grid.delay_steps,
-            channel.node_dofs,
+            channel.known_rows + channel.reaction_grid.delay_steps, channel.node_dofs
         )
-        units = np.array([[self.segment.length_m], [self.segment.force_n]])
+        units = np.array([[self.transcription.length_m], [self.transcription.force_n]])
         observed = [
-            PatternIndices(
-                np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit
-            )
+            PatternIndices(np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit)
             for each, unit in zip(
-                (self._compute_position_columns(), reaction_columns),
-                units,
-                strict=True,
+                (self._compute_position_columns(), reaction_columns), units, strict=True
             )
         ]
-        reaction_indices = PatternIndices(
-            of_resultant[..., None], minus[..., None]
-        )
+        reaction_indices = PatternIndices(of_resultant[..., None], minus[..., None])
         terms.append(
             ExpressionPattern.from_arrays(
-                MOMENT,
-                channel.moment_data,
-                inputs=observed,
-                rows=reaction_indices,
+                MOMENT, channel.moment_data, inputs=observed, rows=reaction_indices
             )
         )
         if len(tool := channel.tool_parameters):
-            data = channel.tool_inputs(
-                np.zeros(len(self.phi_columns)), channel.count
-            )[1]
+            data = channel.tool_inputs(np.zeros(len(self.phi_columns)), channel.count)[1]
             by_phi = PatternIndices(self.phi_columns[tool][:, None])
             terms.append(
                 ExpressionPattern.from_arrays(
-                    channel.tool,
-                    data,
-                    inputs=[by_phi],
-                    rows=PatternIndices(of_resultant, minus),
+                    channel.tool, data, inputs=[by_phi], rows=PatternIndices(of_resultant, minus)
                 )
             )
         if len(lag := channel.low_pass_parameters):
             places = self.offsets.variable + indices
             by_phi = self.phi_columns[lag][:, None, None]
-            unfiltered, filtered = (
-                PatternIndices(places[k : k + 1], self._unit) for k in (0, 1)
-            )
+            unfiltered, filtered = (PatternIndices(places[k : k + 1], self._unit) for k in (0, 1))
             terms.append(
                 ExpressionPattern.from_recursion(
                     LOW_PASS,
@@ -206,10 +172,10 @@ class LiftedResultant(LiftedVariables):
 
     def _compute_position_columns(self) -> Index:
         """Return the columns (n, d) in z of the positions of the grasp's dofs at n grid times."""
-        dofs = self.reactions.segment.sensed_dofs[self.observable.node_dofs]
+        dofs = self.reactions.transcription.sensed_dofs[self.observable.node_dofs]
         return (
-            self.segment.offsets.position
-            + self.observable.known_rows[:, None] * self.segment.dof_count
+            self.transcription.offsets.position
+            + self.observable.known_rows[:, None] * self.transcription.dof_count
             + dofs
         )
 
@@ -230,9 +196,7 @@ class LiftedResultant(LiftedVariables):
     def _unit_derivatives(self) -> sp.csr_array:
         """Diagonal matrix of the derivatives of (Y, φ) by (scaled Y, φ)."""
         scale = np.tile(self._unit, self.observable.count)
-        return sp.csr_array(
-            sp.diags_array(np.append(scale, np.ones(len(self.phi_columns))))
-        )
+        return sp.csr_array(sp.diags_array(np.append(scale, np.ones(len(self.phi_columns)))))
 
     @cached_property
     def _loss_entries(self) -> tuple[Index, Index]:
@@ -246,18 +210,13 @@ class LiftedResultant(LiftedVariables):
         rows, columns = super().hessian_entries()
         both = np.concatenate(
             [
-                np.arange(
-                    self._observable_columns.start,
-                    self._observable_columns.stop,
-                ),
+                np.arange(self._observable_columns.start, self._observable_columns.stop),
                 self.phi_columns,
             ]
         )
         i, j = (both[each] for each in self._loss_entries)
         # Experiments that share a φ need not have them in the same order.
-        return np.append(rows, np.minimum(i, j)), np.append(
-            columns, np.maximum(i, j)
-        )
+        return np.append(rows, np.minimum(i, j)), np.append(columns, np.maximum(i, j))
 
     def hessian_values(
         self,
@@ -271,11 +230,7 @@ class LiftedResultant(LiftedVariables):
         `LiftedVariables.hessian_values`.
         """
         of_equations = super().hessian_values(
-            iterate,
-            z,
-            loss_weight=loss_weight,
-            multipliers=multipliers,
-            weights=weights,
+            iterate, z, loss_weight=loss_weight, multipliers=multipliers, weights=weights
         )
         rows, columns = self._loss_entries
         size = self._resultant_size + len(iterate.phi)
@@ -286,9 +241,7 @@ class LiftedResultant(LiftedVariables):
             derivatives=self._unit_derivatives,
             has_observation_curvature=iterate.has_observation_curvature,
         )
-        positions = np.searchsorted(
-            columns * size + rows, of_loss.columns * size + of_loss.rows
-        )
+        positions = np.searchsorted(columns * size + rows, of_loss.columns * size + of_loss.rows)
         values = np.zeros(len(rows))
         np.add.at(values, positions, loss_weight * of_loss.values)
         return np.append(of_equations, values)

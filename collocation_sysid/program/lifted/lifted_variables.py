@@ -1,8 +1,8 @@
 """Lifted variables: variables of the program that follow from the others, each with an equation.
 
-By default they are eliminated; `lifted_collocation.LiftedCollocation` has them so that exact matrices
-stay sparse. Their equations come after all other constraints, and the variables after all other
-variables. Subclass `LiftedVariables` to lift another quantity; most subclasses only declare
+By default they are eliminated; `lifted_collocation.LiftedCollocation` has them so that exact
+matrices stay sparse. Their equations come after all other constraints, and the variables after all
+other variables. Subclass `LiftedVariables` to lift another quantity; most subclasses only declare
 `patterns` of small expressions, see `expression_patterns`.
 """
 
@@ -45,10 +45,10 @@ class LiftedVariables(ABC):
 
     Attributes
     ----------
-    segment : Transcription
+    transcription : Transcription
         Transcription of the experiment.
     segment_index : int
-        Index of the segment.
+        Index of the transcription.
     first_phi : int
         Index in z where the nuisance parameters of all experiments begin.
     offsets : LiftedOffsets
@@ -57,7 +57,7 @@ class LiftedVariables(ABC):
         Kind of quantity.
     """
 
-    segment: Transcription
+    transcription: Transcription
     segment_index: int
     first_phi: int
     offsets: LiftedOffsets
@@ -93,15 +93,9 @@ class LiftedVariables(ABC):
     @property
     def phi_columns(self) -> Index:
         """Indices (k,) in z of the experiment's nuisance parameters."""
-        return (
-            self.first_phi
-            + self.segment.nuisance_indices.indices
-            - self.segment.nq
-        )
+        return self.first_phi + self.transcription.nuisance_indices.indices - self.transcription.nq
 
-    def with_lifted(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> ExperimentIterate:
+    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
         """Return a copy of the iterate with those quantities replaced that these variables of z
         determine; here the iterate itself, for groups that determine none.
         """
@@ -124,10 +118,7 @@ class LiftedVariables(ABC):
         """Return the scaled equations (count,) at the iterate and z,
         zero where they are satisfied.
         """
-        return np.sum(
-            [pattern.residuals(z, self.count) for pattern in self.patterns],
-            axis=0,
-        )
+        return np.sum([pattern.residuals(z, self.count) for pattern in self.patterns], axis=0)
 
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Return rows in g and columns in z of the additional entries of ∂g/∂z, in the order of
@@ -138,15 +129,11 @@ class LiftedVariables(ABC):
         )
         return self.offsets.row + rows, columns
 
-    def jacobian_values(
-        self, iterate: ExperimentIterate, z: Array
-    ) -> tuple[Array, Array]:
+    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at the iterate and z, and the values of
         `jacobian_entries`: derivatives by scaled variables.
         """
-        evaluated = [
-            pattern.jacobian_values(z, self.count) for pattern in self.patterns
-        ]
+        evaluated = [pattern.jacobian_values(z, self.count) for pattern in self.patterns]
         values, slopes = zip(*evaluated, strict=True)
         return np.sum(values, axis=0), np.concatenate(slopes)
 
@@ -154,9 +141,7 @@ class LiftedVariables(ABC):
         """Return rows and columns in z of the additional entries of the Lagrangian's Hessian, upper
         triangle; an entry may be repeated, and its values are summed.
         """
-        return concatenated_entries(
-            pattern.hessian_entries() for pattern in self.patterns
-        )
+        return concatenated_entries(pattern.hessian_entries() for pattern in self.patterns)
 
     def hessian_values(
         self,
@@ -214,9 +199,7 @@ class LiftedVariables(ABC):
         """
         return None
 
-    def weighted_history(
-        self, iterate: ExperimentIterate, multipliers: Array
-    ) -> WeightedHistory:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
         """Return the history of the iterate, and the weights of each h_k in multipliers ·
         equations.
 
@@ -235,9 +218,7 @@ class LiftedVariables(ABC):
         return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
 
 
-def concatenated_entries(
-    groups: Iterable[tuple[Index, Index]],
-) -> tuple[Index, Index]:
+def concatenated_entries(groups: Iterable[tuple[Index, Index]]) -> tuple[Index, Index]:
     """Concatenate the rows, and the columns, of several groups of entries; without groups both are
     empty.
     """

@@ -14,9 +14,7 @@ from .lifted_variables import LiftedOffsets, LiftedVariables
 
 
 def lift_variables(
-    transcriptions: Sequence[Transcription],
-    first_phi: int,
-    offsets: LiftedOffsets,
+    transcriptions: Sequence[Transcription], first_phi: int, offsets: LiftedOffsets
 ) -> tuple[LiftedVariables, ...]:
     """Create the groups of lifted variables of all experiments.
 
@@ -39,16 +37,12 @@ def lift_variables(
         The groups in the order of their variables in z, and of their equations in g.
     """
     groups: list[LiftedVariables] = []
-    for number, segment in enumerate(transcriptions):
+    for number, transcription in enumerate(transcriptions):
         reactions = None
-        lift = {
-            "segment": segment,
-            "segment_index": number,
-            "first_phi": first_phi,
-        }
+        lift = {"transcription": transcription, "segment_index": number, "first_phi": first_phi}
         resultants = [
             (k, reading)
-            for k, reading in enumerate(segment.residuals)
+            for k, reading in enumerate(transcription.residuals)
             if reading.observable.local is None and reading.observable.count
         ]
         if resultants:
@@ -56,15 +50,12 @@ def lift_variables(
             groups.append(reactions)
             offsets = reactions.next_offsets
         histories = 0
-        if segment.body.has_memory:
-            groups.append(
-                LiftedMemory(**lift, offsets=offsets, reactions=reactions)
-            )
+        if transcription.body.has_memory:
+            groups.append(LiftedMemory(**lift, offsets=offsets, reactions=reactions))
             offsets = groups[-1].next_offsets
             histories = 1
         for history, force in enumerate(
-            segment.dynamics.forces.find_terms_with_internal_variables(),
-            histories,
+            transcription.dynamics.forces.find_terms_with_internal_variables(), histories
         ):
             groups.append(
                 LiftedForceHistory(
@@ -78,7 +69,7 @@ def lift_variables(
             offsets = groups[-1].next_offsets
             histories = history + 1
         for history, force in enumerate(
-            segment.dynamics.forces.find_complementarity_terms(), histories
+            transcription.dynamics.forces.find_complementarity_terms(), histories
         ):
             groups.append(
                 LiftedPressure(
@@ -94,11 +85,7 @@ def lift_variables(
             assert reactions is not None
             groups.append(
                 LiftedResultant(
-                    **lift,
-                    offsets=offsets,
-                    residual_index=k,
-                    residual=reading,
-                    reactions=reactions,
+                    **lift, offsets=offsets, residual_index=k, residual=reading, reactions=reactions
                 )
             )
             offsets = groups[-1].next_offsets

@@ -109,32 +109,20 @@ class BlockBand:
         blocks = sorted(blocks, key=lambda block: block.offset)
         exists = np.array(
             [
-                [
-                    0 <= t + b.offset < count and row_starts[t + b.offset] >= 0
-                    for b in blocks
-                ]
+                [0 <= t + b.offset < count and row_starts[t + b.offset] >= 0 for b in blocks]
                 for t in range(count)
             ]
         )
         self._slabs: dict[tuple[bool, ...], _ColumnBlock] = {}
         for present in map(tuple, np.unique(exists, axis=0)):
-            chosen = [
-                b for b, here in zip(blocks, present, strict=True) if here
-            ]
-            self._slabs[present] = _ColumnBlock.from_blocks(
-                columns, chosen, top=top_rows
-            )
+            chosen = [b for b, here in zip(blocks, present, strict=True) if here]
+            self._slabs[present] = _ColumnBlock.from_blocks(columns, chosen, top=top_rows)
         kinds = [self._slabs[tuple(present)] for present in exists]
-        starts = np.concatenate(
-            [[0], np.cumsum([slab.entry_count for slab in kinds])]
-        )
+        starts = np.concatenate([[0], np.cumsum([slab.entry_count for slab in kinds])])
         self.starts = starts
         self.nnz = int(starts[-1])
         self.indptr = np.concatenate(
-            [
-                [0],
-                *(slab.column_ends + starts[t] for t, slab in enumerate(kinds)),
-            ]
+            [[0], *(slab.column_ends + starts[t] for t, slab in enumerate(kinds))]
         )
         self.indices = np.concatenate(
             [slab.row_indices(row_starts, t) for t, slab in enumerate(kinds)]
@@ -143,13 +131,9 @@ class BlockBand:
             [slab.top_positions + starts[t] for t, slab in enumerate(kinds)]
         )
         self._kinds = kinds
-        self._fill = make_combiner(
-            _make_plan(kinds, starts[:-1], count=count, adds=adds)
-        )
+        self._fill = make_combiner(_make_plan(kinds, starts[:-1], count=count, adds=adds))
 
-    def positions(
-        self, times: Index, offset: int, rows: Index, columns: Index
-    ) -> Index:
+    def positions(self, times: Index, offset: int, rows: Index, columns: Index) -> Index:
         """Return the positions (len(times), len(rows)) in the values of entries of the blocks (t +
         offset, t).
 
@@ -235,9 +219,7 @@ class _ColumnBlock:
     rows: Index
 
     @classmethod
-    def from_blocks(
-        cls, columns: int, blocks: Sequence[BandBlock], top: int
-    ) -> _ColumnBlock:
+    def from_blocks(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _ColumnBlock:
         """Return the structure of a column block of `columns` columns: `top` dense rows, then the
         blocks.
         """
@@ -246,10 +228,7 @@ class _ColumnBlock:
         rows = np.concatenate([top_rows, *(b.rows for b in blocks)])
         cols = np.concatenate([top_columns, *(b.columns for b in blocks)])
         level = np.concatenate(
-            [
-                np.full(len(top_rows), -1),
-                *(np.full(len(b.rows), k) for k, b in enumerate(blocks)),
-            ]
+            [np.full(len(top_rows), -1), *(np.full(len(b.rows), k) for k, b in enumerate(blocks))]
         )
         order = np.lexsort((rows, level, cols))
         place = np.empty(len(order), dtype=np.int64)
@@ -280,12 +259,8 @@ class _ColumnBlock:
         """Return the position in the column block of each entry of block number `block` (an
         index).
         """
-        first = self.top * self.columns + sum(
-            len(b.rows) for b in self.blocks[:block]
-        )
-        return self.sorted_positions[
-            first : first + len(self.blocks[block].rows)
-        ]
+        first = self.top * self.columns + sum(len(b.rows) for b in self.blocks[:block])
+        return self.sorted_positions[first : first + len(self.blocks[block].rows)]
 
     def locate(self, offset: int, rows: Index, columns: Index) -> Index:
         """Return the positions in the column block of entries (rows, columns) of the block at a row
@@ -305,9 +280,7 @@ class _ColumnBlock:
         sorter = np.argsort(codes)
         requested = np.asarray(columns) * width + rows
         entries = sorter[
-            np.minimum(
-                np.searchsorted(codes, requested, sorter=sorter), len(codes) - 1
-            )
+            np.minimum(np.searchsorted(codes, requested, sorter=sorter), len(codes) - 1)
         ]
         if (codes[entries] != requested).any():
             raise IndexError("an entry lies outside the block")
@@ -340,22 +313,8 @@ class CombinePlan:
     sources: NDArray[np.int32]
 
 
-def _make_plan(
-    kinds: Sequence[_ColumnBlock], starts: Index, count: int, adds: bool
-) -> CombinePlan:
-    """Return the tasks that fill the column blocks.
-
-    Parameters
-    ----------
-    kinds : sequence of _ColumnBlock
-        Structure of each column block.
-    starts : array of int
-        First value of each column block.
-    count : int
-        Number of rows of the coefficients.
-    adds : bool
-        Whether values are added to those present, instead of replacing them.
-    """
+def _make_plan(kinds: Sequence[_ColumnBlock], starts: Index, count: int, adds: bool) -> CombinePlan:
+    """Return the tasks that fill the column blocks."""
     targets = []
     sources = []
     maps = {}
@@ -375,13 +334,9 @@ def _make_plan(
                 used += len(places)
             start, length = maps[id(slab), k]
             active = [m for m in block.terms if m.a[t] != 0 or m.b[t] != 0]
-            terms = [(m.a[t], m.b[t], t + m.shift) for m in active] or [
-                (0.0, 0.0, 0)
-            ]
+            terms = [(m.a[t], m.b[t], t + m.shift) for m in active] or [(0.0, 0.0, 0)]
             for number, (a, b, row) in enumerate(terms):
-                tasks.append(
-                    (starts[t], start, length, row, int(adds or number > 0))
-                )
+                tasks.append((starts[t], start, length, row, int(adds or number > 0)))
                 coefficients.append((a, b))
         first_task.append(len(tasks))
     return CombinePlan(
@@ -425,10 +380,7 @@ class Submatrix:
     """
 
     def __init__(
-        self,
-        pattern: SymmetricPattern,
-        rows: Index,
-        columns: Index | None = None,
+        self, pattern: SymmetricPattern, rows: Index, columns: Index | None = None
     ) -> None:
         # Entries are sorted by column, so that those of the transpose are sorted by row.
         across, row_of_entry, source = pattern.full
@@ -441,9 +393,7 @@ class Submatrix:
         self._in_both = source[is_selected] + np.where(
             (row_of_entry > across)[is_selected], 0, pattern.entry_count
         )
-        ends = np.cumsum(
-            np.bincount(place[row_of_entry[is_selected]], minlength=len(rows))
-        )
+        ends = np.cumsum(np.bincount(place[row_of_entry[is_selected]], minlength=len(rows)))
         parts = (
             np.zeros(is_selected.sum()),
             number[across[is_selected]],
@@ -470,9 +420,7 @@ class Submatrix:
         return self._matrix
 
 
-def full_matrix(
-    pattern: SymmetricPattern, lower: Array, skew: Array
-) -> sp.csc_array:
+def full_matrix(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
     """Return the sparse matrix (3n, 3n) of the symmetric part with lower triangle `lower` (m,) and
     the skew part with lower triangle `skew`, (m,) or (0,) for none.
     """
@@ -508,12 +456,9 @@ def skew_block_band(
             block,
             lower_positions=block.full_positions,
             terms=[
-                BlockTerm(t.shift, t.a, b=t.b if by_velocity else 0.0 * t.b)
-                for t in block.terms
+                BlockTerm(t.shift, t.a, b=t.b if by_velocity else 0.0 * t.b) for t in block.terms
             ],
         )
         for block in blocks
     ]
-    return BlockBand(
-        columns, row_starts, blocks=own, top_rows=top_rows, adds=True
-    )
+    return BlockBand(columns, row_starts, blocks=own, top_rows=top_rows, adds=True)

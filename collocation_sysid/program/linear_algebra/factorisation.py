@@ -153,9 +153,7 @@ class _SkylineFactor:
         first = self.sides[-transposed]
         second = self.sides[transposed - 1]
         rows = np.atleast_2d(right.take(self.order, axis=0).T)
-        solved = self.skyline.solve(
-            first, self.pivots, second=second, right=rows
-        )
+        solved = self.skyline.solve(first, self.pivots, second=second, right=rows)
         return solved.T.take(self.rank, axis=0).reshape(right.shape)
 
 
@@ -202,9 +200,7 @@ class _RefinedFactor:
         if self.divergence_flags:
             return self.factorise_complete().solve(right, transposed)
         matrix = self.matrix.T if transposed else self.matrix
-        solution = np.ascontiguousarray(
-            self.approximate.solve(right), dtype=float
-        )
+        solution = np.ascontiguousarray(self.approximate.solve(right), dtype=float)
         size = last = np.abs(solution).max(axis=0, initial=0.0)
         shrinks = 1.0
         if self.accuracy > ACCURACY:
@@ -212,9 +208,7 @@ class _RefinedFactor:
         # The next correction would be about `shrinks` times the last.
         while (shrinks * last > self.accuracy * size).any():
             # In single precision the sizes of small corrections would become zero.
-            correction = np.asarray(
-                self.approximate.solve(right - matrix @ solution), dtype=float
-            )
+            correction = np.asarray(self.approximate.solve(right - matrix @ solution), dtype=float)
             length = np.abs(correction).max(axis=0, initial=0.0)
             shrinks = float((length / np.maximum(last, TINY)).max(initial=0.0))
             self.last_rates[0] = shrinks
@@ -347,9 +341,7 @@ class Factoriser:
         If a supernodal method is asked for and not installed.
     """
 
-    def __init__(
-        self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
-    ) -> None:
+    def __init__(self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> None:
         self.choice: Choice = choice
         position = np.full(pattern.size, -1)
         position[free] = np.arange(len(free))
@@ -360,12 +352,8 @@ class Factoriser:
         columns = columns[self._free_entries]
         self.size = len(free)
         ones = np.ones(len(rows))
-        graph = sp.csr_array(
-            (ones, (rows, columns)), shape=(self.size, self.size)
-        )
-        self._order = reverse_cuthill_mckee(
-            graph + graph.T, symmetric_mode=True
-        ).astype(np.int64)
+        graph = sp.csr_array((ones, (rows, columns)), shape=(self.size, self.size))
+        self._order = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True).astype(np.int64)
         self._rank = rank = np.empty(self.size, dtype=np.int64)
         rank[self._order] = np.arange(self.size)
         low = np.minimum(rank[rows], rank[columns])
@@ -376,13 +364,9 @@ class Factoriser:
         strict = rows != columns
         self._full_rows = np.concatenate([rows, columns[strict]])
         self._full_columns = np.concatenate([columns, rows[strict]])
-        self._full_source = np.concatenate(
-            [self._free_entries, self._free_entries[strict]]
-        )
+        self._full_source = np.concatenate([self._free_entries, self._free_entries[strict]])
         # Whether an entry has the skew part's own sign; none on the diagonal.
-        self._signs = np.concatenate(
-            [strict.astype(float), -np.ones(strict.sum())]
-        )
+        self._signs = np.concatenate([strict.astype(float), -np.ones(strict.sum())])
         self._entries = pattern.entry_count
         # Memory of factors of double and of single precision that is not in use.
         self._pools: dict[bool, list[Pardiso]] = {False: [], True: []}
@@ -392,9 +376,7 @@ class Factoriser:
             self._pools[False].append(self._pardiso(is_single=False))
 
     @classmethod
-    def cached(
-        cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto"
-    ) -> Factoriser:
+    def cached(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
         """Return the analysis of a pattern; the last `LARGEST_CACHED_ANALYSIS_COUNT` are cached.
         Arguments as in `Factoriser`.
         """
@@ -420,10 +402,7 @@ class Factoriser:
         """
         if self.choice != "auto":
             return self.choice == "supernodal"
-        wide = (
-            self.half_bandwidth > NARROW
-            and self._estimate_band_work() > MUCH_WORK
-        )
+        wide = self.half_bandwidth > NARROW and self._estimate_band_work() > MUCH_WORK
         return wide and load_mkl() is not None
 
     def _estimate_band_work(self) -> int:
@@ -435,11 +414,7 @@ class Factoriser:
         matrix is analysed if necessary.
         """
         if self.is_banded:
-            width = (
-                self.skyline.shape[1]
-                if self.skyline
-                else self.half_bandwidth + 1
-            )
+            width = self.skyline.shape[1] if self.skyline else self.half_bandwidth + 1
             return self.size * width
         if self.is_supernodal:
             return self._supernodal_size
@@ -493,9 +468,9 @@ class Factoriser:
             Memory for a factor within the skyline; the factor is valid until it is used again.
             Other methods ignore it.
         is_single : bool
-            Whether the matrix is well conditioned, so that factors of wide bands and supernodal ones
-            may have single precision. Solutions are refined; where that fails, a factor of double
-            precision is computed.
+            Whether the matrix is well conditioned, so that factors of wide bands and supernodal
+            ones may have single precision. Solutions are refined; where that fails, a factor of
+            double precision is computed.
         accuracy : float
             Relative accuracy of solutions that are refined; others have that of the arithmetic.
 
@@ -511,25 +486,19 @@ class Factoriser:
         if skyline_factor:
             return skyline_factor
         if not (np.isfinite(values).all() and np.isfinite(skew).all()):
-            raise np.linalg.LinAlgError(
-                "the matrix has entries that are not finite"
-            )
+            raise np.linalg.LinAlgError("the matrix has entries that are not finite")
         if is_single and self.has_single_precision:
             rounded = self._factorise_definite(values, is_single=True)
             if rounded is not None:
                 return _RefinedFactor(
                     rounded,
                     self.complete_matrix(values, skew),
-                    factorise_complete=cache(
-                        partial(self.factorise, values, skew)
-                    ),
+                    factorise_complete=cache(partial(self.factorise, values, skew)),
                     accuracy=accuracy,
                     last_rates={} if skew.size else self._last_rates,
                 )
         definite = (
-            self._factorise_in_skyline(values, NONE, buffer=buffer)
-            if skew.size
-            else None
+            self._factorise_in_skyline(values, NONE, buffer=buffer) if skew.size else None
         ) or self._factorise_definite(values)
         if not skew.size:
             # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
@@ -545,8 +514,7 @@ class Factoriser:
         @cache
         def complete_factor() -> Factor:
             return self._sparse_factor(
-                self._superlu(values, pivot_below=1.0, skew=skew),
-                is_definite=True,
+                self._superlu(values, pivot_below=1.0, skew=skew), is_definite=True
             )
 
         return _RefinedFactor(
@@ -571,9 +539,7 @@ class Factoriser:
             return None
         return self._factorise_definite(values, is_single=True)
 
-    def _factorise_definite(
-        self, values: Array, is_single: bool = False
-    ) -> Factor | None:
+    def _factorise_definite(self, values: Array, is_single: bool = False) -> Factor | None:
         """Return the factor of a symmetric matrix (entries of the lower triangle), or None if it is
         not positive definite, or the skyline is used, which `_factorise_in_skyline` has tried
         already. With `is_single`, values, factor and solutions are rounded to single precision,
@@ -583,20 +549,14 @@ class Factoriser:
             pool = self._pools[is_single]
             try:
                 pardiso = pool.pop()
-            except (
-                IndexError
-            ):  # not asked for beforehand: other threads take from it too
+            except IndexError:  # not asked for beforehand: other threads take from it too
                 pardiso = self._pardiso(is_single)
             factor = SupernodalFactor(pardiso, pool)
             upper_values = values[self._upper.lower_positions]
             return factor if pardiso.factorise(upper_values) else None
         if not self.is_banded:
             lu = self._superlu(values, pivot_below=0.0)
-            return (
-                self._sparse_factor(lu, is_definite=True)
-                if _has_positive_pivots(lu)
-                else None
-            )
+            return self._sparse_factor(lu, is_definite=True) if _has_positive_pivots(lu) else None
         if self.skyline:
             return None
         band = np.zeros(
@@ -605,15 +565,11 @@ class Factoriser:
             order="F",
         )
         band.T.reshape(-1)[self._band_places] = values[self._free_entries]
-        return (
-            _BandFactor(band, self._order) if cholesky_in_place(band) else None
-        )
+        return _BandFactor(band, self._order) if cholesky_in_place(band) else None
 
     def _pardiso(self, is_single: bool) -> Pardiso:
         """Return a new PARDISO solver for the pattern, of single or double precision."""
-        return Pardiso(
-            self._upper.row_starts, self._upper.columns, is_single=is_single
-        )
+        return Pardiso(self._upper.row_starts, self._upper.columns, is_single=is_single)
 
     @cached_property
     def _supernodal_size(self) -> int:
@@ -631,9 +587,7 @@ class Factoriser:
     def _rows(self) -> _CompleteRows:
         """Both triangles of the matrix on the free dofs, row by row."""
         order = np.lexsort((self._full_columns, self._full_rows))
-        starts = np.searchsorted(
-            self._full_rows[order], np.arange(self.size + 1)
-        )
+        starts = np.searchsorted(self._full_rows[order], np.arange(self.size + 1))
         # SciPy would convert longer integers with every matrix.
         return _CompleteRows(
             starts.astype(np.int32),
@@ -643,17 +597,14 @@ class Factoriser:
         )
 
     def complete_matrix(self, values: Array, skew: Array) -> sp.csr_array:
-        """Return the matrix (k, k) of lower triangles `values` (m,) of the symmetric and `skew` (m,)
-        or (0,) of the skew part.
+        """Return the matrix (k, k) of lower triangles `values` (m,) of the symmetric and `skew`
+        (m,) or (0,) of the skew part.
         """
         rows = self._rows
         entries = values[rows.lower_positions]
         if skew.size:
             entries += rows.skew_signs * skew[rows.lower_positions]
-        return sp.csr_array(
-            (entries, rows.columns, rows.row_starts),
-            shape=(self.size, self.size),
-        )
+        return sp.csr_array((entries, rows.columns, rows.row_starts), shape=(self.size, self.size))
 
     @cached_property
     def _upper(self) -> _UpperTriangle:
@@ -664,9 +615,7 @@ class Factoriser:
         order = np.lexsort((columns, rows))
         starts = np.searchsorted(rows[order], np.arange(self.size + 1))
         return _UpperTriangle(
-            starts,
-            columns[order],
-            lower_positions=self._full_source[here][order],
+            starts, columns[order], lower_positions=self._full_source[here][order]
         )
 
     def allocate(self, sides: int) -> FactorMemory | None:
@@ -695,16 +644,10 @@ class Factoriser:
         buffer = buffer or skyline.allocate(count)
         pivots, growth = skyline.factorise(buffer, values, skew=skew)
         # An entry of the matrix that is not finite makes a pivot infinite or NaN.
-        if not (
-            pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH
-        ):
+        if not (pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH):
             return None
         return _SkylineFactor(
-            skyline,
-            buffer.sides[:count],
-            pivots=pivots,
-            order=self._order,
-            rank=self._rank,
+            skyline, buffer.sides[:count], pivots=pivots, order=self._order, rank=self._rank
         )
 
     def factorise_each(
@@ -762,15 +705,10 @@ class Factoriser:
         # Entries of a matrix that needs no row exchanges.
         values = np.full(self._entries, -1.0)
         degree = np.bincount(self._full_rows, minlength=self.size)
-        values[self._full_source[self._full_rows == self._full_columns]] = (
-            degree
-        )
+        values[self._full_source[self._full_rows == self._full_columns]] = degree
         lu = splu(
             sp.csc_array(
-                (
-                    values[self._full_source],
-                    (self._full_rows, self._full_columns),
-                ),
+                (values[self._full_source], (self._full_rows, self._full_columns)),
                 shape=(self.size, self.size),
             ),
             permc_spec="MMD_AT_PLUS_A",
@@ -794,32 +732,10 @@ class Factoriser:
     def _sparse_factor(self, lu: SuperLU, is_definite: bool) -> _SparseFactor:
         """Return the factor of a factorisation by `_superlu`."""
         columns = self._ordered_columns
-        return _SparseFactor(
-            lu,
-            columns.order,
-            columns.rank,
-            positive_definite=is_definite,
-        )
+        return _SparseFactor(lu, columns.order, columns.rank, positive_definite=is_definite)
 
-    def _superlu(
-        self, values: Array, pivot_below: float, skew: Array = NONE
-    ) -> SuperLU:
-        """Return the factorisation by SuperLU of the matrix in the order of `_ordered_columns`.
-
-        Parameters
-        ----------
-        values : (m,) array
-            Lower triangle of the symmetric part.
-        pivot_below : float
-            Threshold for row exchanges, from 0 (none) to 1 (partial pivoting).
-        skew : (m,) or (0,) array
-            Lower triangle of the skew part; empty for none.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the matrix is singular.
-        """
+    def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
+        """Return the factorisation by SuperLU of the matrix in the order of `_ordered_columns`."""
         entries = values[self._full_source]
         if skew.size:
             entries += self._signs * skew[self._full_source]
@@ -845,12 +761,8 @@ def _has_positive_pivots(lu: SuperLU) -> bool:
 
 
 @lru_cache(maxsize=LARGEST_CACHED_ANALYSIS_COUNT)
-def _cached_analysis(
-    pattern: SymmetricPattern, free: bytes, choice: Choice
-) -> Factoriser:
+def _cached_analysis(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
     """Return the analysis of a pattern, of which the last ones are cached; `free` are the bytes of
     an array of int64.
     """
-    return Factoriser(
-        pattern, np.frombuffer(free, dtype=np.int64), choice=choice
-    )
+    return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice=choice)

@@ -40,10 +40,7 @@ def _routine(name: str, arguments: int) -> Any:
 
 
 # Banded Cholesky factorisation by the type of the numbers.
-_PBTRF = {
-    np.dtype(np.float64): _routine("dpbtrf", 6),
-    np.dtype(np.float32): _routine("spbtrf", 6),
-}
+_PBTRF = {np.dtype(np.float64): _routine("dpbtrf", 6), np.dtype(np.float32): _routine("spbtrf", 6)}
 
 
 @cache
@@ -111,9 +108,7 @@ def solve_band_in_blocks(band: Band, right: Band) -> Band:
     stride = band.itemsize
     # L as a matrix: next rows are adjacent in memory, the next column is `reach` entries further.
     # Only entries within the band may be used.
-    factor = as_strided(
-        band, (size, size), (stride, reach * stride), writeable=False
-    )
+    factor = as_strided(band, (size, size), (stride, reach * stride), writeable=False)
     solution = np.array(right, order="C")
     (trsm,) = get_blas_funcs(("trsm",), dtype=band.dtype)
     starts = range(0, size, step)
@@ -129,29 +124,13 @@ def solve_band_in_blocks(band: Band, right: Band) -> Band:
         for rows, block in _blocks_below(factor, start, stop=stop, reach=reach):
             solution[start:stop] -= block.T @ solution[rows]
         solution[start:stop] = trsm(
-            1.0,
-            factor[start:stop, start:stop],
-            solution[start:stop],
-            lower=1,
-            trans_a=1,
+            1.0, factor[start:stop, start:stop], solution[start:stop], lower=1, trans_a=1
         )
     return solution
 
 
-def _blocks_below(
-    factor: Band, start: int, stop: int, reach: int
-) -> Iterator[tuple[slice, Band]]:
-    """Yield the rows and entries of the blocks of a band below its diagonal block.
-
-    Parameters
-    ----------
-    factor : (n, n) array
-        Lower triangle, of which only the band is defined.
-    start, stop : int
-        Rows and columns of the diagonal block.
-    reach : int
-        Half-bandwidth.
-    """
+def _blocks_below(factor: Band, start: int, stop: int, reach: int) -> Iterator[tuple[slice, Band]]:
+    """Yield the rows and entries of the blocks of a band below its diagonal block."""
     size = len(factor)
     full = slice(stop, min(start + reach + 1, size))
     if full.start < full.stop:

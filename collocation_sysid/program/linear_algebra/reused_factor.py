@@ -1,11 +1,11 @@
 """Solution of a sequence of similar symmetric positive definite systems with few factorisations.
 
-The matrices of successive time steps of a motion differ little, apart from the rotation of the body:
-the stiffness rotates with it. The factor of an earlier time step, rotated with the body, is therefore
-a good preconditioner, and one or two corrections replace a factorisation, which costs several times
-as much for large bodies. The corrections are those of the method of generalised conjugate residuals
-(GCR; Eisenstat, Elman and Schultz, 1983), which also allows a small skew part. Where they become slow,
-the matrix of the present time step is factorised.
+The matrices of successive time steps of a motion differ little, apart from the rotation of the
+body: the stiffness rotates with it. The factor of an earlier time step, rotated with the body, is
+therefore a good preconditioner, and one or two corrections replace a factorisation, which costs
+several times as much for large bodies. The corrections are those of the method of generalised
+conjugate residuals (GCR; Eisenstat, Elman and Schultz, 1983), which also allows a small skew part.
+Where they become slow, the matrix of the present time step is factorised.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ LARGEST_CORRECTION_COUNT = 12
 # Expected error of a solution over the required one, because it is estimated from residuals.
 SAFETY = 0.3
 # A factorisation costs this number of solutions per mean number of entries of a column of a
-# supernodal factor, for `MEASURED_COLUMNS` columns of the right-hand side (measured from 800 to 20,000
-# nodes, see `relative_cost`).
+# supernodal factor, for `MEASURED_COLUMNS` columns of the right-hand side (measured from 800 to
+# 20,000 nodes, see `relative_cost`).
 COST_PER_ENTRY = 0.01
 # The same of a banded factor, which is solved in blocks (measured from 1,300 to 5,000 nodes).
 BAND_COST_PER_ENTRY = 0.0065
@@ -41,8 +41,8 @@ MEASURED_COLUMNS = 5
 
 
 def relative_cost(factoriser: Factoriser, columns: int) -> float:
-    """Return the estimated time of a factorisation in single precision over that of the solution for
-    a number of right-hand sides.
+    """Return the estimated time of a factorisation in single precision over that of the solution
+    for a number of right-hand sides.
 
     The estimate depends on sizes only, so that results can be reproduced.
     """
@@ -89,8 +89,8 @@ class NodeRotation:
         )
 
     def apply(self, rotation: Array, columns: Array) -> Array:
-        """Return columns (k, c) of the free dofs rotated by a matrix (3, 3), as a new array; dofs that
-        are not free count as zero.
+        """Return columns (k, c) of the free dofs rotated by a matrix (3, 3), as a new array; dofs
+        that are not free count as zero.
         """
         count = columns.shape[1]
         if self._is_by_node:
@@ -183,9 +183,7 @@ class FactorSequence:
             return size * np.asarray(self._factor.solve(scaled), dtype=float)
         turn = best_rotation(self._points_m, points_m)
         solution = self._factor.solve(self.rotation.apply(turn.T, scaled))
-        return size * self.rotation.apply(
-            turn, np.asarray(solution, dtype=float)
-        )
+        return size * self.rotation.apply(turn, np.asarray(solution, dtype=float))
 
 
 class _Columns:
@@ -200,7 +198,8 @@ class _Columns:
     residual : (k, a) array
         Residuals of the active columns.
     is_definite : bool
-        Whether no direction so far has a negative curvature, which a positive definite matrix excludes.
+        Whether no direction so far has a negative curvature, which a positive definite matrix
+        excludes.
 
     Parameters
     ----------
@@ -216,11 +215,7 @@ class _Columns:
     """
 
     def __init__(
-        self,
-        product: Callable[[Array], Array],
-        weight: Array,
-        right: Array,
-        guess: Array | None,
+        self, product: Callable[[Array], Array], weight: Array, right: Array, guess: Array | None
     ) -> None:
         self.product = product
         self.weight = weight
@@ -239,8 +234,8 @@ class _Columns:
         return self._inner(self.residual, self.residual)
 
     def correct(self, direction: Array) -> None:
-        """Add the multiple of a direction (k, active), made conjugate to earlier ones, that makes the
-        residuals smallest.
+        """Add the multiple of a direction (k, active), made conjugate to earlier ones, that makes
+        the residuals smallest.
         """
         image = self.product(direction)
         for previous, previous_image, size in self._directions:
@@ -263,8 +258,7 @@ class _Columns:
         self.active = self.active[is_active]
         self.residual = self.residual[:, is_active]
         self._directions = [
-            (d[:, is_active], q[:, is_active], size[is_active])
-            for d, q, size in self._directions
+            (d[:, is_active], q[:, is_active], size[is_active]) for d, q, size in self._directions
         ]
 
     def forget_directions(self) -> None:
@@ -278,8 +272,8 @@ class _Columns:
 
 @dataclass(eq=False)
 class ReusedFactor:
-    """System of one time step, solved with the latest factor of a sequence; the matrix is factorised
-    only where that is too slow.
+    """System of one time step, solved with the latest factor of a sequence; the matrix is
+    factorised only where that is too slow.
 
     Attributes
     ----------
@@ -301,14 +295,9 @@ class ReusedFactor:
         """Whether the symmetric part is positive definite, known after the first solution."""
         return self._complete is None or self._complete.positive_definite
 
-    def solve(
-        self,
-        right: Array,
-        transposed: bool = False,
-        guess: Array | None = None,
-    ) -> Array:
-        """Return the solution for right-hand sides (k,) or (k, m), in the same shape, to the accuracy
-        of the sequence.
+    def solve(self, right: Array, transposed: bool = False, guess: Array | None = None) -> Array:
+        """Return the solution for right-hand sides (k,) or (k, m), in the same shape, to the
+        accuracy of the sequence.
 
         Parameters
         ----------
@@ -328,9 +317,7 @@ class ReusedFactor:
         start = None if guess is None else guess.reshape(columns.shape)
         solution = None
         if self._complete is None:
-            solution = self._solve_iteratively(
-                columns, transposed=transposed, guess=start
-            )
+            solution = self._solve_iteratively(columns, transposed=transposed, guess=start)
         if solution is None:
             solution = self._complete_factor().solve(columns, transposed)
         return solution.reshape(right.shape)
@@ -346,22 +333,17 @@ class ReusedFactor:
     def _solve_iteratively(
         self, right: Array, transposed: bool, guess: Array | None
     ) -> Array | None:
-        """Return the solution (k, m); None if even the factor of this matrix in single precision does
-        not lead to it.
+        """Return the solution (k, m); None if even the factor of this matrix in single precision
+        does not lead to it.
         """
         sequence = self.sequence
-        matrix = sequence.factoriser.complete_matrix(
-            self.matrix.values, self.matrix.skew
-        )
+        matrix = sequence.factoriser.complete_matrix(self.matrix.values, self.matrix.skew)
         diagonal = np.asarray(matrix.diagonal(), dtype=float)
         if not (np.isfinite(matrix.data).all() and (diagonal > 0).all()):
             return None
         by_row = matrix.T if transposed else matrix
         columns = _Columns(
-            lambda each: by_row @ each,
-            weight=1.0 / diagonal[:, None],
-            right=right,
-            guess=guess,
+            lambda each: by_row @ each, weight=1.0 / diagonal[:, None], right=right, guess=guess
         )
         if not columns.is_definite:
             return None
@@ -373,24 +355,16 @@ class ReusedFactor:
             if not len(columns.active):
                 sequence.count_cost(solutions, columns=right.shape[1])
                 return columns.solution
-            correction = sequence.preconditioned(
-                columns.residual, self.points_m
-            )
-            solutions += (FIXED_COLUMNS + len(columns.active)) / (
-                FIXED_COLUMNS + right.shape[1]
-            )
+            correction = sequence.preconditioned(columns.residual, self.points_m)
+            solutions += (FIXED_COLUMNS + len(columns.active)) / (FIXED_COLUMNS + right.shape[1])
             before = columns.residual_size()
             columns.correct(correction)
             if not columns.is_definite:
                 return None
             reduction = np.sqrt(columns.residual_size() / before)
             length = np.abs(correction).max(axis=0, initial=0.0)
-            size = np.abs(columns.solution[:, columns.active]).max(
-                axis=0, initial=0.0
-            )
-            is_accurate = (
-                reduction * length <= SAFETY * sequence.accuracy * size
-            )
+            size = np.abs(columns.solution[:, columns.active]).max(axis=0, initial=0.0)
+            is_accurate = reduction * length <= SAFETY * sequence.accuracy * size
             slowest = float(np.max(reduction, where=~is_accurate, initial=0.0))
             if is_own and not slowest <= CONTRACTION:
                 return None

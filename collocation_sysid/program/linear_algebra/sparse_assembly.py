@@ -29,11 +29,7 @@ class EntryBlock(NamedTuple):
 
     def count_entries(self) -> int:
         """Return the number of entries: the size of the broadcast arrays."""
-        return int(
-            np.prod(
-                np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))
-            )
-        )
+        return int(np.prod(np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))))
 
     def indices(self) -> tuple[Index, Index]:
         """Return row and column index of each entry, flat, in C order of the broadcast arrays."""
@@ -110,8 +106,7 @@ class SparseAssembly:
             else np.flatnonzero(is_initial),
             group_positions=tuple(own[each] for each in group_indices),
             has_duplicates=tuple(
-                bool(np.bincount(each, minlength=1).max() > 1)
-                for each in group_indices
+                bool(np.bincount(each, minlength=1).max() > 1) for each in group_indices
             ),
         )
 
@@ -124,11 +119,7 @@ class SparseAssembly:
         """Return the positions among all values of values of the initial structure, given by their
         positions there.
         """
-        return (
-            positions
-            if self.initial_positions is None
-            else self.initial_positions[positions]
-        )
+        return positions if self.initial_positions is None else self.initial_positions[positions]
 
     def allocate(self, out: Array | None, count: int) -> tuple[Array, Array]:
         """Return arrays for all values, and for the `count` values of the initial structure;
@@ -145,13 +136,9 @@ class SparseAssembly:
             Number of values of the initial structure.
         """
         values = np.empty(len(self.indices)) if out is None else out
-        return values, values[
-            :count
-        ] if self.initial_positions is None else np.empty(count)
+        return values, values[:count] if self.initial_positions is None else np.empty(count)
 
-    def assemble(
-        self, values: Array, initial: Array, groups: Sequence[Array]
-    ) -> None:
+    def assemble(self, values: Array, initial: Array, groups: Sequence[Array]) -> None:
         """Compute all values in place.
 
         Parameters
@@ -182,27 +169,10 @@ class SparseAssembly:
 def _locate(
     structure: tuple[Index, Index], height: int, codes: Index
 ) -> tuple[Index, NDArray[np.bool_]]:
-    """Find entries in a structure.
-
-    Parameters
-    ----------
-    structure : (array, array)
-        Column pointers and row indices.
-    height : int
-        Number of rows of the complete matrix.
-    codes : (c,) array
-        Column · height + row of the entries, ascending.
-
-    Returns
-    -------
-    ((c,) array, (c,) array of bool)
-        Number of entries of the structure before each, and whether it is absent from the structure.
-    """
+    """Find entries in a structure."""
     indptr, indices = structure
     if not len(codes) or codes[0] >= (len(indptr) - 1) * height:
-        return np.full(len(codes), len(indices)), np.ones(
-            len(codes), dtype=bool
-        )
+        return np.full(len(codes), len(indices)), np.ones(len(codes), dtype=bool)
     own = np.repeat(np.arange(len(indptr) - 1) * height, np.diff(indptr))
     own += indices
     before = np.searchsorted(own, codes)

@@ -98,14 +98,10 @@ class Pardiso:
         If MKL is not installed.
     """
 
-    def __init__(
-        self, starts: Index, columns: Index, is_single: bool = False
-    ) -> None:
+    def __init__(self, starts: Index, columns: Index, is_single: bool = False) -> None:
         if load_mkl() is None:
             raise InputError(MISSING)
-        self._dtype: np.dtype[Any] = np.dtype(
-            np.float32 if is_single else np.float64
-        )
+        self._dtype: np.dtype[Any] = np.dtype(np.float32 if is_single else np.float64)
         self.size = len(starts) - 1
         self._handle = np.zeros(64, np.int64)
         self._options = np.zeros(64, np.int32)
@@ -113,9 +109,7 @@ class Pardiso:
         self._columns = columns.astype(np.int32)
         self._values = np.zeros(len(columns), self._dtype)
         kind = ctypes.c_int(POSITIVE_DEFINITE)
-        load_mkl().pardisoinit(
-            _pointer(self._handle), ctypes.byref(kind), _pointer(self._options)
-        )
+        load_mkl().pardisoinit(_pointer(self._handle), ctypes.byref(kind), _pointer(self._options))
         self._options[FROM_ZERO] = 1
         self._options[IN_SINGLE] = is_single
         self._options[COUNTED] = -1
@@ -147,32 +141,12 @@ class Pardiso:
         return result
 
     def _call(
-        self,
-        phase: int,
-        right: NDArray[Any] | None = None,
-        result: NDArray[Any] | None = None,
+        self, phase: int, right: NDArray[Any] | None = None, result: NDArray[Any] | None = None
     ) -> int:
-        """Call one phase of PARDISO and return its error code, 0 or `NOT_POSITIVE`.
-
-        Parameters
-        ----------
-        phase : int
-            The phase, such as `FACTORISE`.
-        right, result : (n,) or (n, m) arrays, optional
-            Right-hand sides, and their solutions, which are overwritten; for `SOLVE` alone.
-
-        Raises
-        ------
-        MemoryError
-            If there is no memory for the factor.
-        numpy.linalg.LinAlgError
-            For any other error except a pivot that is not positive.
-        """
+        """Call one phase of PARDISO and return its error code, 0 or `NOT_POSITIVE`."""
         count = 1 if right is None else right.size // self.size
         settings = (1, 1, POSITIVE_DEFINITE, phase, self.size)
-        one, which, kind, stage, size = (
-            ctypes.byref(ctypes.c_int(k)) for k in settings
-        )
+        one, which, kind, stage, size = (ctypes.byref(ctypes.c_int(k)) for k in settings)
         error = ctypes.c_int(0)
         silent = ctypes.byref(ctypes.c_int(0))
         columns = ctypes.byref(ctypes.c_int(count))
@@ -197,9 +171,7 @@ class Pardiso:
         if error.value == NO_MEMORY:
             raise MemoryError("no memory for the factors of a timestep")
         if error.value not in (0, NOT_POSITIVE):
-            raise np.linalg.LinAlgError(
-                f"PARDISO failed with error {error.value}"
-            )
+            raise np.linalg.LinAlgError(f"PARDISO failed with error {error.value}")
         return error.value
 
     def __del__(self) -> None:

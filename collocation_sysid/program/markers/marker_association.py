@@ -102,7 +102,7 @@ class MarkerAssociation:
         sigma_m = experiment.compute_place_sigma_m()
         points = markers.predict_positions(body.nodes_m)
         k = 2 if markers.on_surface else 3
-        chart = cls(
+        association = cls(
             body,
             sigma_m,
             prior_places_m=points,
@@ -115,7 +115,7 @@ class MarkerAssociation:
             crossed_edges=np.full((len(points), 2, 3), np.nan),
             crossing_counts=np.zeros(len(points), dtype=np.int64),
         )
-        return chart.centred_at(points)
+        return association.centred_at(points)
 
     @classmethod
     def from_exact_places(
@@ -165,18 +165,13 @@ class MarkerAssociation:
         `axes`; zero for exact places.
         """
         sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
-        return (
-            np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m)
-            / sigma
-        )
+        return np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m) / sigma
 
     def places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
         standard deviations along `axes`, linear about the centre; exact places do not move.
         """
-        moved = np.einsum(
-            "mik,mk->mi", self.axes, phi - self.centre_coordinates
-        )
+        moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre_coordinates)
         return self.centre_places_m + self.sigma_m[:, None] * moved
 
     def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
@@ -200,9 +195,7 @@ class MarkerAssociation:
         estimated = self.estimated
         if len(estimated):
             cells = self.cells[estimated]
-            local = self._shape.barycentric(
-                self.places_m(phi)[estimated], cells
-            )
+            local = self._shape.barycentric(self.places_m(phi)[estimated], cells)
             gradients = self._shape.barycentric_gradients(cells) @ (
                 self.sigma_m[estimated, None, None] * self.axes[estimated]
             )
@@ -210,10 +203,7 @@ class MarkerAssociation:
             weights[estimated] = element.shape_functions(local)
             slopes[estimated] = element.shape_gradients(local) @ gradients
             curvatures[estimated] = np.einsum(
-                "mail,mik,mln->makn",
-                _second_derivatives(element, local),
-                gradients,
-                gradients,
+                "mail,mik,mln->makn", _second_derivatives(element, local), gradients, gradients
             )
         return nodes, ShapeFunctions(weights, slopes, hessians=curvatures)
 
@@ -236,9 +226,7 @@ class MarkerAssociation:
         axes = self.axes.copy()
         for m in self.estimated:
             if self.on_surface:
-                points[m], axes[m] = self._shape.nearest_surface_point(
-                    points[m]
-                )
+                points[m], axes[m] = self._shape.nearest_surface_point(points[m])
             else:
                 axes[m] = np.eye(3)
             cells[m], _ = self._shape.nearest_cell(points[m])
@@ -262,13 +250,11 @@ class MarkerAssociation:
         points = self.places_m(phi)
         changed_cell = False
         for m in self.estimated:
-            changed_cell = changed_cell or self._is_outside(
-                points[m], int(self.cells[m])
-            )
+            changed_cell = changed_cell or self._is_outside(points[m], int(self.cells[m]))
         if not changed_cell:
             return self, phi
-        chart = self._without_alternation(points)
-        return chart, chart.centre_coordinates
+        association = self._without_alternation(points)
+        return association, association.centre_coordinates
 
     def _without_alternation(self, points_m: Array) -> MarkerAssociation:
         """Return the association centred at places (M, 3) [m] such that none alternates between two
@@ -292,9 +278,7 @@ class MarkerAssociation:
             is_free = again[m] < LARGEST_CROSSING_COUNT
             if is_free and np.linalg.norm(beyond) > same_m:
                 edge = np.cross(np.cross(*self.axes[m].T), beyond)
-                off_m = np.linalg.norm(
-                    np.cross(points[m] - crossed[m, 0], crossed[m, 1])
-                )
+                off_m = np.linalg.norm(np.cross(points[m] - crossed[m, 0], crossed[m, 1]))
                 again[m] = again[m] + 1 if off_m < same_m else 0
                 crossed[m] = points[m], edge / np.linalg.norm(edge)
             if again[m] == LARGEST_CROSSING_COUNT:
@@ -320,9 +304,9 @@ class MarkerAssociation:
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
             return False  # no other element contains it better
         best, _ = self._shape.nearest_cell(point)
-        smallest = self._shape.barycentric(
-            np.stack([point, point]), np.array([cell, best])
-        ).min(axis=1)
+        smallest = self._shape.barycentric(np.stack([point, point]), np.array([cell, best])).min(
+            axis=1
+        )
         return bool(smallest[1] > smallest[0] + BETTER)
 
     def places_of_points(self, nodes_m: Array, points_m: Array) -> Array:

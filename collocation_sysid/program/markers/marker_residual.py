@@ -21,11 +21,7 @@ from ...common.array_types import Array, Index
 from ...model.nuisance_map import NuisanceMap
 from ...recording.markers import Markers
 from ...recording.nuisance import PLACE
-from ..measurement_residual import (
-    MeasurementResidual,
-    RowStencil,
-    lagrange_weights,
-)
+from ..measurement_residual import MeasurementResidual, RowStencil, lagrange_weights
 from ..observables import PointPositions
 from .marker_association import MarkerAssociation
 
@@ -95,18 +91,12 @@ class MarkerResidual(MeasurementResidual):
             Number of `rows` before the first sample.
         """
         places = np.full((len(markers.names), association.axes.shape[2]), -1)
-        places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(
-            -1, places.shape[1]
-        )
+        places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(-1, places.shape[1])
         shifted = preceding_times + np.arange(len(markers.t_s)) + clock_samples
-        covered = (shifted < len(rows)) & (
-            (shifted >= 0) | is_initially_at_rest
-        )
+        covered = (shifted < len(rows)) & ((shifted >= 0) | is_initially_at_rest)
         is_compared = markers.is_present & covered[:, None]
         return cls(
-            observable=PointPositions(
-                rows, association, coordinate_parameters=places
-            ),
+            observable=PointPositions(rows, association, coordinate_parameters=places),
             nuisance=nuisance,
             huber=huber,
             names=markers.names,
@@ -133,10 +123,7 @@ class MarkerResidual(MeasurementResidual):
         """Number of samples that a marker is interpolated from; 1 if no clock is estimated, and all
         frames have the times of their samples.
         """
-        is_shifted = (
-            len(self.nuisance.clock_indices) > 0
-            or self.markers.offsets_s is not None
-        )
+        is_shifted = len(self.nuisance.clock_indices) > 0 or self.markers.offsets_s is not None
         return min(NEIGHBOURS, self.observable.count) if is_shifted else 1
 
     @cached_property
@@ -161,9 +148,7 @@ class MarkerResidual(MeasurementResidual):
     @cached_property
     def _neighbour_indices(self) -> Index:
         """Indices (T, neighbours) of the samples that each one is interpolated from."""
-        return np.maximum(
-            self._first_neighbour[:, None] + np.arange(self._neighbour_count), 0
-        )
+        return np.maximum(self._first_neighbour[:, None] + np.arange(self._neighbour_count), 0)
 
     @cached_property
     def _stencil(self) -> RowStencil:
@@ -171,18 +156,14 @@ class MarkerResidual(MeasurementResidual):
         samples, and the frame's time [s], delay included.
         """
         count = len(self.markers.names)
-        indices = (
-            self.preceding_times + np.arange(len(self.t_s))
-        ) - self._first_neighbour
+        indices = (self.preceding_times + np.arange(len(self.t_s))) - self._first_neighbour
         place = np.array(
             [
                 indices + self._offsets_s / self.nuisance.interval_s,
                 self.t_s + self._offsets_s + self.delay_s,
             ]
         )
-        places = (
-            self._neighbour_indices[:, None] * count + np.arange(count)[:, None]
-        )
+        places = self._neighbour_indices[:, None] * count + np.arange(count)[:, None]
         return RowStencil(places, np.repeat(place[..., None], count, axis=2))
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -190,9 +171,7 @@ class MarkerResidual(MeasurementResidual):
         the observable; φ is not used.
         """
         samples = int(np.count_nonzero(self._neighbour_indices[:, -1] < known))
-        return RowStencil(
-            self._stencil.indices[:samples], self._stencil.data[:, :samples]
-        )
+        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     def shifted(self, by_s: float) -> MarkerResidual:
         """Return the model of samples taken `by_s` seconds later, with the same stencil and
@@ -218,24 +197,13 @@ class MarkerResidual(MeasurementResidual):
             Position of the frame among the neighbours, in samples, and its time [s].
         """
         place, t_s = ca.vertsplit(data)
-        own = (
-            self.own_parameters[0]
-            if len(self.own_parameters)
-            else np.zeros(0, dtype=np.int64)
-        )
+        own = self.own_parameters[0] if len(self.own_parameters) else np.zeros(0, dtype=np.int64)
         reading = values[:, 0]
         if self._neighbour_count > 1:
-            late = (
-                self.nuisance.marker_delay_s(phi, own, t_s=t_s)
-                / self.nuisance.interval_s
-            )
+            late = self.nuisance.marker_delay_s(phi, own, t_s=t_s) / self.nuisance.interval_s
             places = [ca.SX(k) for k in range(self._neighbour_count)]
-            reading = values @ ca.vertcat(
-                *lagrange_weights(place + late, places)
-            )
-        return self.nuisance.marker_measurement(
-            reading, phi, places=own, t_s=t_s
-        )
+            reading = values @ ca.vertcat(*lagrange_weights(place + late, places))
+        return self.nuisance.marker_measurement(reading, phi, places=own, t_s=t_s)
 
     # Of positions -----------------------------------------------------------------------------
 
@@ -243,15 +211,8 @@ class MarkerResidual(MeasurementResidual):
         """Return predictions (T, M, 3) [m] at φ (k,) from the body's positions (T, n, 3) [m] at the
         samples.
         """
-        plain = replace(
-            self,
-            observable=replace(
-                self.observable, rows=np.arange(len(positions_m))
-            ),
-        )
-        return plain.predict_positions(
-            positions_m.reshape(len(positions_m), -1), phi
-        )
+        plain = replace(self, observable=replace(self.observable, rows=np.arange(len(positions_m))))
+        return plain.predict_positions(positions_m.reshape(len(positions_m), -1), phi)
 
     def predict_positions(self, x: Array, phi: Array) -> Array:
         """Return predictions (t, M, 3) [m] at φ (k,) from the first grid positions x (rows, 3n)

@@ -111,11 +111,7 @@ class DeclaredMotion:
         """Return points (T, M, 3) [m] of the world in the grasp's frame, with the pose of each time
         [m].
         """
-        return np.einsum(
-            "tji,tmj->tmi",
-            self.rotations,
-            points_m - self.translations_m[:, None],
-        )
+        return np.einsum("tji,tmj->tmi", self.rotations, points_m - self.translations_m[:, None])
 
     def without_first_motion(self) -> DeclaredMotion:
         """Return the statements with the poses before `first_motion` is applied."""
@@ -129,16 +125,12 @@ class DeclaredMotion:
         first = self.first_motion
         return self.with_prior_motion(first[:3, :3], first[:3, 3])
 
-    def with_prior_motion(
-        self, rotation: Array, translation_m: Array
-    ) -> DeclaredMotion:
+    def with_prior_motion(self, rotation: Array, translation_m: Array) -> DeclaredMotion:
         """Return the statements with a rigid motion C (`rotation` (3, 3), `translation_m` (3,) [m])
         of the body before the poses U: x → U(Cx).
         """
         shifted = self.translations_m + self.rotations @ translation_m
-        return replace(
-            self, rotations=self.rotations @ rotation, translations_m=shifted
-        )
+        return replace(self, rotations=self.rotations @ rotation, translations_m=shifted)
 
 
 def carrying_grasp(experiment: Experiment) -> Grasp | None:
@@ -147,11 +139,7 @@ def carrying_grasp(experiment: Experiment) -> Grasp | None:
     It must prescribe all axes. All grasps that hold at some sample must hold at all of them and
     have the same poses; of several, the first that prescribes all axes is returned.
     """
-    holding = [
-        grasp
-        for grasp in experiment.grasps
-        if grasp.is_active(experiment.t_s).any()
-    ]
+    holding = [grasp for grasp in experiment.grasps if grasp.is_active(experiment.t_s).any()]
     holding.sort(key=lambda grasp: grasp.axes != "xyz")
     if not holding or holding[0].axes != "xyz":
         return None
@@ -215,13 +203,9 @@ class ModalResponse:
         body = experiment.body
         markers = experiment.markers
         forces = Forces.from_experiment(
-            experiment,
-            experiment.t_s[:1],
-            theta=body.theta_from_values(constants),
+            experiment, experiment.t_s[:1], theta=body.theta_from_values(constants)
         ).only_loads()
-        modes = natural_modes(
-            forces, body.nodes_m, free_dofs=experiment.free_dofs, count=MODES
-        )
+        modes = natural_modes(forces, body.nodes_m, free_dofs=experiment.free_dofs, count=MODES)
         weighted = modes.shapes * forces.mass.inertia_kg[0, ::3, None]
         omega = modes.compute_angular_frequencies_rad_s()
         return cls(
@@ -283,13 +267,9 @@ class ModalResponse:
         """Return the angular frequencies (`STIFFNESSES`, K) [rad/s] of the assumed stiffnesses,
         ascending, for a mesh scale.
         """
-        softest = np.sqrt(
-            STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m)
-        )
+        softest = np.sqrt(STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m))
         stiffnesses = softest * np.geomspace(1.0, STIFFEST, STIFFNESSES)
-        return np.asarray(
-            np.outer(stiffnesses, self.relative_frequencies), dtype=np.float64
-        )
+        return np.asarray(np.outer(stiffnesses, self.relative_frequencies), dtype=np.float64)
 
     def _modal_loads(self, declared: DeclaredMotion) -> Array:
         """Return the modal loads (T, K) of gravity and of the grasp's acceleration, for a declared
@@ -297,15 +277,9 @@ class ModalResponse:
         """
         inverse = declared.rotations.transpose(0, 2, 1)
         step_s = float(declared.t_s[1] - declared.t_s[0])
-        lift = declared.gravity_m_s2 - _second_differences(
-            declared.translations_m, step_s
-        )
+        lift = declared.gravity_m_s2 - _second_differences(declared.translations_m, step_s)
         pushed = np.einsum("tij,tj->ti", inverse, lift)
-        rotated = (
-            inverse
-            @ _second_differences(declared.rotations, step_s)
-            * declared.mesh_scale
-        )
+        rotated = inverse @ _second_differences(declared.rotations, step_s) * declared.mesh_scale
         return pushed @ self.translation_loads.T - np.einsum(
             "tij,kij->tk", rotated, self.rotation_loads
         )
@@ -318,9 +292,7 @@ def delayed_tracks(predictions: Array, t_s: Array, lag_s: float) -> Array:
     at = np.arange(len(t_s)) - lag_s / (t_s[1] - t_s[0])
     low = np.clip(np.floor(at).astype(int), 0, len(t_s) - 2)
     share = (at - low)[:, None, None]
-    shifted = (1 - share) * predictions[:, low] + share * predictions[
-        :, low + 1
-    ]
+    shifted = (1 - share) * predictions[:, low] + share * predictions[:, low + 1]
     shifted[:, (at < 0) | (at > len(t_s) - 1)] = np.nan
     return shifted
 
@@ -336,11 +308,7 @@ def _second_differences(x: Array, step_s: float) -> Array:
 
 
 def oscillator_responses(
-    omega: Array,
-    ratio: float,
-    loads: Array,
-    step_s: float,
-    is_initially_at_rest: bool,
+    omega: Array, ratio: float, loads: Array, step_s: float, is_initially_at_rest: bool
 ) -> Array:
     """Return the coordinates (S, T, K) of oscillators (S, K), exact for loads that are linear
     between samples.
@@ -365,10 +333,7 @@ def oscillator_responses(
     fading = np.exp(root * step_s)
     of_constant = np.expm1(root * step_s) / root
     of_rise = (of_constant - step_s) / (root * step_s)
-    pushes = (
-        of_constant * loads[:-1, None]
-        + of_rise * np.diff(loads, axis=0)[:, None]
-    )
+    pushes = of_constant * loads[:-1, None] + of_rise * np.diff(loads, axis=0)[:, None]
     at_rest = -root.conj() * loads[0] / omega**2
     coordinates = [at_rest if is_initially_at_rest else np.zeros_like(root)]
     for push in pushes:

@@ -58,9 +58,7 @@ class Modes:
         return 2 * np.pi * self.frequencies_hz
 
 
-def natural_modes(
-    forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
-) -> Modes:
+def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6) -> Modes:
     """Return the lowest modes of a body about a state; those without restoring force (ω² not
     positive beyond rounding) are left out and counted in `omitted_count`.
 
@@ -90,11 +88,7 @@ def natural_modes(
         lower[pattern.diagonal[free_dofs]] += SHIFT * largest * mass
         factor = Factoriser.cached(pattern, free_dofs).factorise(lower)
         squares, vectors = _lanczos_modes(
-            stiffness,
-            mass,
-            factor=factor,
-            shift_1_s2=-SHIFT * largest,
-            requested=requested,
+            stiffness, mass, factor=factor, shift_1_s2=-SHIFT * largest, requested=requested
         )
     oscillating = squares > RIGID * largest
     shapes = np.zeros((int(oscillating.sum()), pattern.size))
@@ -110,22 +104,11 @@ def natural_modes(
     )
 
 
-def _dense_modes(
-    stiffness: sp.csc_array, mass: Array, requested: int
-) -> tuple[Array, Array]:
+def _dense_modes(stiffness: sp.csc_array, mass: Array, requested: int) -> tuple[Array, Array]:
     """Return the `requested` lowest eigenvalues (k,) [1/s²], ascending, and eigenvectors (n, k) of
     K φ = λ M φ by a dense solver; k = n if n is smaller.
 
     Eigenvectors have φᵀ M φ = 1.
-
-    Parameters
-    ----------
-    stiffness : sparse (n, n)
-        Symmetric stiffness K [N/m].
-    mass : (n,) array
-        Diagonal of M [kg], positive.
-    requested : int
-        Number of eigenvalues.
     """
     root = np.sqrt(mass)
     scaled = stiffness.toarray() / np.outer(root, root)
@@ -154,27 +137,10 @@ class _ShiftedInverse(LinearOperator):
 
 
 def _lanczos_modes(
-    stiffness: sp.csc_array,
-    mass: Array,
-    factor: Factor,
-    shift_1_s2: float,
-    requested: int,
+    stiffness: sp.csc_array, mass: Array, factor: Factor, shift_1_s2: float, requested: int
 ) -> tuple[Array, Array]:
     """Return the `requested` eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ nearest to a
     shift, by shift-invert Lanczos iterations, ascending; eigenvectors have φᵀ M φ = 1.
-
-    Parameters
-    ----------
-    stiffness : sparse (n, n)
-        Stiffness K [N/m].
-    mass : (n,) array
-        Diagonal of M [kg].
-    factor : Factor
-        Factor of K − shift · M.
-    shift_1_s2 : float
-        The shift, just below zero [1/s²].
-    requested : int
-        Number of eigenvalues, less than n.
     """
     squares, vectors = eigsh(
         stiffness,

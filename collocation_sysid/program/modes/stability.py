@@ -12,13 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.linalg import (
-    ArpackNoConvergence,
-    LinearOperator,
-    eigs,
-    eigsh,
-    splu,
-)
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, eigsh, splu
 
 from ...common.array_types import Array, Index
 from ...fem.pattern import SymmetricPattern
@@ -62,9 +56,7 @@ class Instability:
     e_foldings: float
 
 
-def find_instabilities(
-    collocation: Collocation, z: Array
-) -> tuple[Instability, ...]:
+def find_instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
     """Return the instabilities of the motions at z, at most one for each fitted experiment, in
     their order; experiments whose examined states are stable have none.
 
@@ -78,11 +70,11 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
     """Return the instability of one experiment's motion, or None if all examined states (up to
     `STATES` samples) are stable.
     """
-    experiment = iterate.segment.experiment
+    experiment = iterate.transcription.experiment
     last = len(experiment.t_s) - 1
     samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
     t_s = experiment.t_s[samples]
-    rows = iterate.segment.markers.observable.rows[samples]
+    rows = iterate.transcription.markers.observable.rows[samples]
     is_prescribed = experiment.is_prescribed(t_s).reshape(len(t_s), -1)
     theta = iterate.equations.dynamics.theta
     growths = np.array(
@@ -92,22 +84,15 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
                 x,
                 free_dofs=np.flatnonzero(~there),
             )
-            for time, x, there in zip(
-                t_s, iterate.x[rows], is_prescribed, strict=True
-            )
+            for time, x, there in zip(t_s, iterate.x[rows], is_prescribed, strict=True)
         ]
     )
     worst = int(np.argmax(growths))
     if growths[worst] <= 0:
         return None
-    e_foldings = (
-        np.inf if experiment.is_static else float(np.trapezoid(growths, t_s))
-    )
+    e_foldings = np.inf if experiment.is_static else float(np.trapezoid(growths, t_s))
     return Instability(
-        experiment.name,
-        float(t_s[worst]),
-        growth_1_s=float(growths[worst]),
-        e_foldings=e_foldings,
+        experiment.name, float(t_s[worst]), growth_1_s=float(growths[worst]), e_foldings=e_foldings
     )
 
 
@@ -133,16 +118,11 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     lowers = -at.by_position[0], -at.by_velocity[0]
     if not all(np.isfinite(lower).all() for lower in lowers):
         return 0.0
-    if all(
-        _is_definite(lower, pattern, free_dofs=free_dofs, mass=mass)
-        for lower in lowers
-    ):
+    if all(_is_definite(lower, pattern, free_dofs=free_dofs, mass=mass) for lower in lowers):
         return 0.0
     root = sp.diags_array(1 / np.sqrt(mass))
     stiffness, damping = (
-        sp.csc_array(
-            root @ pattern.matrix(lower)[:, free_dofs][free_dofs] @ root
-        )
+        sp.csc_array(root @ pattern.matrix(lower)[:, free_dofs][free_dofs] @ root)
         for lower in lowers
     )
     noise = SHIFT * np.sqrt(stiffness.diagonal().max())
@@ -150,22 +130,9 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     return growth if growth > noise else 0.0
 
 
-def _is_definite(
-    lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array
-) -> bool:
+def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
     """Return whether a matrix on the free dofs is positive semidefinite up to rounding; true for a
     matrix with a zero diagonal.
-
-    Parameters
-    ----------
-    lower : (m,) array
-        Lower triangle of the complete matrix.
-    pattern : SymmetricPattern
-        Its pattern.
-    free_dofs : (k,) array
-        Sorted dofs that are not prescribed.
-    mass : (k,) array
-        Their masses [kg], the unit of rounding errors.
     """
     own = pattern.diagonal[free_dofs]
     largest = float((lower[own] / mass).max())
@@ -173,11 +140,7 @@ def _is_definite(
         return not lower[own].any()
     shifted = lower.copy()
     shifted[own] += SHIFT * largest * mass
-    return (
-        Factoriser.cached(pattern, free_dofs)
-        .factorise(shifted)
-        .positive_definite
-    )
+    return Factoriser.cached(pattern, free_dofs).factorise(shifted).positive_definite
 
 
 def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
@@ -186,12 +149,8 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     """
     size = len(stiffness.diagonal())
     if size <= DENSE:
-        return float(
-            _exponents(stiffness.toarray(), damping.toarray()).real.max()
-        )
-    lowest = [
-        _lowest_eigenvectors(each) for each in (stiffness, damping) if each.nnz
-    ]
+        return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
+    lowest = [_lowest_eigenvectors(each) for each in (stiffness, damping) if each.nnz]
     basis, _ = np.linalg.qr(np.hstack(lowest))
     in_basis = [basis.T @ (each @ basis) for each in (stiffness, damping)]
     exponents = _exponents(*in_basis)
@@ -204,12 +163,7 @@ def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
     iteration stops early, those that have converged and the start vector.
     """
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
-    options = {
-        "which": "SA",
-        "tol": TOLERANCE,
-        "v0": start,
-        "ncv": 12 * DIRECTIONS,
-    }
+    options = {"which": "SA", "tol": TOLERANCE, "v0": start, "ncv": 12 * DIRECTIONS}
     try:
         return np.asarray(eigsh(matrix, DIRECTIONS, **options)[1])
     except ArpackNoConvergence as stopped:
@@ -219,9 +173,7 @@ def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
 def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
     """Return all 2n complex s with det(s² + D s + K) = 0, for dense matrices (n, n)."""
     size = len(stiffness)
-    chain = np.block(
-        [[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]]
-    )
+    chain = np.block([[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]])
     return np.linalg.eigvals(chain).astype(np.complex128)
 
 
@@ -232,44 +184,31 @@ class _CayleyTransform(LinearOperator):
     method finds them first.
     """
 
-    def __init__(
-        self, stiffness: sp.csc_array, damping: sp.csc_array, sigma: float
-    ) -> None:
+    def __init__(self, stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> None:
         size = len(stiffness.diagonal())
         super().__init__(np.dtype(float), (2 * size, 2 * size))
         self.damping = damping
         self.sigma = sigma
         self.solver = splu(
-            sp.csc_array(
-                sigma**2 * sp.eye_array(size) + sigma * damping + stiffness
-            )
+            sp.csc_array(sigma**2 * sp.eye_array(size) + sigma * damping + stiffness)
         )
 
     def _matvec(self, x: Array) -> Array:
         first, second = np.split(np.ravel(x), 2)
         # (A − σ)(y, w) = (first, second), by way of (σ² + σ D + K) y.
-        y = self.solver.solve(
-            -second - self.damping @ first - self.sigma * first
-        )
+        y = self.solver.solve(-second - self.damping @ first - self.sigma * first)
         w = first + self.sigma * y
-        return np.concatenate(
-            [first + 2 * self.sigma * y, second + 2 * self.sigma * w]
-        )
+        return np.concatenate([first + 2 * self.sigma * y, second + 2 * self.sigma * w])
 
 
-def _growth_about(
-    stiffness: sp.csc_array, damping: sp.csc_array, sigma: float
-) -> float:
+def _growth_about(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
     """Return the largest Re(s) of the exponents s with |s| of about `sigma` [1/s] that solve det(s²
     + D s + K) = 0, for sparse matrices; at least 0.
     """
     turning = _CayleyTransform(stiffness, damping, sigma=sigma)
     try:
         eigenpairs = eigs(
-            turning,
-            4,
-            v0=np.random.default_rng(0).normal(size=turning.shape[0]),
-            ncv=60,
+            turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60
         )
         turned = np.asarray(eigenpairs[0])
     except ArpackNoConvergence as stopped:

@@ -48,11 +48,7 @@ class StreamedResultant(ReactionResultant):
 
     @classmethod
     def from_poses(
-        cls,
-        channel: ReactionResultant,
-        rotations: Array,
-        shifts: Array,
-        step_s: float,
+        cls, channel: ReactionResultant, rotations: Array, shifts: Array, step_s: float
     ) -> StreamedResultant:
         """Return the resultant of the reactions of a grasp at n consecutive time steps.
 
@@ -69,15 +65,12 @@ class StreamedResultant(ReactionResultant):
             Time between two steps [s].
         """
         properties = {
-            name: getattr(channel, name)
-            for name in ReactionResultant.__dataclass_fields__
+            name: getattr(channel, name) for name in ReactionResultant.__dataclass_fields__
         }
         properties["reaction_grid"] = ReactionGrid.from_times(
             step_s * np.arange(len(rotations) - 2, dtype=np.float64)
         )
-        resultant = cls(
-            **properties, rotations=rotations, shifts=shifts, step_s=step_s
-        )
+        resultant = cls(**properties, rotations=rotations, shifts=shifts, step_s=step_s)
         if len(channel.tool_parameters):
             vars(resultant)["tool"] = channel.tool
         return resultant
@@ -124,9 +117,7 @@ class GraspReactions:
     shifts: Array
 
     @classmethod
-    def zeros(
-        cls, rows: int, dofs: int, columns: int, grasps: int
-    ) -> GraspReactions:
+    def zeros(cls, rows: int, dofs: int, columns: int, grasps: int) -> GraspReactions:
         """Return zero arrays for a number of rows, dofs, columns and grasps."""
         moved = np.zeros((rows, dofs, columns))
         rotations = np.zeros((rows, grasps, 3, 3))
@@ -252,18 +243,15 @@ class GraspReactions:
         known = slice(len(x))
         at = rows - DELAY_STEPS
         dofs = channel.sensed_dofs
-        of_force, of_x = (
-            each[at + channel.reaction_grid.delay_steps, known]
-            for each in weights
-        )
+        of_force, of_x = (each[at + channel.reaction_grid.delay_steps, known] for each in weights)
         mass_kg = dynamics.mass.inertia_kg[0, dofs]
         acceleration = of_x @ x
         reaction = mass_kg * acceleration - of_force @ self.forces.force[known]
         position_slopes = self.position_columns[known, :, 1:]
         slopes = self.forces.changes[known, :, 1:]
-        by = mass_kg[:, None] * np.tensordot(
-            of_x, position_slopes, 1
-        ) - np.tensordot(of_force, slopes, 1)
+        by = mass_kg[:, None] * np.tensordot(of_x, position_slopes, 1) - np.tensordot(
+            of_force, slopes, 1
+        )
         by += setting.inertia_derivatives(0, acceleration, dofs=dofs)
         pose_rows = slice(at[0] - 1, at[-1] + 2)
         channels = [

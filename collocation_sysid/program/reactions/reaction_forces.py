@@ -47,17 +47,13 @@ def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
     """
     t = dynamics.tables
     lags = np.arange(dynamics.largest_lag + 1.0)
-    second = np.column_stack(
-        [t.s.sum(axis=1), t.s @ lags, t.s @ lags**2 - 2, t.r]
-    )
+    second = np.column_stack([t.s.sum(axis=1), t.s @ lags, t.s @ lags**2 - 2, t.r])
     is_complete = np.isclose(t.w.sum(axis=1), 1.0)
     moving = is_complete & np.isclose(second, 0.0).all(axis=1)
     rows = moving if moving.any() else is_complete & ~t.s.any(axis=1)
     evaluated = t.p @ lags
     last = int(np.flatnonzero(rows)[-1]) if rows.any() else 0
-    delay = sum(
-        t.w[last, j] * (j + evaluated[last]) for j in range(t.w.shape[1])
-    )
+    delay = sum(t.w[last, j] * (j + evaluated[last]) for j in range(t.w.shape[1]))
     return rows, round(float(delay))
 
 
@@ -108,10 +104,7 @@ class ReactionGradient:
 
 
 def forces_on_dofs(
-    dynamics: Dynamics,
-    x: Array,
-    dofs: Index,
-    histories: Sequence[AnyHistory] = (),
+    dynamics: Dynamics, x: Array, dofs: Index, histories: Sequence[AnyHistory] = ()
 ) -> Array:
     """Return the forces F (N, g) [N] on selected dofs at the evaluations, including those on
     prescribed dofs.
@@ -138,10 +131,7 @@ def forces_on_dofs(
 
 
 def reactions_at(
-    dynamics: Dynamics,
-    x: Array,
-    dofs: Index,
-    histories: Sequence[AnyHistory] = (),
+    dynamics: Dynamics, x: Array, dofs: Index, histories: Sequence[AnyHistory] = ()
 ) -> ReactionForces:
     """Return the reaction forces on selected dofs (g,) of a motion, without changes.
 
@@ -198,32 +188,20 @@ def linearised_reactions(
     """
     dynamics = equations.dynamics.truncated_to(len(x))
     if step is not None:
-        position_changes = np.concatenate(
-            [step[:, dofs, None], position_changes], axis=2
-        )
+        position_changes = np.concatenate([step[:, dofs, None], position_changes], axis=2)
     acceleration = dynamics.acceleration(x)[:, dofs]
     mass_kg = dynamics.mass.inertia_kg[:, dofs]
     reaction = reaction_forces(
         dynamics, mass_kg, force=grasp_forces.force, acceleration=acceleration
     )
     by = reaction_changes(
-        dynamics,
-        mass_kg,
-        force_changes=grasp_forces.changes,
-        position_changes=position_changes,
+        dynamics, mass_kg, force_changes=grasp_forces.changes, position_changes=position_changes
     )
     if is_by_parameters:
         first = 0 if step is None else 1
-        by[..., first:] += equations.inertia_derivatives(
-            slice(len(x)), acceleration, dofs=dofs
-        )
+        by[..., first:] += equations.inertia_derivatives(slice(len(x)), acceleration, dofs=dofs)
     if step is None:
-        return ReactionForces(
-            reaction,
-            x[:, dofs],
-            reaction_by=by,
-            position_by=position_changes,
-        )
+        return ReactionForces(reaction, x[:, dofs], reaction_by=by, position_by=position_changes)
     return ReactionForces(
         reaction + by[..., 0],
         x[:, dofs] + position_changes[..., 0],
@@ -233,11 +211,7 @@ def linearised_reactions(
 
 
 def reaction_vjp(
-    equations: EquationsAtParameters,
-    x: Array,
-    weights: Array,
-    dofs: Index,
-    buffer: Array,
+    equations: EquationsAtParameters, x: Array, weights: Array, dofs: Index, buffer: Array
 ) -> ReactionGradient:
     """Vector–Jacobian product of the reaction forces R on selected dofs, with history variables
     kept constant.
@@ -265,9 +239,7 @@ def reaction_vjp(
     by_p = np.einsum("tg,tgp->p", force_weights[first:, dofs], slopes[:, dofs])
     if equations.mass_depends_on_parameters:
         acceleration = dynamics.acceleration(x)[:, dofs]
-        own = equations.inertia_derivatives(
-            slice(None), acceleration, dofs=dofs
-        )
+        own = equations.inertia_derivatives(slice(None), acceleration, dofs=dofs)
         by_p += np.einsum("tg,tgp->p", weights, own)
     rows = Submatrix(dynamics.pattern, dofs)
     state = np.zeros_like(x)
@@ -276,10 +248,7 @@ def reaction_vjp(
         if weight.any():
             skew = at.by_position_skew[k]
             state[first + k] = rows.extract(at.by_position[k], skew).T @ weight
-            rate[first + k] = (
-                rows.extract(at.by_velocity[k], at.by_velocity_skew[k]).T
-                @ weight
-            )
+            rate[first + k] = rows.extract(at.by_velocity[k], at.by_velocity_skew[k]).T @ weight
     by_x = dynamics.combine_transposed(t.p, state)
     by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
     mass_kg = dynamics.mass.inertia_kg[:, dofs]
@@ -288,9 +257,7 @@ def reaction_vjp(
     return ReactionGradient(by_x, by_p, force_weights=force_weights)
 
 
-def reaction_forces(
-    dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array
-) -> Array:
+def reaction_forces(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array) -> Array:
     """Return the reaction forces R (N, g) [N] of dofs.
 
     Parameters
@@ -308,10 +275,7 @@ def reaction_forces(
 
 
 def reaction_changes(
-    dynamics: Dynamics,
-    mass_kg: Array,
-    force_changes: Array,
-    position_changes: Array,
+    dynamics: Dynamics, mass_kg: Array, force_changes: Array, position_changes: Array
 ) -> Array:
     """Return the changes dR (N, g, columns) of reaction forces at constant masses.
 
@@ -326,10 +290,5 @@ def reaction_changes(
     position_changes : (N, g, columns) array
         Changes of the positions of the dofs [m].
     """
-    second = (
-        dynamics.combine(dynamics.tables.s, position_changes)
-        / dynamics.step_s**2
-    )
-    return mass_kg[..., None] * second - dynamics.combine(
-        dynamics.tables.w, force_changes
-    )
+    second = dynamics.combine(dynamics.tables.s, position_changes) / dynamics.step_s**2
+    return mass_kg[..., None] * second - dynamics.combine(dynamics.tables.w, force_changes)

@@ -5,10 +5,10 @@ In the frame of the sensor with axes Q_k and origin o_k,
 
     W_k = Σ_g (Q_kᵀ R_g, Q_kᵀ (x_g − o_k) × R_g) + load of the tool,
 
-with the reaction forces R of `reaction_forces` and the grasped nodes x_g. A tool of mass m between sensor
-and body, with its centre at c in the frame of the grasp, adds the force m (a_c − g) at its centre,
-a_c being the acceleration of the centre and g gravity. Values are Y = L W, where L is a first-order
-low-pass with an estimated time constant, or the identity.
+with the reaction forces R of `reaction_forces` and the grasped nodes x_g. A tool of mass m between
+sensor and body, with its centre at c in the frame of the grasp, adds the force m (a_c − g) at its
+centre, a_c being the acceleration of the centre and g gravity. Values are Y = L W, where L is a
+first-order low-pass with an estimated time constant, or the identity.
 """
 
 from __future__ import annotations
@@ -26,11 +26,7 @@ from ...fem.pattern import dofs_of
 from ...model.dynamics import Dynamics
 from ...model.generated_functions import GeneratedFunction
 from ...model.nuisance_map import NuisanceMap
-from ...model.recursion import (
-    Recursion,
-    RecursionTrajectory,
-    relaxation_coefficients,
-)
+from ...model.recursion import Recursion, RecursionTrajectory, relaxation_coefficients
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.nuisance import (
@@ -72,8 +68,8 @@ class ReactionGrid:
     reach : int
         Row t depends on the grasp from time t − reach on.
     is_static : bool
-        Whether the rows are equilibria, at times that need not be evenly spaced; the resultant is then
-        linear between them.
+        Whether the rows are equilibria, at times that need not be evenly spaced; the resultant is
+        then linear between them.
     """
 
     t_s: Array
@@ -87,12 +83,7 @@ class ReactionGrid:
         """Build the grid of discrete equations of motion, whose rows determine reaction forces as
         `centred_rows` states.
         """
-        return cls(
-            dynamics.t_s,
-            *centred_rows(dynamics),
-            dynamics.largest_lag,
-            dynamics.is_static,
-        )
+        return cls(dynamics.t_s, *centred_rows(dynamics), dynamics.largest_lag, dynamics.is_static)
 
     @classmethod
     def from_times(cls, t_s: Array) -> ReactionGrid:
@@ -201,11 +192,7 @@ class ReactionResultant:
         """Return how many of the n times are known if the first
         `rows` grid rows of the motion are.
         """
-        return int(
-            np.count_nonzero(
-                self.known_rows + self.reaction_grid.delay_steps < rows
-            )
-        )
+        return int(np.count_nonzero(self.known_rows + self.reaction_grid.delay_steps < rows))
 
     def parameter_indices(self, row: NuisanceRow) -> Index:
         """Return the indices in φ of this sensor's nuisance parameters of one kind; empty if it has
@@ -255,9 +242,7 @@ class ReactionResultant:
             dof_count=3 * len(experiment.body.nodes_m),
             sensed_dofs=sensed,
             node_dofs=np.searchsorted(sensed, own),
-            is_prescribed=np.isin(own, grasp.prescribed_dofs).astype(
-                np.float64
-            ),
+            is_prescribed=np.isin(own, grasp.prescribed_dofs).astype(np.float64),
         )
 
     def compute_clock_limit_s(self) -> float:
@@ -291,12 +276,9 @@ class ReactionResultant:
         nodes = len(self.is_prescribed) // 3
         of_time = np.concatenate([axes.reshape(-1, 9), points], axis=1).T
         is_prescribed = np.broadcast_to(
-            self.is_prescribed.reshape(nodes, 3).T[:, None],
-            (3, self.count, nodes),
+            self.is_prescribed.reshape(nodes, 3).T[:, None], (3, self.count, nodes)
         )
-        return np.concatenate(
-            [np.repeat(of_time[:, :, None], nodes, axis=2), is_prescribed]
-        )
+        return np.concatenate([np.repeat(of_time[:, :, None], nodes, axis=2), is_prescribed])
 
     def moment_inputs(self, reactions: ReactionForces) -> tuple[Array, Array]:
         """Return inputs (6, n, h), positions [m] and reaction forces [N], and data (15, n, h) of
@@ -304,20 +286,12 @@ class ReactionResultant:
         cover.
         """
         k = self.known_rows[: self.known_count(len(reactions.reaction))]
-        both = (
-            reactions.position_m[k],
-            reactions.reaction[k + self.reaction_grid.delay_steps],
-        )
+        both = (reactions.position_m[k], reactions.reaction[k + self.reaction_grid.delay_steps])
         shape = len(k), len(self.node_dofs) // 3, 3
-        u = [
-            np.moveaxis(each[:, self.node_dofs].reshape(shape), 2, 0)
-            for each in both
-        ]
+        u = [np.moveaxis(each[:, self.node_dofs].reshape(shape), 2, 0) for each in both]
         return np.concatenate(u), self.moment_data[:, : len(k)]
 
-    def reaction_jacobians(
-        self, reactions: ReactionForces
-    ) -> tuple[Array, Array]:
+    def reaction_jacobians(self, reactions: ReactionForces) -> tuple[Array, Array]:
         """Return A and B (n, 6, d) of the change dW = A dR + B dx of the resultant without tool and
         without low-pass, by the reaction forces and positions of the d dofs of the grasp.
         """
@@ -343,25 +317,19 @@ class ReactionResultant:
 
     @cached_property
     def tool(self) -> GeneratedFunction:
-        """Generated force and torque (6,) of the tool, m (a_c − g) at c, as a function of `tool_parameters`,
-        see `tool_inputs`.
+        """Generated force and torque (6,) of the tool, m (a_c − g) at c, as a function of
+        `tool_parameters`, see `tool_inputs`.
         """
         return GeneratedFunction(
-            self._tool_load,
-            len(self.tool_parameters),
-            data_size=sum(TOOL_DATA),
+            self._tool_load, len(self.tool_parameters), data_size=sum(TOOL_DATA)
         )
 
     def _tool_load(self, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the expression of force and torque (6,) of the tool in the sensor's axes
         [N, N m], from its parameters φ and the data of `tool_inputs`.
         """
-        axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(
-            data, np.cumsum([0, *TOOL_DATA])
-        )
-        axes, turn, turn_rate = (
-            ca.reshape(each, 3, 3).T for each in (axes, turn, turn_rate)
-        )
+        axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(data, np.cumsum([0, *TOOL_DATA]))
+        axes, turn, turn_rate = (ca.reshape(each, 3, 3).T for each in (axes, turn, turn_rate))
         count = len(self.tool_parameters) - len(self.nuisance.gravity_indices)
         own, tilts = ca.vertsplit(phi, [0, count, len(self.tool_parameters)])
         own *= self.nuisance.scales[self.tool_parameters[:count]][:, None]
@@ -370,9 +338,7 @@ class ReactionResultant:
         centre = centre + own[1:] if own.numel() > 1 else centre
         gravity = self.nuisance.gravity_expression(tilts)
         pull = own[0] * (turn_rate @ centre + shift_rate - gravity)
-        return ca.vertcat(
-            axes.T @ pull, axes.T @ ca.cross(turn @ centre + shift, pull)
-        )
+        return ca.vertcat(axes.T @ pull, axes.T @ ca.cross(turn @ centre + shift, pull))
 
     def tool_inputs(self, phi: Array, count: int) -> tuple[Array, Array]:
         """Return inputs (k,) and data (33, n) of `tool` at the first `count` times, at φ.
@@ -385,9 +351,7 @@ class ReactionResultant:
         rotations, shifts = self.poses_at(self.known_rows[:count])
         turn_rates, shift_rates = self.pose_accelerations(count)
         parts = (axes, rotations, turn_rates, shifts - points, shift_rates)
-        data = np.concatenate(
-            [each.reshape(count, -1) for each in parts], axis=1
-        )
+        data = np.concatenate([each.reshape(count, -1) for each in parts], axis=1)
         return phi[self.tool_parameters], data.T
 
     def pose_accelerations(self, count: int) -> tuple[Array, Array]:
@@ -401,29 +365,19 @@ class ReactionResultant:
         poses = self.grasp.poses
         if len(poses.t_s) < 3 or self.reaction_grid.is_static:
             return np.zeros((count, 3, 3)), np.zeros((count, 3))
-        middle = np.clip(
-            self.t_s[:count], poses.t_s[0] + step_s, poses.t_s[-1] - step_s
-        )
-        before, now, after = (
-            poses.at(middle + way * step_s) for way in (-1, 0, 1)
-        )
+        middle = np.clip(self.t_s[:count], poses.t_s[0] + step_s, poses.t_s[-1] - step_s)
+        before, now, after = (poses.at(middle + way * step_s) for way in (-1, 0, 1))
         pairs = zip(before, now, after, strict=True)
-        rotation_rates, translation_rates = (
-            (b - 2 * n + a) / step_s**2 for b, n, a in pairs
-        )
+        rotation_rates, translation_rates = ((b - 2 * n + a) / step_s**2 for b, n, a in pairs)
         return rotation_rates, translation_rates
 
-    def evaluate_unfiltered(
-        self, reactions: ReactionForces, phi: Array
-    ) -> Array:
+    def evaluate_unfiltered(self, reactions: ReactionForces, phi: Array) -> Array:
         """Return the resultant W (n, 6) [N, N m] of reaction forces at φ including the tool if its
         mass is estimated, before the low-pass.
         """
         value = self.evaluate_without_tool(reactions)
         if len(self.tool_parameters):
-            value = (
-                value + self.tool.evaluate(*self.tool_inputs(phi, len(value))).T
-            )
+            value = value + self.tool.evaluate(*self.tool_inputs(phi, len(value))).T
         return value
 
     # The low-pass -----------------------------------------------------------------------------
@@ -433,9 +387,7 @@ class ReactionResultant:
         """Index in φ of the time constant of the low-pass; empty without a low-pass."""
         return self.parameter_indices(SENSOR_LAG)
 
-    def filter_resultant(
-        self, value: Array, phi: Array
-    ) -> RecursionTrajectory | None:
+    def filter_resultant(self, value: Array, phi: Array) -> RecursionTrajectory | None:
         """Return the low-pass filtered W (n, 6) at φ (k,) as a recursion with derivatives; None
         without a low-pass or without times.
         """
@@ -443,22 +395,14 @@ class ReactionResultant:
             return None
         data = self.low_pass_data[:, : len(value), None]
         return RecursionTrajectory.from_signal(
-            LOW_PASS,
-            phi[self.low_pass_parameters],
-            data=data,
-            signal=value[None],
+            LOW_PASS, phi[self.low_pass_parameters], data=data, signal=value[None]
         )
 
     @cached_property
     def low_pass_data(self) -> Array:
         """Data (2, n) of `LOW_PASS`; there must be a low-pass."""
-        per_step = (
-            self.nuisance.scales[self.low_pass_parameters]
-            / self.reaction_grid.step_s
-        )
-        return np.stack(
-            [np.arange(self.count) == 0, np.repeat(per_step, self.count)]
-        )
+        per_step = self.nuisance.scales[self.low_pass_parameters] / self.reaction_grid.step_s
+        return np.stack([np.arange(self.count) == 0, np.repeat(per_step, self.count)])
 
     # As channels are --------------------------------------------------------------------------
 
@@ -496,25 +440,14 @@ class ReactionResultant:
         value = self.evaluate_unfiltered(forced, phi)
         slope = np.zeros((len(k), 6, size))
         slope[..., columns] = (
-            of_force
-            @ forced.reaction_by[k + self.reaction_grid.delay_steps][
-                :, self.node_dofs
-            ]
+            of_force @ forced.reaction_by[k + self.reaction_grid.delay_steps][:, self.node_dofs]
         )
-        slope[..., columns] += (
-            of_place @ forced.position_by[k][:, self.node_dofs]
-        )
+        slope[..., columns] += of_place @ forced.position_by[k][:, self.node_dofs]
         if len(self.tool_parameters):
-            by_phi = self.tool.evaluate_with_jacobian(
-                *self.tool_inputs(phi, len(k))
-            )[1]
-            slope[..., first + self.tool_parameters] += np.moveaxis(
-                by_phi, 2, 0
-            )
+            by_phi = self.tool.evaluate_with_jacobian(*self.tool_inputs(phi, len(k)))[1]
+            slope[..., first + self.tool_parameters] += np.moveaxis(by_phi, 2, 0)
         if evolution := self.filter_resultant(value, phi):
-            by_lag = (
-                np.arange(size) == first + self.low_pass_parameters[:, None]
-            )
+            by_lag = np.arange(size) == first + self.low_pass_parameters[:, None]
             value = evolution.states[0]
             slope = evolution.jacobian_vector_product(slope[None], by_lag)[0]
         slope = slope.reshape(len(k), 2, 3, size)
@@ -522,9 +455,7 @@ class ReactionResultant:
             np.arange(size), slope
         )
 
-    def vjp(
-        self, motion: ObservedMotion, phi: Array, by_values: Array
-    ) -> VectorJacobianProduct:
+    def vjp(self, motion: ObservedMotion, phi: Array, by_values: Array) -> VectorJacobianProduct:
         """Vector–Jacobian product: derivatives of a scalar by positions, reaction forces and φ from
         those by Y.
 
@@ -542,34 +473,23 @@ class ReactionResultant:
         by_x = np.zeros_like(motion.x)
         by_reaction = np.zeros_like(forced.reaction)
         by_w = by_values.reshape(-1, 6)
-        if evolution := self.filter_resultant(
-            self.evaluate_unfiltered(forced, phi), phi
-        ):
-            (by_w,), by_phi[self.low_pass_parameters] = (
-                evolution.vector_jacobian_product(by_w[None])
+        if evolution := self.filter_resultant(self.evaluate_unfiltered(forced, phi), phi):
+            (by_w,), by_phi[self.low_pass_parameters] = evolution.vector_jacobian_product(
+                by_w[None]
             )
         if len(self.tool_parameters):
-            slopes = self.tool.evaluate_with_jacobian(
-                *self.tool_inputs(phi, len(by_w))
-            )[1]
+            slopes = self.tool.evaluate_with_jacobian(*self.tool_inputs(phi, len(by_w)))[1]
             by_phi[self.tool_parameters] += np.einsum("na,abn->b", by_w, slopes)
         of_force, of_place = self.reaction_jacobians(forced)
         k = self.known_rows[: len(by_w)]
-        by_reaction[
-            np.ix_(k + self.reaction_grid.delay_steps, self.node_dofs)
-        ] = np.einsum("ka,kag->kg", by_w, of_force)
-        by_x[np.ix_(k, self.sensed_dofs[self.node_dofs])] = np.einsum(
-            "ka,kag->kg", by_w, of_place
+        by_reaction[np.ix_(k + self.reaction_grid.delay_steps, self.node_dofs)] = np.einsum(
+            "ka,kag->kg", by_w, of_force
         )
+        by_x[np.ix_(k, self.sensed_dofs[self.node_dofs])] = np.einsum("ka,kag->kg", by_w, of_place)
         return VectorJacobianProduct(by_x, by_reaction, by_phi=by_phi)
 
     def frame_changes(
-        self,
-        grasp: Grasp,
-        motion: ObservedMotion,
-        phi: Array,
-        shifts: Array,
-        rotations: Array,
+        self, grasp: Grasp, motion: ObservedMotion, phi: Array, shifts: Array, rotations: Array
     ) -> Array | float:
         """Return the changes (n, 2, 3, c) of Y due to pose errors that move the frame of the
         sensor; the reaction forces and the load of the tool are constant.
@@ -592,11 +512,7 @@ class ReactionResultant:
             return 0.0
         value = self.evaluate_without_tool(_reactions_of(motion))
         axes = self.frames[0][: len(value)]
-        data = [
-            axes.reshape(-1, 9),
-            value,
-            np.tile(self.point_m, (len(value), 1)),
-        ]
+        data = [axes.reshape(-1, 9), value, np.tile(self.point_m, (len(value), 1))]
         slopes = IN_MOVED_FRAME.evaluate_with_jacobian(
             np.zeros((6, len(value))), np.concatenate(data, axis=1).T
         )[1]
@@ -613,20 +529,13 @@ class ReactionResultant:
 def sensed_dofs(experiment: Experiment) -> Index:
     """Return the dofs (g,) of the nodes of all grasps that a sensor measures, ascending."""
     grasp_dofs = [
-        dofs_of(experiment.grasps[k].nodes)
-        for k in experiment.find_instrumented_grasps()
+        dofs_of(experiment.grasps[k].nodes) for k in experiment.find_instrumented_grasps()
     ]
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *grasp_dofs]))
 
 
 def _reactions_of(motion: ObservedMotion) -> ReactionForces:
-    """Return the reaction forces of a motion.
-
-    Raises
-    ------
-    ValueError
-        If the motion has none.
-    """
+    """Return the reaction forces of a motion."""
     if motion.reactions is None:
         raise ValueError("a resultant needs the reaction forces of the motion")
     return motion.reactions
@@ -644,23 +553,8 @@ def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
 
 
 def _in_moved_frame(offset: ca.SX, data: ca.SX) -> ca.SX:
-    """Return the expression of force and torque (6,) in a frame that is rotated and translated by an
-    offset.
-
-    Parameters
-    ----------
-    offset : (6,) SX
-        Rotation vector [rad], of `cayley_rotation`, and translation [m] of the grasp, along axes of
-        the world.
-    data : (18,) SX
-        Axes (3, 3) of the frame before the offset, row by row, whose columns are its directions in
-        the world; force [N], torque [N m] and the sensor's point [m] along these axes. The point is
-        from the origin of the grasp, about which the frame rotates.
-
-    Returns
-    -------
-    (6,) SX
-        Force and torque about the moved point, along the rotated axes.
+    """Return the expression of force and torque (6,) in a frame that is rotated and translated by
+    an offset.
     """
     turn, shift = ca.vertsplit(offset, 3)
     axes, force, torque, point = ca.vertsplit(data, [0, 9, 12, 15, 18])
@@ -668,9 +562,7 @@ def _in_moved_frame(offset: ca.SX, data: ca.SX) -> ca.SX:
     turned = cayley_rotation(turn) @ axes
     force = axes @ force
     moved = shift + (turned - axes) @ point
-    return ca.vertcat(
-        turned.T @ force, turned.T @ (axes @ torque - ca.cross(moved, force))
-    )
+    return ca.vertcat(turned.T @ force, turned.T @ (axes @ torque - ca.cross(moved, force)))
 
 
 def _by_dof(by_node: Array) -> Array:
@@ -678,22 +570,9 @@ def _by_dof(by_node: Array) -> Array:
     return np.ascontiguousarray(by_node).reshape(*by_node.shape[:2], -1)
 
 
-def _low_pass_step(
-    before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX
-) -> ca.SX:
+def _low_pass_step(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX) -> ca.SX:
     """Return Y after one step of Y' = (W − Y) / T, with W linear between grid times and Y = W at
     the first. The difference W − Y relaxes with the time constant T.
-
-    Parameters
-    ----------
-    before : SX
-        Previous Y, one component or several.
-    now, last : SX
-        Present and previous W, of the same size.
-    lag : SX
-        T in units of its prior standard deviation.
-    data : (2,) SX
-        One at the first time, else zero; and that unit in time steps.
     """
     began = data[0]
     e, c = relaxation_coefficients(lag * data[1])
@@ -705,8 +584,6 @@ def _low_pass_step(
 MOMENT = GeneratedFunction(_moment, 6, data_size=15)
 # W (6,) by a rotation and a translation of the frame; data are Q, W and the point in the frame.
 IN_MOVED_FRAME = GeneratedFunction(_in_moved_frame, 6, data_size=18)
-# Y by W and the φ of `low_pass_parameters`; data are one at the start, otherwise zero, and the T / Δt
-# of a φ of one.
-LOW_PASS = Recursion(
-    _low_pass_step, 1, signal_size=1, constant_count=1, data_size=2
-)
+# Y by W and the φ of `low_pass_parameters`; data are one at the start, otherwise zero, and the T /
+# Δt of a φ of one.
+LOW_PASS = Recursion(_low_pass_step, 1, signal_size=1, constant_count=1, data_size=2)

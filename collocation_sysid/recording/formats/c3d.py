@@ -57,16 +57,10 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
         If ezc3d is not installed, or the file is damaged or inconsistent.
     """
     if find_spec("ezc3d") is None:
-        raise InputError(
-            "reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'"
-        )
+        raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
     header_points, header_frames = _header_counts(content)
     try:
-        read = run_isolated(
-            WORKER,
-            str(Path(path).resolve()),
-            limits=ProcessLimits.for_file(path),
-        )
+        read = run_isolated(WORKER, str(Path(path).resolve()), limits=ProcessLimits.for_file(path))
     except Failed as error:
         raise InputError(
             f"the C3D file is damaged (message of ezc3d: '{error}'); expected a complete file: "
@@ -105,18 +99,10 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
 def _header_counts(content: bytes) -> tuple[int, int | None]:
     """Return the numbers of points and frames in the header; None for the frames if their counter
     overflowed.
-
-    Raises
-    ------
-    InputError
-        If the header is incomplete or states no points or frames, or the file is shorter than these
-        numbers require: ezc3d would silently return the rest.
     """
     start = _BLOCK * (content[0] - 1)
     if len(content) < max(start + 4, _BLOCK):
-        raise InputError(
-            "the file is truncated: the C3D header is incomplete; export it again"
-        )
+        raise InputError("the file is truncated: the C3D header is incomplete; export it again")
     processor = content[start + 3]
     order = ">" if processor == _SGI else "<"
     points, analog, first, last = struct.unpack_from(f"{order}4H", content, 2)

@@ -20,34 +20,21 @@ from ...errors import InputError
 # Of pixels: integers count, floats are metres.
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 # Of columns of clouds, by their numbers there.
-_TYPES = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    8: "f8",
-}
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # Before the PNG of an image that is packed for depth: a word, and two numbers of how.
 _PACKED = np.dtype([("kind", "<i4"), ("scale", "<f4"), ("shift", "<f4")])
 
 
 def camera_data_kind(message: Any) -> str:
-    """Return a description of the camera data in a message, such as "depth images, 640 x 480"; empty
-    if it contains none.
+    """Return a description of the camera data in a message, such as "depth images, 640 x 480";
+    empty if it contains none.
     """
     if hasattr(message, "point_step") and hasattr(message, "fields"):
         return "clouds of points"
-    if getattr(message, "encoding", None) in ENCODINGS and hasattr(
-        message, "step"
-    ):
+    if getattr(message, "encoding", None) in ENCODINGS and hasattr(message, "step"):
         return f"depth images, {message.width} x {message.height}"
     packed = str(getattr(message, "format", ""))
-    if hasattr(message, "data") and (
-        "compressedDepth" in packed or "16UC1" in packed
-    ):
+    if hasattr(message, "data") and ("compressedDepth" in packed or "16UC1" in packed):
         return "compressed depth images"
     return ""
 
@@ -68,14 +55,11 @@ def is_camera_model(message: Any) -> bool:
     None.
     """
     return (
-        all(_field(message, name) is not None for name in "kpd")
-        and len(_field(message, "k")) == 9
+        all(_field(message, name) is not None for name in "kpd") and len(_field(message, "k")) == 9
     )
 
 
-def camera_matrix(
-    message: Any, rectified: bool, shape: tuple[int, int]
-) -> Array:
+def camera_matrix(message: Any, rectified: bool, shape: tuple[int, int]) -> Array:
     """Return the matrix (3, 3) of the camera model in a message.
 
     Parameters
@@ -161,17 +145,6 @@ def decode_image(message: Any) -> Any:
 def _decode_compressed(kind: str, data: bytes) -> Any:
     """Return the pixels of a compressed image: counts, or metres for compressed 32FC1, NaN where
     there is no depth.
-
-    Parameters
-    ----------
-    kind : str
-        Format that the message states.
-    data : bytes
-
-    Raises
-    ------
-    InputError
-        If it is no PNG of 16 bits.
     """
     packed = "compressedDepth" in kind
     try:
@@ -187,11 +160,7 @@ def _decode_compressed(kind: str, data: bytes) -> Any:
         return counts
     how = np.frombuffer(data, _PACKED, 1)[0]
     with np.errstate(divide="ignore"):
-        return np.where(
-            counts > 0,
-            float(how["scale"]) / (counts - float(how["shift"])),
-            np.nan,
-        )
+        return np.where(counts > 0, float(how["scale"]) / (counts - float(how["shift"])), np.nan)
 
 
 def read_png(source: Path | BytesIO) -> Any:
@@ -236,9 +205,7 @@ def decode_cloud(message: Any) -> dict[str, Array]:
             }
         )
     except (KeyError, ValueError) as error:
-        columns = ", ".join(
-            f"{each.name} of type {each.datatype}" for each in fields
-        )
+        columns = ", ".join(f"{each.name} of type {each.datatype}" for each in fields)
         raise InputError(
             f"a cloud has the fields {columns} in points of {message.point_step} bytes; expected "
             "each name once, of the types 1 to 8 of sensor_msgs/PointField, within these bytes"
@@ -249,21 +216,7 @@ def decode_cloud(message: Any) -> dict[str, Array]:
 
 
 def _unpadded_rows(message: Any, step: int, size: int) -> Any:
-    """Return the bytes (rows, columns × size) of a message, without the padding of its rows.
-
-    Parameters
-    ----------
-    message : message
-    step : int
-        Bytes from row to row.
-    size : int
-        Bytes of a pixel or point.
-
-    Raises
-    ------
-    InputError
-        If the message has another number of bytes, or its rows are too short.
-    """
+    """Return the bytes (rows, columns × size) of a message, without the padding of its rows."""
     data = np.frombuffer(_message_data(message), "u1")
     height = message.height
     if len(data) != height * step or step < message.width * size:
@@ -271,15 +224,9 @@ def _unpadded_rows(message: Any, step: int, size: int) -> Any:
             f"a message has {len(data)} bytes; expected {height} rows of {message.width} times "
             f"{size} bytes, with {step} bytes from row to row"
         )
-    return np.ascontiguousarray(
-        data.reshape(height, step)[:, : message.width * size]
-    )
+    return np.ascontiguousarray(data.reshape(height, step)[:, : message.width * size])
 
 
 def _message_data(message: Any) -> bytes:
     """Return the data of a message; JSON messages have it in base64."""
-    return (
-        b64decode(message.data)
-        if isinstance(message.data, str)
-        else bytes(message.data)
-    )
+    return b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)

@@ -62,9 +62,7 @@ class Quantity:
         return f"{self.key}_{self.unit}"
 
 
-TIME = Quantity(
-    "t", "time", unit="s", words="time zeit prüfzeit temps tiempo tempo"
-)
+TIME = Quantity("t", "time", unit="s", words="time zeit prüfzeit temps tiempo tempo")
 DISPLACEMENTS = tuple(Quantity(axis, "length", unit="m") for axis in "xyz")
 FORCES = tuple(Quantity(f"f{axis}", "force", unit="n") for axis in "xyz")
 TORQUES = tuple(Quantity(f"t{axis}", "torque", unit="nm") for axis in "xyz")
@@ -75,61 +73,29 @@ DISPLACEMENT = Quantity(
     words="displacement extension elongation compression deflection stroke crosshead position travel "
     "weg standardweg traversenweg verformung déplacement",
 )
-FORCE = Quantity(
-    "force", "force", unit="n", words="force load kraft standardkraft"
-)
-STRAIN = Quantity(
-    "strain", "ratio", unit="1", words="strain dehnung stauchung déformation"
-)
-STRESS = Quantity(
-    "stress", "pressure", unit="pa", words="stress spannung contrainte"
-)
+FORCE = Quantity("force", "force", unit="n", words="force load kraft standardkraft")
+STRAIN = Quantity("strain", "ratio", unit="1", words="strain dehnung stauchung déformation")
+STRESS = Quantity("stress", "pressure", unit="pa", words="stress spannung contrainte")
 TENSION = Quantity("tension", "force", unit="n", words="tension")
-PRESSURE = Quantity(
-    "pressure", "pressure", unit="pa", words="pressure druck pression"
-)
+PRESSURE = Quantity("pressure", "pressure", unit="pa", words="pressure druck pression")
 _STRETCHES = "stretch lambda λ streckung"
-STRETCH = Quantity(
-    "stretch", "ratio", unit="1", words=_STRETCHES, unitless=True
-)
+STRETCH = Quantity("stretch", "ratio", unit="1", words=_STRETCHES, unitless=True)
 SECOND_STRETCH = Quantity(
-    "second_stretch",
-    "ratio",
-    unit="1",
-    words=_STRETCHES,
-    qualifier="second",
-    unitless=True,
+    "second_stretch", "ratio", unit="1", words=_STRETCHES, qualifier="second", unitless=True
 )
 LATERAL_STRETCH = Quantity(
-    "lateral_stretch",
-    "ratio",
-    unit="1",
-    words=_STRETCHES,
-    qualifier="lateral",
-    unitless=True,
+    "lateral_stretch", "ratio", unit="1", words=_STRETCHES, qualifier="lateral", unitless=True
 )
-SECOND_STRAIN = Quantity(
-    "second_strain", "ratio", unit="1", words=STRAIN.words, qualifier="second"
-)
+SECOND_STRAIN = Quantity("second_strain", "ratio", unit="1", words=STRAIN.words, qualifier="second")
 LATERAL_STRAIN = Quantity(
     "lateral_strain", "ratio", unit="1", words=STRAIN.words, qualifier="lateral"
 )
-VOLUME_RATIO = Quantity(
-    "volume_ratio", "ratio", unit="1", words="volumenverhältnis", unitless=True
-)
+VOLUME_RATIO = Quantity("volume_ratio", "ratio", unit="1", words="volumenverhältnis", unitless=True)
 SECOND_STRESS = Quantity(
-    "second_stress",
-    "pressure",
-    unit="pa",
-    words=STRESS.words,
-    qualifier="second",
+    "second_stress", "pressure", unit="pa", words=STRESS.words, qualifier="second"
 )
 TRUE_STRESS = Quantity(
-    "true_stress",
-    "pressure",
-    unit="pa",
-    words=STRESS.words,
-    qualifier="deformed",
+    "true_stress", "pressure", unit="pa", words=STRESS.words, qualifier="deformed"
 )
 KNOWN_QUANTITIES = (
     *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
@@ -210,32 +176,16 @@ def read_columns(
     grid = read_table(decode(read_bytes(path)))
     if "t_s" in grid.columns and not column_names:
         _require_known_columns(grid, quantities, all_of=requires_all)
-    places = _find_columns(
-        grid,
-        quantities,
-        mapped=column_names or {},
-        column_advice=column_advice,
-    )
+    places = _find_columns(grid, quantities, mapped=column_names or {}, column_advice=column_advice)
     t = places.pop(TIME.key, None)
-    if len(places) < (len(quantities) if requires_all else 1) or (
-        requires_times and t is None
-    ):
+    if len(places) < (len(quantities) if requires_all else 1) or (requires_times and t is None):
         raise _columns_error(grid, quantities, all_of=requires_all)
     values = {}
     for key, (place, factor) in places.items():
-        values[key] = (
-            factor
-            * numeric_cells(grid, [place], blank_allowed=blank_allowed)[:, 0]
-        )
+        values[key] = factor * numeric_cells(grid, [place], blank_allowed=blank_allowed)[:, 0]
         if np.isnan(values[key]).all():
-            raise InputError(
-                f"column {grid.columns[place]} has no values; remove it"
-            )
-    t_s = (
-        np.arange(float(len(grid.rows)))
-        if t is None
-        else times_in_column(grid, *t)
-    )
+            raise InputError(f"column {grid.columns[place]} has no values; remove it")
+    t_s = np.arange(float(len(grid.rows))) if t is None else times_in_column(grid, *t)
     return QuantityTable(grid, t_s, values=values)
 
 
@@ -250,60 +200,31 @@ def _find_columns(
 ) -> dict[str, tuple[int, float]]:
     """Return index of the column and factor to SI of each quantity that the table has, by the
     quantity's key; quantities without a column are omitted.
-
-    Parameters
-    ----------
-    grid : TextTable
-    quantities : sequence of Quantity
-        Quantities that are searched for, besides the time.
-    mapped : mapping of str to str
-        Names of columns by key, as stated by the user. If it contains more than the time, only the
-        time is recognised by its name; other quantities are those stated.
-    column_advice : callable, optional
-        See `read_columns`.
-
-    Raises
-    ------
-    InputError
-        For an unknown key, a column that does not exist or exists twice, or a unit that is missing
-        or wrong.
     """
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
     for key in mapped:
         if key not in by_key:
-            expected = (
-                f"expected one of {', '.join(by_key)}{hint_at(key, by_key)}"
-            )
+            expected = f"expected one of {', '.join(by_key)}{hint_at(key, by_key)}"
             raise InputError(f"columns has the key {key!r}; {expected}")
     chosen = {
-        key: _column_named_by_user(grid, by_key[key], name=name)
-        for key, name in mapped.items()
+        key: _column_named_by_user(grid, by_key[key], name=name) for key, name in mapped.items()
     }
     sought = quantities if not chosen.keys() - {TIME.key} else ()
     recognised = {
         quantity.key: column
         for quantity in (TIME, *sought)
         if quantity.key not in chosen
-        and (column := find_column(grid, quantity, advice=column_advice))
-        is not None
+        and (column := find_column(grid, quantity, advice=column_advice)) is not None
     }
     return chosen | recognised
 
 
-def _column_named_by_user(
-    grid: TextTable, quantity: Quantity, name: str
-) -> tuple[int, float]:
+def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tuple[int, float]:
     """Return index and factor to SI of the column that the user names for a quantity.
 
     The unit is in the name of the column or else behind it in `name`, as in "Load (N)"; a quantity
     that is `unitless` needs none. A number at the end of a name, as in "lambda_2", is no unit; only
     a 1 is, if there is no other.
-
-    Raises
-    ------
-    InputError
-        If the column does not exist or exists twice, its unit is missing or of another dimension,
-        or it is named as a strain or stress of the deformed specimen where the undeformed is meant.
     """
     bare, unit_of_user = name_and_unit(name)
     column = name if name in grid.columns else bare
@@ -314,10 +235,7 @@ def _column_named_by_user(
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
     units = [each for each in (name_and_unit(column)[1], unit_of_user) if each]
-    unit = next(
-        (each for each in units if not each.isdigit()),
-        "1" if "1" in units else None,
-    )
+    unit = next((each for each in units if not each.isdigit()), "1" if "1" in units else None)
     if unit is None and quantity.unitless:
         unit = quantity.unit
     if quantity in (STRAIN, STRESS) and _words(column) & _DEFORMED:
@@ -332,9 +250,7 @@ def _column_named_by_user(
 
 
 def find_column(
-    grid: TextTable,
-    quantity: Quantity,
-    advice: Callable[[TextTable], str] | None = None,
+    grid: TextTable, quantity: Quantity, advice: Callable[[TextTable], str] | None = None
 ) -> tuple[int, float] | None:
     """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
     name fits. Of several columns with a fitting name, those with another unit are ignored.
@@ -360,24 +276,18 @@ def find_column(
         elif advice is not None:
             remedy = advice(grid)
         else:
-            remedy = " or ".join(
-                column_statement({quantity.key: name}) for name in names
-            )
+            remedy = " or ".join(column_statement({quantity.key: name}) for name in names)
         raise grid.error_at(
             f"the columns {', '.join(names)} could all be {quantity.key}; expected one of them, "
             f"or {remedy}"
         )
     if units and not fitting:
         first = next(iter(units))
-        raise _unit_error(
-            grid, grid.columns[first], unit=units[first], quantity=quantity
-        )
+        raise _unit_error(grid, grid.columns[first], unit=units[first], quantity=quantity)
     return fitting[0] if fitting else None
 
 
-def _fitting_names(
-    grid: TextTable, quantity: Quantity
-) -> Mapping[int, str | None]:
+def _fitting_names(grid: TextTable, quantity: Quantity) -> Mapping[int, str | None]:
     """Return the unit by index of each column whose name fits a quantity, whatever its unit; None
     for a column without a unit, 1 if the quantity is `unitless`.
     """
@@ -391,9 +301,7 @@ def _fitting_names(
     return units
 
 
-def _fitting_columns(
-    grid: TextTable, quantity: Quantity
-) -> list[tuple[int, float]]:
+def _fitting_columns(grid: TextTable, quantity: Quantity) -> list[tuple[int, float]]:
     """Return index and factor to SI of each column whose name and unit fit a quantity."""
     factors = {
         k: si_factor(unit, quantity.dimension)
@@ -412,9 +320,9 @@ def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
     """Return the names of all columns that may hold a quantity although their names do not fit it,
     in their order.
 
-    These are columns of quantities with a dimension whose unit fits, as "s_mpa" for a stress, and of
-    `unitless` quantities those with one of its words and no unit but a number, as "lambda_2" for a
-    second stretch. Names that fit another known quantity are left out.
+    These are columns of quantities with a dimension whose unit fits, as "s_mpa" for a stress, and
+    of `unitless` quantities those with one of its words and no unit but a number, as "lambda_2" for
+    a second stretch. Names that fit another known quantity are left out.
     """
     names = []
     for column in grid.columns:
@@ -438,10 +346,7 @@ def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
 
 def column_statement(names: Mapping[str, str]) -> str:
     """Return the key `columns` of a problem file in TOML that names a column for each quantity."""
-    entries = [
-        f"{key} = {json.dumps(name, ensure_ascii=False)}"
-        for key, name in names.items()
-    ]
+    entries = [f"{key} = {json.dumps(name, ensure_ascii=False)}" for key, name in names.items()]
     return f"columns = {{ {', '.join(entries)} }}"
 
 
@@ -476,44 +381,23 @@ def _words(name: str) -> set[str]:
 # Errors -------------------------------------------------------------------------------------------
 
 
-def _require_known_columns(
-    grid: TextTable, quantities: Sequence[Quantity], all_of: bool
-) -> None:
+def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_of: bool) -> None:
     """Check that every column holds a known quantity; see `_columns_error` for `quantities` and
     `all_of`.
-
-    Raises
-    ------
-    InputError
-        If one does not.
     """
     known = {quantity.key for quantity in KNOWN_QUANTITIES}
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
             hint = hint_at(column, [quantity.column for quantity in quantities])
             raise _columns_error(
-                grid,
-                quantities,
-                all_of=all_of,
-                why=f": {column} is not among them{hint}",
+                grid, quantities, all_of=all_of, why=f": {column} is not among them{hint}"
             )
 
 
 def _columns_error(
     grid: TextTable, quantities: Sequence[Quantity], all_of: bool, why: str = ""
 ) -> InputError:
-    """Return the error for a table without the wanted columns.
-
-    Parameters
-    ----------
-    grid : TextTable
-    quantities : sequence of Quantity
-        Wanted quantities.
-    all_of : bool
-        Whether all of them are needed, or one.
-    why : str
-        Addition to the message.
-    """
+    """Return the error for a table without the wanted columns."""
     expected = ", ".join(quantity.column for quantity in quantities)
     needed = [
         f"; a {quantity.key} needs {size} of the undeformed specimen"
@@ -528,9 +412,7 @@ def _columns_error(
     )
 
 
-def _unit_error(
-    grid: TextTable, column: str, unit: str | None, quantity: Quantity
-) -> InputError:
+def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quantity) -> InputError:
     """Return the error for a column without a unit (`unit` is None), or with a unit of another
     dimension than `quantity` has.
     """

@@ -105,10 +105,7 @@ class _LazyImages(Sequence[Array]):
 
 
 def read_depth(
-    path: Path,
-    count_m: float | None,
-    length_m: float,
-    known_camera_fields: Container[str] = (),
+    path: Path, count_m: float | None, length_m: float, known_camera_fields: Container[str] = ()
 ) -> DepthFileContent:
     """Read a file, a topic of a log, or all files of a folder in the order of their names.
 
@@ -133,11 +130,7 @@ def read_depth(
     if (address := TopicAddress.from_path(path)) is not None:
         with located(path):
             return _read_topic(
-                path,
-                address,
-                count_m=count_m,
-                length_m=length_m,
-                known=known_camera_fields,
+                path, address, count_m=count_m, length_m=length_m, known=known_camera_fields
             )
     if path.is_dir():
         return _read_folder(path, count_m, length_m=length_m)
@@ -156,51 +149,23 @@ def read_depth(
         raise error.located(path) from error
     except (Exception, SystemExit) as error:
         raise InputError(
-            f"the file cannot be read ({reason(error)}); expected a valid {kind} file",
-            path,
+            f"the file cannot be read ({reason(error)}); expected a valid {kind} file", path
         ) from error
     if isinstance(content, DepthFileContent):
         return content
     if kind in CLOUDS:
-        return DepthFileContent(
-            [], [_scaled_cloud(content, path, length_m=length_m)]
-        )
+        return DepthFileContent([], [_scaled_cloud(content, path, length_m=length_m)])
     with located(path):
         return DepthFileContent([_in_metres(content, count_m)], [])
 
 
 def _read_topic(
-    path: Path,
-    address: TopicAddress,
-    count_m: float | None,
-    length_m: float,
-    known: Container[str],
+    path: Path, address: TopicAddress, count_m: float | None, length_m: float, known: Container[str]
 ) -> DepthFileContent:
-    """Read the messages of a topic in the order of their times, and the camera model beside them.
-
-    Parameters
-    ----------
-    path : Path
-        Path with the topic, for messages.
-    address : TopicAddress
-        Log and topic.
-    count_m : float or None
-        Depth of one count of an integer image [m]; None for a millimetre.
-    length_m : float
-        Unit of the coordinates of clouds [m].
-    known : container of str
-        "matrix" and "distortion" if they are known otherwise and therefore not read.
-
-    Raises
-    ------
-    InputError
-        If the topic is missing or has no depth data.
-    """
+    """Read the messages of a topic in the order of their times, and the camera model beside them."""
     with open_log(address.log, address.episode) as log:
         require_topic(log, address.topic)
-        t_s, messages = sort_by_time(
-            list(log.messages(address.topic)), log.start_ns
-        )
+        t_s, messages = sort_by_time(list(log.messages(address.topic)), log.start_ns)
         camera = _camera_of_topic(log, address.topic)
     kind = camera_data_kind(messages[0]) if messages else ""
     if not kind:
@@ -211,11 +176,7 @@ def _read_topic(
         )
     if "images" not in kind:
         clouds = [
-            _scaled_cloud(
-                _points_from_columns(decode_cloud(each)),
-                path,
-                length_m=length_m,
-            )
+            _scaled_cloud(_points_from_columns(decode_cloud(each)), path, length_m=length_m)
             for each in messages
         ]
         return DepthFileContent([], clouds, t_s=t_s)
@@ -226,14 +187,10 @@ def _read_topic(
         rectified = RECTIFIED.search(address.topic.lower()) is not None
         with located(f"{address.log}#{camera[0]}"):
             if "matrix" not in known:
-                matrix = camera_matrix(
-                    camera[1], rectified, shape=images[0].shape
-                )
+                matrix = camera_matrix(camera[1], rectified, shape=images[0].shape)
             if "distortion" not in known:
                 distortion = distortion_coefficients(camera[1], rectified)
-    return DepthFileContent(
-        images, [], t_s=t_s, matrix=matrix, distortion=distortion
-    )
+    return DepthFileContent(images, [], t_s=t_s, matrix=matrix, distortion=distortion)
 
 
 def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
@@ -242,39 +199,15 @@ def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
     """
     above = [str(each) for each in PurePosixPath(topic).parents]
     names = [f"{each.rstrip('/')}/{CAMERA}" for each in above]
-    if (
-        name := next((each for each in names if each in log.topics), None)
-    ) is None:
+    if (name := next((each for each in names if each in log.topics), None)) is None:
         return None
     message = next((each for _, each in log.messages(name)), None)
     return (name, message) if is_camera_model(message) else None
 
 
-def _read_folder(
-    path: Path, count_m: float | None, length_m: float
-) -> DepthFileContent:
-    """Read all depth files of a folder, in the order of their names.
-
-    Parameters
-    ----------
-    path : Path
-        Folder with images or clouds of one kind. Its file times.csv, if there is one, has their
-        times; without it the times of the result are None.
-    count_m : float or None
-        Depth of one count of an integer image [m]; None for a millimetre.
-    length_m : float
-        Unit of the coordinates of clouds [m].
-
-    Raises
-    ------
-    InputError
-        If there are no files, files of several kinds, or another number of times than files.
-    """
-    files = sorted(
-        each
-        for each in path.iterdir()
-        if each.suffix.lower() in (*IMAGES, *CLOUDS)
-    )
+def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFileContent:
+    """Read all depth files of a folder, in the order of their names."""
+    files = sorted(each for each in path.iterdir() if each.suffix.lower() in (*IMAGES, *CLOUDS))
     if not files:
         raise InputError(
             f"the folder contains no files {', '.join((*IMAGES, *CLOUDS))}; expected depth images "
@@ -300,19 +233,12 @@ def _read_folder(
                 times,
             )
     images = [image for part in parts for image in part.images_m]
-    return DepthFileContent(
-        images, [cloud for part in parts for cloud in part.clouds_m], t_s=t_s
-    )
+    return DepthFileContent(images, [cloud for part in parts for cloud in part.clouds_m], t_s=t_s)
 
 
 def _in_metres(image: Array, count_m: float | None) -> Array:
     """Return depths [m] of an image (rows, columns) of integer counts, each `count_m` [m] or a
     millimetre if None, or of floats in metres; 0 and NaN stay.
-
-    Raises
-    ------
-    InputError
-        If the image has several channels, or a float is beyond `LARGEST_LENGTH_M`.
     """
     if image.ndim != 2:
         raise InputError(
@@ -330,9 +256,7 @@ def _require_possible_lengths(values_m: Array) -> None:
     """Raise an `InputError` if a length [m] is beyond `LARGEST_LENGTH_M` in magnitude, which no
     camera can have measured; values that are not finite are not compared.
     """
-    largest_m = np.max(
-        np.abs(values_m), initial=0.0, where=np.isfinite(values_m)
-    )
+    largest_m = np.max(np.abs(values_m), initial=0.0, where=np.isfinite(values_m))
     if largest_m > LARGEST_LENGTH_M:
         raise InputError(
             f"the largest length in the file is {largest_m:.3g} m; expected at most "
@@ -342,25 +266,8 @@ def _require_possible_lengths(values_m: Array) -> None:
 
 
 def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
-    """Return points (P, 3) or (P, 6) in metres; normals in the last three columns are unchanged.
-
-    Parameters
-    ----------
-    points : array
-        Points in the unit `length_m` [m].
-    path : Path
-        File, for messages.
-    length_m : float
-        Factor from the unit of the points to metres.
-
-    Raises
-    ------
-    InputError
-        For another shape, or a length beyond `LARGEST_LENGTH_M`.
-    """
-    with np.errstate(
-        invalid="ignore"
-    ):  # a damaged file may have signalling NaN
+    """Return points (P, 3) or (P, 6) in metres; normals in the last three columns are unchanged."""
+    with np.errstate(invalid="ignore"):  # a damaged file may have signalling NaN
         points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise InputError(
@@ -379,18 +286,9 @@ def _read_npz(path: Path) -> DepthFileContent:
 
     One image or cloud may lack the axis of samples. Counts are multiplied by count_m, by default
     `USUAL_COUNT_M`.
-
-    Raises
-    ------
-    InputError
-        If the archive has none of the three arrays, or several.
     """
     arrays = load_arrays(path)
-    names = [
-        name
-        for name in ("depth_m", "depth_counts", "points_m")
-        if name in arrays
-    ]
+    names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
     if len(names) != 1:
         raise InputError(
             f"the archive contains {', '.join(arrays) or 'nothing'}; expected exactly one of "
@@ -400,19 +298,12 @@ def _read_npz(path: Path) -> DepthFileContent:
     values = arrays[names[0]]
     if names[0] == "depth_counts":
         values = values * float(arrays.get("count_m", USUAL_COUNT_M))
-    samples = [
-        np.asarray(each, dtype=float)
-        for each in (values if values.ndim == 3 else [values])
-    ]
+    samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
     clouded = names[0] == "points_m"
     for sample in samples:
         _require_possible_lengths(sample)
-    camera = (
-        arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose")
-    )
-    return DepthFileContent(
-        [] if clouded else samples, samples if clouded else [], *camera
-    )
+    camera = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
+    return DepthFileContent([] if clouded else samples, samples if clouded else [], *camera)
 
 
 @contextmanager
@@ -437,11 +328,6 @@ def _standard_error_silenced() -> Iterator[None]:
 def _read_exr(path: Path) -> Array:
     """Read the depths (rows, columns) of an OpenEXR image in its own unit: the channel Z, else R,
     else Y, else V, else the first.
-
-    Raises
-    ------
-    InputError
-        If the package OpenEXR is not installed. Exceptions of the package are not converted.
     """
     try:
         library = import_module("OpenEXR")
@@ -453,27 +339,17 @@ def _read_exr(path: Path) -> Array:
     # What the library writes on both streams it also raises.
     with redirect_stdout(None), _standard_error_silenced():
         channels: Mapping[str, Any] = library.File(str(path)).channels()
-    names = [name for name in ("Z", "R", "Y", "V") if name in channels] or [
-        *channels
-    ]
+    names = [name for name in ("Z", "R", "Y", "V") if name in channels] or [*channels]
     return np.asarray(channels[names[0]].pixels, dtype=float)
 
 
 def _points_from_columns(columns: Mapping[str, Array]) -> Array:
-    """Return points (P, 3), or (P, 6) with normals, from columns by name.
-
-    Raises
-    ------
-    InputError
-        If x, y or z is missing.
-    """
+    """Return points (P, 3), or (P, 6) with normals, from columns by name."""
     if not {*"xyz"} <= {*columns}:
         raise InputError(
             f"the point cloud has the columns {', '.join(columns)}; expected x, y and z among them"
         )
-    return _with_normals(
-        np.column_stack([columns[axis] for axis in "xyz"]), columns
-    )
+    return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
 
 
 def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
@@ -487,32 +363,21 @@ def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
 
 
 def _read_pcd(path: Path) -> Array:
-    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary, in its own unit.
-
-    Raises
-    ------
-    InputError
-        If the file has no header, is compressed, or lacks a coordinate. Other damage raises
-        exceptions of Python and NumPy.
-    """
+    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary, in its own unit."""
     raw = path.read_bytes()
     head = dict[str, list[str]]()
     begins = 0
     while "DATA" not in head:
         ends = raw.find(b"\n", begins)
         if ends < 0:
-            raise InputError(
-                "the file has no line that begins with DATA; expected a PCD file"
-            )
+            raise InputError("the file has no line that begins with DATA; expected a PCD file")
         words = raw[begins:ends].decode("ascii", "replace").split()
         head |= {words[0]: words[1:]} if words and words[0] != "#" else {}
         begins = ends + 1
     kinds = zip(head["TYPE"], head["SIZE"], strict=True)
     counts = head.get("COUNT", ["1"] * len(head["FIELDS"]))
     fields = zip(head["FIELDS"], kinds, counts, strict=True)
-    form = np.dtype(
-        [(f, f"<{t.lower()}{s}", (int(c),)) for f, (t, s), c in fields]
-    )
+    form = np.dtype([(f, f"<{t.lower()}{s}", (int(c),)) for f, (t, s), c in fields])
     if head["DATA"] == ["binary"]:
         rows = np.frombuffer(raw, form, int(head["POINTS"][0]), begins)
         columns = {name: rows[name][:, 0] for name in rows.dtype.names or ()}

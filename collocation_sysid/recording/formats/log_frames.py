@@ -110,9 +110,7 @@ class LogFrames:
         path = frame_path(self.edges, parent, child=child)
         if not all(map(self._is_static, path)):
             return None
-        return np.linalg.inv(self._pose_in_root(parent, path)) @ (
-            self._pose_in_root(child, path)
-        )
+        return np.linalg.inv(self._pose_in_root(parent, path)) @ (self._pose_in_root(child, path))
 
     def static_neighbours(self, frame: str) -> list[str]:
         """Names of the other frames that static transforms connect with a frame."""
@@ -127,9 +125,7 @@ class LogFrames:
         poses = np.array(list(self.edges[edge].values()))
         return bool(np.ptp(poses, axis=0).max() <= SAME_POSE)
 
-    def _pose_in_root(
-        self, frame: str, path: Iterable[tuple[str, str]]
-    ) -> Array:
+    def _pose_in_root(self, frame: str, path: Iterable[tuple[str, str]]) -> Array:
         """Return the pose (4, 4) of a frame in the uppermost frame of a path of static edges that
         leads upwards from it.
         """
@@ -156,10 +152,7 @@ def _transform_topics(log: Log) -> list[str]:
         name
         for name, (kind, _) in log.topics.items()
         if any(part in f"{name} {kind}".lower() for part in TRANSFORM_NAMES)
-        and any(
-            is_transforms(message)
-            for _, message in islice(log.messages(name), 1)
-        )
+        and any(is_transforms(message) for _, message in islice(log.messages(name), 1))
     ]
 
 

@@ -85,9 +85,7 @@ class TopicAddress:
                     "two frames PARENT>CHILD, the file of a robot (.urdf), rad or deg, or the index of an "
                     "episode"
                 )
-                raise InputError(
-                    f"found {part!r} after the topic; expected {expected}"
-                )
+                raise InputError(f"found {part!r} after the topic; expected {expected}")
         return cls(Path(log), topic, **options)
 
 
@@ -207,8 +205,7 @@ class _Bag:
         """Open the bag; return self, with topics and start."""
         self._reader.open()
         self.topics = {
-            name: (str(info.msgtype), info.msgcount)
-            for name, info in self._reader.topics.items()
+            name: (str(info.msgtype), info.msgcount) for name, info in self._reader.topics.items()
         }
         self.start_ns = self._reader.start_time
         return self
@@ -219,9 +216,7 @@ class _Bag:
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Yield time of recording [ns] and message, see `Log.messages`."""
-        chosen = [
-            each for each in self._reader.connections if each.topic == topic
-        ]
+        chosen = [each for each in self._reader.connections if each.topic == topic]
         for connection, at_ns, content in self._reader.messages(chosen):
             yield at_ns, self._reader.deserialize(content, connection.msgtype)
 
@@ -248,9 +243,7 @@ class _Mcap:
         self._reader = make_reader(self._file, decoder_factories=decoders)
         summary = self._reader.get_summary()
         if summary is None or summary.statistics is None:
-            raise InputError(
-                "the log is truncated: it has no summary; `mcap recover` creates one"
-            )
+            raise InputError("the log is truncated: it has no summary; `mcap recover` creates one")
         counts = summary.statistics.channel_message_counts
         self.topics = {}
         for key, channel in summary.channels.items():
@@ -267,9 +260,7 @@ class _Mcap:
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Yield time of recording [ns] and message, see `Log.messages`."""
-        for _, _, message, content in self._reader.iter_decoded_messages(
-            topics=[topic]
-        ):
+        for _, _, message, content in self._reader.iter_decoded_messages(topics=[topic]):
             yield message.log_time, content
 
 
@@ -282,9 +273,7 @@ class _Json:
         """
         if message_encoding != "json":
             return None
-        return partial(
-            json.loads, object_hook=lambda each: SimpleNamespace(**each)
-        )
+        return partial(json.loads, object_hook=lambda each: SimpleNamespace(**each))
 
 
 @dataclass
@@ -314,15 +303,10 @@ class _Dataset:
         and the timestamp, are no topics.
         """
         require_packages("pyarrow")
-        info = json.loads(
-            (self.path / "meta" / "info.json").read_text(encoding="utf-8")
-        )
+        info = json.loads((self.path / "meta" / "info.json").read_text(encoding="utf-8"))
         self._episodes = int(info["total_episodes"])
         for name, feature in info["features"].items():
-            if (
-                feature["dtype"].startswith(("float", "int"))
-                and "index" not in name
-            ):
+            if feature["dtype"].startswith(("float", "int")) and "index" not in name:
                 self.topics[name] = feature["dtype"], int(info["total_frames"])
                 self.names[name] = _component_names(feature, name)
         self.topics.pop("timestamp", None)
@@ -353,18 +337,13 @@ class _Dataset:
                 f"found the episode {episode}; expected an index from 0 to {self._episodes - 1}"
             )
         frames = dataset.dataset(self.path / "data", format="parquet").to_table(
-            columns=["timestamp", topic],
-            filter=dataset.field("episode_index") == episode,
+            columns=["timestamp", topic], filter=dataset.field("episode_index") == episode
         )
         values: Array = np.asarray(frames[topic].to_pylist(), dtype=float)
-        for t_s, each in zip(
-            frames["timestamp"].to_pylist(), values, strict=True
-        ):
+        for t_s, each in zip(frames["timestamp"].to_pylist(), values, strict=True):
             yield (
                 round(t_s * 1e9),
-                SimpleNamespace(
-                    name=self.names[topic], position=np.atleast_1d(each)
-                ),
+                SimpleNamespace(name=self.names[topic], position=np.atleast_1d(each)),
             )
 
 

@@ -45,14 +45,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     first = rows[0]
     pairs = zip(first.cells[::2], first.cells[1::2], strict=False)
     header = Header({key: (text, first.line) for key, text in pairs})
-    top = next(
-        (k for k, row in enumerate(rows) if row.cells[0] == "Frame"), None
-    )
-    if (
-        top is None
-        or top < 4
-        or not "".join(rows[top].cells[1:2]).startswith("Time")
-    ):
+    top = next((k for k, row in enumerate(rows) if row.cells[0] == "Frame"), None)
+    if top is None or top < 4 or not "".join(rows[top].cells[1:2]).startswith("Time"):
         raise InputError(
             "this is not a Motive CSV file with markers; expected rows of Type, Name, ID and "
             "Position, then 'Frame,Time (Seconds),X,Y,Z,…'"
@@ -60,24 +54,16 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     heads = _column_headings(rows[1:top], rows[top])
     columns = _marker_columns(heads, rows[top].line)
     labels = list(columns)
-    chosen = choose(
-        labels, [name for name in labels if name.startswith("Unlabeled")]
-    )
-    titles = [
-        f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads
-    ]
+    chosen = choose(labels, [name for name in labels if name.startswith("Unlabeled")])
+    titles = [f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads]
     table = table_of_rows(titles, rows[top + 1 :])
-    header.require_count(
-        "Total Exported Frames", len(table.rows), what="frames"
-    )
+    header.require_count("Total Exported Frames", len(table.rows), what="frames")
     rate_key = next((key for key in _RATES if header.number(key)), _RATES[0])
     (unit, _) = header.entries.get("Length Units", ("", 0))
     raw = tracks_of_table(
         table,
         labels,
-        coordinate_columns=[
-            each.coordinate_columns for each in columns.values()
-        ],
+        coordinate_columns=[each.coordinate_columns for each in columns.values()],
         chosen=chosen,
         time=1,
         unit=length_unit_of_text(unit, "line 1, Length Units"),
@@ -95,9 +81,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     return replace(raw, notes=tuple(notes))
 
 
-def _column_headings(
-    above: Sequence[Row], axes: Row
-) -> list[tuple[str, str, str, str]]:
+def _column_headings(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
     """Return type, name, quantity and axis of every column, from the rows of the header `above` and
     the row of the axes.
 
@@ -117,18 +101,6 @@ def _marker_columns(
 ) -> dict[str, _MarkerColumns]:
     """Return the columns of every marker by its name, in the order of the columns; measured columns
     have priority over fitted ones.
-
-    Parameters
-    ----------
-    heads : sequence of (str, str, str, str)
-        Type, name, quantity and axis of every column.
-    line : int
-        Line of the axes, for messages.
-
-    Raises
-    ------
-    InputError
-        If two markers of one type have one name, or a marker lacks an axis.
     """
     by_kind: dict[tuple[str, str], dict[str, int]] = {}
     for column, (kind, name, quantity, axis) in enumerate(heads):
@@ -136,9 +108,7 @@ def _marker_columns(
             continue
         axes = by_kind.setdefault((name, kind), {})
         if axis in axes:
-            message = (
-                f"two markers are named '{name}'; expected names that differ"
-            )
+            message = f"two markers are named '{name}'; expected names that differ"
             raise InputError(message, where=f"line {line}")
         axes[axis] = column
     columns: dict[str, _MarkerColumns] = {}
@@ -147,9 +117,5 @@ def _marker_columns(
             message = f"marker '{name}' has the columns {', '.join(axes)}; expected X, Y and Z"
             raise InputError(message, where=f"line {line}")
         if kind == _MEASURED or name not in columns:
-            columns[name] = _MarkerColumns(
-                kind, (axes["X"], axes["Y"], axes["Z"])
-            )
-    return dict(
-        sorted(columns.items(), key=lambda item: item[1].coordinate_columns)
-    )
+            columns[name] = _MarkerColumns(kind, (axes["X"], axes["Y"], axes["Z"]))
+    return dict(sorted(columns.items(), key=lambda item: item[1].coordinate_columns))

@@ -29,9 +29,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         increase.
     """
     table = read_table(text)
-    return (_read_long if "marker" in table.columns else _read_wide)(
-        table, choose
-    )
+    return (_read_long if "marker" in table.columns else _read_wide)(table, choose)
 
 
 def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
@@ -58,36 +56,20 @@ def _wide_labels(table: TextTable) -> list[str]:
 
     The columns are t_s and, for each marker, <name>_x, <name>_y and <name>_z, in any order and
     without a unit in their names.
-
-    Raises
-    ------
-    InputError
-        If a column is missing, unknown or repeated, or there is no marker.
     """
     header = table.columns
     labels = dict.fromkeys(
-        column[:-2]
-        for column in header
-        if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
+        column[:-2] for column in header if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
     )
-    expected = [
-        "t_s",
-        *(f"{label}_{axis}" for label in labels for axis in "xyz"),
-    ]
+    expected = ["t_s", *(f"{label}_{axis}" for label in labels for axis in "xyz")]
     counts = Counter(header)
     known = set(expected)
     faulty = {
         "unknown": [column for column in header if column not in known],
         "missing": [column for column in expected if column not in counts],
-        "repeated": sorted(
-            column for column, count in counts.items() if count > 1
-        ),
+        "repeated": sorted(column for column, count in counts.items() if count > 1),
     }
-    faults = [
-        f"{what} {', '.join(columns)}"
-        for what, columns in faulty.items()
-        if columns
-    ]
+    faults = [f"{what} {', '.join(columns)}" for what, columns in faulty.items() if columns]
     if not faults and labels:
         return list(labels)
     raise InputError(
@@ -103,24 +85,14 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
     markers to read from their labels.
 
     The times of the result are those of all rows, sorted. Only rows of chosen markers are checked.
-
-    Raises
-    ------
-    InputError
-        If a name is blank, a column is missing, a cell is not a number, or the times of a marker do
-        not increase.
     """
     axes, unit = _long_columns(table)
     of_row = [row.cells[table.columns.index("marker")] for row in table.rows]
     if "" in of_row:
-        raise table.error_at(
-            "column marker is blank; expected a name", of_row.index("")
-        )
+        raise table.error_at("column marker is blank; expected a name", of_row.index(""))
     labels = list(dict.fromkeys(of_row))
     chosen = [labels[k] for k in choose(labels)]
-    row_t_s = numeric_cells(
-        table, [table.columns.index("t_s")], blank_allowed=False
-    )[:, 0]
+    row_t_s = numeric_cells(table, [table.columns.index("t_s")], blank_allowed=False)[:, 0]
     t_s, frame = np.unique(row_t_s, return_inverse=True)
     coordinates = np.full((len(t_s), len(chosen), 3), np.nan)
     for k, label in enumerate(chosen):
@@ -129,9 +101,7 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
         if fault := first_unordered_time(row_t_s[own]):
             raise rows.error_at(f"marker '{label}': {fault[1]}", fault[0])
         columns = [table.columns.index(axis) for axis in axes]
-        coordinates[frame[own], k] = numeric_cells(
-            rows, columns, blank_allowed=True
-        )
+        coordinates[frame[own], k] = numeric_cells(rows, columns, blank_allowed=True)
     return RawTracks(
         chosen,
         coordinates,
@@ -145,11 +115,6 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
 def _long_columns(table: TextTable) -> tuple[list[str], str | None]:
     """Return the names of the columns of x, y and z, and the unit in these names, such as "mm" of
     x_mm; None if they name none.
-
-    Raises
-    ------
-    InputError
-        If the columns are not exactly t_s, marker and three coordinates of one unit.
     """
     for unit in (None, *METRES_PER_UNIT):
         axes = [f"{axis}_{unit}" if unit else axis for axis in "xyz"]

@@ -44,15 +44,12 @@ def read_columns(path: Path) -> Mapping[str, Array]:
     if columns is not None:
         return columns
     if b"end_header" not in content[:LONGEST_HEADER]:
-        raise InputError(
-            "the file has no line end_header; expected a complete .ply file"
-        )
+        raise InputError("the file has no line end_header; expected a complete .ply file")
     try:
         mesh = read_content(path)
     except InputError as error:
         raise InputError(
-            f"the file cannot be read ({error.message}); expected a valid .ply file",
-            path,
+            f"the file cannot be read ({error.message}); expected a valid .ply file", path
         ) from error
     points = np.asarray(mesh.points, dtype=float)
     return {**mesh.point_data, **dict(zip("xyz", points.T, strict=False))}
@@ -61,31 +58,15 @@ def read_columns(path: Path) -> Mapping[str, Array]:
 def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
     """Return the columns (P,) by name of a file whose first element is `vertex` with numbers only;
     None for any other.
-
-    Raises
-    ------
-    InputError
-        If the file has fewer points than its header states.
     """
     header, end, body = content[:LONGEST_HEADER].partition(b"end_header\n")
-    lines = [
-        line.split() for line in header.decode("ascii", "replace").splitlines()
-    ]
-    lines = [
-        words
-        for words in lines
-        if words and words[0] not in ("comment", "obj_info")
-    ]
+    lines = [line.split() for line in header.decode("ascii", "replace").splitlines()]
+    lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
     if not end or len(lines) < 3 or lines[0] != ["ply"] or b"\r" in header:
         return None
     _, form, element, *properties = lines
     is_vertex = element[:2] == ["element", "vertex"] and len(element) == 3
-    if (
-        form[0] != "format"
-        or len(form) < 2
-        or not is_vertex
-        or not element[2].isdecimal()
-    ):
+    if form[0] != "format" or len(form) < 2 or not is_vertex or not element[2].isdecimal():
         return None
     count = int(element[2])
     fields: list[tuple[str, str]] = []
@@ -100,9 +81,7 @@ def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
         return None
     body = content[len(header) + len(end) :]
     if form[1] in _ORDERS:
-        row = np.dtype(
-            [(name, _ORDERS[form[1]] + kind) for name, kind in fields]
-        )
+        row = np.dtype([(name, _ORDERS[form[1]] + kind) for name, kind in fields])
         if len(body) < count * row.itemsize:
             _refuse_short(count, len(body) // row.itemsize)
         rows: NDArray = np.frombuffer(body, row, count)

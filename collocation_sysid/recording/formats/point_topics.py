@@ -14,14 +14,7 @@ from ...common.array_types import Array
 from ...errors import InputError
 from ..gap_interpolation import interpolate_without_gaps
 from .logs import Log, TopicAddress, open_log, require_topic
-from .topics import (
-    AXES,
-    csv_content,
-    nested_field,
-    point_of_message,
-    sort_by_time,
-    topic_as_csv,
-)
+from .topics import AXES, csv_content, nested_field, point_of_message, sort_by_time, topic_as_csv
 
 TOPIC_LIST_SEPARATOR = ","
 
@@ -47,8 +40,7 @@ def address_as_csv(address: TopicAddress) -> bytes:
     times = max((t_s for t_s, _, _ in tracks.values()), key=len)
     markers = marker_names(names)
     values = np.concatenate(
-        [interpolate_without_gaps(times, *tracks[name][:2]) for name in names],
-        axis=1,
+        [interpolate_without_gaps(times, *tracks[name][:2]) for name in names], axis=1
     )
     columns = [f"{marker}_{axis}" for marker in markers for axis in AXES]
     return csv_content(columns, times, values=values)
@@ -64,28 +56,17 @@ def marker_names(topics: list[str]) -> list[str]:
     while head < shortest - 1 and len({each[head] for each in parts}) == 1:
         head += 1
     tail = 0
-    while (
-        tail < shortest - 1 - head
-        and len({each[-1 - tail] for each in parts}) == 1
-    ):
+    while tail < shortest - 1 - head and len({each[-1 - tail] for each in parts}) == 1:
         tail += 1
     return ["/".join(each[head : len(each) - tail]) for each in parts]
 
 
 def _track(log: Log, topic: str) -> tuple[Array, Array, set[str]]:
-    """Return times (S,) [s], points (S, 3) [m] and the frames of a topic.
-
-    Raises
-    ------
-    InputError
-        If the topic does not exist, is empty, or has messages without a single point.
-    """
+    """Return times (S,) [s], points (S, 3) [m] and the frames of a topic."""
     require_topic(log, topic)
     messages = list(log.messages(topic))
     if not messages:
-        raise InputError(
-            f"the topic {topic} has no messages; expected a topic with points"
-        )
+        raise InputError(f"the topic {topic} has no messages; expected a topic with points")
     t_s, ordered = sort_by_time(messages, log.start_ns)
     points = [point_of_message(message) for message in ordered]
     if any(point is None for point in points):
@@ -109,8 +90,7 @@ def _require_one_frame(frames: dict[str, set[str]]) -> None:
     if len(set().union(*frames.values())) <= 1:
         return
     stated = "; ".join(
-        f"{topic}: {', '.join(sorted(of)) or 'none'}"
-        for topic, of in frames.items()
+        f"{topic}: {', '.join(sorted(of)) or 'none'}" for topic, of in frames.items()
     )
     raise InputError(
         f"points of one marker table have different frame_id ({stated}); expected one frame: "

@@ -27,19 +27,12 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         from the header's.
     """
     rows = tab_rows(text)
-    count = next(
-        (k for k, row in enumerate(rows) if not _KEY.fullmatch(row.cells[0])),
-        len(rows),
-    )
+    count = next((k for k, row in enumerate(rows) if not _KEY.fullmatch(row.cells[0])), len(rows))
     above = {row.cells[0]: row for row in rows[:count]}
     if "MARKER_NAMES" not in above:
-        raise InputError(
-            "the header lacks MARKER_NAMES; expected a Qualisys TSV file with 3D data"
-        )
+        raise InputError("the header lacks MARKER_NAMES; expected a Qualisys TSV file with 3D data")
     labels = [cell for cell in above["MARKER_NAMES"].cells[1:] if cell]
-    header_values = {
-        key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()
-    }
+    header_values = {key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()}
     header = Header(header_values)
     header.require_count("NO_OF_MARKERS", len(labels), what="marker names")
     frames = rows[count:]
@@ -62,27 +55,11 @@ def _has_column_names(row: Row) -> bool:
     """Return whether a row holds column names instead of numbers: one of its first three cells
     begins with a letter and is not "nan".
     """
-    return any(
-        re.match(r"[A-Za-z]", cell) and cell.lower() != "nan"
-        for cell in row.cells[:3]
-    )
+    return any(re.match(r"[A-Za-z]", cell) and cell.lower() != "nan" for cell in row.cells[:3])
 
 
 def _leading_columns(frames: list[Row], coordinates: int) -> list[str]:
-    """Return the names of the columns before the first coordinate: Frame and Time, or none.
-
-    Parameters
-    ----------
-    frames : list of Row
-        Rows of numbers, perhaps with a row of names first.
-    coordinates : int
-        Number of columns of coordinates.
-
-    Raises
-    ------
-    InputError
-        If the number of cells fits neither.
-    """
+    """Return the names of the columns before the first coordinate: Frame and Time, or none."""
     if not frames:
         return []
     first = frames[0]

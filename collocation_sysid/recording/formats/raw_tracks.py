@@ -11,14 +11,7 @@ from typing import Any, Protocol
 
 from ...common.array_types import Array
 from ...errors import InputError
-from .text import (
-    Row,
-    TextTable,
-    number_from_text,
-    numeric_cells,
-    table_of_rows,
-    times_in_column,
-)
+from .text import Row, TextTable, number_from_text, numeric_cells, table_of_rows, times_in_column
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +57,7 @@ class RawTracks:
 class LabelChooser(Protocol):
     """A function that picks markers by the labels of a file, before any of their cells is read."""
 
-    def __call__(
-        self, labels: Sequence[str], excluded: Collection[str] = ()
-    ) -> list[int]:
+    def __call__(self, labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
         """Return the indices of the chosen labels; those in `excluded` only if they are requested
         by name.
         """
@@ -103,9 +94,7 @@ def tracks_of_table(
         If a cell of a chosen marker is neither blank nor a number, or time does not increase.
     """
     cells = numeric_cells(
-        table,
-        [column for k in chosen for column in coordinate_columns[k]],
-        blank_allowed=True,
+        table, [column for k in chosen for column in coordinate_columns[k]], blank_allowed=True
     )
     return RawTracks(
         labels=[labels[k] for k in chosen],
@@ -146,9 +135,7 @@ class Header:
             raise InputError(message, where=f"line {line}")
         return value
 
-    def require_count(
-        self, key: str, count: int, what: str, line: int | None = None
-    ) -> None:
+    def require_count(self, key: str, count: int, what: str, line: int | None = None) -> None:
         """Raise an `InputError` if the number stated by a key differs from `count`.
 
         A key that is blank or missing passes; a statement that is no number above 0 does not.
@@ -169,9 +156,7 @@ class Header:
                 f"{key} is {declared:g}, but the file contains {count} {what}; expected equal numbers: "
                 "the file may be truncated"
             )
-            raise InputError(
-                message, where=f"line {line or self.entries[key][1]}"
-            )
+            raise InputError(message, where=f"line {line or self.entries[key][1]}")
 
 
 def tracks_of_frames(
@@ -206,20 +191,12 @@ def tracks_of_frames(
     """
     chosen = choose(labels)
     table = table_of_rows(
-        [*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")],
-        frames,
+        [*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")], frames
     )
     header.require_count(count_key, len(frames), what="frames")
-    places = [
-        range(k, k + 3) for k in range(len(leading), len(table.columns), 3)
-    ]
+    places = [range(k, k + 3) for k in range(len(leading), len(table.columns), 3)]
     time = leading.index("Time") if "Time" in leading else None
     fields |= {"rate_hz": header.number(rate_key), "rate_key": rate_key}
     return tracks_of_table(
-        table,
-        labels,
-        coordinate_columns=places,
-        chosen=chosen,
-        time=time,
-        **fields,
+        table, labels, coordinate_columns=places, chosen=chosen, time=time, **fields
     )

@@ -36,9 +36,7 @@ _SEPARATOR = re.compile("[,;\t]")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _POINTED = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
-_EMPTY = (
-    "the file is empty; expected a line of column names, then rows of numbers"
-)
+_EMPTY = "the file is empty; expected a line of column names, then rows of numbers"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +95,7 @@ def read_bytes(path: str | Path) -> bytes:
     try:
         return Path(path).read_bytes()
     except OSError as error:
-        raise InputError(
-            f"the file cannot be read: {error.strerror}"
-        ) from error
+        raise InputError(f"the file cannot be read: {error.strerror}") from error
 
 
 def decode(content: bytes) -> str:
@@ -110,10 +106,7 @@ def decode(content: bytes) -> str:
     InputError
         If it is empty or blank, or not text.
     """
-    text = next(
-        filter(None, (_decoded(content, encoding) for encoding in _ENCODINGS)),
-        None,
-    )
+    text = next(filter(None, (_decoded(content, encoding) for encoding in _ENCODINGS)), None)
     if text is None and content:
         raise InputError(
             "this is not a CSV text file (UTF-8), nor a file of another known format; expected a "
@@ -130,17 +123,13 @@ def _decoded(content: bytes, encoding: str) -> str | None:
     Text with a NUL character is none. Other encodings than UTF-8, which decode anything, must also
     have a separator of cells and no control characters; UTF-16 needs a byte order mark.
     """
-    if encoding == "utf-16" and not content.startswith(
-        (b"\xff\xfe", b"\xfe\xff")
-    ):
+    if encoding == "utf-16" and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return None
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
         return None
-    odd = encoding != "utf-8-sig" and (
-        _CONTROL.search(text) or not _SEPARATOR.search(text)
-    )
+    odd = encoding != "utf-8-sig" and (_CONTROL.search(text) or not _SEPARATOR.search(text))
     return None if "\0" in text or odd else text
 
 
@@ -165,27 +154,17 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
     """
     if separator is None:
         lines = text.splitlines()
-        shares = {
-            mark: sum(mark in line for line in lines) / len(lines)
-            for mark in ";\t"
-        }
-        separator = next(
-            (mark for mark, share in shares.items() if share > 0.5), ","
-        )
+        shares = {mark: sum(mark in line for line in lines) / len(lines) for mark in ";\t"}
+        separator = next((mark for mark, share in shares.items() if share > 0.5), ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     try:
-        rows = [
-            Row(reader.line_num, [cell.strip() for cell in cells])
-            for cells in reader
-        ]
+        rows = [Row(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except csv.Error as error:
         raise InputError(f"this is not a CSV text file: {error}") from error
     rows = [row for row in rows if any(row.cells)]
     if not rows:
         raise InputError(_EMPTY)
-    if separator != "," and not any(
-        _POINTED.fullmatch(cell) for row in rows for cell in row.cells
-    ):
+    if separator != "," and not any(_POINTED.fullmatch(cell) for row in rows for cell in row.cells):
         for row in rows:
             commas = [_DECIMAL_COMMA.fullmatch(cell) for cell in row.cells]
             row.cells[:] = [
@@ -200,16 +179,10 @@ def tab_rows(text: str) -> list[Row]:
     skipped.
     """
     lines = enumerate(re.split("\r\n|\r|\n", text), start=1)
-    return [
-        Row(k, [cell.strip() for cell in line.split("\t")])
-        for k, line in lines
-        if line
-    ]
+    return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
 
 
-def table_of_rows(
-    columns: list[str], rows: list[Row], names_line: int = 1
-) -> TextTable:
+def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> TextTable:
     """Return a table of rows that are as wide as their column names.
 
     Blank columns at the end of all rows are cut.
@@ -232,9 +205,7 @@ def table_of_rows(
         )
     width = len(columns)
     common = len(rows[0].cells)
-    if common > width and all(
-        len(r.cells) == common and not any(r.cells[width:]) for r in rows
-    ):
+    if common > width and all(len(r.cells) == common and not any(r.cells[width:]) for r in rows):
         rows = [Row(row.line, row.cells[:width]) for row in rows]
     table = TextTable(columns, rows, names_line=names_line)
     for k, row in enumerate(rows):
@@ -263,17 +234,13 @@ def read_table(text: str) -> TextTable:
     numeric = (
         k
         for k, row in enumerate(rows)
-        if len(row.cells) > 1
-        and all(is_number(c.replace(",", ".")) for c in row.cells if c)
+        if len(row.cells) > 1 and all(is_number(c.replace(",", ".")) for c in row.cells if c)
     )
     names = 0 if "t_s" in rows[0].cells else max(next(numeric, 0) - 1, 0)
     header = rows[names].cells
     if names and all(map(_is_unit, header)):
         above = rows[names - 1].cells
-        header = [
-            f"{a} ({u.strip('()[]')})"
-            for a, u in zip_longest(above, header, fillvalue="")
-        ]
+        header = [f"{a} ({u.strip('()[]')})" for a, u in zip_longest(above, header, fillvalue="")]
     return table_of_rows(header, rows[names + 1 :], names_line=rows[names].line)
 
 
@@ -283,19 +250,13 @@ def _is_unit(cell: str) -> bool:
     """
     bare = cell.strip("()[]")
     bracketed = cell in (f"({bare})", f"[{bare}]")
-    return (
-        not bare
-        or bracketed
-        or any(si_factor(bare, dimension) for dimension in UNITS)
-    )
+    return not bare or bracketed or any(si_factor(bare, dimension) for dimension in UNITS)
 
 
 # Cells --------------------------------------------------------------------------------------------
 
 
-def numeric_cells(
-    grid: TextTable, columns: Sequence[int], blank_allowed: bool
-) -> Array:
+def numeric_cells(grid: TextTable, columns: Sequence[int], blank_allowed: bool) -> Array:
     """Return the cells of some columns as numbers (rows, columns); NaN where blank.
 
     Parameters
@@ -320,16 +281,11 @@ def numeric_cells(
                 value = number_from_text(cell) if cell else math.nan
             except ValueError:
                 value = math.inf
-            if abs(value) > LARGEST_NUMBER or (
-                math.isnan(value) and not blank_allowed
-            ):
-                expected = (
-                    "a number or a blank cell" if blank_allowed else "a number"
-                )
+            if abs(value) > LARGEST_NUMBER or (math.isnan(value) and not blank_allowed):
+                expected = "a number or a blank cell" if blank_allowed else "a number"
                 name = grid.columns[column]
                 raise grid.error_at(
-                    f"column {name} holds '{excerpt(cell)}'; expected {expected}",
-                    i,
+                    f"column {name} holds '{excerpt(cell)}'; expected {expected}", i
                 )
             values[i, j] = value
     return values

@@ -19,11 +19,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.files import require_regular
 from ...errors import InputError, hint_at
-from .camera_messages import (
-    camera_data_kind,
-    is_camera_model,
-    use_of_camera_message,
-)
+from .camera_messages import camera_data_kind, is_camera_model, use_of_camera_message
 from .logs import Log, TopicAddress, open_log, require_packages, require_topic
 
 AXES = ("x", "y", "z")
@@ -37,14 +33,7 @@ _POSES = (
     ("translation", "rotation"),
     ("position", "orientation"),
 )
-_POINTS = (
-    "pose.pose.position",
-    "pose.position",
-    "position",
-    "translation",
-    "point",
-    "pose",
-)
+_POINTS = ("pose.pose.position", "pose.position", "position", "translation", "point", "pose")
 _NAMES = ("marker_name", "name", "id", "ns", "child_frame_id")
 _NUMBER_FIELDS = {
     "fluid_pressure": "pressure_pa",
@@ -109,9 +98,7 @@ def list_topics(path: str | Path) -> list[LogTopic]:
     with open_log(Path(path), episode=0) as log:
         marker_frames = _marker_frames(log)
         topics = [
-            _describe_topic(
-                log, Path(path), name=name, marker_frames=marker_frames
-            )
+            _describe_topic(log, Path(path), name=name, marker_frames=marker_frames)
             for name in log.topics
         ]
         points = [
@@ -163,9 +150,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
             )
         times, ordered = sort_by_time(messages, log.start_ns)
         by_namespace = has_namespaces(ordered)
-        rows = [
-            _message_values(each, by_namespace=by_namespace) for each in ordered
-        ]
+        rows = [_message_values(each, by_namespace=by_namespace) for each in ordered]
         unit = address.unit or log.unit
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if not columns:
@@ -173,16 +158,10 @@ def topic_as_csv(address: TopicAddress) -> bytes:
             f"the topic {address.topic} contains neither poses, points, wrenches, joint positions "
             "nor numbers; expected a topic with one of these"
         )
-    values = np.array(
-        [[row.get(name, np.nan) for name in columns] for row in rows]
-    )
+    values = np.array([[row.get(name, np.nan) for name in columns] for row in rows])
     if address.robot is not None:
         return csv_content(
-            POSE,
-            times,
-            values=_poses_from_joints(
-                columns, values, address=address, unit=unit
-            ),
+            POSE, times, values=_poses_from_joints(columns, values, address=address, unit=unit)
         )
     return csv_content(columns, times, values=values)
 
@@ -211,27 +190,13 @@ def frame_of_message(message: Any) -> str:
     empty if neither names one.
     """
     first = next(iter(first_list(message)), None)
-    frame = nested_field(message, "header.frame_id") or nested_field(
-        first, "header.frame_id"
-    )
+    frame = nested_field(message, "header.frame_id") or nested_field(first, "header.frame_id")
     return str(frame or "").lstrip("/")
 
 
-def _describe_topic(
-    log: Log, path: Path, name: str, marker_frames: Iterable[str]
-) -> LogTopic:
+def _describe_topic(log: Log, path: Path, name: str, marker_frames: Iterable[str]) -> LogTopic:
     """Return the description of a topic from its first messages: type, number of messages, rate,
     possible uses and the addresses to write for them.
-
-    Parameters
-    ----------
-    log : Log
-    path : Path
-        Path of the log.
-    name : str
-        Name of the topic.
-    marker_frames : iterable of str
-        Frames of markers, from which chains of frames begin too.
     """
     kind, count = log.topics[name]
     first = list(islice(log.messages(name), _FIRST))
@@ -245,15 +210,11 @@ def _describe_topic(
         edges = _all_transforms(log, log.messages(name), topic=name)
         chains = moving_chains(edges)
         chains += chains_from(edges, marker_frames, chains=chains)
-        serves = (
-            "poses of one frame relative to another"
-            if chains
-            else "static frames"
-        )
+        serves = "poses of one frame relative to another" if chains else "static frames"
         write = [f"{write[0]}#{parent}>{child}" for parent, child in chains]
-        if name.removesuffix(
+        if name.removesuffix(STATIC_TOPIC_SUFFIX) in log.topics and name.endswith(
             STATIC_TOPIC_SUFFIX
-        ) in log.topics and name.endswith(STATIC_TOPIC_SUFFIX):
+        ):
             serves += f", part of the chains of {name.removesuffix(STATIC_TOPIC_SUFFIX)}"
     elif first and (use := use_of_camera_message(first[0][1])):
         serves = use
@@ -263,10 +224,7 @@ def _describe_topic(
         messages = [message for _, message in first]
         by_namespace = has_namespaces(messages)
         columns = set[str]().union(
-            *(
-                _message_values(each, by_namespace=by_namespace)
-                for each in messages
-            )
+            *(_message_values(each, by_namespace=by_namespace) for each in messages)
         )
         serves = _possible_uses(columns, messages[0])
         if serves.startswith("positions"):
@@ -297,18 +255,14 @@ def _possible_uses(columns: set[str], message: Any) -> str:
     if all(column[-2:] in ("_x", "_y", "_z") for column in columns):
         markers = sorted({column[:-2] for column in columns})
         spaces = groupby(markers, key=lambda marker: marker.rpartition("/")[0])
-        return "marker tracks: " + "; ".join(
-            ", ".join(markers) for _, markers in spaces
-        )
+        return "marker tracks: " + "; ".join(", ".join(markers) for _, markers in spaces)
     return "numbers: a pressure, a tension, a reading"
 
 
 # From messages to rows ----------------------------------------------------------------------------
 
 
-def sort_by_time(
-    messages: list[tuple[int, Any]], start_ns: int
-) -> tuple[Array, list[Any]]:
+def sort_by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Any]]:
     """Return the times (S,) [s] of messages, ascending, and the messages in this order; of messages
     with the same time the first is kept.
 
@@ -320,10 +274,7 @@ def sort_by_time(
         Time of recording of the log's first message.
     """
     t_s = np.array(
-        [
-            measurement_time_s(message, at_ns, start_ns=start_ns)
-            for at_ns, message in messages
-        ]
+        [measurement_time_s(message, at_ns, start_ns=start_ns) for at_ns, message in messages]
     )
     times, first = np.unique(t_s, return_index=True)
     return times, [messages[k][1] for k in first]
@@ -350,9 +301,7 @@ def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
         nested_field(message, "timestamp"),
         nested_field(first, "header.stamp"),
     )
-    stamped_ns = next(
-        (_nanoseconds(each) for each in stamps if each is not None), 0
-    )
+    stamped_ns = next((_nanoseconds(each) for each in stamps if each is not None), 0)
     if not stamped_ns:
         return (recorded_ns - start_ns) / 1e9
     is_another = abs(stamped_ns - recorded_ns) > SAME_CLOCK_NS
@@ -363,22 +312,9 @@ def _nanoseconds(stamp: Any) -> int:
     """Return a stamp of seconds and nanoseconds, under any of the usual field names, in
     nanoseconds; a missing field counts as 0.
     """
-    counted = {
-        10**9: ("sec", "seconds", "secs"),
-        1: ("nanosec", "nsec", "nanos", "nsecs"),
-    }
+    counted = {10**9: ("sec", "seconds", "secs"), 1: ("nanosec", "nsec", "nanos", "nsecs")}
     return sum(
-        factor
-        * int(
-            next(
-                (
-                    getattr(stamp, name)
-                    for name in names
-                    if hasattr(stamp, name)
-                ),
-                0,
-            )
-        )
+        factor * int(next((getattr(stamp, name) for name in names if hasattr(stamp, name)), 0))
         for factor, names in counted.items()
     )
 
@@ -400,22 +336,12 @@ def _message_values(message: Any, *, by_namespace: bool) -> Row:
         return dict(zip(POSE, pose, strict=True))
     points = _points_of_message(message, by_namespace=by_namespace)
     if points:
-        return {
-            f"{name}_{axis}": p[k]
-            for name, p in points.items()
-            for k, axis in enumerate(AXES)
-        }
+        return {f"{name}_{axis}": p[k] for name, p in points.items() for k, axis in enumerate(AXES)}
     for name, column in _NUMBER_FIELDS.items():
         if isinstance(value := nested_field(message, name), (int, float)):
             return {column: float(value)}
-        if (
-            name == "data"
-            and isinstance(value, (list, np.ndarray))
-            and len(np.shape(value)) == 1
-        ):
-            return {
-                f"{column}_{k}": float(each) for k, each in enumerate(value)
-            }
+        if name == "data" and isinstance(value, (list, np.ndarray)) and len(np.shape(value)) == 1:
+            return {f"{column}_{k}": float(each) for k, each in enumerate(value)}
     return {}
 
 
@@ -425,17 +351,11 @@ def _pose_of_message(message: Any) -> tuple[float, ...] | None:
     """
     for position, rotation in _POSES:
         if hasattr(turned := nested_field(message, rotation), "w"):
-            return (
-                *_vector(nested_field(message, position)),
-                *_vector(turned),
-                turned.w,
-            )
+            return (*_vector(nested_field(message, position)), *_vector(turned), turned.w)
     return None
 
 
-def _points_of_message(
-    message: Any, *, by_namespace: bool
-) -> dict[str, tuple[float, ...]]:
+def _points_of_message(message: Any, *, by_namespace: bool) -> dict[str, tuple[float, ...]]:
     """Return positions (x, y, z) by name: of a single point, or of those items of the first list
     that have a position; empty if there are none.
 
@@ -445,8 +365,7 @@ def _points_of_message(
         return {nested_field(message, "header.frame_id") or "point": one}
     items = enumerate(first_list(message))
     places = {
-        _item_name(item, k, by_namespace=by_namespace): _position_of_item(item)
-        for k, item in items
+        _item_name(item, k, by_namespace=by_namespace): _position_of_item(item) for k, item in items
     }
     return {key: place for key, place in places.items() if place is not None}
 
@@ -467,14 +386,7 @@ def _position_of_item(item: Any) -> tuple[float, ...] | None:
     """Return the position of an item of a list; None if it has none."""
     if _is_vector(item):
         return _vector(item)
-    return next(
-        (
-            _vector(p)
-            for name in _POINTS
-            if _is_vector(p := nested_field(item, name))
-        ),
-        None,
-    )
+    return next((_vector(p) for name in _POINTS if _is_vector(p := nested_field(item, name))), None)
 
 
 def _item_name(item: Any, index: int, *, by_namespace: bool) -> str:
@@ -482,13 +394,9 @@ def _item_name(item: Any, index: int, *, by_namespace: bool) -> str:
     `by_namespace` its namespace and a slash are put before it, if it has one.
     """
     names = (nested_field(item, name) for name in _NAMES)
-    name = str(
-        next((name for name in names if name not in (None, "")), index + 1)
-    )
+    name = str(next((name for name in names if name not in (None, "")), index + 1))
     return (
-        f"{namespace}/{name}"
-        if by_namespace and (namespace := nested_field(item, "ns"))
-        else name
+        f"{namespace}/{name}" if by_namespace and (namespace := nested_field(item, "ns")) else name
     )
 
 
@@ -498,11 +406,7 @@ def has_namespaces(messages: Iterable[Any]) -> bool:
     """
     return (
         len(
-            {
-                nested_field(item, "ns")
-                for each in messages
-                for item in first_list(each)
-            }
+            {nested_field(item, "ns") for each in messages for item in first_list(each)}
             - {None, ""}
         )
         > 1
@@ -535,10 +439,7 @@ def is_transforms(message: Any) -> bool:
     """Return whether a message places frames in others: it has a list of transforms, or is a
     transform itself.
     """
-    return (
-        nested_field(message, "transforms") is not None
-        or transform_frames(message) is not None
-    )
+    return nested_field(message, "transforms") is not None or transform_frames(message) is not None
 
 
 def transform_frames(transform: Any) -> tuple[str, str] | None:
@@ -549,18 +450,11 @@ def transform_frames(transform: Any) -> tuple[str, str] | None:
     parent = nested_field(transform, "parent_frame_id") or nested_field(
         transform, "header.frame_id"
     )
-    is_one = (
-        child
-        and parent
-        and _pose_of_message(transform)
-        and not hasattr(transform, "twist")
-    )
+    is_one = child and parent and _pose_of_message(transform) and not hasattr(transform, "twist")
     return (parent.lstrip("/"), child.lstrip("/")) if is_one else None
 
 
-def poses_of_transforms(
-    messages: Iterable[tuple[int, Any]], start_ns: int
-) -> Edges:
+def poses_of_transforms(messages: Iterable[tuple[int, Any]], start_ns: int) -> Edges:
     """Return poses of child frames in their parents, by (parent, child) and time [s], from messages
     with their times of recording [ns]; times count from `start_ns` [ns].
 
@@ -570,18 +464,14 @@ def poses_of_transforms(
     for at_ns, message in messages:
         for each in nested_field(message, "transforms") or [message]:
             pose = _pose_of_message(each)
-            if (
-                edge := transform_frames(each)
-            ) is not None and pose is not None:
+            if (edge := transform_frames(each)) is not None and pose is not None:
                 edges.setdefault(edge, {}).setdefault(
                     measurement_time_s(each, at_ns, start_ns=start_ns), pose
                 )
     return edges
 
 
-def _all_transforms(
-    log: Log, moving: Iterable[tuple[int, Any]], topic: str
-) -> Edges:
+def _all_transforms(log: Log, moving: Iterable[tuple[int, Any]], topic: str) -> Edges:
     """Return the poses of a topic's transforms `moving` and of the fixed transforms in its static
     topic, which have the time 0, by (parent, child) and time [s].
 
@@ -610,9 +500,7 @@ def moving_chains(edges: Edges) -> list[tuple[str, str]]:
     chains = []
     for frame in above:
         chain = [frame]
-        while (
-            parent := above.get(chain[-1])
-        ) is not None and parent not in chain:
+        while (parent := above.get(chain[-1])) is not None and parent not in chain:
             chain.append(parent)
         if chain[-1] not in above and moving & set(chain):
             chains.append((chain[-1], frame))
@@ -650,44 +538,21 @@ def chains_from(
     return found
 
 
-def _poses_through_frames(
-    edges: Edges, address: TopicAddress
-) -> tuple[Array, Array]:
+def _poses_through_frames(edges: Edges, address: TopicAddress) -> tuple[Array, Array]:
     """Return times (T,) [s] and poses (T, 7) of one frame in another: position, then quaternion (x,
     y, z, w), through all frames between them.
 
     The times are those of the most frequent transform; others are interpolated along screw motions.
-
-    Parameters
-    ----------
-    edges : Edges
-        Poses of child frames in their parents, by (parent, child) and time [s].
-    address : TopicAddress
-        States the two frames; None is possible if there is only one pair.
-
-    Raises
-    ------
-    InputError
-        If no frame moves between them, or there is no common time.
     """
     require_packages("pytransform3d")
-    from pytransform3d.trajectories import (
-        pqs_from_transforms,
-        transforms_from_pqs,
-    )
-    from pytransform3d.transform_manager import (
-        NumpyTimeseriesTransform as Series,
-    )
+    from pytransform3d.trajectories import pqs_from_transforms, transforms_from_pqs
+    from pytransform3d.transform_manager import NumpyTimeseriesTransform as Series
     from pytransform3d.transform_manager import StaticTransform as Static
-    from pytransform3d.transform_manager import (
-        TemporalTransformManager as Manager,
-    )
+    from pytransform3d.transform_manager import TemporalTransformManager as Manager
 
     parent, child = requested_frames(edges, address)
     path = frame_path(edges, parent, child=child)
-    moving = [
-        np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1
-    ]
+    moving = [np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1]
     if not moving:
         raise InputError(
             f"{child} does not move relative to {parent} in this log; expected two frames that "
@@ -704,9 +569,7 @@ def _poses_through_frames(
     manager = Manager(check=False)
     for edge in path:
         at_s = np.array(sorted(edges[edge]))
-        poses = np.array([edges[edge][t] for t in at_s])[
-            :, [0, 1, 2, 6, 3, 4, 5]
-        ]
+        poses = np.array([edges[edge][t] for t in at_s])[:, [0, 1, 2, 6, 3, 4, 5]]
         if len(at_s) > 1:
             series: Any = Series(at_s, poses)
         else:
@@ -767,13 +630,8 @@ def frame_path(
 
     ours = up(child)
     theirs = up(parent)
-    path = [
-        edge for edge in (*ours, *theirs) if (edge in ours) != (edge in theirs)
-    ]
-    roots = {
-        (each[-1][0] if each else frame)
-        for each, frame in ((ours, child), (theirs, parent))
-    }
+    path = [edge for edge in (*ours, *theirs) if (edge in ours) != (edge in theirs)]
+    roots = {(each[-1][0] if each else frame) for each, frame in ((ours, child), (theirs, parent))}
     if not path or len(roots) > 1:
         raise InputError(
             f"no chain of frames leads from {parent} to {child}; expected a transform (tf or "
@@ -787,23 +645,6 @@ def _poses_from_joints(
 ) -> Array:
     """Return poses (T, 7) of a robot's link from joint positions (T, joints), by its URDF file:
     position [m], then quaternion (x, y, z, w).
-
-    Parameters
-    ----------
-    columns : list of str
-        Names of the joints; those that the robot does not have are ignored.
-    values : (T, joints) array
-        Positions; angles in `unit`, displacements in metres.
-    address : TopicAddress
-        States the URDF file, and the two links.
-    unit : {"rad", "deg"} or None
-        None raises an `InputError`.
-
-    Raises
-    ------
-    InputError
-        If the file is no URDF, a link or all joints are missing, frames or unit are not stated, or
-        a joint is beyond its limits.
     """
     require_packages("pytransform3d")
     from pytransform3d.transformations import pq_from_transform
@@ -820,9 +661,7 @@ def _poses_from_joints(
     try:
         robot.load_urdf(address.robot.read_text(encoding="utf-8"))
     except Exception as error:  # lxml's and the library's own
-        raise InputError(
-            f"this is not a valid URDF file: {error}", address.robot
-        ) from error
+        raise InputError(f"this is not a valid URDF file: {error}", address.robot) from error
     parent, child = address.frames
     for frame in address.frames:
         if not robot.has_frame(frame):
@@ -837,11 +676,7 @@ def _poses_from_joints(
             "the log does not state the unit of the joint positions; expected #rad or #deg after "
             "the topic"
         )
-    limits = {
-        name: robot.get_joint_limits(name)
-        for name in columns
-        if _has_joint(robot, name)
-    }
+    limits = {name: robot.get_joint_limits(name) for name in columns if _has_joint(robot, name)}
     if not limits:
         joints = ", ".join(columns)
         raise InputError(
@@ -854,13 +689,9 @@ def _poses_from_joints(
         for name, value in zip(columns, position, strict=True):
             if name in limits:
                 angle = np.radians(value) if unit == "deg" else value
-                _require_joint_limits(
-                    name, angle, limits=limits[name], address=address
-                )
+                _require_joint_limits(name, angle, limits=limits[name], address=address)
                 robot.set_joint(name, angle)
-        poses[row] = pq_from_transform(robot.get_transform(child, parent))[
-            [0, 1, 2, 4, 5, 6, 3]
-        ]
+        poses[row] = pq_from_transform(robot.get_transform(child, parent))[[0, 1, 2, 4, 5, 6, 3]]
     return poses
 
 
@@ -880,16 +711,8 @@ def _require_joint_limits(
     by more than `JOINT_LIMIT_SLACK`: the library would silently clip it. The message names the
     robot of `address`.
     """
-    if (
-        not limits[0] - JOINT_LIMIT_SLACK
-        <= angle
-        <= limits[1] + JOINT_LIMIT_SLACK
-    ):
-        hint = (
-            ""
-            if address.unit
-            else "; if these are degrees, append #deg to the topic"
-        )
+    if not limits[0] - JOINT_LIMIT_SLACK <= angle <= limits[1] + JOINT_LIMIT_SLACK:
+        hint = "" if address.unit else "; if these are degrees, append #deg to the topic"
         raise InputError(
             f"the joint {name} is at {angle:.4g}, outside its limits {limits[0]:.4g} to "
             f"{limits[1]:.4g} in {address.robot and address.robot.name}; expected positions within "

@@ -33,9 +33,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
             where=f"line {rows[-1].line}",
         )
     _, keys, values, names, axes, *frames = rows
-    header_values = zip(
-        values.cells, [values.line] * len(keys.cells), strict=False
-    )
+    header_values = zip(values.cells, [values.line] * len(keys.cells), strict=False)
     header = Header(dict(zip(keys.cells, header_values, strict=False)))
     if missing := [key for key in _KEYS if key not in header.entries]:
         there = ", ".join(filter(None, keys.cells))
@@ -44,9 +42,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
             "export the file again"
         )
         raise InputError(message, where=f"line {keys.line}")
-    unit = length_unit_of_text(
-        header.entries["Units"][0], f"line {values.line}"
-    )
+    unit = length_unit_of_text(header.entries["Units"][0], f"line {values.line}")
     labels = [cell for cell in names.cells[2:] if cell]
     if names.cells[0] != "Frame#" or axes.cells[0]:
         raise InputError(
@@ -54,9 +50,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
             "names of the markers, and X1, Y1, Z1 … below them",
             where=f"line {names.line}",
         )
-    header.require_count(
-        "NumMarkers", len(labels), what="marker names", line=names.line
-    )
+    header.require_count("NumMarkers", len(labels), what="marker names", line=names.line)
     return tracks_of_frames(
         header,
         "NumFrames",

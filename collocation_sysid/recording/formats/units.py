@@ -11,32 +11,11 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0},
     "length": {**METRES_PER_UNIT, "µm": 1e-6, "um": 1e-6, '"': 0.0254},
-    "force": {
-        "n": 1.0,
-        "mn": 1e-3,
-        "MN": 1e6,
-        "kn": 1e3,
-        "kgf": 9.80665,
-        "lbf": 4.4482216,
-    },
+    "force": {"n": 1.0, "mn": 1e-3, "MN": 1e6, "kn": 1e3, "kgf": 9.80665, "lbf": 4.4482216},
     "torque": {"nm": 1.0, "nmm": 1e-3, "mnm": 1e-3},
     "pressure": {
-        **{
-            "pa": 1.0,
-            "mPa": 1e-3,
-            "hpa": 1e2,
-            "kpa": 1e3,
-            "mpa": 1e6,
-            "gpa": 1e9,
-        },
-        **{
-            "n/mm²": 1e6,
-            "n/mm2": 1e6,
-            "n/mm^2": 1e6,
-            "bar": 1e5,
-            "mbar": 1e2,
-            "psi": 6894.757,
-        },
+        **{"pa": 1.0, "mPa": 1e-3, "hpa": 1e2, "kpa": 1e3, "mpa": 1e6, "gpa": 1e9},
+        **{"n/mm²": 1e6, "n/mm2": 1e6, "n/mm^2": 1e6, "bar": 1e5, "mbar": 1e2, "psi": 6894.757},
     },
     "ratio": {"-": 1.0, "1": 1.0, "mm/mm": 1.0, "m/m": 1.0, "%": 1e-2},
 }
@@ -59,12 +38,7 @@ def si_factor(unit_text: str, dimension: str) -> float | None:
     Blanks, "·" and "*" in the unit are ignored. Capitals matter only where they distinguish two
     units, such as "MN" and "mn" or "mPa" and "mpa".
     """
-    bare = (
-        unit_text.replace("·", "")
-        .replace("*", "")
-        .replace(" ", "")
-        .replace("μ", "µ")
-    )
+    bare = unit_text.replace("·", "").replace("*", "").replace(" ", "").replace("μ", "µ")
     known = UNITS[dimension]
     if bare not in known and dimension == "length":
         bare = _SPELLINGS.get(bare.lower(), bare)

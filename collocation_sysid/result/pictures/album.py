@@ -16,12 +16,7 @@ from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI
 from ..replay import MotionRecord, damaged_run_refused, read_run
 from .camera_pictures import camera_pictures
-from .confidence import (
-    Confidence,
-    budget_picture,
-    confidence_ellipses,
-    correlation_matrix,
-)
+from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
 from .field_intervals import field_picture
 from .mesh_pictures import elements_picture, mesh_picture
 from .over_time import marker_errors, marker_tracks, sensor_picture
@@ -32,9 +27,7 @@ from .stress_strain import strain_picture
 
 
 def all_pictures(
-    replays: Sequence[MotionRecord],
-    result: Result,
-    truth: Mapping[str, float] | None = None,
+    replays: Sequence[MotionRecord], result: Result, truth: Mapping[str, float] | None = None
 ) -> dict[str, Figure]:
     """Return all pictures of a run except that of its Jacobian, by file name without ending.
 
@@ -57,14 +50,10 @@ def all_pictures(
         if not item.fixed and n in result.collect_estimates()
     ]
     pictures = (
-        {"convergence": convergence(result.history, names, truth=truth)}
-        if result.history
-        else {}
+        {"convergence": convergence(result.history, names, truth=truth)} if result.history else {}
     )
     if (scan := result.scan) is not None:
-        pictures["scan"] = scan_picture(
-            scan.young_pa, scan.misfit, best=scan.best
-        )
+        pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, best=scan.best)
     confidence = Confidence.from_result(result)
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
@@ -75,20 +64,14 @@ def all_pictures(
     if with_mesh:
         body = with_mesh[0]
         pictures["mesh"] = mesh_picture(body)
-        pictures["elements"] = elements_picture(
-            body.undeformed_m, body.tetrahedra
-        )
+        pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
         for name, values in body.fields.items():
             pictures[f"field_{name}"] = field_picture(body, name, values=values)
-    drawn = (
-        named for replay in replays for named in experiment_pictures(replay)
-    )
+    drawn = (named for replay in replays for named in experiment_pictures(replay))
     return with_unique_names(chain(pictures.items(), drawn))
 
 
-def with_unique_names(
-    pictures: Iterable[tuple[str, Figure]],
-) -> dict[str, Figure]:
+def with_unique_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figure]:
     """Return pictures by file name without suffix, in which characters that a file name cannot have
     become underscores; "_2", "_3", … is appended to a name that an earlier picture has already.
     """
@@ -96,9 +79,7 @@ def with_unique_names(
     for text, figure in pictures:
         name = safe_name(text)
         numbered = (f"{name}_{k}" for k in count(2))
-        named[
-            next(free for free in chain([name], numbered) if free not in named)
-        ] = figure
+        named[next(free for free in chain([name], numbered) if free not in named)] = figure
     return named
 
 
@@ -126,26 +107,16 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     if len(names):
         yield (
             f"tracks_{replay.name}",
-            marker_tracks(
-                t_s,
-                names,
-                measured_m=measured,
-                fitted_m=fitted,
-                simulated_m=rolled_out,
-            ),
+            marker_tracks(t_s, names, measured_m=measured, fitted_m=fitted, simulated_m=rolled_out),
         )
         yield (
             f"error_{replay.name}",
-            marker_errors(
-                t_s, measured, fitted_m=fitted, simulated_m=rolled_out
-            ),
+            marker_errors(t_s, measured, fitted_m=fitted, simulated_m=rolled_out),
         )
     if len(names) and not replay.static:
         yield (
             f"spectrum_{replay.name}",
-            spectrum_picture(
-                t_s, measured, fitted_m=fitted, natural_hz=replay.natural_hz
-            ),
+            spectrum_picture(t_s, measured, fitted_m=fitted, natural_hz=replay.natural_hz),
         )
     for series in replay.sensor_series:
         count = len(replay.sensor_columns[series.kind])
@@ -156,15 +127,10 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         )
     for name, values in replay.readings.items():
         places = values.shape[1] // 3
-        names = (
-            [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
-        )
+        names = [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
         unit = replay.reading_units.get(name)
         units = [unit] * places if unit else []
-        yield (
-            f"reading_{replay.name}_{name}",
-            sensor_picture(values, names, units=units),
-        )
+        yield (f"reading_{replay.name}_{name}", sensor_picture(values, names, units=units))
     yield from camera_pictures(replay)
     if replay.has_shapes():
         yield f"shapes_{replay.name}", shapes_picture(replay)
@@ -176,17 +142,11 @@ def _infinities_as_nan(markers_m: Array | None) -> Array | None:
     """Return a copy of markers (T, M, 3) with NaN in place of infinities, where a method or
     simulation diverged; None for None.
     """
-    return (
-        None
-        if markers_m is None
-        else np.where(np.isfinite(markers_m), markers_m, np.nan)
-    )
+    return None if markers_m is None else np.where(np.isfinite(markers_m), markers_m, np.nan)
 
 
 def save_pictures(
-    folder: str | Path,
-    pictures: Mapping[str, Figure],
-    say: Callable[[str], None] | None = None,
+    folder: str | Path, pictures: Mapping[str, Figure], say: Callable[[str], None] | None = None
 ) -> list[Path]:
     """Write each picture as <name>.png and return the files; existing ones are replaced.
 
@@ -212,18 +172,14 @@ def save_pictures(
                 say(f"drawing picture {k} of {len(pictures)}: {file.name}")
             # Harder compression takes longer than drawing, for a tenth of the size.
             with replaced_file(file) as draft:
-                figure.savefig(
-                    draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2}
-                )
+                figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
             complete_steps(StepUnit.PICTURE)
             files.append(file)
     return files
 
 
 def redraw_pictures(
-    run: str | Path,
-    folder: str | Path,
-    say: Callable[[str], None] | None = None,
+    run: str | Path, folder: str | Path, say: Callable[[str], None] | None = None
 ) -> list[Path]:
     """Write the pictures of a run folder into `folder`, all but that of the Jacobian, and return
     the files.

@@ -62,19 +62,13 @@ def depth_picture(rows: Array) -> Figure:
     times = np.unique(rows[np.isnan(rows[:, 3]), 0])
     points = rows[np.isfinite(rows[:, 3])]
     if not len(points):
-        return _sentence_figure(
-            "no point is near enough to the body to be compared"
-        )
+        return _sentence_figure("no point is near enough to the body to be compared")
     fitted = bool(np.isfinite(points[:, 4]).any())
     axes, dot = _new_panels(points, times, rows=1 + fitted)
     nearest, farthest = np.percentile(points[:, 3], [1, 99])
     depth = {"cmap": "viridis", "vmin": nearest, "vmax": farthest, "s": dot}
     end = (
-        max(
-            1e-3,
-            1e3
-            * float(np.nanpercentile(np.abs(points[:, 4]), SCALE_PERCENTILE)),
-        )
+        max(1e-3, 1e3 * float(np.nanpercentile(np.abs(points[:, 4]), SCALE_PERCENTILE)))
         if fitted
         else 1.0
     )
@@ -83,12 +77,7 @@ def depth_picture(rows: Array) -> Figure:
         here = points[points[:, 0] == t_s]
         lines = rows[(rows[:, 0] == t_s) & np.isnan(rows[:, 3]), 1:3]
         image = _draw_panel(
-            column[0],
-            here[:, 1:3],
-            values=here[:, 3],
-            lines=lines,
-            colour=VERMILION,
-            style=depth,
+            column[0], here[:, 1:3], values=here[:, 3], lines=lines, colour=VERMILION, style=depth
         )
         scales = [(image, "depth [m]")]
         title = f"t = {t_s:.4g} s" if len(times) > 1 else ""
@@ -107,9 +96,7 @@ def depth_picture(rows: Array) -> Figure:
             )
             scales.append((distances, "distance behind the surface [mm]"))
             rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
-            column[1].set_title(
-                f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT
-            )
+            column[1].set_title(f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT)
     for row, (scale, label) in zip(axes, scales, strict=True):
         bar = row[0].figure.colorbar(scale, ax=row)
         bar.set_label(label, fontsize=SMALL_PT)
@@ -123,8 +110,7 @@ def depth_picture(rows: Array) -> Figure:
 def _sentence_figure(text: str) -> Figure:
     """Return a small figure that has only the sentence `text`."""
     figure = Figure(
-        figsize=(MAX_PANEL_SHARE * PAGE_MM / MM_PER_INCH, TITLE_HEIGHT_INCH),
-        layout="constrained",
+        figsize=(MAX_PANEL_SHARE * PAGE_MM / MM_PER_INCH, TITLE_HEIGHT_INCH), layout="constrained"
     )
     axes = figure.subplots()
     axes.set_axis_off()
@@ -132,36 +118,16 @@ def _sentence_figure(text: str) -> Figure:
     return figure
 
 
-def _new_panels(
-    points: Array, times: Array, rows: int
-) -> tuple[NDArray[np.object_], float]:
+def _new_panels(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_], float]:
     """Return panels (rows, times) with the proportions of the points' extent, and the area of a
     dot.
-
-    Parameters
-    ----------
-    points : (P, 8)
-        Points of `MotionRecord.visible_points`, at least one.
-    times : (m,)
-        Times of the samples, one column each, at least one.
-    rows : int
-        Number of rows of panels.
-
-    Returns
-    -------
-    axes : (rows, m) array of Axes
-        Axes of a new figure.
-    dot : float
-        Area of a dot [pt²], such that dots cover the share `COVERED_SHARE` of the extent.
     """
     inch = PAGE_MM / MM_PER_INCH
     count = len(times)
     across = min(1 / count, MAX_PANEL_SHARE)
     width, height = np.ptp(points[:, 1:3], axis=0)
     panel = (
-        across
-        * inch
-        * float(np.clip(height / max(width, 1e-12), *PANEL_ASPECT_LIMITS))
+        across * inch * float(np.clip(height / max(width, 1e-12), *PANEL_ASPECT_LIMITS))
         + TITLE_HEIGHT_INCH
     )
     size = (max(MAX_PANEL_SHARE, across * count) * inch, panel * rows)
@@ -171,38 +137,14 @@ def _new_panels(
         * PANEL_ASPECT_LIMITS[0]
         / max(1, len(points) / count)
     )
-    return Figure(figsize=size, layout="constrained").subplots(
-        rows, count, squeeze=False
-    ), dot
+    return Figure(figsize=size, layout="constrained").subplots(rows, count, squeeze=False), dot
 
 
 def _draw_panel(
-    axes: Axes,
-    image_points: Array,
-    values: Array,
-    lines: Array,
-    colour: str,
-    style: dict[str, Any],
+    axes: Axes, image_points: Array, values: Array, lines: Array, colour: str, style: dict[str, Any]
 ) -> PathCollection:
-    """Draw points and outlines, and return the points; outlines far from all points are cut off.
-
-    Parameters
-    ----------
-    axes : Axes
-    image_points : (P, 2)
-        u and v of the points [pixels, or mm for a point cloud], at least one.
-    values : (P,)
-        Values that colour the points.
-    lines : (k, 2)
-        u and v of the outlines in the same unit, NaN after each face.
-    colour : str
-        Colour of the outlines.
-    style : dict
-        Further arguments of `Axes.scatter`.
-    """
-    drawn = axes.scatter(
-        *image_points.T, c=values, linewidths=0, zorder=1, **style
-    )
+    """Draw points and outlines, and return the points; outlines far from all points are cut off."""
+    drawn = axes.scatter(*image_points.T, c=values, linewidths=0, zorder=1, **style)
     # Of more faces thinner ones, or these would hide the points.
     thin = min(0.5, THICK_LINE_ROWS / max(1, len(lines)))
     axes.plot(*lines.T, color=colour, linewidth=thin, zorder=2)
@@ -213,18 +155,9 @@ def _draw_panel(
     low = np.maximum(both.min(axis=0), low - room)
     high = np.minimum(both.max(axis=0), high + room)
     margin = 0.03 * (high - low).max()
-    axes.set(
-        xlim=(low[0] - margin, high[0] + margin),
-        ylim=(high[1] + margin, low[1] - margin),
-    )
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(high[1] + margin, low[1] - margin))
     axes.set(aspect="equal")
     axes.tick_params(labelsize=SMALL_PT, width=0.6)
     if not ((lines >= low) & (lines <= high)).all(axis=1).any():
-        axes.text(
-            0.5,
-            0.02,
-            "the body is not in view",
-            transform=axes.transAxes,
-            ha="center",
-        )
+        axes.text(0.5, 0.02, "the body is not in view", transform=axes.transAxes, ha="center")
     return drawn

@@ -66,9 +66,7 @@ class Confidence:
         """
         if (uncertainty := result.uncertainty) is None:
             return None
-        known = np.isfinite(np.diag(uncertainty.covariance)) & np.isfinite(
-            uncertainty.quantiles
-        )
+        known = np.isfinite(np.diag(uncertainty.covariance)) & np.isfinite(uncertainty.quantiles)
         indices = np.flatnonzero(known).tolist()
         names = [uncertainty.names[k] for k in indices]
         values = np.array([result.parameters[name].value for name in names])
@@ -80,9 +78,7 @@ class Confidence:
         )
 
 
-def ellipse_outline(
-    confidence: Confidence, i: int, j: int, points: int = 181
-) -> Array:
+def ellipse_outline(confidence: Confidence, i: int, j: int, points: int = 181) -> Array:
     """Return the outline (points, 2) of the joint 95 % region of two logarithms, about their
     estimates.
 
@@ -98,16 +94,9 @@ def ellipse_outline(
     angle = np.linspace(0.0, 2 * np.pi, points)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     deviation = np.sqrt(np.diag(confidence.covariance)[pair])
-    rho = float(
-        np.clip(confidence.covariance[i, j] / deviation.prod(), -1.0, 1.0)
-    )
+    rho = float(np.clip(confidence.covariance[i, j] / deviation.prod(), -1.0, 1.0))
     root = np.array([[1.0, 0.0], [rho, np.sqrt(1 - rho**2)]])
-    return (
-        JOINT_RADIUS
-        * confidence.quantiles[pair]
-        * deviation
-        * (circle @ root.T)
-    )
+    return JOINT_RADIUS * confidence.quantiles[pair] * deviation * (circle @ root.T)
 
 
 def confidence_ellipses(confidence: Confidence) -> Figure:
@@ -123,22 +112,12 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
         At least two parameters.
     """
     count = len(confidence.names) - 1
-    half = (
-        confidence.quantiles * np.sqrt(np.diag(confidence.covariance))
-    ).tolist()
+    half = (confidence.quantiles * np.sqrt(np.diag(confidence.covariance))).tolist()
     scales = [
-        _DeviationAxis.from_reach(
-            1.15 * min(JOINT_RADIUS * each, MAX_HALF_WIDTH)
-        )
-        for each in half
+        _DeviationAxis.from_reach(1.15 * min(JOINT_RADIUS * each, MAX_HALF_WIDTH)) for each in half
     ]
     figure = framed_figure(
-        COLUMN_MM,
-        COLUMN_MM if count > 1 else 62,
-        left_mm=14,
-        right_mm=2,
-        foot_mm=11,
-        top_mm=2,
+        COLUMN_MM, COLUMN_MM if count > 1 else 62, left_mm=14, right_mm=2, foot_mm=11, top_mm=2
     )
     spaces = {"wspace": 0.12, "hspace": 0.12}
     panels = figure.subplots(count, count, squeeze=False, gridspec_kw=spaces)
@@ -149,51 +128,29 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
         i = column
         j = row + 1
         _draw_pair(
-            axes,
-            ellipse_outline(confidence, i, j=j),
-            half_width=half[i],
-            half_height=half[j],
+            axes, ellipse_outline(confidence, i, j=j), half_width=half[i], half_height=half[j]
         )
         style_axes(axes)
         axes.set(xlim=scales[i].limits, ylim=scales[j].limits)
         last = row == count - 1
         first = column == 0
         axes.set_xticks(scales[i].ticks, scales[i].labels if last else [""] * 3)
-        axes.set_yticks(
-            scales[j].ticks, scales[j].labels if first else [""] * 3
-        )
-        axes.set_xlabel(
-            scales[i].axis_label(confidence.names[i]) if last else "",
-            fontsize=TEXT_PT,
-        )
+        axes.set_yticks(scales[j].ticks, scales[j].labels if first else [""] * 3)
+        axes.set_xlabel(scales[i].axis_label(confidence.names[i]) if last else "", fontsize=TEXT_PT)
         if first:
-            axes.set_ylabel(
-                scales[j].axis_label(confidence.names[j]), fontsize=TEXT_PT
-            )
+            axes.set_ylabel(scales[j].axis_label(confidence.names[j]), fontsize=TEXT_PT)
             axes.yaxis.set_label_coords(-0.13 * count, 0.5)
     note = "deviation from the estimate:\n95 % region of each pair,\n95 % interval of each alone"
-    figure.text(
-        0.98,
-        0.97,
-        note if count > 1 else "",
-        ha="right",
-        va="top",
-        fontsize=SMALL_PT,
-    )
+    figure.text(0.98, 0.97, note if count > 1 else "", ha="right", va="top", fontsize=SMALL_PT)
     return figure
 
 
-def _draw_pair(
-    axes: Axes, outline: Array, half_width: float, half_height: float
-) -> None:
+def _draw_pair(axes: Axes, outline: Array, half_width: float, half_height: float) -> None:
     """Draw a region with the outline (points, 2), about the origin, filled into `axes`, and a cross
     of half widths `half_width` and `half_height`, all as deviations of logarithms.
     """
     axes.fill(*outline.T, facecolor=to_rgba(SKY, 0.35), edgecolor=BLUE, lw=1.0)
-    for line in (
-        [[-half_width, half_width], [0, 0]],
-        [[0, 0], [-half_height, half_height]],
-    ):
+    for line in ([[-half_width, half_width], [0, 0]], [[0, 0], [-half_height, half_height]]):
         axes.plot(*line, color=BLACK, lw=0.8, solid_capstyle="butt")
 
 
@@ -225,17 +182,12 @@ class _DeviationAxis:
             factor = round_length(np.exp(0.9 * reach))
             size = float(np.log(factor))
             return cls(
-                reach,
-                (-size, 0.0, size),
-                labels=(f"÷{factor:g}", "1", f"×{factor:g}"),
-                unit="",
+                reach, (-size, 0.0, size), labels=(f"÷{factor:g}", "1", f"×{factor:g}"), unit=""
             )
         share = round_length(1 - np.exp(-0.9 * reach))
         number = f"{100 * share:g}"
         ticks = (float(np.log1p(-share)), 0.0, float(np.log1p(share)))
-        return cls(
-            reach, ticks, labels=(f"−{number}", "0", f"+{number}"), unit=" [%]"
-        )
+        return cls(reach, ticks, labels=(f"−{number}", "0", f"+{number}"), unit=" [%]")
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -258,9 +210,7 @@ def correlation_matrix(confidence: Confidence) -> Figure:
     correlation = correlation_from_covariance(confidence.covariance)
     count = len(confidence.names)
     figure = framed_figure(64, 52, left_mm=8, right_mm=7, foot_mm=6, top_mm=5)
-    axes, bar_axes = figure.subplots(
-        1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06}
-    )
+    axes, bar_axes = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
     image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
     for (i, j), value in np.ndenumerate(correlation):
         axes.text(
@@ -316,9 +266,7 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
     )
     axes = figure.subplots()
     starts = [0.0] * len(rows)
-    for source, colour in zip(
-        sources, [*COLOUR_CYCLE[: len(drawn)], GREY], strict=True
-    ):
+    for source, colour in zip(sources, [*COLOUR_CYCLE[: len(drawn)], GREY], strict=True):
         widths = [
             1 - sum(shares[row].get(s, 0.0) for s in drawn)
             if source == OTHERS
@@ -326,11 +274,7 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
             for row in rows
         ]
         bars = axes.barh(
-            range(len(rows)),
-            widths,
-            left=starts,
-            color=colour,
-            label=source_label(source),
+            range(len(rows)), widths, left=starts, color=colour, label=source_label(source)
         )
         for bar in bars:  # a white line keeps neighbours apart
             bar.set(edgecolor="white", linewidth=0.4)

@@ -16,14 +16,7 @@ from ...fem.meshes.mesh import boundary_of
 from ..figure_style import PAGE_MM, SMALL_PT
 from ..replay import MotionRecord
 from .projection import ParallelCamera
-from .scene import (
-    BodyDrawing,
-    SheetView,
-    aspect_ratio,
-    draw_directions,
-    draw_scale,
-    sheet,
-)
+from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
 from .shapes import FIELD_COLOURS
 
 # Height of the titles [mm].
@@ -82,49 +75,31 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
     # Wide intervals where the data add nothing would take up the colour scale.
     low = np.quantile(known[:, 1], 0.05)
     high = np.quantile(known[:, 2], 0.95)
-    scale = ScalarMappable(
-        (LogNorm if low > 0 else Normalize)(low, high), FIELD_COLOURS
-    )
-    untold = np.clip(
-        (values[:, 3] - FADING_START) / (FADING_END - FADING_START),
-        0.0,
-        MAX_FADING,
-    )[:, None]
+    scale = ScalarMappable((LogNorm if low > 0 else Normalize)(low, high), FIELD_COLOURS)
+    untold = np.clip((values[:, 3] - FADING_START) / (FADING_END - FADING_START), 0.0, MAX_FADING)[
+        :, None
+    ]
     no_nodes = np.zeros(len(nodes_m), dtype=bool)
     for row, own in enumerate(rows):
         faces, owners = boundary_of(cells[own])
-        for column, (title, place) in enumerate(
-            zip(COLUMN_TITLES, (1, 0, 2), strict=True)
-        ):
+        for column, (title, place) in enumerate(zip(COLUMN_TITLES, (1, 0, 2), strict=True)):
             corner = (
                 CORNER_MM + column * (width + GAP_MM),
                 FOOT_MM + (1 - row) * (height + GAP_MM),
             )
-            view = SheetView.fit_points(
-                camera, nodes_m, room_mm=(width, height), corner_mm=corner
-            )
+            view = SheetView.fit_points(camera, nodes_m, room_mm=(width, height), corner_mm=corner)
             colours = scale.to_rgba(values[:, place])[:, :3]
-            colours = (1 - np.nan_to_num(untold)) * colours + np.nan_to_num(
-                untold
-            )
+            colours = (1 - np.nan_to_num(untold)) * colours + np.nan_to_num(untold)
             colours[np.isnan(values[:, place])] = OTHER_REGION_COLOUR
             BodyDrawing(axes, view, surface=faces).update(
-                nodes_m,
-                no_nodes,
-                markers_m=np.zeros((0, 3)),
-                colours=colours[own[owners]],
+                nodes_m, no_nodes, markers_m=np.zeros((0, 3)), colours=colours[own[owners]]
             )
             if row == 0:
                 axes.text(
                     corner[0] + width / 2, total - HEAD_MM / 2, title, ha="center", va="center",
                     fontsize=SMALL_PT,
                 )  # fmt: skip
-    place = (
-        PAGE_MM - BAR_ROOM_MM + 4,
-        FOOT_MM,
-        2.5,
-        total - HEAD_MM - FOOT_MM - 4,
-    )
+    place = (PAGE_MM - BAR_ROOM_MM + 4, FOOT_MM, 2.5, total - HEAD_MM - FOOT_MM - 4)
     bar_axes = axes.inset_axes(place, transform=axes.transData)
     ticks = LogLocator(subs=(1.0, 2.0, 5.0)) if low > 0 else None
     bar = figure.colorbar(scale, cax=bar_axes, ticks=ticks, format="%.3g")

@@ -10,14 +10,7 @@ from matplotlib.figure import Figure
 from ...program.forward.loss_of_stability import StabilityLoss
 from ..figure_style import PAGE_MM, SMALL_PT
 from .projection import ParallelCamera
-from .scene import (
-    BodyDrawing,
-    SheetView,
-    aspect_ratio,
-    draw_directions,
-    draw_scale,
-    sheet,
-)
+from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
 from .shapes import FIELD_COLOURS
 
 # Height of the title [mm].
@@ -45,13 +38,8 @@ def instability_picture(instability: StabilityLoss) -> Figure:
         Positions at the loss of stability, and the mode, whose largest amplitude is 1.
     """
     extent_m = float(np.ptp(instability.positions_m, axis=0).max())
-    shown_m = (
-        instability.positions_m
-        + RELATIVE_AMPLITUDE * extent_m * instability.mode
-    )
-    camera = ParallelCamera.facing_motion(
-        shown_m[None], np.array([0.0, 0.0, 1.0])
-    )
+    shown_m = instability.positions_m + RELATIVE_AMPLITUDE * extent_m * instability.mode
+    camera = ParallelCamera.facing_motion(shown_m[None], np.array([0.0, 0.0, 1.0]))
     aspect = aspect_ratio(camera, shown_m)
     width = PAGE_MM - 2 * MARGIN_MM
     height = min(width / aspect, MAX_BODY_HEIGHT_MM)
@@ -59,12 +47,8 @@ def instability_picture(instability: StabilityLoss) -> Figure:
     view = SheetView.fit_points(
         camera, shown_m, room_mm=(width, height), corner_mm=(MARGIN_MM, FOOT_MM)
     )
-    amplitude = np.linalg.norm(instability.mode, axis=1)[
-        instability.faces
-    ].mean(axis=1)
-    colours = ScalarMappable(Normalize(0.0, 1.0), FIELD_COLOURS).to_rgba(
-        amplitude
-    )[:, :3]
+    amplitude = np.linalg.norm(instability.mode, axis=1)[instability.faces].mean(axis=1)
+    colours = ScalarMappable(Normalize(0.0, 1.0), FIELD_COLOURS).to_rgba(amplitude)[:, :3]
     none = np.zeros(len(shown_m), dtype=bool)
     BodyDrawing(axes, view, surface=instability.faces).update(
         shown_m, none, markers_m=np.zeros((0, 3)), colours=colours
@@ -74,13 +58,7 @@ def instability_picture(instability: StabilityLoss) -> Figure:
         f"and {instability.larger_stretch:.3g}, "
         f"wavelength {1e3 * instability.wavelength_m:.3g} mm"
     )
-    axes.text(
-        PAGE_MM / 2,
-        HEAD_MM / 2 + height + FOOT_MM,
-        title,
-        ha="center",
-        fontsize=SMALL_PT,
-    )
+    axes.text(PAGE_MM / 2, HEAD_MM / 2 + height + FOOT_MM, title, ha="center", fontsize=SMALL_PT)
     draw_directions(axes, camera, origin_mm=(6.0, FOOT_MM))
     draw_scale(axes, view.mm_per_m, corner_mm=(MARGIN_MM, 3.5))
     return figure

@@ -15,13 +15,7 @@ from matplotlib.image import AxesImage
 from ...common.array_types import Array
 from ...program.collocation import Collocation
 from ...recording.measurement_selection import shortened_experiment
-from ..figure_style import (
-    PAGE_MM,
-    SMALL_PT,
-    framed_figure,
-    style_axes,
-    symbol_as_mathtext,
-)
+from ..figure_style import PAGE_MM, SMALL_PT, framed_figure, style_axes, symbol_as_mathtext
 
 # Timesteps shown: enough to see the band, few enough to see its blocks.
 SHOWN_STEPS = 6
@@ -50,12 +44,12 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     """
     total = collocation.transcriptions[0].grid_times
     collocation, z = _first_steps(collocation, z)
-    segment = collocation.transcriptions[0]
+    transcription = collocation.transcriptions[0]
     nq = collocation.nq
-    first = segment.dynamics.first_row
-    steps = min(SHOWN_STEPS, segment.grid_times)
-    height = segment.constraints_per_time
-    width = segment.dof_count
+    first = transcription.dynamics.first_row
+    steps = min(SHOWN_STEPS, transcription.grid_times)
+    height = transcription.constraints_per_time
+    width = transcription.dof_count
     rows = (steps - first) * height
     matrix = abs(collocation.jacobian(z)[:, : nq + steps * width])[:rows]
     band = matrix[:, nq:]
@@ -63,35 +57,26 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     largest = float(np.nan_to_num(matrix.data).max(initial=1e-300))
     norm = LogNorm(largest * 10.0**-DECADES, largest, clip=True)
 
-    figure = framed_figure(
-        PAGE_MM, 88, left_mm=12, right_mm=13, foot_mm=10.5, top_mm=6
-    )
+    figure = framed_figure(PAGE_MM, 88, left_mm=12, right_mm=13, foot_mm=10.5, top_mm=6)
     widths = (0.05 * max(1, nq), 1, 0.2, 0.95, 0.01, 0.03)
     grid = figure.add_gridspec(1, 6, width_ratios=widths, wspace=0.03)
-    full_axes, middle, right, bar_axes = (
-        figure.add_subplot(grid[k]) for k in (0, 1, 3, 5)
-    )
+    full_axes, middle, right, bar_axes = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
     if nq:
         _draw_magnitudes(full_axes, matrix[:, :nq], norm=norm)
     _draw_magnitudes(middle, band, norm=norm)
     image = _draw_magnitudes(right, block, norm=norm)
     style_axes(full_axes, "", xlabel="", ylabel="equations of motion")
     full_axes.set_xticks(
-        np.arange(nq) + 0.5,
-        [symbol_as_mathtext(p.name) for p in collocation.parameters.free],
+        np.arange(nq) + 0.5, [symbol_as_mathtext(p.name) for p in collocation.parameters.free]
     )
     full_axes.set_ylim(rows, 0)
-    _tick_blocks(
-        full_axes, "y", letter="c", times=range(first, steps), size=height
-    )
+    _tick_blocks(full_axes, "y", letter="c", times=range(first, steps), size=height)
     style_axes(middle, f"{steps} of {total} timesteps", xlabel="node positions")
     _tick_blocks(middle, "x", letter="x", times=range(steps), size=width)
-    _tick_blocks(
-        middle, "y", letter="c", times=range(first, steps), size=height
-    )
+    _tick_blocks(middle, "y", letter="c", times=range(first, steps), size=height)
     middle.tick_params(labelleft=False, left=False)
     name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
-    free = "" if segment.has_constraints_of_grasps else ", free dofs only"
+    free = "" if transcription.has_constraints_of_grasps else ", free dofs only"
     style_axes(
         right,
         f"{name}: connectivity of the mesh",
@@ -108,57 +93,34 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     return figure
 
 
-def _first_steps(
-    collocation: Collocation, z: Array
-) -> tuple[Collocation, Array]:
+def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
     """Return the problem of all fitted experiments on their first samples, which contain at least
     `SHOWN_STEPS` time steps if the recordings do, and its variables.
 
     The complete Jacobian may need gigabytes. Positions and shared parameters are those of z;
     nuisance parameters are at their guesses, and measurements are associated with the body again.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Complete problem; not modified.
-    z : (variables,) array
-        Its variables.
     """
     count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
     few = [
-        shortened_experiment(segment.experiment, count, shortens_sensors=True)
-        for segment in collocation.transcriptions
+        shortened_experiment(transcription.experiment, count, shortens_sensors=True)
+        for transcription in collocation.transcriptions
     ]
     short = replace(collocation, experiments=few, associations={})
     p = np.concatenate(
-        [
-            z[: collocation.nq],
-            *(s.compute_guess_phi() for s in short.transcriptions),
-        ]
+        [z[: collocation.nq], *(s.compute_guess_phi() for s in short.transcriptions)]
     )
     pairs = zip(collocation.iterates(z), short.transcriptions, strict=True)
     return short, short.pack(
-        p, [part.x[: segment.grid_times] for part, segment in pairs]
+        p, [part.x[: transcription.grid_times] for part, transcription in pairs]
     )
 
 
-def _draw_magnitudes(
-    axes: Axes, matrix: sp.csc_array, norm: LogNorm
-) -> AxesImage:
+def _draw_magnitudes(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
     """Draw the magnitudes of a sparse matrix on a raster no finer than the picture, and return the
     image.
 
     Each raster element has the largest magnitude of its entries, of which NaN counts as zero;
     elements without an entry stay empty.
-
-    Parameters
-    ----------
-    axes : Axes
-        Modified in place; their coordinates are columns and rows of the matrix.
-    matrix : (rows, columns) sparse array
-        Magnitudes, none negative.
-    norm : LogNorm
-        Colour scale.
     """
     rows, columns = matrix.shape  # type: ignore[misc]
     entries = sp.coo_array(matrix)
@@ -178,29 +140,10 @@ def _draw_magnitudes(
     )
 
 
-def _tick_blocks(
-    axes: Axes, side: str, letter: str, times: Sequence[int], size: int
-) -> None:
-    """Label the blocks of a matrix along one side, and draw lines between them.
-
-    Parameters
-    ----------
-    axes : Axes
-    side : {"x", "y"}
-    letter : str
-        Symbol of a block.
-    times : sequence of int
-        Index of each block's timestep.
-    size : int
-        Rows or columns of a block.
-    """
+def _tick_blocks(axes: Axes, side: str, letter: str, times: Sequence[int], size: int) -> None:
+    """Label the blocks of a matrix along one side, and draw lines between them."""
     labels = [f"${letter}_{{{t}}}$" for t in times]
-    axes.set(
-        **{
-            f"{side}ticks": (np.arange(len(times)) + 0.5) * size,
-            f"{side}ticklabels": labels,
-        }
-    )
+    axes.set(**{f"{side}ticks": (np.arange(len(times)) + 0.5) * size, f"{side}ticklabels": labels})
     rule = axes.axvline if side == "x" else axes.axhline
     for k in range(1, len(times)):
         rule(k * size, color="#B0B0B0", lw=0.4)

@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ...fem.meshes.mesh_checks import edge_lengths, mean_ratios
-from ..figure_style import (
-    BLUE,
-    COLUMN_MM,
-    SMALL_PT,
-    VERMILION,
-    framed_figure,
-    style_axes,
-)
+from ..figure_style import BLUE, COLUMN_MM, SMALL_PT, VERMILION, framed_figure, style_axes
 from ..replay import MotionRecord
 from .projection import ELEVATION_DEG, ParallelCamera, Triangles
 from .scene import (
@@ -57,22 +50,9 @@ DECLARED_POSITION = "position given"
 UNSTATED_PLACE = "position not given"
 TENDON = "tendons"
 MARK_STYLES: dict[str, dict[str, Any]] = {
-    DECLARED_POSITION: {
-        "ls": "",
-        "marker": "x",
-        "ms": 3.2,
-        "mec": BLUE,
-        "mew": 0.8,
-    },
+    DECLARED_POSITION: {"ls": "", "marker": "x", "ms": 3.2, "mec": BLUE, "mew": 0.8},
     TENDON: {"color": BLUE, "lw": 1.0, "marker": ".", "ms": 2.0},
-    UNSTATED_PLACE: {
-        "ls": "",
-        "marker": "s",
-        "ms": 5.0,
-        "mfc": "none",
-        "mec": BLUE,
-        "mew": 0.6,
-    },
+    UNSTATED_PLACE: {"ls": "", "marker": "s", "ms": 5.0, "mfc": "none", "mec": BLUE, "mew": 0.6},
 }
 
 
@@ -97,9 +77,7 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     is_grasped = np.asarray(replay.is_prescribed.any(axis=0))
     part_names = replay.part_names
     front = ParallelCamera.facing_motion(nodes_m[None], up)
-    behind = (
-        front.raised(-ELEVATION_DEG).turned(180.0, up).raised(ELEVATION_DEG)
-    )
+    behind = front.raised(-ELEVATION_DEG).turned(180.0, up).raised(ELEVATION_DEG)
     everything = np.vstack([nodes_m, places_m, declared_m])
     aspect = aspect_ratio(front, everything)
     named = 0 < len(names) <= MAX_WRITTEN_NAMES
@@ -107,49 +85,27 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     is_side_by_side = aspect < 1.0
     room = COLUMN_MM - 2 * margin
     width = (room - GAP_MM) / 2 if is_side_by_side else room
-    height = min(
-        width / aspect, MAX_BODY_HEIGHT_MM / (1 if is_side_by_side else 2)
-    )
+    height = min(width / aspect, MAX_BODY_HEIGHT_MM / (1 if is_side_by_side else 2))
     elsewhere = not np.array_equal(declared_m, places_m)
     marked = elsewhere or replay.tendons_m is not None
     head = HEAD_MM + LINE_MM * ((len(part_names) > 1) + marked)
-    total = (
-        head + FOOT_MM + (height if is_side_by_side else 2 * height + GAP_MM)
-    )
+    total = head + FOOT_MM + (height if is_side_by_side else 2 * height + GAP_MM)
     figure, axes = sheet(COLUMN_MM, total)
     corners = (
         (margin, total - head - height),
-        (margin + width + GAP_MM, FOOT_MM)
-        if is_side_by_side
-        else (margin, FOOT_MM),
+        (margin + width + GAP_MM, FOOT_MM) if is_side_by_side else (margin, FOOT_MM),
     )
-    first = _are_named_in_front(
-        front, behind, places_m=places_m, nodes_m=nodes_m, surface=surface
-    )
+    first = _are_named_in_front(front, behind, places_m=places_m, nodes_m=nodes_m, surface=surface)
     views = []
     marks = set[str]()
-    for camera, corner, mine in zip(
-        (front, behind), corners, (first, ~first), strict=True
-    ):
-        view = SheetView.fit_points(
-            camera, everything, room_mm=(width, height), corner_mm=corner
-        )
+    for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
+        view = SheetView.fit_points(camera, everything, room_mm=(width, height), corner_mm=corner)
         BodyDrawing(
-            axes,
-            view,
-            surface=surface,
-            parts=replay.surface_parts,
-            nodes=replay.surface_nodes,
+            axes, view, surface=surface, parts=replay.surface_parts, nodes=replay.surface_nodes
         ).update(nodes_m, is_grasped, markers_m=places_m)
-        marks |= _draw_declared_positions(
-            axes, view, places_m=places_m, declared_m=declared_m
-        )
+        marks |= _draw_declared_positions(axes, view, places_m=places_m, declared_m=declared_m)
         if replay.tendons_m is not None:
-            axes.plot(
-                *view.to_sheet_mm(replay.tendons_m).T,
-                zorder=5.5,
-                **MARK_STYLES[TENDON],
-            )
+            axes.plot(*view.to_sheet_mm(replay.tendons_m).T, zorder=5.5, **MARK_STYLES[TENDON])
             marks.add(TENDON)
         if named:
             dots = view.to_sheet_mm(places_m[mine])
@@ -163,15 +119,8 @@ def mesh_picture(replay: MotionRecord) -> Figure:
             )
         views.append(view)
     for view, x in zip(views, (0.15, 0.85), strict=True):
-        draw_directions(
-            axes, view.camera, origin_mm=(COLUMN_MM * x, 5.0), length_mm=4.5
-        )
-    draw_scale(
-        axes,
-        views[0].mm_per_m,
-        corner_mm=(COLUMN_MM / 2 - 12, 4.0),
-        longest_mm=15.0,
-    )
+        draw_directions(axes, view.camera, origin_mm=(COLUMN_MM * x, 5.0), length_mm=4.5)
+    draw_scale(axes, views[0].mm_per_m, corner_mm=(COLUMN_MM / 2 - 12, 4.0), longest_mm=15.0)
     lines = _legend_lines(replay, marks)
     for k, handles in enumerate(lines):
         draw_legend(axes, handles, corner_mm=(1.0, total - 1.5 - k * LINE_MM))
@@ -187,17 +136,11 @@ def _legend_lines(replay: MotionRecord, marks: set[str]) -> list[list[Line2D]]:
         entries += ["markers", "behind the body"]
     lines = [
         legend_handles(*entries),
-        [
-            Line2D([], [], label=name, **MARK_STYLES[name])
-            for name in sorted(marks)
-        ],
+        [Line2D([], [], label=name, **MARK_STYLES[name]) for name in sorted(marks)],
     ]
     if len(replay.part_names) > 1:
         lines.append(
-            [
-                part_legend_handle(k, name or "rest")
-                for k, name in enumerate(replay.part_names)
-            ]
+            [part_legend_handle(k, name or "rest") for k, name in enumerate(replay.part_names)]
         )
     return [handles for handles in lines if handles]
 
@@ -205,43 +148,21 @@ def _legend_lines(replay: MotionRecord, marks: set[str]) -> list[list[Line2D]]:
 def _draw_declared_positions(
     axes: Axes, view: SheetView, places_m: Array, declared_m: Array
 ) -> set[str]:
-    """Mark markers whose estimated place differs from the stated one, or that have no stated place.
-
-    Parameters
-    ----------
-    axes : Axes
-    view : SheetView
-    places_m, declared_m : (M, 3)
-        Estimated and stated places; stated ones are NaN where there is none.
-
-    Returns
-    -------
-    set of str
-        The kinds of marks that were drawn, for the legend.
-    """
+    """Mark markers whose estimated place differs from the stated one, or that have no stated place."""
     estimated_mm = view.to_sheet_mm(places_m)
     declared_mm = view.to_sheet_mm(declared_m)
     drawn = set[str]()
     unknown = np.isnan(declared_m[:, 0])
     moved = (
-        np.linalg.norm(estimated_mm - declared_mm, axis=1)
-        > MIN_MARK_DISTANCE_MM
+        np.linalg.norm(estimated_mm - declared_mm, axis=1) > MIN_MARK_DISTANCE_MM
     )  # False for NaN
     if unknown.any():
-        axes.plot(
-            *estimated_mm[unknown].T, zorder=6, **MARK_STYLES[UNSTATED_PLACE]
-        )
+        axes.plot(*estimated_mm[unknown].T, zorder=6, **MARK_STYLES[UNSTATED_PLACE])
         drawn.add(UNSTATED_PLACE)
     if moved.any():
-        axes.plot(
-            *declared_mm[moved].T, zorder=6, **MARK_STYLES[DECLARED_POSITION]
-        )
+        axes.plot(*declared_mm[moved].T, zorder=6, **MARK_STYLES[DECLARED_POSITION])
         segments = np.stack([declared_mm[moved], estimated_mm[moved]], axis=1)
-        axes.add_collection(
-            LineCollection(
-                list(segments), colors=BLUE, linewidths=0.5, zorder=6
-            )
-        )
+        axes.add_collection(LineCollection(list(segments), colors=BLUE, linewidths=0.5, zorder=6))
         drawn.add(DECLARED_POSITION)
     return drawn
 
@@ -258,77 +179,33 @@ def _are_named_in_front(
 
     It is the view in which the marker is not hidden; if it is hidden in both or in none, the nearer
     one.
-
-    Parameters
-    ----------
-    front, behind : ParallelCamera
-        Cameras of the two views.
-    places_m : (M, 3)
-        Places of the markers.
-    nodes_m : (n, 3)
-        Nodes of the body.
-    surface : (F, 3)
-        Nodes of the boundary triangles.
     """
-    hidden = [
-        camera.are_hidden(places_m, nodes_m, surface=surface)
-        for camera in (front, behind)
-    ]
+    hidden = [camera.are_hidden(places_m, nodes_m, surface=surface) for camera in (front, behind)]
     is_in_front = (
-        front.coordinates_to_viewer_m(places_m)
-        >= front.coordinates_to_viewer_m(nodes_m).mean()
+        front.coordinates_to_viewer_m(places_m) >= front.coordinates_to_viewer_m(nodes_m).mean()
     )
     return np.where(hidden[0] == hidden[1], is_in_front, ~hidden[0])
 
 
 def _write_names(
-    axes: Axes,
-    dots: Array,
-    names: Sequence[str],
-    middle: float,
-    edges: tuple[float, float],
+    axes: Axes, dots: Array, names: Sequence[str], middle: float, edges: tuple[float, float]
 ) -> None:
     """Write names in the margins, level with their markers but not overlapping, with a line to
     each.
-
-    Parameters
-    ----------
-    axes : Axes
-    dots : (k, 2)
-        Positions of the markers on the sheet [mm].
-    names : (k,) str
-    middle : float
-        Markers left of this have their names in the left margin [mm].
-    edges : (float, float)
-        Inner edges of the left and the right margin [mm].
     """
     on_left = dots[:, 0] < middle
     for edge, members, align in zip(
-        edges,
-        (np.flatnonzero(on_left), np.flatnonzero(~on_left)),
-        ("right", "left"),
-        strict=True,
+        edges, (np.flatnonzero(on_left), np.flatnonzero(~on_left)), ("right", "left"), strict=True
     ):
         members = members[np.argsort(dots[members, 1])]
-        for m, level in zip(
-            members, spread_levels(dots[members, 1], LINE_MM), strict=True
-        ):
+        for m, level in zip(members, spread_levels(dots[members, 1], LINE_MM), strict=True):
             inner = edge + (1.5 if align == "right" else -1.5)
             axes.plot(
                 [dots[m, 0], inner, edge], [dots[m, 1], level, level], color="#707070", lw=0.4,
                 zorder=3.5,
             )  # fmt: skip
-            text: dict[str, Any] = {
-                "ha": align,
-                "va": "center_baseline",
-                "fontsize": SMALL_PT,
-            }
-            axes.text(
-                edge + (-0.5 if align == "right" else 0.5),
-                level,
-                names[int(m)],
-                **text,
-            )
+            text: dict[str, Any] = {"ha": align, "va": "center_baseline", "fontsize": SMALL_PT}
+            axes.text(edge + (-0.5 if align == "right" else 0.5), level, names[int(m)], **text)
 
 
 def spread_levels(levels: Array, gap: float) -> Array:
@@ -365,35 +242,18 @@ def elements_picture(nodes_m: Array, tetrahedra: NDArray[np.integer]) -> Figure:
         Corner nodes of the elements.
     """
     quality = np.minimum(mean_ratios(nodes_m, tetrahedra), 1.0)  # rounding
-    size_mm = 1e3 * np.sqrt(
-        (edge_lengths(nodes_m, tetrahedra) ** 2).mean(axis=1)
-    )
-    figure = framed_figure(
-        COLUMN_MM, 42, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=5.5
-    )
-    size_axes, quality_axes = figure.subplots(
-        1, 2, sharey=True, gridspec_kw={"wspace": 0.08}
-    )
+    size_mm = 1e3 * np.sqrt((edge_lengths(nodes_m, tetrahedra) ** 2).mean(axis=1))
+    figure = framed_figure(COLUMN_MM, 42, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=5.5)
+    size_axes, quality_axes = figure.subplots(1, 2, sharey=True, gridspec_kw={"wspace": 0.08})
     widest = float(size_mm.max())
     spread = np.ptp(size_mm) > 0.02 * widest
-    limits = (
-        (float(size_mm.min()), widest)
-        if spread
-        else (0.9 * widest, 1.1 * widest)
-    )
+    limits = (float(size_mm.min()), widest) if spread else (0.9 * widest, 1.1 * widest)
     size_axes.hist(size_mm, HISTOGRAM_BINS, range=limits, color=BLUE)
     quality_axes.hist(quality, HISTOGRAM_BINS, range=(0.0, 1.0), color=BLUE)
     worst = float(quality.min())
     quality_axes.axvline(worst, color=VERMILION, lw=1.0)
-    style_axes(
-        size_axes,
-        f"{len(tetrahedra)} elements",
-        xlabel="size [mm]",
-        ylabel="elements",
-    )
-    style_axes(
-        quality_axes, f"worst {worst:.2f}", xlabel="quality, 1 = regular"
-    )
+    style_axes(size_axes, f"{len(tetrahedra)} elements", xlabel="size [mm]", ylabel="elements")
+    style_axes(quality_axes, f"worst {worst:.2f}", xlabel="quality, 1 = regular")
     quality_axes.title.set_color(VERMILION)
     for axes in (size_axes, quality_axes):
         axes.grid(False, axis="x")

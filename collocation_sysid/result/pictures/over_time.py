@@ -51,17 +51,9 @@ def drawn_models(
     """
     named = (
         ("fitted", fitted_m, {"color": BLUE, "lw": LINE_PT}),
-        (
-            "simulated",
-            simulated_m,
-            {"color": VERMILION, "lw": LINE_PT, "ls": (0, (4, 2))},
-        ),
+        ("simulated", simulated_m, {"color": VERMILION, "lw": LINE_PT, "ls": (0, (4, 2))}),
     )
-    return [
-        (label, model, style)
-        for label, model, style in named
-        if model is not None
-    ]
+    return [(label, model, style) for label, model, style in named if model is not None]
 
 
 # Left, bottom, width and height of axes, in shares of the figure.
@@ -132,57 +124,34 @@ def marker_tracks(
         the fit, or else of the simulation, are shown; without both the first ones.
     """
     drawn = drawn_models(fitted_m, simulated_m)
-    shown = _worst_markers(
-        measured_m, [model for _, model, _ in drawn], count=max_markers
-    )
-    some = (
-        f"{len(shown)} of {len(names)} markers, those with the largest errors"
-    )
+    shown = _worst_markers(measured_m, [model for _, model, _ in drawn], count=max_markers)
+    some = f"{len(shown)} of {len(names)} markers, those with the largest errors"
     title = some if len(shown) < len(names) else ""
     head = TRACK_LAYOUT.legend_mm + (5.0 if title else 0.0)
     rows_mm = len(shown) * (TRACK_LAYOUT.row_mm + TRACK_LAYOUT.row_gap_mm)
     height = head + rows_mm - TRACK_LAYOUT.row_gap_mm + TRACK_LAYOUT.foot_mm
     figure = fixed_figure(PAGE_MM, height)
     errors = [1e3 * (model - measured_m)[:, shown] for _, model, _ in drawn]
-    reach = (
-        max(
-            (float(np.nanmax(np.abs(e), initial=0.0)) for e in errors),
-            default=0.0,
-        )
-        or 1.0
-    )
+    reach = max((float(np.nanmax(np.abs(e), initial=0.0)) for e in errors), default=0.0) or 1.0
     margin = 0.03 * (t_s[-1] - t_s[0]) or 1.0
     start = t_s[0] - margin
     stop = t_s[-1] + margin
-    dots = {
-        "ls": "",
-        "marker": ".",
-        "ms": 3.5,
-        "color": BLACK,
-        "mec": "none",
-        "alpha": 0.7,
-    }
+    dots = {"ls": "", "marker": ".", "ms": 3.5, "color": BLACK, "mec": "none", "alpha": 0.7}
     for row, marker in enumerate(shown):
         for axis, letter in enumerate("xyz"):
-            upper_box, lower_box = _axes_boxes(
-                row, axis, height=height, head=head
-            )
+            upper_box, lower_box = _axes_boxes(row, axis, height=height, head=head)
             upper = figure.add_axes(upper_box)
             lower = figure.add_axes(lower_box)
             measured = 1e3 * measured_m[:, marker, axis]
             style_axes(
-                upper,
-                f"{names[marker]}, {letter}",
-                xlabel="",
-                ylabel="" if axis else "[mm]",
+                upper, f"{names[marker]}, {letter}", xlabel="", ylabel="" if axis else "[mm]"
             )
             style_axes(lower, "", xlabel="", ylabel="" if axis else "error")
             for each in (upper, lower):
                 each.set_xlim(start, stop)
                 each.xaxis.set_major_locator(MaxNLocator(4))
                 each.yaxis.set_label_coords(
-                    (3.5 - TRACK_LAYOUT.first_margin_mm) / _column_width_mm(),
-                    0.5,
+                    (3.5 - TRACK_LAYOUT.first_margin_mm) / _column_width_mm(), 0.5
                 )
             upper.plot(t_s, measured, label="measured", zorder=3, **dots)
             lower.axhline(0.0, color=BLACK, lw=0.6)
@@ -202,39 +171,19 @@ def marker_tracks(
         "bbox_to_anchor": (0.005, 1 - 1.0 / height),
         "borderaxespad": 0.0,
     }
-    title_style = {
-        "title": title,
-        "title_fontsize": TEXT_PT,
-        "alignment": "left",
-    }
+    title_style = {"title": title, "title_fontsize": TEXT_PT, "alignment": "left"}
     add_figure_legend(figure, 3, markerscale=2, **placement, **title_style)
     return figure
 
 
-def _axes_boxes(
-    row: int, axis: int, height: float, head: float
-) -> tuple[Box, Box]:
+def _axes_boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
     """Return the positions of an upper and a lower pair of axes, each as (left, bottom, width,
     height) in shares of the figure.
-
-    Parameters
-    ----------
-    row, axis : int
-        Indices of the row (marker) and the column (coordinate).
-    height, head : float
-        Heights of the figure and of the space above the first row [mm].
     """
     width = _column_width_mm()
     layout = TRACK_LAYOUT
-    x = (
-        layout.first_margin_mm + axis * (width + layout.column_gap_mm)
-    ) / PAGE_MM
-    bottom = (
-        height
-        - head
-        - row * (layout.row_mm + layout.row_gap_mm)
-        - layout.row_mm
-    )
+    x = (layout.first_margin_mm + axis * (width + layout.column_gap_mm)) / PAGE_MM
+    bottom = height - head - row * (layout.row_mm + layout.row_gap_mm) - layout.row_mm
     split = (1 - layout.upper_share) * layout.row_mm
     return (
         (
@@ -250,37 +199,19 @@ def _axes_boxes(
 def _column_width_mm() -> float:
     """Return the width of one of the three columns [mm]."""
     layout = TRACK_LAYOUT
-    return (
-        PAGE_MM
-        - layout.first_margin_mm
-        - layout.last_margin_mm
-        - 2 * layout.column_gap_mm
-    ) / 3
+    return (PAGE_MM - layout.first_margin_mm - layout.last_margin_mm - 2 * layout.column_gap_mm) / 3
 
 
-def _worst_markers(
-    measured_m: Array, models_m: Sequence[Array], count: int
-) -> list[int]:
+def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> list[int]:
     """Return the indices of at most `count` markers with the largest RMS residuals, in their
     original order.
 
     Residuals are those of the first model; without a model, or if there are not more markers, the
     first markers are returned.
-
-    Parameters
-    ----------
-    measured_m : (T, M, 3)
-        Measured markers, NaN where missing.
-    models_m : sequence of (T, M, 3)
-        Markers of each model.
-    count : int
-        Largest number of markers.
     """
     if measured_m.shape[1] <= count or not models_m:
         return list(range(min(count, measured_m.shape[1])))
-    squares = np.nan_to_num(
-        np.sum((models_m[0] - measured_m) ** 2, axis=2)
-    ).sum(axis=0)
+    squares = np.nan_to_num(np.sum((models_m[0] - measured_m) ** 2, axis=2)).sum(axis=0)
     present = np.maximum(1, np.isfinite(measured_m[:, :, 0]).sum(axis=0))
     return sorted(np.argsort(-squares / present)[:count].tolist())
 
@@ -290,10 +221,7 @@ LOG_AXIS_RATIO = 15.0
 
 
 def marker_errors(
-    t_s: Array,
-    measured_m: Array,
-    fitted_m: Array | None,
-    simulated_m: Array | None = None,
+    t_s: Array, measured_m: Array, fitted_m: Array | None, simulated_m: Array | None = None
 ) -> Figure:
     """Return a figure of the root mean square distance [mm] of the markers over time, fitted and
     simulated, with that over all samples in the legend.
@@ -310,9 +238,7 @@ def marker_errors(
         Fitted and simulated markers [m]. None is left out, and so is a trajectory without any
         finite distance; without both the axes are empty.
     """
-    figure = framed_figure(
-        COLUMN_MM, 52, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=9
-    )
+    figure = framed_figure(COLUMN_MM, 52, left_mm=13, right_mm=2, foot_mm=9.5, top_mm=9)
     axes = figure.subplots()
     totals = []
     for label, model_m, style in drawn_models(fitted_m, simulated_m):
@@ -346,9 +272,7 @@ def rms_over_markers(squares: Array) -> Array:
 HEIGHT_MM = 42.0
 
 
-def sensor_picture(
-    samples: Array, names: Sequence[str], units: Sequence[str] = ()
-) -> Figure:
+def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = ()) -> Figure:
     """Return a figure of the numbers of a sensor over time, three in a row, as the force above the
     torque.
 
@@ -367,20 +291,13 @@ def sensor_picture(
         samples, [1, *np.cumsum([len(names)] * 2) + 1], axis=1
     )
     there = np.asarray(np.isfinite(measured).any(axis=0))
-    shown = [
-        k for k in range(len(names)) if there[k - k % 3 : k - k % 3 + 3].any()
-    ]
+    shown = [k for k in range(len(names)) if there[k - k % 3 : k - k % 3 + 3].any()]
     columns = min(3, len(shown))
     size = PAGE_MM / 25.4, HEIGHT_MM * -(-len(shown) // columns) / 25.4
     figure = NotebookFigure(figsize=size, layout="constrained")
-    grid = figure.subplots(
-        -(-len(shown) // columns), columns, sharex=True, squeeze=False
-    )
+    grid = figure.subplots(-(-len(shown) // columns), columns, sharex=True, squeeze=False)
     drawn = drawn_models(
-        *(
-            each if np.isfinite(each).any() else None
-            for each in (fitted, rolled_out)
-        )
+        *(each if np.isfinite(each).any() else None for each in (fitted, rolled_out))
     )
     for k, each in zip(shown, grid.flat, strict=False):
         last = k in shown[-columns:]
@@ -391,14 +308,7 @@ def sensor_picture(
             ylabel=f"[{units[k]}]" if units else "",
         )
         each.yaxis.set_major_locator(MaxNLocator(4))
-        dots = {
-            "ls": "",
-            "marker": ".",
-            "ms": 3.0,
-            "color": BLACK,
-            "mec": "none",
-            "alpha": 0.5,
-        }
+        dots = {"ls": "", "marker": ".", "ms": 3.0, "color": BLACK, "mec": "none", "alpha": 0.5}
         each.plot(t_s[:, 0], measured[:, k], label="measured", **dots)
         for label, values, style in drawn:
             each.plot(t_s[:, 0], values[:, k], label=label, **style)

@@ -57,9 +57,7 @@ class ParallelCamera:
     axes: Array
 
     @classmethod
-    def from_direction(
-        cls, direction: ArrayLike, up: ArrayLike
-    ) -> ParallelCamera:
+    def from_direction(cls, direction: ArrayLike, up: ArrayLike) -> ParallelCamera:
         """Return the camera that is in the direction `direction` (3,) from the body, with `up` (3,)
         upright.
 
@@ -89,27 +87,18 @@ class ParallelCamera:
         motion = (positions_m - positions_m.mean(axis=0)) @ level.T
         extent = (positions_m[0] - positions_m[0].mean(axis=0)) @ level.T
         # A body hardly moving is seen from its broad side.
-        spread = sum(
-            np.einsum("ki,kj->ij", d, d) / len(d)
-            for d in (motion.reshape(-1, 2), extent)
-        )
+        spread = sum(np.einsum("ki,kj->ij", d, d) / len(d) for d in (motion.reshape(-1, 2), extent))
         least = np.linalg.eigh(spread)[1][:, 0] @ level
         # Of the two opposite directions the one nearer to +x, −y.
         if least @ (1.0, -1.1, 0.01) < 0:
             least = -least
-        return (
-            cls.from_direction(least, up)
-            .turned(AZIMUTH_DEG, up)
-            .raised(ELEVATION_DEG)
-        )
+        return cls.from_direction(least, up).turned(AZIMUTH_DEG, up).raised(ELEVATION_DEG)
 
     def turned(self, angle_deg: float, up: ArrayLike) -> ParallelCamera:
         """Return the camera moved around the body by an angle [°] about `up` (3,), a unit vector;
         counter-clockwise as seen from above.
         """
-        turn = Rotation.from_rotvec(
-            np.radians(angle_deg) * np.asarray(up, dtype=float)
-        )
+        turn = Rotation.from_rotvec(np.radians(angle_deg) * np.asarray(up, dtype=float))
         return ParallelCamera(turn.apply(self.axes))
 
     def raised(self, angle_deg: float) -> ParallelCamera:
@@ -117,9 +106,7 @@ class ParallelCamera:
         angle = np.radians(angle_deg)
         right, top, forward = self.axes
         direction = np.cos(angle) * forward + np.sin(angle) * top
-        return ParallelCamera(
-            np.array([right, np.cross(direction, right), direction])
-        )
+        return ParallelCamera(np.array([right, np.cross(direction, right), direction]))
 
     def project(self, points_m: ArrayLike) -> Array:
         """Return the positions (…, 2) [m] in the picture of points (…, 3) [m]."""
@@ -129,9 +116,7 @@ class ParallelCamera:
         """Return the coordinate (…) [m] of points (…, 3) [m] towards the viewer."""
         return np.asarray(points_m) @ self.axes[2]
 
-    def visible_faces(
-        self, positions_m: Array, surface: Triangles
-    ) -> VisibleFaces:
+    def visible_faces(self, positions_m: Array, surface: Triangles) -> VisibleFaces:
         """Return the triangles that are turned towards the viewer, from far to near; those that
         others hide are included.
 
@@ -143,16 +128,10 @@ class ParallelCamera:
             Nodes of the triangles, counter-clockwise as seen from outside.
         """
         corners = positions_m[surface] @ self.axes.T
-        normals = np.cross(
-            corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        )
-        normals /= np.maximum(
-            np.linalg.norm(normals, axis=1, keepdims=True), 1e-300
-        )
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         front = np.flatnonzero(normals[:, 2] > 0)
-        order = front[
-            np.argsort(corners[front, :, 2].mean(axis=1), kind="stable")
-        ]
+        order = front[np.argsort(corners[front, :, 2].mean(axis=1), kind="stable")]
         light = np.clip(normals[order] @ LIGHT_DIRECTION, 0.0, 1.0)
         return VisibleFaces(
             corners[order, :, :2],
@@ -196,13 +175,9 @@ class ParallelCamera:
             weights = np.stack([opposite_a, opposite_b], axis=1) / area[:, None]
             weights = np.column_stack([weights, 1 - weights.sum(axis=1)])
             is_inside = (weights >= 0).all(axis=1)
-            surface_coordinate = np.einsum(
-                "kc,kc->k", weights[is_inside], to_viewer[is_inside]
-            )
+            surface_coordinate = np.einsum("kc,kc->k", weights[is_inside], to_viewer[is_inside])
             # A marker on the surface, or a noise's breadth below, is not hidden by it.
-            behind[k] = bool(
-                (surface_coordinate > point[2] + 0.05 * size).any()
-            )
+            behind[k] = bool((surface_coordinate > point[2] + 0.05 * size).any())
         return behind
 
 

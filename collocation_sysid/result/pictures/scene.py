@@ -21,39 +21,14 @@ from .projection import ParallelCamera, Triangles
 
 EDGE_COLOUR = "#5A6B7B"
 # Colours of the parts of a body, repeated for further parts.
-PART_COLOURS = (
-    "#B4D0EA",
-    "#F0D3A0",
-    "#B9DDC2",
-    "#E2C3D9",
-    "#D9D9A8",
-    "#C9C3E6",
-)
+PART_COLOURS = ("#B4D0EA", "#F0D3A0", "#B9DDC2", "#E2C3D9", "#D9D9A8", "#C9C3E6")
 # Triangles above which edges are not drawn, because they would hide the faces.
 MAX_EDGED_TRIANGLES = 6000
-_MARKER_STYLE = {
-    "ls": "",
-    "marker": "o",
-    "ms": 3.2,
-    "mec": VERMILION,
-    "mew": 0.7,
-}
-_CAMERA_POINT_STYLE = {
-    "ls": "",
-    "marker": ".",
-    "ms": 2.4,
-    "mec": "none",
-    "mfc": BLUE,
-}
+_MARKER_STYLE = {"ls": "", "marker": "o", "ms": 3.2, "mec": VERMILION, "mew": 0.7}
+_CAMERA_POINT_STYLE = {"ls": "", "marker": ".", "ms": 2.4, "mec": "none", "mfc": BLUE}
 # Largest number of drawn points of cameras; more only take longer to draw.
 MAX_CAMERA_POINTS = 1000
-_GRASPED_STYLE = {
-    "ls": "",
-    "marker": "s",
-    "ms": 2.2,
-    "mfc": BLACK,
-    "mec": "none",
-}
+_GRASPED_STYLE = {"ls": "", "marker": "s", "ms": 2.2, "mfc": BLACK, "mec": "none"}
 
 
 def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
@@ -87,11 +62,7 @@ class SheetView:
 
     @classmethod
     def fit_points(
-        cls,
-        camera: ParallelCamera,
-        points_m: Array,
-        room_mm: ArrayLike,
-        corner_mm: ArrayLike,
+        cls, camera: ParallelCamera, points_m: Array, room_mm: ArrayLike, corner_mm: ArrayLike
     ) -> SheetView:
         """Return the view that shows all points as large as possible in the middle of a box on the
         sheet.
@@ -109,11 +80,7 @@ class SheetView:
         room = np.asarray(room_mm, dtype=float)
         corner = np.asarray(corner_mm, dtype=float)
         scale = float(np.min(room / np.maximum(high - low, 1e-12)))
-        return cls(
-            camera,
-            scale,
-            origin_mm=corner + room / 2 - scale * (low + high) / 2,
-        )
+        return cls(camera, scale, origin_mm=corner + room / 2 - scale * (low + high) / 2)
 
     def moved_by(self, by_mm: ArrayLike) -> SheetView:
         """Return the view moved on the sheet by `by_mm` (2,)."""
@@ -132,9 +99,7 @@ def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
     return float((high - low)[0] / (high - low)[1])
 
 
-def _projected_extent(
-    camera: ParallelCamera, points_m: Array
-) -> tuple[Array, Array]:
+def _projected_extent(camera: ParallelCamera, points_m: Array) -> tuple[Array, Array]:
     """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture of
     a camera; points that are NaN are left out.
     """
@@ -156,9 +121,7 @@ def with_nearby_outlines(points_m: Array, outlines_m: Array | None) -> Array:
     low = np.nanmin(points_m, axis=1)
     high = np.nanmax(points_m, axis=1)
     margin = (high - low).max(axis=1, keepdims=True) / 2
-    clipped_m = np.clip(
-        outlines_m, (low - margin)[:, None], (high + margin)[:, None]
-    )
+    clipped_m = np.clip(outlines_m, (low - margin)[:, None], (high + margin)[:, None])
     return np.concatenate([points_m, clipped_m], axis=1)
 
 
@@ -196,18 +159,12 @@ class BodyDrawing:
         self.edge_colour = edge_colour
         self.nodes = surface if nodes is None else nodes
         indices = (
-            np.zeros(len(surface), dtype=np.int64)
-            if parts is None
-            else parts % len(PART_COLOURS)
+            np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(PART_COLOURS)
         )
-        self.part_colours = np.array([to_rgb(skin) for skin in PART_COLOURS])[
-            indices
-        ]
+        self.part_colours = np.array([to_rgb(skin) for skin in PART_COLOURS])[indices]
         self.has_edges = len(surface) <= MAX_EDGED_TRIANGLES
         self.faces = PolyCollection(
-            [],
-            linewidths=0.3 if self.has_edges else 0.1,
-            edgecolors=EDGE_COLOUR,
+            [], linewidths=0.3 if self.has_edges else 0.1, edgecolors=EDGE_COLOUR
         )
         self.faces.set_joinstyle("round")
         if edge_colour is not None:
@@ -215,15 +172,9 @@ class BodyDrawing:
             self.faces.set_linewidth(0.6 if self.has_edges else 0.1)
         axes.add_collection(self.faces, autolim=False)
         self.grasped = axes.add_line(Line2D([], [], zorder=3, **_GRASPED_STYLE))
-        self.outlines = axes.add_line(
-            Line2D([], [], zorder=0.5, lw=0.6, color=BLACK)
-        )
-        self.camera_points = axes.add_line(
-            Line2D([], [], zorder=3.5, **_CAMERA_POINT_STYLE)
-        )
-        self.hidden_markers = axes.add_line(
-            Line2D([], [], mfc="none", zorder=4, **_MARKER_STYLE)
-        )
+        self.outlines = axes.add_line(Line2D([], [], zorder=0.5, lw=0.6, color=BLACK))
+        self.camera_points = axes.add_line(Line2D([], [], zorder=3.5, **_CAMERA_POINT_STYLE))
+        self.hidden_markers = axes.add_line(Line2D([], [], mfc="none", zorder=4, **_MARKER_STYLE))
         self.visible_markers = axes.add_line(
             Line2D([], [], mfc=VERMILION, zorder=5, **_MARKER_STYLE)
         )
@@ -268,10 +219,7 @@ class BodyDrawing:
         unshaded = self.part_colours if colours is None else colours
         shaded: Any = brightness[:, None] * unshaded[faces]
         self.faces.set_verts(
-            list(
-                self.view.origin_mm
-                + self.view.mm_per_m * visible_faces.polygons
-            )
+            list(self.view.origin_mm + self.view.mm_per_m * visible_faces.polygons)
         )
         if self.edge_colour is not None:
             return
@@ -279,36 +227,22 @@ class BodyDrawing:
         if not self.has_edges:
             self.faces.set_edgecolor(shaded)
         visible = np.unique(self.nodes[faces])
-        self.grasped.set_data(
-            *self.view.to_sheet_mm(positions_m[visible[is_grasped[visible]]]).T
-        )
+        self.grasped.set_data(*self.view.to_sheet_mm(positions_m[visible[is_grasped[visible]]]).T)
         if outlines_m is not None:
             self.outlines.set_data(*self.view.to_sheet_mm(outlines_m).T)
         if camera_points_m is not None:
-            few_m = camera_points_m[
-                :: 1 + len(camera_points_m) // MAX_CAMERA_POINTS
-            ]
+            few_m = camera_points_m[:: 1 + len(camera_points_m) // MAX_CAMERA_POINTS]
             self.camera_points.set_data(
                 *self.view.to_sheet_mm(
-                    few_m[
-                        ~camera.are_hidden(
-                            few_m, positions_m, surface=self.surface
-                        )
-                    ]
+                    few_m[~camera.are_hidden(few_m, positions_m, surface=self.surface)]
                 ).T
             )
         hidden = camera.are_hidden(markers_m, positions_m, surface=self.surface)
-        self.hidden_markers.set_data(
-            *self.view.to_sheet_mm(markers_m[hidden]).T
-        )
-        self.visible_markers.set_data(
-            *self.view.to_sheet_mm(markers_m[~hidden]).T
-        )
+        self.hidden_markers.set_data(*self.view.to_sheet_mm(markers_m[hidden]).T)
+        self.visible_markers.set_data(*self.view.to_sheet_mm(markers_m[~hidden]).T)
 
 
-def draw_scale(
-    axes: Axes, mm_per_m: float, corner_mm: ArrayLike, longest_mm: float = 20.0
-) -> None:
+def draw_scale(axes: Axes, mm_per_m: float, corner_mm: ArrayLike, longest_mm: float = 20.0) -> None:
     """Draw a scale bar of a round length from `corner_mm` to the right, with its length beside it.
 
     Parameters
@@ -326,24 +260,17 @@ def draw_scale(
     length_m = round_length(longest_mm / mm_per_m)
     end = x + length_m * mm_per_m
     axes.plot([x, end], [y, y], color=BLACK, lw=1.2, solid_capstyle="butt")
-    axes.text(
-        end + 1, y, f"{1e3 * length_m:g} mm", va="center", fontsize=SMALL_PT
-    )
+    axes.text(end + 1, y, f"{1e3 * length_m:g} mm", va="center", fontsize=SMALL_PT)
 
 
 def round_length(longest: float) -> float:
     """Return the largest of 1, 2, 5 · 10ᵏ that is not above `longest`, a positive number."""
     decade = 10.0 ** np.floor(np.log10(longest))
-    return float(
-        max(f * decade for f in (1, 2, 5) if f * decade <= longest * (1 + 1e-9))
-    )
+    return float(max(f * decade for f in (1, 2, 5) if f * decade <= longest * (1 + 1e-9)))
 
 
 def draw_directions(
-    axes: Axes,
-    camera: ParallelCamera,
-    origin_mm: ArrayLike,
-    length_mm: float = 5.0,
+    axes: Axes, camera: ParallelCamera, origin_mm: ArrayLike, length_mm: float = 5.0
 ) -> None:
     """Draw arrows of `length_mm` along x, y and z from `origin_mm` (2,) on a sheet, as the camera
     projects them; an axis nearly along the viewing direction is left out.
@@ -354,11 +281,7 @@ def draw_directions(
         if size < 0.2:
             continue
         tip: Any = start + length_mm * direction
-        arrow = {
-            "arrowstyle": "->,head_length=0.15,head_width=0.1",
-            "lw": 0.7,
-            "shrinkA": 0,
-        }
+        arrow = {"arrowstyle": "->,head_length=0.15,head_width=0.1", "lw": 0.7, "shrinkA": 0}
         axes.annotate("", tip, tuple(start), arrowprops={**arrow, "shrinkB": 0})
         x, y = tip + 1.6 * direction / size
         axes.text(x, y, letter, ha="center", va="center", fontsize=SMALL_PT)
@@ -379,12 +302,7 @@ def legend_handles(*entries: str, camera_points: str = "") -> list[Line2D]:
         camera_points: {**_CAMERA_POINT_STYLE, "ms": 4.0},
     }
     return [
-        Line2D(
-            [],
-            [],
-            label=name,
-            **styles.get(name, {**_MARKER_STYLE, "mfc": VERMILION}),
-        )
+        Line2D([], [], label=name, **styles.get(name, {**_MARKER_STYLE, "mfc": VERMILION}))
         for name in (*entries, camera_points)
         if name
     ]
@@ -402,9 +320,7 @@ def part_legend_handle(part: int, name: str) -> Line2D:
     return Line2D([], [], label=name, **look)
 
 
-def draw_legend(
-    axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike
-) -> None:
+def draw_legend(axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike) -> None:
     """Draw a legend with these entries, which have labels, in one line into the axes of a sheet;
     its upper left corner is at `corner_mm` (2,), and earlier legends stay.
     """

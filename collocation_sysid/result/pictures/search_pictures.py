@@ -57,9 +57,7 @@ def convergence(
     KeyError
         If one of the parameters is missing in an iteration or in `truth`.
     """
-    figure = framed_figure(
-        COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4
-    )
+    figure = framed_figure(COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4)
     heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
     grid = figure.add_gridspec(5, 1, height_ratios=heights, hspace=0.12)
     panels = [figure.add_subplot(grid[row]) for row in (0, 1, 2, 4)]
@@ -73,17 +71,11 @@ def convergence(
     for axes, (label, values, colour) in zip(panels, curves, strict=False):
         for part in rungs:
             style: dict[str, Any] = {"ms": 2.5, "lw": LINE_PT, "color": colour}
-            axes.plot(
-                numbers[part], _positive_or_nan(values[part]), "o-", **style
-            )
+            axes.plot(numbers[part], _positive_or_nan(values[part]), "o-", **style)
         style_axes(axes, "", xlabel="", ylabel=label)
         make_log_axis(axes)
     _mark_continuation_stages(panels[:3], history, stages=rungs)
-    drawn = (
-        list(history[0].parameters)
-        if names is None and history
-        else list(names or ())
-    )
+    drawn = list(history[0].parameters) if names is None and history else list(names or ())
     _draw_parameters(panels[3], history, names=drawn, truth=truth)
     panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
     for axes in panels:
@@ -98,33 +90,17 @@ def _continuation_stages(history: Sequence[Iteration]) -> list[slice]:
     timesteps was fitted; empty without iterations.
     """
     shares = [iteration.share for iteration in history]
-    starts = [
-        k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]
-    ]
-    return (
-        [slice(a, b) for a, b in pairwise([*starts, len(shares)])]
-        if starts
-        else []
-    )
+    starts = [k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]]
+    return [slice(a, b) for a, b in pairwise([*starts, len(shares)])] if starts else []
 
 
 def _mark_continuation_stages(
-    panels: Sequence[Axes],
-    history: Sequence[Iteration],
-    stages: Sequence[slice],
+    panels: Sequence[Axes], history: Sequence[Iteration], stages: Sequence[slice]
 ) -> None:
     """Mark the iterations at which the fit takes in more timesteps; loss and error increase there.
 
     Lines are drawn between the stages, and the title of the first panel is set to the shares of
     the timesteps.
-
-    Parameters
-    ----------
-    panels : sequence of Axes
-        At least one.
-    history : sequence of Iteration
-    stages : sequence of slice
-        Ranges of `_continuation_stages`; with fewer than two nothing is changed.
     """
     if len(stages) < 2:
         return
@@ -133,19 +109,9 @@ def _mark_continuation_stages(
         if part.start:
             between = (history[part.start - 1].number + first.number) / 2
             for axes in panels:
-                axes.axvline(
-                    between,
-                    color=_STAGE_COLOUR,
-                    lw=0.8,
-                    ls=(0, (2, 2)),
-                    zorder=0.5,
-                )
-    shares = ", ".join(
-        f"{100 * history[part.start].share:.3g}" for part in stages
-    )
-    panels[0].set_title(
-        f"continuation: {shares} % of the time steps in turn", fontsize=SMALL_PT
-    )
+                axes.axvline(between, color=_STAGE_COLOUR, lw=0.8, ls=(0, (2, 2)), zorder=0.5)
+    shares = ", ".join(f"{100 * history[part.start].share:.3g}" for part in stages)
+    panels[0].set_title(f"continuation: {shares} % of the time steps in turn", fontsize=SMALL_PT)
 
 
 def _draw_parameters(
@@ -159,47 +125,20 @@ def _draw_parameters(
 
     A reference of zero counts as 1, and ratios that are not positive are left out. Without
     iterations only the axes and the line at 1 are drawn.
-
-    Parameters
-    ----------
-    axes : Axes
-        Modified in place; the y axis becomes logarithmic.
-    history : sequence of Iteration
-        Iterations, each with the named parameters (otherwise KeyError).
-    names : sequence of str
-        Names of the parameters.
-    truth : mapping or None
-        True values by name, one for each named parameter (otherwise KeyError); None for the final
-        values.
     """
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
     for k, name in enumerate(names if history else ()):
-        values = np.array(
-            [iteration.parameters[name] for iteration in history], dtype=float
-        )
+        values = np.array([iteration.parameters[name] for iteration in history], dtype=float)
         symbol = symbol_as_mathtext(name)
         unit = unit_of(name)
         reference = values[-1] if truth is None else truth[name]
         label = f"{symbol} = {values[-1]:.4g} {unit}"
-        style = {
-            "ms": 2.5,
-            "lw": LINE_PT,
-            "color": COLOUR_CYCLE[k % len(COLOUR_CYCLE)],
-        }
+        style = {"ms": 2.5, "lw": LINE_PT, "color": COLOUR_CYCLE[k % len(COLOUR_CYCLE)]}
         axes.plot(
-            numbers,
-            _positive_or_nan(values / (reference or 1.0)),
-            "o-",
-            label=label,
-            **style,
+            numbers, _positive_or_nan(values / (reference or 1.0)), "o-", label=label, **style
         )
-    style_axes(
-        axes,
-        "",
-        xlabel="",
-        ylabel=f"θ / {'final θ' if truth is None else 'truth'}",
-    )
+    style_axes(axes, "", xlabel="", ylabel=f"θ / {'final θ' if truth is None else 'truth'}")
     make_log_axis(axes)
     if history and names:
         add_legend_above(axes, columns=2)
@@ -228,19 +167,9 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
     best : int
         Index of the modulus at which the solve starts.
     """
-    figure = framed_figure(
-        COLUMN_MM, HEIGHT_MM, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=6
-    )
+    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=6)
     axes = figure.subplots()
-    axes.plot(
-        young_pa,
-        misfit,
-        "o-",
-        ms=2.5,
-        lw=LINE_PT,
-        color=BLUE,
-        label="simulated",
-    )
+    axes.plot(young_pa, misfit, "o-", ms=2.5, lw=LINE_PT, color=BLUE, label="simulated")
     style_axes(axes, "", xlabel="Young's modulus E [Pa]", ylabel="misfit [σ]")
     axes.set_xscale("log")
     make_log_axis(axes)
@@ -251,14 +180,6 @@ def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
             young_pa[failed], foot, "x", ms=5, color=VERMILION, clip_on=False, zorder=3,
             label="simulation failed",
         )  # fmt: skip
-    axes.plot(
-        young_pa[best],
-        misfit[best],
-        "D",
-        ms=5,
-        color=ORANGE,
-        zorder=3,
-        label="start",
-    )
+    axes.plot(young_pa[best], misfit[best], "D", ms=5, color=ORANGE, zorder=3, label="start")
     add_legend_above(axes, columns=3)
     return figure

@@ -50,9 +50,9 @@ BAR_MM = 2.5
 # Width of the colour bar with its labels [mm].
 BAR_ROOM_MM = 20.0
 # Colour map from pale to dark, without its darkest fifth, so that markers stand out.
-FIELD_COLOURS = ListedColormap(
-    colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))
-).with_extremes(bad="0.85")
+FIELD_COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).with_extremes(
+    bad="0.85"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,19 +99,12 @@ def shapes_picture(
     measured_m = replay.measured_m
     assert positions_m is not None  # it was chosen among those that have some
     finite = np.flatnonzero(np.isfinite(positions_m).all(axis=(1, 2)))
-    shown = finite[
-        np.unique(np.linspace(0, len(finite) - 1, count).astype(int))
-    ]
+    shown = finite[np.unique(np.linspace(0, len(finite) - 1, count).astype(int))]
     surface_m = positions_m[:, np.unique(replay.surface)]
-    camera = camera or ParallelCamera.facing_motion(
-        surface_m[finite], replay.up
-    )
-    outlines_m = (
-        None if replay.obstacles_m is None else replay.obstacles_m[shown]
-    )
+    camera = camera or ParallelCamera.facing_motion(surface_m[finite], replay.up)
+    outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[shown]
     extents_m = with_nearby_outlines(
-        np.concatenate([surface_m[shown], measured_m[shown]], axis=1),
-        outlines_m,
+        np.concatenate([surface_m[shown], measured_m[shown]], axis=1), outlines_m
     )
     places = camera.project(extents_m)
     lefts = np.nanmin(places[..., 0], axis=1)
@@ -120,25 +113,15 @@ def shapes_picture(
     high = float(np.nanmax(places[..., 1]))
     width = PAGE_MM - CORNER_MM - (BAR_ROOM_MM if field else 0.0)
     room = width - len(shown) * GAP_MM
-    scale = min(
-        room / float((rights - lefts).sum()), MAX_BODY_HEIGHT_MM / (high - low)
-    )
+    scale = min(room / float((rights - lefts).sum()), MAX_BODY_HEIGHT_MM / (high - low))
     gap = GAP_MM + (room - scale * float((rights - lefts).sum())) / len(shown)
     total = HEAD_MM + scale * (high - low) + FOOT_MM
     figure, axes = sheet(PAGE_MM, total)
-    colours = (
-        [None] * len(shown)
-        if field is None
-        else _draw_colour_bar(axes, field, samples=shown)
-    )
+    colours = [None] * len(shown) if field is None else _draw_colour_bar(axes, field, samples=shown)
     start = CORNER_MM + (gap - GAP_MM) / 2
-    for t, first, last, colour in zip(
-        shown, lefts, rights, colours, strict=True
-    ):
+    for t, first, last, colour in zip(shown, lefts, rights, colours, strict=True):
         view = SheetView(
-            camera,
-            scale,
-            origin_mm=np.array([start - scale * first, FOOT_MM - scale * low]),
+            camera, scale, origin_mm=np.array([start - scale * first, FOOT_MM - scale * low])
         )
         body = BodyDrawing(
             axes,
@@ -147,9 +130,7 @@ def shapes_picture(
             parts=replay.surface_parts,
             nodes=replay.surface_nodes,
         )
-        obstacles_m = (
-            None if replay.obstacles_m is None else replay.obstacles_m[t]
-        )
+        obstacles_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
         body.update(
             positions_m[t],
             replay.is_prescribed[t],
@@ -163,14 +144,8 @@ def shapes_picture(
         start += scale * (last - first) + gap
     draw_directions(axes, camera, origin_mm=(7.5, FOOT_MM + 3.0))
     draw_scale(axes, scale, corner_mm=(2.0, total - 2.5))
-    marks = (
-        ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
-    )
-    draw_legend(
-        axes,
-        legend_handles("grasped", *marks),
-        corner_mm=(PAGE_MM * 0.3, total - 1.0),
-    )
+    marks = ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
+    draw_legend(axes, legend_handles("grasped", *marks), corner_mm=(PAGE_MM * 0.3, total - 1.0))
     return figure
 
 
@@ -184,16 +159,9 @@ def _draw_colour_bar(axes: Axes, field: SurfaceField, samples: Index) -> Array:
     values = field.values_at(samples)
     low = np.nanmin(values)
     high = np.nanmax(values)
-    scale = ScalarMappable(
-        Normalize(0.0 if 0 <= low < high / 5 else low, high), FIELD_COLOURS
-    )
+    scale = ScalarMappable(Normalize(0.0 if 0 <= low < high / 5 else low, high), FIELD_COLOURS)
     height = axes.get_ylim()[1]
-    place = (
-        PAGE_MM - BAR_ROOM_MM + 2,
-        FOOT_MM,
-        BAR_MM,
-        height - HEAD_MM - FOOT_MM,
-    )
+    place = (PAGE_MM - BAR_ROOM_MM + 2, FOOT_MM, BAR_MM, height - HEAD_MM - FOOT_MM)
     bar_axes = axes.inset_axes(place, transform=axes.transData)
     bar = axes.figure.colorbar(scale, cax=bar_axes, ticks=MaxNLocator(4))
     bar.outline.set_linewidth(0.4)
@@ -217,9 +185,7 @@ def obstacle_pictures(replay: MotionRecord) -> dict[str, Figure]:
         return {}
     camera = _camera_facing_weights(replay, positions_m, weights=pressures_pa)
     fields = {
-        "pressure": SurfaceField(
-            "pressure [Pa]", lambda samples: pressures_pa[samples]
-        ),
+        "pressure": SurfaceField("pressure [Pa]", lambda samples: pressures_pa[samples]),
         "gap": SurfaceField("gap [mm]", lambda samples: 1e3 * gaps_m[samples]),
     }
     return {
@@ -236,35 +202,16 @@ def _camera_facing_weights(
 
     The weight of a triangle counts in proportion to its projected area, whether or not another
     part of the body hides it. Samples with NaN are ignored.
-
-    Parameters
-    ----------
-    replay : MotionRecord
-        Experiment, for its surface and the upward direction.
-    positions_m : (T, n, 3)
-        Positions of the nodes.
-    weights : (T, F)
-        Weights of the boundary triangles, such as the pressure.
     """
     there = np.isfinite(positions_m).all(axis=(1, 2))
     front = ParallelCamera.facing_motion(
         positions_m[there][:, np.unique(replay.surface)], replay.up
     )
     low = front.raised(-2 * ELEVATION_DEG)
-    views = [
-        front,
-        low,
-        front.turned(180.0, replay.up),
-        low.turned(180.0, replay.up),
-    ]
+    views = [front, low, front.turned(180.0, replay.up), low.turned(180.0, replay.up)]
     corners = positions_m[there][:, replay.surface]
-    normals = np.cross(
-        corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
-    )
-    shown = [
-        (np.maximum(normals @ view.axes[2], 0) * weights[there]).sum()
-        for view in views
-    ]
+    normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    shown = [(np.maximum(normals @ view.axes[2], 0) * weights[there]).sum() for view in views]
     return views[int(np.argmax(shown))]
 
 
@@ -278,11 +225,7 @@ MAX_SHAPES = 20
 
 
 def field_shapes(
-    replay: MotionRecord,
-    body: Body,
-    constants: Mapping[str, float],
-    field: str | None,
-    count: int,
+    replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str | None, count: int
 ) -> Figure:
     """Return a figure of `count` shapes of an experiment, fitted or else simulated, coloured by a
     field of its elements.
@@ -311,9 +254,7 @@ def field_shapes(
         expected = f"expected one of {', '.join(FIELD_TITLES)}{hint_at(field, list(FIELD_TITLES))}"
         raise InputError(f"no field {field!r}; {expected}")
     coloured = (
-        None
-        if field is None
-        else _surface_field(replay, body, constants=constants, field=field)
+        None if field is None else _surface_field(replay, body, constants=constants, field=field)
     )
     return shapes_picture(replay, count, field=coloured)
 
@@ -321,19 +262,7 @@ def field_shapes(
 def _surface_field(
     replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str
 ) -> SurfaceField:
-    """Return a field of the elements on the boundary triangles of an experiment.
-
-    Parameters
-    ----------
-    replay : MotionRecord
-        Experiment with shapes.
-    body : Body
-        Its body.
-    constants : mapping of name to value
-        Values of the body's constants by name, at which stresses and energies are computed.
-    field : str
-        Key of `FIELD_TITLES`.
-    """
+    """Return a field of the elements on the boundary triangles of an experiment."""
     elements = ElementFields.from_body(body, body.theta_from_values(constants))
     cells = body.mesh.surface_cells
 

@@ -30,10 +30,7 @@ SHOWN_DECADES = 8
 
 
 def spectrum_picture(
-    t_s: Array,
-    measured_m: Array,
-    fitted_m: Array | None,
-    natural_hz: Array | None,
+    t_s: Array, measured_m: Array, fitted_m: Array | None, natural_hz: Array | None
 ) -> Figure:
     """Return a figure of the spectral density of the measured tracks and of the residual, with the
     natural frequencies.
@@ -51,31 +48,20 @@ def spectrum_picture(
         Natural frequencies [Hz], ascending; those above half the sampling rate are left out, and
         None draws none.
     """
-    figure = framed_figure(
-        COLUMN_MM, 58, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=9
-    )
+    figure = framed_figure(COLUMN_MM, 58, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=9)
     axes = figure.subplots()
     rate = (len(t_s) - 1) / (t_s[-1] - t_s[0])
     hertz, density = spectral_density(measured_m, rate)
     axes.plot(hertz, density, color=BLACK, lw=LINE_PT, label="measured")
     if fitted_m is not None:
         _, rest = spectral_density(measured_m - fitted_m, rate)
-        axes.plot(
-            hertz, rest, color=BLUE, lw=LINE_PT, label="measured − fitted"
-        )
+        axes.plot(hertz, rest, color=BLUE, lw=LINE_PT, label="measured − fitted")
     style_axes(axes, "", xlabel="frequency [Hz]", ylabel="density [mm²/Hz]")
     make_log_axis(axes)
     low, high = axes.get_ylim()
-    axes.set_ylim(
-        max(low, np.nanmax(density, initial=0.0) * 10.0**-SHOWN_DECADES),
-        4 * high,
-    )
+    axes.set_ylim(max(low, np.nanmax(density, initial=0.0) * 10.0**-SHOWN_DECADES), 4 * high)
     axes.set_xlim(0, rate / 2)
-    _draw_modes(
-        axes,
-        natural_hz if natural_hz is not None else np.zeros(0),
-        limit_hz=rate / 2,
-    )
+    _draw_modes(axes, natural_hz if natural_hz is not None else np.zeros(0), limit_hz=rate / 2)
     add_legend_above(axes, columns=2)
     return figure
 
@@ -111,12 +97,8 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
     for place, marker in enumerate(markers):
         is_present = present[:, marker]
         for axis in range(3):
-            filled[:, place, axis] = np.interp(
-                t, t[is_present], tracks_m[is_present, marker, axis]
-            )
-    hertz, density = periodogram(
-        1e3 * filled, rate_hz, "hann", padded, detrend="linear", axis=0
-    )
+            filled[:, place, axis] = np.interp(t, t[is_present], tracks_m[is_present, marker, axis])
+    hertz, density = periodogram(1e3 * filled, rate_hz, "hann", padded, detrend="linear", axis=0)
     mean = density.sum(axis=2).mean(axis=1)
     return hertz[1:], np.where(mean[1:] > 0, mean[1:], np.nan)
 
@@ -128,28 +110,15 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
     shown = natural_hz[natural_hz < limit_hz]
     for group in _neighbour_groups(shown, 0.05 * limit_hz):
         for hertz in shown[group]:
-            axes.axvline(
-                hertz, color="#808080", lw=0.8, ls=(0, (2, 1.5)), zorder=0.9
-            )
-        mode_label = (
-            f"{group[0] + 1}"
-            if len(group) == 1
-            else f"{group[0] + 1}–{group[-1] + 1}"
-        )
+            axes.axvline(hertz, color="#808080", lw=0.8, ls=(0, (2, 1.5)), zorder=0.9)
+        mode_label = f"{group[0] + 1}" if len(group) == 1 else f"{group[0] + 1}–{group[-1] + 1}"
         axes.annotate(
             mode_label, (shown[group].mean(), 1.0), xycoords=("data", "axes fraction"),
             xytext=(0, -1), textcoords="offset points", ha="center", va="top",
             fontsize=SMALL_PT, bbox={"fc": "white", "ec": "none", "pad": 0.8},
         )  # fmt: skip
     if len(shown):
-        axes.plot(
-            [],
-            [],
-            color="#808080",
-            lw=0.8,
-            ls=(0, (2, 1.5)),
-            label="natural frequencies",
-        )
+        axes.plot([], [], color="#808080", lw=0.8, ls=(0, (2, 1.5)), label="natural frequencies")
 
 
 def _neighbour_groups(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
@@ -157,8 +126,4 @@ def _neighbour_groups(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
     than `gap`; every value is in one group.
     """
     breaks = np.flatnonzero(np.diff(ascending) >= gap) + 1
-    return [
-        group
-        for group in np.split(np.arange(len(ascending)), breaks)
-        if len(group)
-    ]
+    return [group for group in np.split(np.arange(len(ascending)), breaks) if len(group)]

@@ -7,13 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ...common.array_types import Array
-from ..figure_style import (
-    BLACK,
-    COLUMN_MM,
-    add_legend_above,
-    framed_figure,
-    style_axes,
-)
+from ..figure_style import BLACK, COLUMN_MM, add_legend_above, framed_figure, style_axes
 from .over_time import drawn_models
 
 # Readable units of stress, the largest first: name and factor from pascal.
@@ -23,9 +17,7 @@ READABLE = 1.0
 HEIGHT_MM = 58
 
 
-def strain_picture(
-    strain: Array, t_s: Array, samples: Array, name: str, unit: str
-) -> Figure:
+def strain_picture(strain: Array, t_s: Array, samples: Array, name: str, unit: str) -> Figure:
     """Return a figure of one measurement of a specimen over its strain, in the order of time.
 
     Parameters
@@ -46,23 +38,11 @@ def strain_picture(
     at = np.interp(samples[:, 0], t_s, strain)
     shown_unit, factor = _readable_unit(samples[:, 1], unit)
     measured, fitted, simulated = factor * samples[:, 1:].T
-    figure = framed_figure(
-        COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=9
-    )
+    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=9)
     axes = figure.subplots()
-    dots = {
-        "ls": "",
-        "marker": ".",
-        "ms": 4.0,
-        "color": BLACK,
-        "mec": "none",
-        "alpha": 0.6,
-    }
+    dots = {"ls": "", "marker": ".", "ms": 4.0, "color": BLACK, "mec": "none", "alpha": 0.6}
     axes.plot(at, measured, label="measured", zorder=3, **dots)
-    models = (
-        each if np.isfinite(each).any() else None
-        for each in (fitted, simulated)
-    )
+    models = (each if np.isfinite(each).any() else None for each in (fitted, simulated))
     for label, values, style in drawn_models(*models):
         axes.plot(at, values, label=label, **style)
     label = f"{name} [{shown_unit}]" if shown_unit else name

@@ -20,36 +20,18 @@ from ...features.feature import SimulatedCheck
 from ...features.registry import FEATURES
 from ...methods.initial_trajectories import initial_variables
 from ...methods.reduced_space import ReducedSpace
-from ...methods.stiffness_scan import (
-    SOFT_PA,
-    start_problem,
-    typical_constants,
-    typical_parameters,
-)
+from ...methods.stiffness_scan import SOFT_PA, start_problem, typical_constants, typical_parameters
 from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.lifted.lifted_collocation import (
-    lifted_count,
-    with_lifted_variables,
-)
+from ...program.lifted.lifted_collocation import lifted_count, with_lifted_variables
 from ...program.modes.stability import Instability, find_instabilities
-from ...statistics.assessment import (
-    rotation_step_concerns,
-    stability_concerns,
-)
+from ...statistics.assessment import rotation_step_concerns, stability_concerns
 from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.concerns import Concern
-from ...statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    rank,
-)
-from ...statistics.misspecification.modal_misspecifications import (
-    find_misspecifications_by_modes,
-)
-from ...statistics.misspecification.plausibility import (
-    size_and_density_hypotheses,
-)
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
+from ...statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
+from ...statistics.misspecification.plausibility import size_and_density_hypotheses
 from ...statistics.scale_identifiability import scale_concerns, static_concerns
 from ...statistics.stability_concerns import strain_stability_concerns
 from .body_check import (
@@ -63,19 +45,8 @@ from .body_check import (
 from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
 from .grasp_extent import grasp_extent_concerns
-from .measurements import (
-    MarkerCheck,
-    RecordingCheck,
-    check_recording,
-    recording_concerns,
-)
-from .modes_check import (
-    ModeCheck,
-    ModesCheck,
-    check_modes,
-    mode_concerns,
-    mode_notes,
-)
+from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
+from .modes_check import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
 
 __all__ = [
     "BodyCheck",
@@ -145,12 +116,7 @@ class LiftedKind(NamedTuple):
 
 LIFTED_KINDS = (
     LiftedKind("memory", "overstresses", "memory", "the viscoelastic stresses"),
-    LiftedKind(
-        "reaction",
-        "wrenches",
-        "reactions",
-        "the measured wrenches or stresses",
-    ),
+    LiftedKind("reaction", "wrenches", "reactions", "the measured wrenches or stresses"),
 )
 
 
@@ -218,9 +184,7 @@ class CheckResult(QuickCheck):
 
     def find_chosen_cost(self) -> MethodCost | None:
         """Return the cost of the chosen method; None if it is not known."""
-        return next(
-            (cost for cost in self.costs if cost.method == self.method), None
-        )
+        return next((cost for cost in self.costs if cost.method == self.method), None)
 
     @property
     def lifted_texts(self) -> dict[str, str]:
@@ -237,9 +201,7 @@ class CheckResult(QuickCheck):
     @property
     def derivatives_agree(self) -> bool:
         """Whether the errors of both derivative checks are below `DERIVATIVE_TOLERANCE`."""
-        return (
-            max(self.jacobian_error, self.hessian_error) < DERIVATIVE_TOLERANCE
-        )
+        return max(self.jacobian_error, self.hessian_error) < DERIVATIVE_TOLERANCE
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -253,9 +215,7 @@ class CheckResult(QuickCheck):
         except in optional attributes of parts, which are left out. Each cause has its message and
         strength, see `Hypothesis.as_dict`.
         """
-        return content(replace(self, causes=())) | {
-            "causes": [c.as_dict() for c in self.causes]
-        }
+        return content(replace(self, causes=())) | {"causes": [c.as_dict() for c in self.causes]}
 
 
 def quick_check(problem: Problem) -> QuickCheck:
@@ -267,27 +227,14 @@ def quick_check(problem: Problem) -> QuickCheck:
     return QuickCheck(**_quick_fields(replace(problem, parameters=usual), {}))
 
 
-def _quick_fields(
-    problem: Problem, positions_m: Mapping[str, Array]
-) -> dict[str, Any]:
-    """Return the arguments of `QuickCheck` by name.
-
-    Parameters
-    ----------
-    problem : Problem
-    positions_m : mapping of experiment name to (T, n, 3)
-        Simulations at the guess, for those that have one.
-    """
+def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
+    """Return the arguments of `QuickCheck` by name."""
     bodies = _bodies(problem)
-    edges_m = {
-        name: body.edges_m[1] for body in bodies for name in body.experiments
-    }
+    edges_m = {name: body.edges_m[1] for body in bodies for name in body.experiments}
     experiments = problem.experiments
     return {
         "bodies": bodies,
-        "recordings": tuple(
-            check_recording(e, positions_m.get(e.name)) for e in experiments
-        ),
+        "recordings": tuple(check_recording(e, positions_m.get(e.name)) for e in experiments),
         "holds": tuple(
             grasp_check
             for e in experiments
@@ -298,9 +245,7 @@ def _quick_fields(
 
 
 def check_problem(
-    problem: Problem,
-    report_progress: Callable[[str], None] | None = None,
-    full: bool = False,
+    problem: Problem, report_progress: Callable[[str], None] | None = None, full: bool = False
 ) -> CheckResult:
     """Check a problem: simulate it at the guess, compare derivatives, and look for likely mistakes.
 
@@ -327,9 +272,7 @@ def check_problem(
     collocation = problem.collocation()
     notes = []
     if problem.parameters.list_names_without_guess():
-        report_progress(
-            "searching for initial values, because no guess is given"
-        )
+        report_progress("searching for initial values, because no guess is given")
         collocation, scan = start_problem(collocation)
         problem = replace(problem, parameters=collocation.parameters)
         notes = [scan.sentence] if scan else []
@@ -337,23 +280,15 @@ def check_problem(
     started_s = time.perf_counter()
     first = shortened_problem(problem).collocation()
     first_z, start_notes = initial_variables(first)
-    total_s = (
-        (time.perf_counter() - started_s)
-        * _grid_rows(collocation)
-        / _grid_rows(first)
-    )
+    total_s = (time.perf_counter() - started_s) * _grid_rows(collocation) / _grid_rows(first)
     report_progress("comparing derivatives with differences")
     jacobian_error, hessian_error = derivative_errors(first, first_z)
     report_progress("estimating time and memory of the methods")
-    program = _program_fields(
-        problem, collocation, first=first, first_z=first_z
-    )
+    program = _program_fields(problem, collocation, first=first, first_z=first_z)
     simulated = first
     z = first_z
     if full or total_s <= LONGEST_SIMULATION_S:
-        report_progress(
-            f"simulating the recordings at the guess, about {max(1, round(total_s))} s"
-        )
+        report_progress(f"simulating the recordings at the guess, about {max(1, round(total_s))} s")
         simulated = collocation
         (z, start_notes) = initial_variables(collocation)
     report_progress("computing natural modes and testing the description")
@@ -378,9 +313,7 @@ def check_problem(
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
-        rms_at_guess_m=None
-        if simulated is first
-        else collocation.rms_marker_distance_m(z),
+        rms_at_guess_m=None if simulated is first else collocation.rms_marker_distance_m(z),
         motions=_natural_modes(problem, collocation),
         **program,
         jacobian_error=jacobian_error,
@@ -396,16 +329,11 @@ def check_problem(
         for concern in feature.guess_concerns(parts, simulated is not first)
     ]
     concerns = (
-        *_concerns(
-            problem, findings, unstable=find_instabilities(simulated, z)
-        ),
+        *_concerns(problem, findings, unstable=find_instabilities(simulated, z)),
         *strain_stability_concerns(parts),
         *at_guess,
     )
-    notes += [
-        *start_notes,
-        *(each for m in findings.motions for each in mode_notes(m)),
-    ]
+    notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]
     chosen_cost = findings.find_chosen_cost()
     notes += cost_notes(chosen_cost, findings.costs) if chosen_cost else []
     if simulated is first:
@@ -413,17 +341,13 @@ def check_problem(
             "only the first samples of the recordings were simulated at the guess; check --full "
             f"simulates all of them, in about {total_s:.2g} s"
         )
-    notes += [SUBSTEPS_NOTE] * (
-        problem.substeps == "auto" and bool(findings.motions)
-    )
+    notes += [SUBSTEPS_NOTE] * (problem.substeps == "auto" and bool(findings.motions))
     findings = replace(findings, concerns=concerns)
     known = [note for note in problem.notes if note not in findings.warnings]
     return replace(findings, notes=(*known, *notes))
 
 
-def _fit_to_markers_s(
-    collocation: Collocation, total_s: float, samples: int
-) -> float:
+def _fit_to_markers_s(collocation: Collocation, total_s: float, samples: int) -> float:
     """Return the estimated time [s] to fit the first `samples` samples, each counted as one time
     step, to the markers alone; `total_s` is the time to simulate the complete recordings [s] of
     `collocation`.
@@ -432,32 +356,17 @@ def _fit_to_markers_s(
     return FIT_SIMULATIONS * total_s * share
 
 
-def _simulated_fields(
-    problem: Problem, collocation: Collocation, z: Array
-) -> dict[str, Any]:
+def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
     """Return the fields of `QuickCheck` and the totals of `CheckResult` for simulations at the
     guess.
-
-    Parameters
-    ----------
-    problem : Problem
-        Complete problem.
-    collocation : Collocation
-        Program that was simulated, perhaps that of the first samples.
-    z : (variables,) array
-        Its variables.
     """
     positions_m = {}
     for part in collocation.iterates(z):
-        at_samples = part.x[part.segment.markers.observable.rows]
-        positions_m[part.segment.experiment.name] = at_samples.reshape(
-            len(at_samples), -1, 3
-        )
+        at_samples = part.x[part.transcription.markers.observable.rows]
+        positions_m[part.transcription.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     shared_fields = _quick_fields(problem, positions_m)
     recordings = shared_fields["recordings"]
-    distances_m = [
-        r.find_farthest_marker().distance_m for r in recordings if r.markers
-    ]
+    distances_m = [r.find_farthest_marker().distance_m for r in recordings if r.markers]
     return shared_fields | {
         "experiments": len(recordings),
         "samples": sum(recording.samples for recording in recordings),
@@ -468,42 +377,20 @@ def _simulated_fields(
 
 def _grid_rows(collocation: Collocation) -> int:
     """Return the number of times of the grids of all fitted experiments together."""
-    return sum(segment.grid_times for segment in collocation.transcriptions)
+    return sum(transcription.grid_times for transcription in collocation.transcriptions)
 
 
 def _program_fields(
-    problem: Problem,
-    collocation: Collocation,
-    first: Collocation,
-    first_z: Array,
+    problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
 ) -> dict[str, Any]:
-    """Return size of the program and cost of the methods, as fields of `CheckResult`.
-
-    Parameters
-    ----------
-    problem : Problem
-    collocation : Collocation
-        Program of the complete recordings.
-    first : Collocation
-        Program of their first samples.
-    first_z : (variables,) array
-        Variables of `first` at the guess.
-    """
+    """Return size of the program and cost of the methods, as fields of `CheckResult`."""
     lifted = with_lifted_variables(collocation)
     jacobian, hessian = nonzeros(problem, lifted)
     # Reduced space as the file has it, whichever method is chosen.
-    named = (
-        problem.solver(),
-        problem.solver(ReducedSpace.name),
-        ReducedSpace(),
-    )
+    named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
     reduced = next(each for each in named if isinstance(each, ReducedSpace))
     method = problem.method
-    name = (
-        method
-        if isinstance(method, str)
-        else getattr(method, "name", repr(method))
-    )
+    name = method if isinstance(method, str) else getattr(method, "name", repr(method))
     counted = method_costs(
         collocation,
         first,
@@ -518,33 +405,21 @@ def _program_fields(
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,
-        "memory_mb": next(
-            (cost.memory_mb for cost in counted if cost.method == name), None
-        ),
+        "memory_mb": next((cost.memory_mb for cost in counted if cost.method == name), None),
         "costs": counted,
     }
 
 
-def _natural_modes(
-    problem: Problem, collocation: Collocation
-) -> tuple[ModesCheck, ...]:
+def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesCheck, ...]:
     """Return the natural modes at the guess of each fitted experiment that moves, in their order,
     with the scheme and step of the collocation; static and held out experiments are left out. Every
     parameter must have a guess.
-
-    Raises
-    ------
-    SimulationError
-        If a body has no stress-free shape at the guess, or a factorisation fails.
     """
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses
     return tuple(
         check_modes(
-            s.experiment,
-            scheme,
-            step_s=s.dynamics.step_s,
-            theta=s.body.theta_from_values(guesses),
+            s.experiment, scheme, step_s=s.dynamics.step_s, theta=s.body.theta_from_values(guesses)
         )
         for s in collocation.transcriptions
         if not s.experiment.is_static
@@ -554,16 +429,7 @@ def _natural_modes(
 def _concerns(
     problem: Problem, findings: CheckResult, unstable: Sequence[Instability]
 ) -> tuple[Concern, ...]:
-    """Return the expected problems, the likeliest mistakes first.
-
-    Parameters
-    ----------
-    problem : Problem
-    findings : CheckResult
-        Findings; its concerns are not used.
-    unstable : sequence of Instability
-        Losses of stability in the simulation at the guess.
-    """
+    """Return the expected problems, the likeliest mistakes first."""
     experiments = problem.experiments
     parameters = problem.parameters
     bodies = findings.bodies
@@ -573,35 +439,17 @@ def _concerns(
         *(cause.concern() for cause in findings.causes),
         *static_concerns(experiments, parameters),
         *scale_concerns(experiments, parameters),
-        *(
-            each
-            for body in bodies
-            for each in _body_concerns(body, len(bodies) == 1)
-        ),
-        *(
-            each
-            for grasp_check in findings.holds
-            for each in grasp_concerns(grasp_check)
-        ),
+        *(each for body in bodies for each in _body_concerns(body, len(bodies) == 1)),
+        *(each for grasp_check in findings.holds for each in grasp_concerns(grasp_check)),
         *grasp_extent_concerns(problem),
-        *(
-            each
-            for motion in findings.motions
-            for each in mode_concerns(motion)
-        ),
+        *(each for motion in findings.motions for each in mode_concerns(motion)),
         *stability_concerns(unstable),
         *(
             each
             for e in experiments
-            for each in rotation_step_concerns(
-                e, problem.choose_first_substeps()
-            )
+            for each in rotation_step_concerns(e, problem.choose_first_substeps())
         ),
-        *(
-            c
-            for r in findings.recordings
-            for c in recording_concerns(r, body_of[r.experiment])
-        ),
+        *(c for r in findings.recordings for c in recording_concerns(r, body_of[r.experiment])),
         *(cost_concerns(chosen, findings.costs) if chosen else ()),
     )
 
@@ -611,10 +459,7 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
     parameter must have a guess.
     """
     guesses = problem.parameters.guesses
-    names = [
-        tuple(e.name for e in problem.experiments if e.body is b)
-        for b in problem.bodies
-    ]
+    names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
     specimens = {e.name for e in problem.experiments if e.specimen is not None}
     return tuple(
         check_body(
@@ -637,9 +482,7 @@ def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
     experiments under "of".
     """
     of = f"in the body of {', '.join(map(repr, body.experiments))}"
-    named = (
-        replace(each, data={"of": of, **each.data}) for each in body.concerns
-    )
+    named = (replace(each, data={"of": of, **each.data}) for each in body.concerns)
     return body.concerns if alone else tuple(named)
 
 
@@ -655,17 +498,11 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
         For a size or a density that no body can have.
     """
     constants = typical_constants(problem.parameters)
-    odd = (
-        oddity
-        for body in problem.bodies
-        for oddity in size_and_density_hypotheses(body)
-    )
+    odd = (oddity for body in problem.bodies for oddity in size_and_density_hypotheses(body))
     doubtful = (
         cause
         for e in problem.experiments
-        for cause in find_misspecifications_by_modes(
-            e, constants, huber=problem.huber
-        )
+        for cause in find_misspecifications_by_modes(e, constants, huber=problem.huber)
     )
     by_feature = (
         cause

@@ -112,9 +112,7 @@ def slenderness(mesh: TetMesh) -> Slenderness:
     area = float(_areas(mesh.points_m[mesh.surface]).sum())
     thickness = min(float(edges[0]), 6 * mesh.volume_m3 / area)
     cell = float(np.cbrt(6 * np.median(mesh.volumes_m3)))
-    return Slenderness(
-        float(edges[-1]), thickness, cells_across=thickness / cell
-    )
+    return Slenderness(float(edges[-1]), thickness, cells_across=thickness / cell)
 
 
 def element_concerns(
@@ -134,9 +132,7 @@ def element_concerns(
         Element of the lowest quality.
     """
     name = body.element.name
-    poisson = max(
-        engineering_constants(*lame)[1] for lame in body.lame(theta).values()
-    )
+    poisson = max(engineering_constants(*lame)[1] for lame in body.lame(theta).values())
     limit = LOCKING_POISSON.get(name, np.inf)
     return [
         *concern_if(
@@ -204,9 +200,7 @@ def _covariance(mesh: TetMesh) -> Array:
 
 def _areas(triangles: Array) -> Array:
     """Return the areas (k,) [m²] of triangles given by their corners (k, 3, 3) [m]."""
-    normals = np.cross(
-        triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    )
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.linalg.norm(normals, axis=1) / 2
 
 
@@ -304,9 +298,7 @@ def check_body(
     """
     mesh = body.mesh
     fields = {
-        part.field_name: part.field.describe_resolution()
-        for part in body.parts
-        if part.field
+        part.field_name: part.field.describe_resolution() for part in body.parts if part.field
     }
     quality = mesh.quality()
     worst = worst_elements(mesh)
@@ -328,11 +320,7 @@ def check_body(
         cells_across=shape.cells_across,
         guess=_constants_at_guess(body, theta),
         concerns=(
-            *(
-                ()
-                if is_homogeneous
-                else element_concerns(body, theta, shape=shape, worst=worst[0])
-            ),
+            *(() if is_homogeneous else element_concerns(body, theta, shape=shape, worst=worst[0])),
             *rest_stability_concerns(body, theta),
             *(() if is_homogeneous else _field_concerns(fields)),
         ),
@@ -360,9 +348,7 @@ def _rest_shape_change_m(body: Body, theta: Array) -> float:
         return 0.0
     if body.rest_shape_failure(theta) is not None:
         return float("nan")
-    change_m = (
-        body.inverse_equilibrium.solve(theta).positions_m - body.nodes.points_m
-    )
+    change_m = body.inverse_equilibrium.solve(theta).positions_m - body.nodes.points_m
     return float(np.linalg.norm(change_m, axis=1).max())
 
 
@@ -383,15 +369,10 @@ def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
         young, poisson = engineering_constants(*lame)
-        moduli |= {
-            part.full_name("young_pa"): young,
-            part.full_name("poisson"): poisson,
-        }
+        moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
     constants = zip(body.constants, theta.tolist(), strict=True)
     coefficients = body.list_field_coefficient_names()
-    return moduli | {
-        name: value for name, value in constants if name not in coefficients
-    }
+    return moduli | {name: value for name, value in constants if name not in coefficients}
 
 
 # Distance from the box of the held nodes, in mean edges, below which it is by chance whether a node
@@ -435,9 +416,7 @@ class GraspCheck:
     axes: str = "xyz"
 
 
-def check_grasps(
-    experiment: Experiment, mean_edge_m: float
-) -> tuple[GraspCheck, ...]:
+def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck, ...]:
     """Return a summary of the grasped nodes for each grasp of the body in an experiment, without
     obstacles, see `GraspCheck`.
 
@@ -449,29 +428,14 @@ def check_grasps(
     """
     points_m = experiment.body.nodes.points_m
     return tuple(
-        _check_grasp(
-            experiment.name, points_m, grasp=g, mean_edge_m=mean_edge_m
-        )
+        _check_grasp(experiment.name, points_m, grasp=g, mean_edge_m=mean_edge_m)
         for g in experiment.body_grasps
     )
 
 
-def _check_grasp(
-    name: str, points_m: Array, grasp: Grasp, mean_edge_m: float
-) -> GraspCheck:
+def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> GraspCheck:
     """Return number and bounding box of the nodes that a grasp prescribes, and how many nodes are
     so close to a face of the box that rounding may decide.
-
-    Parameters
-    ----------
-    name : str
-        Name of the experiment.
-    points_m : (n, 3) array
-        Nodes of the undeformed body.
-    grasp : Grasp
-        Grasp with its nodes selected, at least one.
-    mean_edge_m : float
-        Mean edge length of the mesh [m].
     """
     nodes = grasp.nodes
     grasped_m = points_m[nodes]
@@ -479,19 +443,13 @@ def _check_grasp(
     low = grasped_m.min(axis=0)
     high = grasped_m.max(axis=0)
     outside_m = np.concatenate([low - free_m, free_m - high], axis=1)
-    is_neighbour = (
-        outside_m.max(axis=1, initial=-np.inf) < NEIGHBOUR_EDGES * mean_edge_m
-    )
+    is_neighbour = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOUR_EDGES * mean_edge_m
     # Behind faces of the box that the body goes on beyond, as far as the nearest held node.
     inner = (outside_m > 0).any(axis=0)
-    inside_m = np.concatenate([grasped_m - low, high - grasped_m], axis=1)[
-        :, inner
-    ]
+    inside_m = np.concatenate([grasped_m - low, high - grasped_m], axis=1)[:, inner]
     least_m = ROUND_OFF_EDGES * mean_edge_m
     reach_m = NEARLY_GRASPED_EDGES * mean_edge_m
-    slightly_outside = (
-        (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
-    )
+    slightly_outside = (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
     slightly_inside = (inside_m > least_m) & (inside_m < reach_m)
     return GraspCheck(
         name,
@@ -510,14 +468,11 @@ def grasp_sentence(grasp_check: GraspCheck) -> str:
     [mm], and the axes along which they are held unless these are all, as text.
     """
     size = " × ".join(
-        f"{1e3 * (b - a):.4g}"
-        for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)
+        f"{1e3 * (b - a):.4g}" for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)
     )
     low = ", ".join(f"{1e3 * x:.4g}" for x in grasp_check.low_m)
     axes = (
-        ""
-        if grasp_check.axes == "xyz"
-        else f", held along {' and '.join(grasp_check.axes)} only"
+        "" if grasp_check.axes == "xyz" else f", held along {' and '.join(grasp_check.axes)} only"
     )
     nodes = f"{grasp_check.nodes} nodes, {grasp_check.share:.0%} of all"
     return f"{nodes}, in a box of {size} mm at ({low}) mm{axes}"
@@ -534,9 +489,5 @@ def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
         "nearly_free": grasp_check.nearly_free,
     }
     return concern_if(
-        by_chance,
-        False,
-        code="description/grasp",
-        experiment=grasp_check.experiment,
-        **counts,
+        by_chance, False, code="description/grasp", experiment=grasp_check.experiment, **counts
     )

@@ -16,10 +16,7 @@ from ...methods.interior_point import InteriorPoint
 from ...methods.reduced_space import ReducedSpace, memory_mb
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.lifted.lifted_collocation import (
-    lifted_nonzeros,
-    with_lifted_variables,
-)
+from ...program.lifted.lifted_collocation import lifted_nonzeros, with_lifted_variables
 from ...program.linear_algebra.factorisation import Choice
 from ...program.sweep import Sweep
 from ...recording.experiment import Experiment
@@ -33,9 +30,7 @@ BYTES_PER_NONZERO = 280.0
 SMALL_PROGRAM_VARIABLES = 50_000
 
 
-def require_memory(
-    problem: Problem, collocation: Collocation, method: object
-) -> None:
+def require_memory(problem: Problem, collocation: Collocation, method: object) -> None:
     """Raise an `InputError` if a solve needs more memory than this machine has.
 
     Small programs, other methods than interior point and reduced space, and machines of unknown
@@ -58,15 +53,9 @@ def require_memory(
     if there_mb is None or collocation.variable_count < SMALL_PROGRAM_VARIABLES:
         return
     if isinstance(method, InteriorPoint):
-        needed_mb = interior_point_mb(
-            sum(nonzeros(problem, with_lifted_variables(collocation)))
-        )
+        needed_mb = interior_point_mb(sum(nonzeros(problem, with_lifted_variables(collocation))))
         fits = memory_mb(collocation) < there_mb
-        remedy = (
-            'method = "reduced-space"'
-            if fits
-            else "a coarser mesh or a shorter window_s"
-        )
+        remedy = 'method = "reduced-space"' if fits else "a coarser mesh or a shorter window_s"
     elif isinstance(method, ReducedSpace):
         needed_mb = memory_mb(collocation)
         remedy = "a coarser mesh, fewer substeps or a shorter window_s"
@@ -97,8 +86,8 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
     problem : Problem
         Problem; its parameters may lack guesses.
     lifted : Collocation
-        Program of the problem with lifted variables, as interior point needs it, and with a guess of
-        every parameter.
+        Program of the problem with lifted variables, as interior point needs it, and with a guess
+        of every parameter.
     """
     further = lifted_nonzeros(lifted)
     problem = replace(problem, parameters=lifted.parameters)
@@ -108,16 +97,10 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
         if not experiment.validation:
             parts = list(short.experiments)
             parts[k] = shortened_experiment(
-                experiment,
-                first_sample_count(experiment) + 1,
-                shortens_sensors=True,
+                experiment, first_sample_count(experiment) + 1, shortens_sensors=True
             )
             more = _count_nonzeros(replace(problem, experiments=parts)) - least
-            total = (
-                total
-                + max(0, len(experiment.t_s) - first_sample_count(experiment))
-                * more
-            )
+            total = total + max(0, len(experiment.t_s) - first_sample_count(experiment)) * more
     return int(total[0]) + further[0], int(total[1]) + further[1]
 
 
@@ -176,11 +159,7 @@ class MethodCost:
 
 
 def method_costs(
-    collocation: Collocation,
-    short: Collocation,
-    z: Array,
-    nonzeros: int,
-    factorisation: Choice,
+    collocation: Collocation, short: Collocation, z: Array, nonzeros: int, factorisation: Choice
 ) -> tuple[MethodCost, ...]:
     """Return the estimated memory [MB] and time [s] of reduced space and of interior point, in this
     order.
@@ -206,17 +185,12 @@ def method_costs(
         MethodCost(
             "reduced-space",
             memory_mb(collocation),
-            time_s=_estimated_sweeps_s(
-                collocation, short, z=z, factorisation=factorisation
-            ),
+            time_s=_estimated_sweeps_s(collocation, short, z=z, factorisation=factorisation),
         ),
         MethodCost(
             "interior-point",
             interior_point_mb(nonzeros),
-            time_s=TYPICAL_ITERATIONS
-            * SECONDS_PER_NONZERO
-            * nonzeros
-            * width**TIMESTEP_POWER,
+            time_s=TYPICAL_ITERATIONS * SECONDS_PER_NONZERO * nonzeros * width**TIMESTEP_POWER,
         ),
     )
 
@@ -226,12 +200,9 @@ def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
     interior point: free dofs and overstresses.
     """
     return [
-        len(segment.free_dofs)
-        + sum(
-            b.columns.stop - b.columns.start
-            for b in segment.body.memory.branches
-        )
-        for segment in collocation.transcriptions
+        len(transcription.free_dofs)
+        + sum(b.columns.stop - b.columns.start for b in transcription.body.memory.branches)
+        for transcription in collocation.transcriptions
     ]
 
 
@@ -249,10 +220,7 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
     quickest = min(others, key=lambda cost: cost.time_s or np.inf)
     if chosen.time_s is None or quickest.time_s is None:
         return []
-    if (
-        chosen.time_s < LONG_SOLVE_S
-        or quickest.time_s > LARGEST_TIME_SHARE * chosen.time_s
-    ):
+    if chosen.time_s < LONG_SOLVE_S or quickest.time_s > LARGEST_TIME_SHARE * chosen.time_s:
         return []
     return [
         f'solver.method = "{quickest.method}" finds the same optimum much faster than '
@@ -260,9 +228,7 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
     ]
 
 
-def cost_concerns(
-    chosen: MethodCost, others: Sequence[MethodCost]
-) -> list[Concern]:
+def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Concern]:
     """Return a concern if the chosen method needs at least the memory that this machine has, with
     another method that fits as remedy, or else a shorter recording; none if the machine's memory is
     unknown.
@@ -278,55 +244,30 @@ def cost_concerns(
     if available is None or chosen.memory_mb < available:
         return []
     fitting = [cost for cost in others if cost.memory_mb < available]
-    remedy = (
-        f'set solver.method = "{fitting[0].method}"'
-        if fitting
-        else "shorten window_s"
-    )
+    remedy = f'set solver.method = "{fitting[0].method}"' if fitting else "shorten window_s"
     sizes = {"needed_gb": chosen.memory_mb / 1e3, "there_gb": available / 1e3}
-    return [
-        Concern(
-            "memory/short",
-            data={"method": chosen.method, **sizes, "remedy": remedy},
-        )
-    ]
+    return [Concern("memory/short", data={"method": chosen.method, **sizes, "remedy": remedy})]
 
 
 def _estimated_sweeps_s(
-    collocation: Collocation,
-    short: Collocation,
-    z: Array,
-    factorisation: Choice,
+    collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
 ) -> float | None:
     """Return the estimated time of all sweeps of a solve [s], from one timed sweep over the first
     rows of each experiment and its `search_factor`; None if the equations cannot be solved.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Complete program, which gives the number of rows.
-    short : Collocation
-        Program of the first samples.
-    z : (variables,) array
-        Variables of `short` at the start.
-    factorisation : {"auto", "band", "sparse", "supernodal"}
-        Option of reduced space.
     """
     total = 0.0
     free_names = {item.name for item in collocation.parameters.free}
-    for segment, part in zip(
-        collocation.transcriptions, short.iterates(z), strict=True
-    ):
+    for transcription, part in zip(collocation.transcriptions, short.iterates(z), strict=True):
         rows = min(TIMED_ROWS, len(part.x))
         setting = part.equations
-        solver = Sweep(part.segment, rows, factorisation=factorisation)
+        solver = Sweep(part.transcription, rows, factorisation=factorisation)
         began = time.perf_counter()
         try:
             solver.forward(part.x[:rows], setting)
         except SimulationError:
             return None
-        sweep_s = segment.grid_times / rows * (time.perf_counter() - began)
-        total += search_factor(segment.experiment, free_names) * sweep_s
+        sweep_s = transcription.grid_times / rows * (time.perf_counter() - began)
+        total += search_factor(transcription.experiment, free_names) * sweep_s
     return TYPICAL_SWEEPS * total
 
 

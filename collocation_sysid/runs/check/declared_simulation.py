@@ -12,7 +12,4 @@ def is_declared_simulated(problem: Problem) -> bool:
     """Return whether the assumptions state that the damping law is exact, which declares that the
     recordings were simulated.
     """
-    return (
-        problem.uncertainty.collect_considered().get(SIMULATION_ASSUMPTION)
-        is None
-    )
+    return problem.uncertainty.collect_considered().get(SIMULATION_ASSUMPTION) is None

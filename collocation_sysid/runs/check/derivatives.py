@@ -13,10 +13,7 @@ from ...common.array_types import Array
 from ...features.registry import FEATURES
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
-from ...program.lifted.lifted_collocation import (
-    lifted_nonzeros,
-    with_lifted_variables,
-)
+from ...program.lifted.lifted_collocation import lifted_nonzeros, with_lifted_variables
 from ...recording.experiment import Experiment
 from ...recording.measurement_selection import shortened_experiment
 
@@ -51,9 +48,7 @@ def shortened_problem(problem: Problem) -> Problem:
     return replace(problem, experiments=short)
 
 
-def derivative_errors(
-    collocation: Collocation, z: Array
-) -> tuple[float, float]:
+def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
     """Return the largest relative errors of the first and the second derivatives.
 
     Errors are relative to the largest entry of the exact derivative. Exact derivatives along a
@@ -82,9 +77,7 @@ def derivative_errors(
     program = with_lifted_variables(collocation)
     plain = collocation
     if program is not collocation:  # gradients alone need no such variables
-        of_slopes = _slope_error(
-            plain.objective, plain.gradient, z=z, rng=rng, step=step
-        )
+        of_slopes = _slope_error(plain.objective, plain.gradient, z=z, rng=rng, step=step)
         if plain.has_eliminated_histories:
             forces = rng.normal(size=plain.constraint_count)
             through = partial(plain.jacobian_vjp, multipliers=forces)
@@ -100,25 +93,15 @@ def derivative_errors(
     multipliers = rng.normal(size=collocation.constraint_count)
 
     def lagrangian_gradient(at: Array) -> Array:
-        return (
-            collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
-        )
+        return collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
 
     hessian = collocation.hessian(point, 1.0, multipliers=multipliers)
     slope = collocation.jacobian(point) @ direction
     first = _deviation(
-        collocation.constraint_values,
-        slope,
-        point=point,
-        direction=direction,
-        step=step,
+        collocation.constraint_values, slope, point=point, direction=direction, step=step
     )
     second = _deviation(
-        lagrangian_gradient,
-        hessian @ direction,
-        point=point,
-        direction=direction,
-        step=step,
+        lagrangian_gradient, hessian @ direction, point=point, direction=direction, step=step
     )
     return max(first, of_slopes), second
 
@@ -131,67 +114,35 @@ def _difference_step(collocation: Collocation) -> float:
         (
             STEP,
             *(
-                feature.largest_difference_step(segment.experiment)
-                for segment in collocation.transcriptions
+                feature.largest_difference_step(transcription.experiment)
+                for transcription in collocation.transcriptions
                 for feature in FEATURES
             ),
         )
     )
 
 
-def _slope_error(
-    function, gradient, z: Array, rng: np.random.Generator, step: float
-) -> float:
+def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: float) -> float:
     """Return the relative error of a gradient along a random direction, at a random point near z,
     from central differences.
-
-    Parameters
-    ----------
-    function, gradient : callable
-        Functions of the variables: the value, and its gradient (variables,).
-    z : (variables,) array
-        Centre of the random points.
-    rng : Generator
-        Source of the random numbers; its state advances.
-    step : float
-        Step of the differences.
     """
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
     return _deviation(
-        function,
-        gradient(point) @ direction,
-        point=point,
-        direction=direction,
-        step=step,
+        function, gradient(point) @ direction, point=point, direction=direction, step=step
     )
 
 
-def _deviation(
-    function, exact: Array, point: Array, direction: Array, step: float
-) -> float:
+def _deviation(function, exact: Array, point: Array, direction: Array, step: float) -> float:
     """Return the largest deviation of an exact derivative from fourth-order central differences,
     relative to the largest magnitude in `exact`.
 
     If `exact` is zero, the result is 0 for equal differences, else huge; it is NaN if a value is
     not finite.
-
-    Parameters
-    ----------
-    function : callable
-        Function of the variables, which returns a number or an array.
-    exact : array
-        Its derivative along `direction` at `point`.
-    point, direction : (variables,) arrays
-        Where and along which the function is differentiated.
-    step : float
-        Step of the differences.
     """
     after, before, two_after, two_before = (
         function(point + k * step * direction) for k in (1, -1, 2, -2)
     )
-    differences = (8 * (after - before) - (two_after - two_before)) / (
-        12 * step
-    )
+    differences = (8 * (after - before) - (two_after - two_before)) / (12 * step)
     largest = max(float(np.abs(exact).max()), np.finfo(float).tiny)
     return float(np.abs(differences - exact).max()) / largest

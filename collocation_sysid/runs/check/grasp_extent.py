@@ -1,7 +1,7 @@
 """Whether the grasped nodes reach as far into the body as the box that selects them.
 
-A box that ends between two layers of nodes holds only the nodes inside. If the fingers end where the
-box does, the modelled body is free over a longer part than the real one, and its stiffness is
+A box that ends between two layers of nodes holds only the nodes inside. If the fingers end where
+the box does, the modelled body is free over a longer part than the real one, and its stiffness is
 estimated too high: a cantilever's deflection grows with the third to fourth power of its length.
 """
 

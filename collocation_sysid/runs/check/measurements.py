@@ -65,8 +65,8 @@ class RecordingCheck:
     markers : tuple of MarkerCheck
         One for each marker; empty without markers.
     unplaced : int
-        Number of markers without a stated place, which are attached at the point of the body that is
-        nearest to their first sample, so that their distance says nothing about the poses.
+        Number of markers without a stated place, which are attached at the point of the body that
+        is nearest to their first sample, so that their distance says nothing about the poses.
     instruments : tuple of str
         Other instruments, in words.
     air_density_kg_m3 : float
@@ -98,9 +98,7 @@ class RecordingCheck:
         return max(self.markers, key=lambda marker: marker.missing)
 
 
-def check_recording(
-    experiment: Experiment, positions_m: Array | None
-) -> RecordingCheck:
+def check_recording(experiment: Experiment, positions_m: Array | None) -> RecordingCheck:
     """Return a summary of the measurements of an experiment.
 
     Parameters
@@ -114,9 +112,7 @@ def check_recording(
     miss = np.zeros((0, len(markers.names)))
     if positions_m is not None:
         measured_m = markers.positions_m[: len(positions_m)]
-        miss = np.linalg.norm(
-            markers.predict_positions(positions_m) - measured_m, axis=2
-        )
+        miss = np.linalg.norm(markers.predict_positions(positions_m) - measured_m, axis=2)
     findings = []
     missing = markers.count_missing()
     for k, name in enumerate(markers.names):
@@ -142,22 +138,14 @@ def check_recording(
         samples=markers.count_samples(),
         missing=int(missing.sum()),
         markers=tuple(findings),
-        instruments=tuple(
-            text
-            for feature in FEATURES
-            for text in feature.instruments(experiment)
-        ),
+        instruments=tuple(text for feature in FEATURES for text in feature.instruments(experiment)),
         air_density_kg_m3=experiment.air_density_kg_m3,
-        test=""
-        if experiment.specimen is None
-        else f"{experiment.specimen.test} specimen",
+        test="" if experiment.specimen is None else f"{experiment.specimen.test} specimen",
         unplaced=int((~markers.located).sum()),
     )
 
 
-def recording_concerns(
-    recording: RecordingCheck, body: BodyCheck
-) -> list[Concern]:
+def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Concern]:
     """Return up to four concerns about the markers of a recording; each names the worst marker
     only. Empty without markers.
 
@@ -171,52 +159,27 @@ def recording_concerns(
     if not recording.markers:
         return []
 
-    def marker_data(
-        marker: MarkerCheck, distance_m: float | None = 0.0
-    ) -> dict[str, Any]:
+    def marker_data(marker: MarkerCheck, distance_m: float | None = 0.0) -> dict[str, Any]:
         """Return the data of a concern about a marker; `distance_m` [m] is None or 0 if it does not
         matter.
         """
         by_mm = 1e3 * (distance_m or 0.0)
         frames = recording.frames
         named = {"marker": marker.name, "experiment": recording.experiment}
-        return named | {
-            "by_mm": by_mm,
-            "missing": marker.missing,
-            "frames": frames,
-        }
+        return named | {"by_mm": by_mm, "missing": marker.missing, "frames": frames}
 
     farthest = recording.find_farthest_marker()
     most_missing = recording.find_most_missing_marker()
-    worst = max(
-        recording.markers, key=lambda marker: marker.start_miss_m or 0.0
-    )
+    worst = max(recording.markers, key=lambda marker: marker.start_miss_m or 0.0)
     unseen = most_missing.samples == 0
-    missing = (
-        not unseen
-        and most_missing.missing > LARGEST_MISSING_SHARE * recording.frames
-    )
+    missing = not unseen and most_missing.missing > LARGEST_MISSING_SHARE * recording.frames
     astray = (worst.start_miss_m or 0.0) > LARGEST_START_MISS_DIAGONALS * float(
         np.linalg.norm(body.size_m)
     )
     off = farthest.distance_m > LARGEST_DISTANCE_EDGES * body.edges_m[1]
     return [
-        *concern_if(
-            off,
-            False,
-            code="markers/off",
-            **marker_data(farthest, farthest.distance_m),
-        ),
-        *concern_if(
-            unseen, False, code="markers/unseen", **marker_data(most_missing)
-        ),
-        *concern_if(
-            missing, False, code="markers/missing", **marker_data(most_missing)
-        ),
-        *concern_if(
-            astray,
-            False,
-            code="markers/astray",
-            **marker_data(worst, worst.start_miss_m),
-        ),
+        *concern_if(off, False, code="markers/off", **marker_data(farthest, farthest.distance_m)),
+        *concern_if(unseen, False, code="markers/unseen", **marker_data(most_missing)),
+        *concern_if(missing, False, code="markers/missing", **marker_data(most_missing)),
+        *concern_if(astray, False, code="markers/astray", **marker_data(worst, worst.start_miss_m)),
     ]

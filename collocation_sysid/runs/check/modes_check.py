@@ -13,11 +13,7 @@ from numpy.typing import NDArray
 from ...common.array_types import Array
 from ...errors import SimulationError
 from ...model.forces import Forces
-from ...model.numerical_damping import (
-    PERIOD_ERROR,
-    numerical_mode,
-    substeps_needed,
-)
+from ...model.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
 from ...model.schemes import Scheme
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.forward.newton_solver import NewtonSolver
@@ -105,9 +101,7 @@ class ModesCheck:
         return self.modes[0] if self.modes else None
 
 
-def check_modes(
-    experiment: Experiment, scheme: Scheme, step_s: float, theta: Array
-) -> ModesCheck:
+def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> ModesCheck:
     """Return the natural modes of an experiment about the sample with fewest prescribed dofs, and
     the errors of the scheme.
 
@@ -134,15 +128,10 @@ def check_modes(
     count = is_prescribed.sum(axis=(1, 2))
     least = int(np.flatnonzero(count == count.min())[-1])
     time_s = float(experiment.t_s[least])
-    x, about = _reference_state(
-        experiment, is_prescribed[least], time_s=time_s, theta=theta
-    )
+    x, about = _reference_state(experiment, is_prescribed[least], time_s=time_s, theta=theta)
     free = np.flatnonzero(~is_prescribed[least])
     modes = natural_modes(
-        Forces.from_experiment(experiment, time_s, theta=theta),
-        x,
-        free_dofs=free,
-        count=MODE_COUNT,
+        Forces.from_experiment(experiment, time_s, theta=theta), x, free_dofs=free, count=MODE_COUNT
     )
     findings = _mode_findings(modes, experiment, scheme=scheme, step_s=step_s)
     needed = None
@@ -170,31 +159,16 @@ def check_modes(
 
 
 def _reference_state(
-    experiment: Experiment,
-    is_prescribed: NDArray[np.bool_],
-    time_s: float,
-    theta: Array,
+    experiment: Experiment, is_prescribed: NDArray[np.bool_], time_s: float, theta: Array
 ) -> tuple[Array, str]:
     """Return positions about which the body oscillates, and the name of this state: the equilibrium
     if nodes are held and it can be found ("rest state"), else the undeformed shape, placed rigidly
     ("undeformed shape").
-
-    Parameters
-    ----------
-    experiment : Experiment
-    is_prescribed : (n, 3)
-        Coordinates that are held.
-    time_s : float
-        Time of the poses and loads [s].
-    theta : (k,) array
-        Constants θ of the body.
     """
     if is_prescribed.any():
         try:
             solver = NewtonSolver(experiment, prescribed=is_prescribed)
-            return equilibrium(
-                experiment, theta, time_s=time_s, solver=solver
-            ), "rest state"
+            return equilibrium(experiment, theta, time_s=time_s, solver=solver), "rest state"
         except SimulationError:
             pass
     return experiment.rigid_positions([time_s])[0], "undeformed shape"
@@ -205,29 +179,13 @@ def _mode_findings(
 ) -> tuple[ModeCheck, ...]:
     """Return frequency, samples and steps per period, damping ratio, and the errors of the scheme
     in period and damping, for each mode, lowest first.
-
-    Parameters
-    ----------
-    modes : Modes
-        Natural modes.
-    experiment : Experiment
-        Its sampling interval is used.
-    scheme : Scheme
-        Time scheme.
-    step_s : float
-        Step of the time grid [s].
     """
     findings = []
-    for frequency, ratio in zip(
-        modes.frequencies_hz, modes.damping_ratios, strict=True
-    ):
+    for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
         omega = 2 * np.pi * frequency
         undamped = numerical_mode(scheme, omega, timestep_s=step_s)
         damped = numerical_mode(
-            scheme,
-            omega,
-            timestep_s=step_s,
-            damping_ratio=_oscillating_damping_ratio(float(ratio)),
+            scheme, omega, timestep_s=step_s, damping_ratio=_oscillating_damping_ratio(float(ratio))
         )
         findings.append(
             ModeCheck(
@@ -235,8 +193,7 @@ def _mode_findings(
                 float(1 / frequency / experiment.timestep_s),
                 steps_per_period=float(1 / frequency / step_s),
                 damping_ratio=float(ratio),
-                numerical_damping_ratio=round(damped.damping_ratio, ROUNDING)
-                + 0.0,  # no −0
+                numerical_damping_ratio=round(damped.damping_ratio, ROUNDING) + 0.0,  # no −0
                 period_error=undamped.period_error,
             )
         )
@@ -274,16 +231,8 @@ def mode_concerns(motion: ModesCheck) -> list[Concern]:
     duration_data = {"duration_s": motion.duration_s}
     return [
         *_grid_concerns(motion, mode),
-        *concern_if(
-            samples < FEW_SAMPLES,
-            False,
-            code="information/rate",
-            **first,
-            **rate_data,
-        ),
-        *concern_if(
-            is_short, False, code="information/short", **first, **duration_data
-        ),
+        *concern_if(samples < FEW_SAMPLES, False, code="information/rate", **first, **rate_data),
+        *concern_if(is_short, False, code="information/short", **first, **duration_data),
     ]
 
 
@@ -298,17 +247,9 @@ def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
     if abs(added) > _damping_limit(mode):
         remedy = _step_remedy(motion)
         if motion.scheme != UNDAMPED:
-            or_finer = (
-                ""
-                if motion.substeps_needed is None
-                else f", or {_substeps_setting(motion)}"
-            )
+            or_finer = "" if motion.substeps_needed is None else f", or {_substeps_setting(motion)}"
             remedy = f'set transcription.scheme = "{UNDAMPED}"{or_finer}'
-        grid = {
-            "scheme": motion.scheme,
-            "step_ms": 1e3 * motion.timestep_s,
-            "ratio": abs(added),
-        }
+        grid = {"scheme": motion.scheme, "step_ms": 1e3 * motion.timestep_s, "ratio": abs(added)}
         code = "scheme/adds" if added > 0 else "scheme/takes"
         return [Concern(code, data=first | grid | {"remedy": remedy})]
     steps = {

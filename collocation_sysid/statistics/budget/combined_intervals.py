@@ -98,45 +98,26 @@ def combine(
         return CombinedEstimate(estimate.value, None, statistical95=None)
     is_corrected = error is not None or known_effect != 0.0
     known = [estimate.value, *(estimate.statistical95 or ())]
-    corrections = (
-        () if error is None else (error.extrapolated, *(error.interval95 or ()))
-    )
-    at = IntervalCoordinate.for_estimate(
-        name, (*known, *corrections), linear=linear
-    )
+    corrections = () if error is None else (error.extrapolated, *(error.interval95 or ()))
+    at = IntervalCoordinate.for_estimate(name, (*known, *corrections), linear=linear)
     optimum = at.from_value(estimate.value)
     centre = optimum if error is None else at.from_value(error.extrapolated)
     centre += known_effect
-    value = (
-        _clip(bounds, at.to_value(centre)) if is_corrected else estimate.value
-    )
-    correction = (
-        at.to_value(centre) - at.to_value(centre - known_effect)
-        if known_effect
-        else None
-    )
+    value = _clip(bounds, at.to_value(centre)) if is_corrected else estimate.value
+    correction = at.to_value(centre) - at.to_value(centre - known_effect) if known_effect else None
     spread = estimate.statistical_std_error
     if spread is not None:
-        spread *= at.derivative(estimate.value) / at.derivative(
-            at.to_value(centre)
-        )
+        spread *= at.derivative(estimate.value) / at.derivative(at.to_value(centre))
     if estimate.statistical95 is None:
-        return CombinedEstimate(
-            value, spread, statistical95=None, known_correction=correction
-        )
-    low, high = (
-        at.from_value(end) + centre - optimum for end in estimate.statistical95
-    )
+        return CombinedEstimate(value, spread, statistical95=None, known_correction=correction)
+    low, high = (at.from_value(end) + centre - optimum for end in estimate.statistical95)
     statistical95 = _interval(at, low, high=high, bounds=bounds)
     if not is_corrected:
         least, most = estimate.statistical95
         statistical95 = _clip(bounds, least), _clip(bounds, most)
     if systematic is None:
         return CombinedEstimate(
-            value,
-            spread,
-            statistical95=statistical95,
-            known_correction=correction,
+            value, spread, statistical95=statistical95, known_correction=correction
         )
     if error is not None and error.interval95 is not None:
         low, high = map(at.from_value, error.interval95)
@@ -144,9 +125,7 @@ def combine(
         high = high + known_effect
     low, high = widened_interval((low, high), centre, deviation=systematic)
     combined95 = _interval(at, low, high=high, bounds=bounds)
-    deviation = (
-        (high - low) / 2 / NORMAL_95 / at.derivative(at.to_value(centre))
-    )
+    deviation = (high - low) / 2 / NORMAL_95 / at.derivative(at.to_value(centre))
     return CombinedEstimate(
         value,
         spread,
@@ -157,9 +136,7 @@ def combine(
     )
 
 
-def widened_interval(
-    ends: Interval, centre: float, deviation: float
-) -> Interval:
+def widened_interval(ends: Interval, centre: float, deviation: float) -> Interval:
     """Return a 95 % interval with one more independent contribution, added in quadrature.
 
     Parameters
@@ -183,9 +160,7 @@ def _clip(bounds: Interval, value: float) -> float:
     return float(min(max(value, low), high))
 
 
-def _interval(
-    at: IntervalCoordinate, low: float, high: float, bounds: Interval
-) -> Interval:
+def _interval(at: IntervalCoordinate, low: float, high: float, bounds: Interval) -> Interval:
     """Return the interval between two coordinates, `low` and `high`, as values clipped to
     bounds.
     """

@@ -22,23 +22,12 @@ from ...program.measurement_residual import MeasurementResidual
 from ...program.observable_response import ObservableResponse
 from ...program.observables import ObservedMotion
 from ...program.reactions.reaction_forces import GraspForces
-from ...program.sweep import (
-    ForwardSubstitution,
-    PrescribedColumns,
-    Sweep,
-    SweepColumns,
-)
+from ...program.sweep import ForwardSubstitution, PrescribedColumns, Sweep, SweepColumns
 from ...recording.experiment import Experiment
 from ...recording.nuisance import KINDS
 from ..linearised import linearise_fit
 from .shape_error import CORRELATION
-from .systematic_effects import (
-    ASSUMPTIONS,
-    CORRELATION_KEY,
-    Assumption,
-    Effect,
-    ExperimentAtAnswer,
-)
+from .systematic_effects import ASSUMPTIONS, CORRELATION_KEY, Assumption, Effect, ExperimentAtAnswer
 
 # A threshold of Huber's loss that no residual reaches.
 UNWEIGHTED = 1e9
@@ -96,14 +85,10 @@ class ResidualChanges(NamedTuple):
         """
         excluded = set(assumptions)
         remaining = [
-            k
-            for k, name in enumerate(self.names)
-            if name.partition(" ")[0] not in excluded
+            k for k, name in enumerate(self.names) if name.partition(" ")[0] not in excluded
         ]
         names = tuple(self.names[k] for k in remaining)
-        return ResidualChanges(
-            names, [block[..., remaining] for block in self.blocks]
-        )
+        return ResidualChanges(names, [block[..., remaining] for block in self.blocks])
 
 
 def changes_of_assumptions(
@@ -167,52 +152,30 @@ def changes_of_nuisances(
         estimated too.
         """
         nuisance = experiment.nuisance
-        sigmas = {
-            row: deviations.get(row.name, row.considered) for row in KINDS
-        }
-        more = {
-            r.name: s
-            for r, s in sigmas.items()
-            if s and nuisance.sigma(r) is None
-        }
+        sigmas = {row: deviations.get(row.name, row.considered) for row in KINDS}
+        more = {r.name: s for r, s in sigmas.items() if s and nuisance.sigma(r) is None}
         return replace(experiment, nuisance=replace(nuisance, **more))
 
-    wider = [
-        with_added_nuisances(experiment)
-        for experiment in collocation.experiments
-    ]
-    wide = replace(
-        collocation, experiments=wider, huber=UNWEIGHTED
-    )  # whatever their weights
+    wider = [with_added_nuisances(experiment) for experiment in collocation.experiments]
+    wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
     p, positions = collocation.unpack(z)
-    values = dict(
-        zip(collocation.list_parameter_names(), p.tolist(), strict=True)
-    )
+    values = dict(zip(collocation.list_parameter_names(), p.tolist(), strict=True))
     at = wide.pack(
-        np.array(
-            [values.get(name, 0.0) for name in wide.list_parameter_names()]
-        ),
-        positions,
+        np.array([values.get(name, 0.0) for name in wide.list_parameter_names()]), positions
     )
     new = np.array(
-        [
-            k
-            for k, name in enumerate(wide.list_parameter_names())
-            if name not in values
-        ],
+        [k for k, name in enumerate(wide.list_parameter_names()) if name not in values],
         dtype=np.int64,
     )
     names: dict[int, str] = {}
-    for segment in wide.transcriptions:
+    for transcription in wide.transcriptions:
         own = zip(
-            segment.list_parameter_indices()[wide.nq :],
-            segment.nuisance.entries,
+            transcription.list_parameter_indices()[wide.nq :],
+            transcription.nuisance.entries,
             strict=True,
         )
         names |= {int(place): entry.row.name for place, entry in own}
-    blocks = [
-        block.jacobian[..., new] for block in linearise_fit(wide, at).blocks
-    ]
+    blocks = [block.jacobian[..., new] for block in linearise_fit(wide, at).blocks]
     return ResidualChanges(tuple(names[k] for k in new.tolist()), blocks)
 
 
@@ -246,24 +209,15 @@ def changed_residuals(
     ResidualChanges
         Not multiplied by Huber's weights.
     """
-    names = tuple(
-        name for row, _ in assumptions for name in row.list_components()
-    )
+    names = tuple(name for row, _ in assumptions for name in row.list_components())
     changes: list[Array] = []
     for part in collocation.iterates(z):
         at = ExperimentAtAnswer(
-            part,
-            collocation.parameters,
-            surface_correlation=surface_correlation,
+            part, collocation.parameters, surface_correlation=surface_correlation
         )
-        is_specimen = part.segment.experiment.specimen is not None
+        is_specimen = part.transcription.experiment.specimen is not None
         effects = [
-            (
-                None
-                if is_specimen and not row.of_specimens
-                else row.effect(at, axis),
-                sigma,
-            )
+            (None if is_specimen and not row.of_specimens else row.effect(at, axis), sigma)
             for row, sigma in assumptions
             for axis in range(len(row.list_components()))
         ]
@@ -274,17 +228,10 @@ def changed_residuals(
 def _changes_by_effects(
     fitted: ExperimentAtAnswer, effects: Sequence[tuple[Effect | None, float]]
 ) -> Iterator[Array]:
-    """Yield the changes (T, M, 3, a) of the residuals of each measurement by a effects, in σ.
-
-    Parameters
-    ----------
-    fitted : ExperimentAtAnswer
-    effects : sequence of (Effect or None, float)
-        Effects per unit, each with its standard deviation in that unit; None has no effect.
-    """
+    """Yield the changes (T, M, 3, a) of the residuals of each measurement by a effects, in σ."""
     part = fitted.iterate
     count = len(effects)
-    segment = part.segment
+    transcription = part.transcription
     prescribed = part.equations.prescribed
     x = part.x
     forces = np.zeros((*x.shape, count))
@@ -299,33 +246,25 @@ def _changes_by_effects(
             rows[..., k] -= sigma * effect.mass_kg * fitted.acceleration
         if effect.time_stretch:
             mass = fitted.dynamics.mass.inertia_kg
-            rows[..., k] += (
-                2 * sigma * effect.time_stretch * mass * fitted.acceleration
-            )
+            rows[..., k] += 2 * sigma * effect.time_stretch * mass * fitted.acceleration
         if effect.displacement_m is not None:
             displacements_m[..., k] = sigma * np.where(
                 np.isnan(prescribed.positions_m), 0.0, effect.displacement_m
             )
-    forces[: fitted.dynamics.first_row] = rows[: fitted.dynamics.first_row] = (
-        0.0
-    )
-    solver = Sweep(segment)
+    forces[: fitted.dynamics.first_row] = rows[: fitted.dynamics.first_row] = 0.0
+    solver = Sweep(transcription)
     columns = _EffectColumns(
         part.equations,
         count,
         has_parameters=False,
-        prescribed=PrescribedColumns.from_columns(
-            solver, prescribed.dofs, columns=displacements_m
-        ),
+        prescribed=PrescribedColumns.from_columns(solver, prescribed.dofs, columns=displacements_m),
         forces_n=forces,
         rows_n=rows,
     )
     for response in propagate_columns(
-        part, solver, columns=columns, inertia_n=rows[:, segment.sensed_dofs]
+        part, solver, columns=columns, inertia_n=rows[:, transcription.sensed_dofs]
     ):
-        yield response.reading.residual_changes(
-            response.values, response.changes, phi=part.phi
-        )
+        yield response.reading.residual_changes(response.values, response.changes, phi=part.phi)
 
 
 class ColumnResponse(NamedTuple):
@@ -350,10 +289,7 @@ class ColumnResponse(NamedTuple):
 
 
 def propagate_columns(
-    iterate: ExperimentIterate,
-    solver: Sweep,
-    columns: SweepColumns,
-    inertia_n: Array | float = 0.0,
+    iterate: ExperimentIterate, solver: Sweep, columns: SweepColumns, inertia_n: Array | float = 0.0
 ) -> Iterator[ColumnResponse]:
     """Propagate columns of a forward substitution to the observables; yield one response for each
     measurement of the experiment, in their order.
@@ -370,38 +306,29 @@ def propagate_columns(
         Changes of the equations of motion of the sensed dofs, which reaction forces do not contain
         [N].
     """
-    segment = iterate.segment
+    transcription = iterate.transcription
     x = iterate.x
     phi = iterate.phi
-    sensed = GraspForces.zeros(
-        len(x), len(segment.sensed_dofs), columns=columns.count
-    )
+    sensed = GraspForces.zeros(len(x), len(transcription.sensed_dofs), columns=columns.count)
     response = ObservableResponse.from_rows(
         iterate,
-        ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(
-            x
-        ),
+        ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(x),
         grasp_forces=sensed,
     )
     columns_numbered = np.arange(columns.count)
     size = columns.count + len(phi)
     motions = response.motions(is_by_parameters=False)
-    for reading, motion in zip(segment.residuals, motions, strict=True):
+    for reading, motion in zip(transcription.residuals, motions, strict=True):
         motion = _without_row_changes(motion, inertia_n)
         values, slopes = reading.observable.linearise(
             motion, phi, columns=columns_numbered, size=size
         )
         yield ColumnResponse(
-            reading,
-            motion,
-            values=values,
-            changes=slopes.by_common[..., : columns.count],
+            reading, motion, values=values, changes=slopes.by_common[..., : columns.count]
         )
 
 
-def _without_row_changes(
-    motion: ObservedMotion, inertia_n: Array | float
-) -> ObservedMotion:
+def _without_row_changes(motion: ObservedMotion, inertia_n: Array | float) -> ObservedMotion:
     """Return the motion with `inertia_n` (N, g, c) [N], or a number, subtracted from the changes of
     its reaction forces; a motion without reaction forces is returned as it is.
     """

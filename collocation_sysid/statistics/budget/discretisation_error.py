@@ -160,23 +160,16 @@ class Refinement:
             is left out.
         """
         if std_errors is None:
-            std_errors = {
-                name: each.statistical_std_error
-                for name, each in estimates.items()
-            }
+            std_errors = {name: each.statistical_std_error for name, each in estimates.items()}
         moves = {
             name: abs(estimates[name].value - error.extrapolated) / spread
             for name, error in self.errors.items()
             if (spread := std_errors.get(name))
         }
         # Moduli that move alike differ by rounding: the first is the parameter itself.
-        return max(
-            moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0)
-        )
+        return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
-    def suggested_substeps(
-        self, estimates: Mapping[str, Estimate], order: float
-    ) -> int:
+    def suggested_substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
         """Return the number of steps per sample, from 1 to `MOST_SUBSTEPS`, that makes every
         correction small if the present errors are those of one step per sample.
 
@@ -217,9 +210,7 @@ class _Extrapolation:
     order: float | None = None
 
     @classmethod
-    def from_values(
-        cls, x: Sequence[float], order: float, least: float
-    ) -> _Extrapolation:
+    def from_values(cls, x: Sequence[float], order: float, least: float) -> _Extrapolation:
         """Extrapolate values at steps or edge lengths halved repeatedly.
 
         A single value has no change and no uncertainty. Two values are extrapolated by the
@@ -256,10 +247,7 @@ class _Extrapolation:
         remaining = last / (2 ** min(observed_order, order) - 1)
         uncertainty = OBSERVED * abs(remaining)
         return cls(
-            float(changes.sum()) + remaining,
-            uncertainty,
-            above=uncertainty,
-            order=observed_order,
+            float(changes.sum()) + remaining, uncertainty, above=uncertainty, order=observed_order
         )
 
 
@@ -292,12 +280,7 @@ def discretisation_error(
     linear if any of them is not positive. `step` and `mesh` of the result are the changes of the
     value itself with the first halving.
     """
-    known = (
-        estimate.value,
-        *(estimate.statistical95 or ()),
-        *by_step,
-        *by_mesh,
-    )
+    known = (estimate.value, *(estimate.statistical95 or ()), *by_step, *by_mesh)
     at = IntervalCoordinate.for_estimate(name, known, linear=linear)
     x = at.from_value(estimate.value)
     step = _Extrapolation.from_values(
@@ -346,9 +329,7 @@ def discretisation_errors(
     """
     errors = {}
     for name, estimate in estimates.items():
-        steps, meshes = (
-            [values[name] for values in level] for level in (by_step, by_mesh)
-        )
+        steps, meshes = ([values[name] for values in level] for level in (by_step, by_mesh))
         if any(value != estimate.value for value in (*steps, *meshes)):
             errors[name] = discretisation_error(
                 name,
@@ -361,9 +342,7 @@ def discretisation_errors(
     return errors
 
 
-def change_in_observations(
-    fit: LinearisedFit, residual_changes: Sequence[Array]
-) -> Array:
+def change_in_observations(fit: LinearisedFit, residual_changes: Sequence[Array]) -> Array:
     """Return the change (p,) of all parameters, to first order, if the residuals change; parameters
     at a bound do not change.
 
@@ -374,9 +353,7 @@ def change_in_observations(
     residual_changes : sequence of (T, M, 3) arrays
         Changes of the residuals of each block, in units of σ, without Huber's weights.
     """
-    return estimate_changes(
-        fit, [each[..., None] for each in residual_changes]
-    )[:, 0]
+    return estimate_changes(fit, [each[..., None] for each in residual_changes])[:, 0]
 
 
 def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
@@ -404,9 +381,7 @@ def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
         slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
         problem = problem.with_rows(np.zeros(len(slope)), slope)
         weighted_change = (
-            change
-            * block.compute_root_weight()[..., None]
-            * block.is_measured[..., None]
+            change * block.compute_root_weight()[..., None] * block.is_measured[..., None]
         )
         score += slope.T @ weighted_change.reshape(len(slope), count)
     estimates = np.zeros((len(fit.names), count))

@@ -25,15 +25,13 @@ RELAXATION_TIME = "τ="
 
 
 def supports_memory(body: Body, is_static: bool) -> bool:
-    """Return whether a branch of memory can be added: the experiment is dynamic, no part of the body
-    has memory, and its elements do not average the volume change.
+    """Return whether a branch of memory can be added: the experiment is dynamic, no part of the
+    body has memory, and its elements do not average the volume change.
     """
     return not (is_static or body.has_memory or body.element.mean_dilatation)
 
 
-def is_distinguishable(
-    tau_s: float, sampling_s: float, duration_s: float
-) -> bool:
+def is_distinguishable(tau_s: float, sampling_s: float, duration_s: float) -> bool:
     """Return whether a recording can distinguish the relaxation time `tau_s` from other effects.
 
     Memory that is faster than one sampling interval acts as damping by γ_r, memory that is slower
@@ -43,10 +41,7 @@ def is_distinguishable(
 
 
 def memory_forces_n(
-    body: Body,
-    dynamics: Dynamics,
-    x: Array,
-    relaxation_times_s: Sequence[float],
+    body: Body, dynamics: Dynamics, x: Array, relaxation_times_s: Sequence[float]
 ) -> Array:
     """Return the forces (B, N, 3n) [N] of B branches of memory with the share one, each alone, at
     the evaluations of a motion.
@@ -76,21 +71,14 @@ def memory_forces_n(
     )
     positions, velocities = dynamics.all_evaluation_states(x)
     intervals_s = dynamics.compute_intervals_to_next_s()
-    state = MemoryState.at_start(
-        remembering, positions[0], theta, loaded_s=dynamics.loaded_since_s
-    )
+    state = MemoryState.at_start(remembering, positions[0], theta, loaded_s=dynamics.loaded_since_s)
     for row, position in enumerate(positions):
         if row:
             state = state.advance(
-                dynamics.forces,
-                position,
-                velocities[row],
-                interval_s=intervals_s[row - 1],
+                dynamics.forces, position, velocities[row], interval_s=intervals_s[row - 1]
             )
         forces_n[:, row] = remembering.stresses.memory_force(
-            np.repeat(position[None], count, axis=0),
-            _overstress_by_time(state, count),
-            theta,
+            np.repeat(position[None], count, axis=0), _overstress_by_time(state, count), theta
         )
     return forces_n
 
@@ -121,7 +109,5 @@ def _overstress_by_time(state: MemoryState, count: int) -> Array:
     memory = state.body.memory
     overstress = np.zeros((count, memory.width))
     for number, branch in enumerate(memory.branches):
-        overstress[number % count, branch.points] = state.overstress[
-            branch.columns
-        ]
+        overstress[number % count, branch.points] = state.overstress[branch.columns]
     return overstress

@@ -56,14 +56,10 @@ class FirstContact:
         nearest_m = np.inf
         row = 0
         for first in range(0, len(x), ROWS_AT_ONCE):
-            gaps_m = law.gaps(
-                contact.points.vectors(x[first : first + ROWS_AT_ONCE])
-            )
+            gaps_m = law.gaps(contact.points.vectors(x[first : first + ROWS_AT_ONCE]))
             touching = np.flatnonzero((gaps_m < law.widths_m).any(axis=1))
             gaps_m = gaps_m.min(axis=1)
-            row_in_chunk = (
-                int(touching[0]) if len(touching) else int(gaps_m.argmin())
-            )
+            row_in_chunk = int(touching[0]) if len(touching) else int(gaps_m.argmin())
             if gaps_m[row_in_chunk] < nearest_m:
                 nearest_m = float(gaps_m[row_in_chunk])
                 row = first + row_in_chunk
@@ -72,10 +68,7 @@ class FirstContact:
         y = contact.points.vectors(x[row : row + 1])
         gaps_m, slopes = law.gaps_with_slopes(y)
         gaps_m = gaps_m[0]
-        weights = (
-            law.surface.area_m2
-            * contact.scaled_pressures(x[row : row + 1])[0, 0]
-        )
+        weights = law.surface.area_m2 * contact.scaled_pressures(x[row : row + 1])[0, 0]
         if not weights.any():
             weights = (gaps_m == gaps_m.min()).astype(float)
         weights = weights / weights.sum()
@@ -83,15 +76,8 @@ class FirstContact:
         # The row before has the surface as it is without contact.
         before = max(row - 1, 0)
         origin_m = x[before].reshape(-1, 3)[law.obstacle.nodes[0]]
-        place_m = (
-            origin_m
-            + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
-        )
-        return cls(
-            row,
-            place_m,
-            normal=normal / max(float(np.linalg.norm(normal)), 1e-9),
-        )
+        place_m = origin_m + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
+        return cls(row, place_m, normal=normal / max(float(np.linalg.norm(normal)), 1e-9))
 
 
 def contact_changes_by_size_n(dynamics: Dynamics, x: Array) -> Iterator[Array]:
@@ -116,9 +102,7 @@ def contact_changes_by_size_n(dynamics: Dynamics, x: Array) -> Iterator[Array]:
         yield power * contact.force(states_of(contact))
 
 
-def rigid_contact_change_n(
-    experiment: Experiment, dynamics: Dynamics, x: Array
-) -> Array | None:
+def rigid_contact_change_n(experiment: Experiment, dynamics: Dynamics, x: Array) -> Array | None:
     """Return the change of the contact forces at the evaluations, (evaluations, 3n) [N], if contact
     were rigid instead of obeying the pressure law, to first order; None without contact that has an
     energy (with complementarity contact is rigid already).
@@ -139,9 +123,7 @@ def rigid_contact_change_n(
     change_n = np.zeros_like(xi)
     for contact in contact_terms(experiment):
         if not contact.is_complementarity:
-            change_n += contact.rigid_limit_n(
-                forces.states_of_terms(xi, nu)(contact)
-            )
+            change_n += contact.rigid_limit_n(forces.states_of_terms(xi, nu)(contact))
     return change_n
 
 
@@ -156,9 +138,7 @@ def _contacts_with_energy(forces: Forces) -> list[Contact]:
     ]
 
 
-def obstacle_shifts_m(
-    iterate: ExperimentIterate,
-) -> Iterator[tuple[Obstacle, Array]]:
+def obstacle_shifts_m(iterate: ExperimentIterate) -> Iterator[tuple[Obstacle, Array]]:
     """Yield each obstacle with the shift (N, 3) per relative size that preserves first contact [m].
 
     The body scales about the middle of its grasps. Along axes that no grasp prescribes, it scales
@@ -170,41 +150,26 @@ def obstacle_shifts_m(
     Nothing is yielded without obstacles. The shift is along the obstacle's normal at first contact,
     moves with the rotation of the obstacle, and is in world axes at the N grid times.
     """
-    experiment = iterate.segment.experiment
+    experiment = iterate.transcription.experiment
     forces = iterate.equations.dynamics.forces
     t_s = iterate.equations.dynamics.t_s[: len(iterate.x)]
-    contacts = [
-        term for term in forces.external_terms if isinstance(term, Contact)
-    ]
+    contacts = [term for term in forces.external_terms if isinstance(term, Contact)]
     if not contacts:
         return
-    first_contacts = [
-        FirstContact.from_motion(contact, iterate.x) for contact in contacts
-    ]
+    first_contacts = [FirstContact.from_motion(contact, iterate.x) for contact in contacts]
     travels_m = [
-        np.ptp(
-            iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0
-        ).max()
+        np.ptp(iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0).max()
         for c in contacts
     ]
     support = min(
-        zip(
-            (each.row for each in first_contacts),
-            travels_m,
-            range(len(contacts)),
-            strict=True,
-        )
+        zip((each.row for each in first_contacts), travels_m, range(len(contacts)), strict=True)
     )
-    prescribed_axes = set(
-        "".join(grasp.axes for grasp in experiment.body_grasps)
-    )
+    prescribed_axes = set("".join(grasp.axes for grasp in experiment.body_grasps))
     free = np.array([axis not in prescribed_axes for axis in "xyz"])
     for contact, each in zip(contacts, first_contacts, strict=True):
         obstacle = contact.law_of_contact.obstacle
-        turn, shift = (
-            values[0] for values in experiment.rigid_motion(t_s[each.row])
-        )
-        pivot_m = turn @ iterate.segment.nuisance.grasp_pivot_m + shift
+        turn, shift = (values[0] for values in experiment.rigid_motion(t_s[each.row]))
+        pivot_m = turn @ iterate.transcription.nuisance.grasp_pivot_m + shift
         pivot_m = np.where(free, first_contacts[support[-1]].place_m, pivot_m)
         way_m = each.normal * (each.normal @ (each.place_m - pivot_m))
         rotations, _ = obstacle.poses.at(t_s)

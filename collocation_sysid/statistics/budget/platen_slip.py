@@ -27,9 +27,7 @@ LARGEST_TENSION = 0.2
 
 
 def slip_displacements_m(
-    iterate: ExperimentIterate,
-    theta: Array,
-    reactions_n: Array,
+    iterate: ExperimentIterate, theta: Array, reactions_n: Array
 ) -> Array | None:
     """Return the displacements (N, g) [m] of the g prescribed dofs if faces that stick to platens
     slide freely; zero for dofs that remain held.
@@ -52,14 +50,12 @@ def slip_displacements_m(
         None if no face may slide (see `sliding_faces`), if obstacles touch the body, whose
         stiffness these equations lack, or if the linearised equations are singular.
     """
-    experiment = iterate.segment.experiment
+    experiment = iterate.transcription.experiment
     prescribed = iterate.equations.prescribed
     axis = pressed_axis(prescribed.dofs, prescribed.positions_m)
     if axis is None or experiment.obstacles or not is_load_only(experiment):
         return None
-    faces = sliding_faces(
-        experiment, prescribed.dofs, reactions_n=reactions_n, axis=axis
-    )
+    faces = sliding_faces(experiment, prescribed.dofs, reactions_n=reactions_n, axis=axis)
     released = _released_dofs(experiment, faces, axis=axis)
     if not len(released):
         return None
@@ -128,21 +124,14 @@ def sliding_faces(
         if len(grasp.axes) < 3 or np.ptp(heights_m) > tolerance_m:
             continue
         normal = np.isin(dofs, 3 * grasp.nodes + axis)
-        outward_n = reactions_n[:, normal].sum(axis=1) * np.sign(
-            heights_m.mean() - middle_m
-        )
+        outward_n = reactions_n[:, normal].sum(axis=1) * np.sign(heights_m.mean() - middle_m)
         compression_n = -outward_n.min()
-        if (
-            compression_n > 0
-            and outward_n.max() <= LARGEST_TENSION * compression_n
-        ):
+        if compression_n > 0 and outward_n.max() <= LARGEST_TENSION * compression_n:
             faces.append(grasp)
     return faces
 
 
-def _released_dofs(
-    experiment: Experiment, faces: list[Grasp], axis: int
-) -> Index:
+def _released_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> Index:
     """Return the tangential dofs (s,) of the faces, ascending, without those that a plane of
     symmetry holds.
 
@@ -170,16 +159,9 @@ def _released_dofs(
     return np.array(sorted(released), dtype=np.int64)
 
 
-def _relaxed(
-    stiffness: sp.csc_array, force_n: Array, kept: Index, positions_m: Array
-) -> Array:
+def _relaxed(stiffness: sp.csc_array, force_n: Array, kept: Index, positions_m: Array) -> Array:
     """Return the displacements (3n,) [m] that balance forces (3n,) [N] to first order, without the
     rigid motions that the kept dofs leave free.
-
-    Raises
-    ------
-    RuntimeError
-        If the equations are singular.
     """
     moving = np.setdiff1d(np.arange(len(force_n)), kept)
     is_kept: NDArray[np.bool_] = np.zeros(len(force_n), dtype=bool)
@@ -192,8 +174,7 @@ def _relaxed(
     scale = float(np.abs(stiffness.diagonal()).mean())
     border = sp.csc_array(scale * modes)
     matrix = sp.block_array(
-        [[stiffness[moving][:, moving], border.T], [border, None]],
-        format="csc",
+        [[stiffness[moving][:, moving], border.T], [border, None]], format="csc"
     )
     right = np.concatenate([force_n[moving], np.zeros(len(modes))])
     moved_m = np.zeros(len(force_n))

@@ -53,15 +53,10 @@ def thickness_m(body: Body) -> float:
     """
     a, b, c = np.moveaxis(body.mesh.points_m[body.mesh.surface], 1, 0)
     area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    return min(
-        6 * body.mesh.volume_m3 / area_m2,
-        float(extents_m(body.mesh.points_m)[-1]),
-    )
+    return min(6 * body.mesh.volume_m3 / area_m2, float(extents_m(body.mesh.points_m)[-1]))
 
 
-def surface_modes(
-    body: Body, known: Index, correlation: float = CORRELATION
-) -> Array:
+def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) -> Array:
     """Return displacements (modes, n, 3) of the nodes for unit standard deviation of the surface's
     error.
 
@@ -87,49 +82,25 @@ def surface_modes(
     surface = np.flatnonzero(area_m2 > 0)
     fields = np.zeros((len(corners.points_m), SURFACE_MODES))
     length_m = correlation * float(extents_m(corners.points_m)[0])
-    own = _correlation_modes(
-        corners.points_m[surface], area_m2[surface], length_m=length_m
-    )
+    own = _correlation_modes(corners.points_m[surface], area_m2[surface], length_m=length_m)
     fields[surface, : own.shape[1]] = own
     if known.size:
         away_m = KDTree(corners.points_m[known]).query(corners.points_m)[0]
-        fields *= (
-            1 - np.exp(-((away_m / (KNOWN_WITHIN * length_m)) ** 2))[:, None]
-        )
+        fields *= 1 - np.exp(-((away_m / (KNOWN_WITHIN * length_m)) ** 2))[:, None]
     displacements = fields[:, :, None] * normals[:, None, :]
-    harmonic = _harmonic_extension(
-        corners, surface, values=displacements.reshape(len(fields), -1)
-    )
+    harmonic = _harmonic_extension(corners, surface, values=displacements.reshape(len(fields), -1))
     of_corners = harmonic.reshape(len(fields), SURFACE_MODES, 3)
     return _extend_to_all_nodes(body, of_corners.transpose(1, 0, 2))
 
 
-def _correlation_modes(
-    points_m: Array, weights: Array, length_m: float
-) -> Array:
+def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Array:
     """Return the strongest modes of a random field with unit variance and Gaussian correlation,
     scaled by their standard deviations.
 
     Of more than `MOST_NODES` points a random subset, the same in every call, determines the modes.
-
-    Parameters
-    ----------
-    points_m : (n, 3) array
-        Points [m].
-    weights : (n,) array
-        Areas of the points, of which the shares count.
-    length_m : float
-        Correlation length [m].
-
-    Returns
-    -------
-    (n, m) array
-        `SURFACE_MODES` modes, or n if that is less, the strongest first.
     """
     count = min(len(points_m), MOST_NODES)
-    chosen = np.sort(
-        np.random.default_rng(0).permutation(len(points_m))[:count]
-    )
+    chosen = np.sort(np.random.default_rng(0).permutation(len(points_m))[:count])
 
     def covariance(a: Array, b: Array) -> Array:
         """Return the covariances (k, l) of the field between points a (k, 3) and b (l, 3)."""
@@ -146,9 +117,7 @@ def _correlation_modes(
     return covariance(points_m, points_m[chosen]) @ scaled
 
 
-def _harmonic_extension(
-    nodes: ElementNodes, surface: Index, values: Array
-) -> Array:
+def _harmonic_extension(nodes: ElementNodes, surface: Index, values: Array) -> Array:
     """Return a copy of values (n, m) at the corners in which those inside the surface are replaced
     by the solution of Laplace's equation on the mesh graph.
 
@@ -166,9 +135,7 @@ def _harmonic_extension(
     adjacency = sp.csr_array((ones, (rows, columns)), shape=(count, count))
     laplacian = sp.csc_array(sp.diags_array(adjacency.sum(axis=1)) - adjacency)
     right = -(laplacian[inside][:, surface] @ values[surface])
-    extended[inside] = splu(sp.csc_array(laplacian[inside][:, inside])).solve(
-        right
-    )
+    extended[inside] = splu(sp.csc_array(laplacian[inside][:, inside])).solve(right)
     return extended
 
 
@@ -181,9 +148,7 @@ def _extend_to_all_nodes(body: Body, corner_fields: Array) -> Array:
     fields[:, :corners] = corner_fields
     ends = body.nodes.ends
     if len(ends):
-        fields[:, corners : corners + len(ends)] = corner_fields[:, ends].mean(
-            axis=2
-        )
+        fields[:, corners : corners + len(ends)] = corner_fields[:, ends].mean(axis=2)
     return fields
 
 
@@ -195,16 +160,10 @@ def standing_nodes(body: Body, gravity_m_s2: Array) -> Index:
     """
     points_m = body.nodes.points_m
     length = float(np.linalg.norm(gravity_m_s2))
-    up = (
-        -np.asarray(gravity_m_s2) / length
-        if length
-        else np.array([0.0, 0.0, 1.0])
-    )
+    up = -np.asarray(gravity_m_s2) / length if length else np.array([0.0, 0.0, 1.0])
     height_m = points_m @ up
     low_m = height_m.min()
-    return np.flatnonzero(
-        height_m <= low_m + STANDING * max(np.ptp(height_m), 1e-300)
-    )
+    return np.flatnonzero(height_m <= low_m + STANDING * max(np.ptp(height_m), 1e-300))
 
 
 def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
@@ -247,6 +206,4 @@ def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
     limit_m = MOST_SAG * float(extents_m(body.mesh.points_m)[0])
     if not np.isfinite(largest):
         return np.zeros_like(x)
-    return difference_m.reshape(-1, 3) * min(
-        1.0, limit_m / max(largest, 1e-300)
-    )
+    return difference_m.reshape(-1, 3) * min(1.0, limit_m / max(largest, 1e-300))

@@ -36,10 +36,7 @@ from ...model.parameters import Parameters
 from ...program.collocation import ExperimentIterate
 from ...program.reactions.reaction_forces import forces_on_dofs, reaction_forces
 from ...recording.grasp import free_rigid_motions
-from ...recording.homogeneous_deformation import (
-    STRESS_PER_FORCE,
-    HomogeneousDeformation,
-)
+from ...recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
 from ...recording.nuisance import DEGREE
 from ...recording.placement import place_markers
 from .memory_effect import (
@@ -49,11 +46,7 @@ from .memory_effect import (
     memory_forces_n,
     supports_memory,
 )
-from .obstacle_effects import (
-    contact_changes_by_size_n,
-    obstacle_shifts_m,
-    rigid_contact_change_n,
-)
+from .obstacle_effects import contact_changes_by_size_n, obstacle_shifts_m, rigid_contact_change_n
 from .platen_slip import slip_displacements_m
 from .shape_error import (
     CORRELATION,
@@ -127,7 +120,7 @@ class ExperimentAtAnswer:
     @property
     def body(self) -> Body:
         """Body of the experiment."""
-        return self.iterate.segment.body
+        return self.iterate.transcription.body
 
     @property
     def dynamics(self) -> Dynamics:
@@ -161,9 +154,7 @@ class ExperimentAtAnswer:
         """Return values (N, 3n) of all rows from those of the evaluations (N − first row, 3n), zero
         before the first; a new array.
         """
-        return np.concatenate(
-            [np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated]
-        )
+        return np.concatenate([np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated])
 
     def internal_n(
         self,
@@ -193,9 +184,7 @@ class ExperimentAtAnswer:
         undamped = (self.theta if theta is None else theta).copy()
         undamped[list(self.body.tied_shares)] = 0.0
         dynamics = self.dynamics.with_theta(undamped)
-        histories = dynamics.forces_with_histories(
-            dynamics.histories(self.iterate.x)
-        ).memory_state
+        histories = dynamics.forces_with_histories(dynamics.histories(self.iterate.x)).memory_state
         xi, nu = dynamics.evaluation_states(self.iterate.x)
         evaluated = self.body if body is None else body
         return self.pad_rows(
@@ -246,7 +235,7 @@ class ExperimentAtAnswer:
         largest = float(np.abs(moved_m).max(initial=0.0))
         if not largest:
             return np.zeros_like(self.iterate.x)
-        step = SMALL_STRAIN * self.iterate.segment.length_m / largest
+        step = SMALL_STRAIN * self.iterate.transcription.length_m / largest
         own = self.stress_free_m + step * moved_m[: len(self.stress_free_m)]
         other = self.body.with_stress_free(own)
         return (self.internal_n(body=other) - self.internal_force_n) / step
@@ -268,16 +257,14 @@ class ExperimentAtAnswer:
 
         Places of the surface that are in contact with an obstacle are known and do not move.
         """
-        segment = self.iterate.segment
-        gaps_m = surface_gaps_and_pressures(
-            segment.experiment, self.theta, x=self.iterate.x
-        )[0]
+        transcription = self.iterate.transcription
+        gaps_m = surface_gaps_and_pressures(transcription.experiment, self.theta, x=self.iterate.x)[
+            0
+        ]
         nearest = np.fmin.reduce(gaps_m, axis=0)
-        is_in_contact = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
+        is_in_contact = np.nan_to_num(nearest, nan=np.inf) < transcription.length_m
         known = np.unique(self.body.mesh.surface[is_in_contact])
-        modes = surface_modes(
-            self.body, known, correlation=self.surface_correlation
-        )
+        modes = surface_modes(self.body, known, correlation=self.surface_correlation)
         return thickness_m(self.body) * modes
 
     @cached_property
@@ -286,21 +273,16 @@ class ExperimentAtAnswer:
         relaxation time [s]; without relaxation times that the recording cannot distinguish from
         other effects, and empty if memory cannot be added, see `memory_effect`.
         """
-        experiment = self.iterate.segment.experiment
+        experiment = self.iterate.transcription.experiment
         if not supports_memory(self.body, experiment.is_static):
             return {}
         distinguishable = [
             tau_s
             for tau_s in RELAXATION_TIMES_S
-            if is_distinguishable(
-                tau_s, experiment.timestep_s, experiment.duration_s
-            )
+            if is_distinguishable(tau_s, experiment.timestep_s, experiment.duration_s)
         ]
         forces_n = memory_forces_n(
-            self.stress_free_body,
-            self.dynamics,
-            self.iterate.x,
-            relaxation_times_s=distinguishable,
+            self.stress_free_body, self.dynamics, self.iterate.x, relaxation_times_s=distinguishable
         )
         return dict(zip(distinguishable, forces_n, strict=True))
 
@@ -314,7 +296,7 @@ class ExperimentAtAnswer:
         own = prescribed[prescribed < self.body.nodes.points_m.size]
         points_m = self.body.nodes.points_m
         if len(free_rigid_motions(points_m, _dof_mask(own, len(points_m)))):
-            gravity = self.iterate.segment.experiment.gravity_m_s2
+            gravity = self.iterate.transcription.experiment.gravity_m_s2
             nodes = standing_nodes(self.body, gravity)
             return (3 * nodes[:, None] + np.arange(3)).ravel()
         return own
@@ -330,10 +312,7 @@ class ExperimentAtAnswer:
 
     def compute_buoyancy_n(self) -> Array:
         """Return the buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
-        lifted = (
-            -self.dynamics.mass.displaced_kg
-            * self.dynamics.forces.weight.gravity
-        )
+        lifted = -self.dynamics.mass.displaced_kg * self.dynamics.forces.weight.gravity
         return np.broadcast_to(lifted, self.iterate.x.shape)
 
     @cached_property
@@ -356,16 +335,9 @@ class ExperimentAtAnswer:
         force = forces_on_dofs(self.dynamics, x, dofs=dofs)
         mass = self.dynamics.mass.inertia_kg[:, dofs]
         reaction_n = reaction_forces(
-            self.dynamics,
-            mass,
-            force=force,
-            acceleration=self.acceleration[:, dofs],
+            self.dynamics, mass, force=force, acceleration=self.acceleration[:, dofs]
         )
-        return np.where(
-            np.isnan(self.iterate.equations.prescribed.positions_m),
-            0.0,
-            reaction_n,
-        )
+        return np.where(np.isnan(self.iterate.equations.prescribed.positions_m), 0.0, reaction_n)
 
     @cached_property
     def proportional_s(self) -> Array:
@@ -374,21 +346,15 @@ class ExperimentAtAnswer:
         """
         gamma_r_s = np.zeros(len(self.body.cells))
         for part, start in zip(self.body.parts, self.body.starts, strict=False):
-            if (
-                GAMMA_R in part.damping.constants
-                and part.damping.stress is None
-            ):
-                gamma_r_s[part.cells] = self.theta[
-                    start + part.constants.index(GAMMA_R)
-                ]
+            if GAMMA_R in part.damping.constants and part.damping.stress is None:
+                gamma_r_s[part.cells] = self.theta[start + part.constants.index(GAMMA_R)]
         return gamma_r_s
 
     @cached_property
     def young_pa(self) -> float:
         """Young's modulus of the softest part at small strain, at the answer [Pa]."""
         return min(
-            engineering_constants(*moduli)[0]
-            for moduli in self.body.lame(self.theta).values()
+            engineering_constants(*moduli)[0] for moduli in self.body.lame(self.theta).values()
         )
 
 
@@ -441,9 +407,7 @@ class Assumption:
         """Return the names of the components, each after that of the assumption and a space; the
         name alone if there is one component.
         """
-        return tuple(
-            f"{self.name} {a}" for a in self.component_names.split()
-        ) or (self.name,)
+        return tuple(f"{self.name} {a}" for a in self.component_names.split()) or (self.name,)
 
 
 # What each changes ------------------------------------------------------------------------------
@@ -463,27 +427,23 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     """
     larger = 1 + SMALL
     smaller = 1 - SMALL
-    force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(
-        smaller
-    )
+    force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
     force = force / (2 * SMALL)
     # Of a body made under gravity the deflection over the size grows with the weight over s².
-    heavier = at.force_change_by_scan_weight() * (
-        -2.0 if at.body.has_declared_mass else 1.0
-    )
+    heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_declared_mass else 1.0)
     mass = (0.0 if at.body.has_declared_mass else 3.0) * at.own_mass_kg
     for change_n in contact_changes_by_size_n(at.dynamics, at.iterate.x):
         force += at.pad_rows(change_n)
-    segment = at.iterate.segment
-    rotations: Array = np.nan_to_num(segment.prescribed_motion.pose_rows[0])
+    transcription = at.iterate.transcription
+    rotations: Array = np.nan_to_num(transcription.prescribed_motion.pose_rows[0])
     arms_m = (
-        segment.prescribed_motion.displaced_nodes(at.iterate.phi)[0]
-        - segment.nuisance.grasp_pivot_m
+        transcription.prescribed_motion.displaced_nodes(at.iterate.phi)[0]
+        - transcription.nuisance.grasp_pivot_m
     )
     displacement_m = np.einsum("tgj,gj->tg", rotations, arms_m)
     for obstacle, shift_m in obstacle_shifts_m(at.iterate):
         obstacle_dofs = np.searchsorted(
-            segment.prescribed_motion.dofs, obstacle.prescribed_dofs
+            transcription.prescribed_motion.dofs, obstacle.prescribed_dofs
         )
         displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
     air = 3.0 * at.compute_buoyancy_n() + 2.0 * at.air_drag_n
@@ -501,8 +461,7 @@ def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
     if any(part.has_free_density for part in at.body.parts):
         return None
     return Effect(
-        at.weight_and_drag(at.own_mass_kg) + at.force_change_by_scan_weight(),
-        at.own_mass_kg,
+        at.weight_and_drag(at.own_mass_kg) + at.force_change_by_scan_weight(), at.own_mass_kg
     )
 
 
@@ -524,24 +483,15 @@ def _stiffness_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
     body = at.stress_free_body
     place_m = at.stress_free_m[:, axis]
     shares = _linear_shares(
-        place_m[body.cells].mean(axis=1),
-        body.geometry[..., -1].sum(axis=1),
-        extent_m=place_m,
+        place_m[body.cells].mean(axis=1), body.geometry[..., -1].sum(axis=1), extent_m=place_m
     )
     stiffer = body.with_stiffness_factors(1.0 + shares)
     return Effect(at.internal_n(body=stiffer) - at.internal_force_n)
 
 
 def _linear_shares(place_m: Array, weights: Array, extent_m: Array) -> Array:
-    """Return numbers (k,) that increase linearly along an axis, with a mean of zero and the magnitude
-    one at the farther end of the body.
-
-    Parameters
-    ----------
-    place_m, weights : (k,) arrays
-        Coordinates along the axis [m], and their weights in the mean.
-    extent_m : (n,) array
-        Coordinates of all nodes [m], of which the farthest from the mean is the end.
+    """Return numbers (k,) that increase linearly along an axis, with a mean of zero and the
+    magnitude one at the farther end of the body.
     """
     middle_m = np.average(place_m, weights=weights)
     return (place_m - middle_m) / np.abs(extent_m - middle_m).max()
@@ -564,22 +514,15 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     gamma = at.proportional_s[:, None, None]
     for x, v, own in zip(xi, nu, force, strict=True):
         stretch, rate = (
-            np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells])
-            for each in (x, v)
+            np.einsum("eqa,eaj->eqj", slopes, each.reshape(-1, 3)[body.cells]) for each in (x, v)
         )
         squared = np.sum(stretch**2, axis=2, keepdims=True)
         strain = 0.5 * (squared - 1)
-        if at.iterate.segment.experiment.specimen is not None:
+        if at.iterate.transcription.experiment.specimen is not None:
             strain = (1 - squared**-1.5) / 3
-        pull = (
-            strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)
-        ) * stretch
+        pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
         pull = weight[..., None] * (pull + gamma * strain * rate)
-        np.subtract.at(
-            own.reshape(-1, 3),
-            body.cells,
-            np.einsum("eqa,eqj->eaj", slopes, pull),
-        )
+        np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
     force[: at.dynamics.first_row] = 0.0
     return Effect(force)
 
@@ -606,19 +549,13 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of clocks that are fast by a share, so that less time passes than they
     show; None for a static experiment.
     """
-    if at.iterate.segment.experiment.is_static:
+    if at.iterate.transcription.experiment.is_static:
         return None
     slower = at.internal_n(time_factor=1 + SMALL)
     faster = at.internal_n(time_factor=1 - SMALL)
-    drag = (
-        at.body.tied_damping_rate(at.theta)
-        * at.dynamics.mass.damped_kg
-        * at.states[1]
-    )
+    drag = at.body.tied_damping_rate(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
     air = 2.0 * at.air_drag_n
-    return Effect(
-        (faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0
-    )
+    return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
 
 
 def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -650,25 +587,21 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a mass of each marker, per kilogram, which is part of neither the mass of
-    the body nor a point mass of the problem; None without markers.
+    """Return the effect of a mass of each marker, per kilogram, which is part of neither the mass
+    of the body nor a point mass of the problem; None without markers.
 
     It is distributed to nodes by the weights of the marker's place; estimated places are those of
     the association at the answer.
     """
-    segment = at.iterate.segment
-    placement = segment.experiment.markers.placement
+    transcription = at.iterate.transcription
+    placement = transcription.experiment.markers.placement
     if not len(placement.nodes):
         return None
-    association = segment.association.markers
+    association = transcription.association.markers
     if association.sigma_m.any():
-        placement = place_markers(
-            association.centre_places_m, at.body.nodes_m, at.body
-        )
+        placement = place_markers(association.centre_places_m, at.body.nodes_m, at.body)
     node_mass_kg = np.bincount(
-        placement.nodes.ravel(),
-        weights=placement.weights.ravel(),
-        minlength=len(at.body.nodes_m),
+        placement.nodes.ravel(), weights=placement.weights.ravel(), minlength=len(at.body.nodes_m)
     )
     mass_kg: Array = np.repeat(node_mass_kg, 3).astype(float)
     return Effect(at.weight_and_drag(mass_kg), mass_kg)
@@ -681,12 +614,8 @@ def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper.
     """
     prescribed = at.iterate.equations.prescribed
-    holding = at.iterate.segment.experiment.body_grasps
-    gripped = [
-        grasp.prescribed_dofs
-        for grasp in holding
-        if len(grasp.axes) == len(_AXES)
-    ]
+    holding = at.iterate.transcription.experiment.body_grasps
+    gripped = [grasp.prescribed_dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
     if not gripped:
         return None
     area_m2 = at.body.sum_dof_volumes_m3()[prescribed.dofs] ** (2 / 3)
@@ -704,7 +633,7 @@ def _grasp_edge(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
     None without a gripper, and on a test bench, where platens end at the faces of the specimen.
     """
-    if at.iterate.segment.experiment.is_static and _is_driven(at).any():
+    if at.iterate.transcription.experiment.is_static and _is_driven(at).any():
         return None
     return _grip(at, 0)
 
@@ -726,7 +655,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     `Grasp.displacement_scale` of it. Specimens are treated by
     `_machine_of_specimen`.
     """
-    experiment = at.iterate.segment.experiment
+    experiment = at.iterate.transcription.experiment
     prescribed = at.iterate.equations.prescribed
     if experiment.specimen is not None:
         return _machine_of_specimen(at, experiment.specimen)
@@ -736,8 +665,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     for grasp in experiment.grasps:
         for axis in range(3):
             here = np.flatnonzero(
-                np.isin(prescribed.dofs, grasp.prescribed_dofs)
-                & (prescribed.dofs % 3 == axis)
+                np.isin(prescribed.dofs, grasp.prescribed_dofs) & (prescribed.dofs % 3 == axis)
             )
             if driven[here].any():
                 force_n = at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
@@ -767,16 +695,14 @@ def _gauge_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of a gauge length of a homogeneous specimen that is longer than stated by a
     share, per unit of that share: all prescribed strains are smaller by it; None for a body.
     """
-    deformation = at.iterate.segment.experiment.specimen
+    deformation = at.iterate.transcription.experiment.specimen
     if deformation is None:
         return None
     prescribed = at.iterate.equations.prescribed
     displacement_m = np.zeros_like(prescribed.positions_m)
     for node in deformation.displaced_nodes():
         columns = np.searchsorted(prescribed.dofs, 3 * node + np.arange(3))
-        displacement_m[:, columns] = (
-            at.body.nodes_m[node] - prescribed.positions_m[:, columns]
-        )
+        displacement_m[:, columns] = at.body.nodes_m[node] - prescribed.positions_m[:, columns]
     return Effect(displacement_m=displacement_m)
 
 
@@ -787,25 +713,19 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     Friction has the size of the normal force and is opposite to the displacement. Planes of
     symmetry have no normal force in the loading direction, and no friction.
     """
-    experiment = at.iterate.segment.experiment
+    experiment = at.iterate.transcription.experiment
     prescribed = at.iterate.equations.prescribed
     if not experiment.is_static:
         return None
     pressed = {_AXES[k] for k in np.unique(prescribed.dofs[_is_driven(at)] % 3)}
-    platens = [
-        g
-        for g in experiment.grasps
-        if len(g.axes) < 3 and pressed & set(g.axes)
-    ]
+    platens = [g for g in experiment.grasps if len(g.axes) < 3 and pressed & set(g.axes)]
     force = np.zeros_like(at.iterate.x)
     x = at.iterate.x
     start = at.body.nodes_m.ravel()
     for grasp in platens:
         across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
         for node in grasp.nodes:
-            normal = np.isin(
-                prescribed.dofs, [3 * node + _AXES.index(a) for a in grasp.axes]
-            )
+            normal = np.isin(prescribed.dofs, [3 * node + _AXES.index(a) for a in grasp.axes])
             press = np.linalg.norm(at.grasp_force_n[:, normal], axis=1)
             dofs = [3 * node + k for k in across]
             way = x[:, dofs] - start[dofs]
@@ -818,9 +738,7 @@ def _platen_slip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of faces that slide freely on platens instead of sticking; None if other
     measurements than loads show the grip, or no face may slide, see `slip_displacements_m`.
     """
-    displacement_m = slip_displacements_m(
-        at.iterate, at.theta, reactions_n=at.grasp_force_n
-    )
+    displacement_m = slip_displacements_m(at.iterate, at.theta, reactions_n=at.grasp_force_n)
     if displacement_m is None:
         return None
     return Effect(displacement_m=displacement_m)
@@ -831,39 +749,28 @@ def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
     contact, or where it is rigid already.
     """
     change_n = rigid_contact_change_n(
-        at.iterate.segment.experiment, at.dynamics, x=at.iterate.x
+        at.iterate.transcription.experiment, at.dynamics, x=at.iterate.x
     )
     return None if change_n is None else Effect(at.pad_rows(change_n))
 
 
 def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
-    return (
-        Effect(at.compute_buoyancy_n())
-        if at.dynamics.mass.added_kg.any()
-        else None
-    )
+    return Effect(at.compute_buoyancy_n()) if at.dynamics.mass.added_kg.any() else None
 
 
 def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more added mass, as a share of that in the model; None in a vacuum and
     for a static experiment.
     """
-    if (
-        at.iterate.segment.experiment.is_static
-        or not at.dynamics.mass.added_kg.any()
-    ):
+    if at.iterate.transcription.experiment.is_static or not at.dynamics.mass.added_kg.any():
         return None
     return Effect(mass_kg=at.dynamics.mass.added_kg)
 
 
 def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
-    return (
-        Effect(at.air_drag_n)
-        if at.iterate.segment.experiment.has_air_drag
-        else None
-    )
+    return Effect(at.air_drag_n) if at.iterate.transcription.experiment.has_air_drag else None
 
 
 def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
@@ -871,42 +778,24 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
     difference of the forces along the answer.
 
     Parts with a custom law keep it, and so do parts of linear material, for which all laws agree.
-
-    Parameters
-    ----------
-    at : ExperimentAtAnswer
-    law : str
-        Name of the other law in `DAMPINGS`.
-
-    Returns
-    -------
-    Effect or None
-        None if no part has another law, no γ_r is above zero, or the experiment is static.
     """
     body = at.body
     names = body.constants.items()
     is_damped = any(
-        constant is GAMMA_R and value
-        for (_, constant), value in zip(names, at.theta, strict=False)
+        constant is GAMMA_R and value for (_, constant), value in zip(names, at.theta, strict=False)
     )
-    if at.iterate.segment.experiment.is_static or not is_damped:
+    if at.iterate.transcription.experiment.is_static or not is_damped:
         return None
     parts = tuple(
         replace(part, damping=DAMPINGS[law])
-        if part.damping in DAMPINGS.values()
-        and part.material is not MATERIALS["linear"]
+        if part.damping in DAMPINGS.values() and part.material is not MATERIALS["linear"]
         else part
         for part in body.parts
     )
-    if all(
-        own.damping is other.damping
-        for own, other in zip(body.parts, parts, strict=True)
-    ):
+    if all(own.damping is other.damping for own, other in zip(body.parts, parts, strict=True)):
         return None
     xi, nu = at.dynamics.evaluation_states(at.iterate.x)
-    histories = at.dynamics.forces_with_histories(
-        at.dynamics.histories(at.iterate.x)
-    ).memory_state
+    histories = at.dynamics.forces_with_histories(at.dynamics.histories(at.iterate.x)).memory_state
     forces_n = (
         each.force(xi, nu, theta=at.theta, memory_input=histories)
         for each in (body.with_parts(parts), body)
@@ -936,12 +825,7 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
         return None
     return Effect(
         at.force_change_by_reference(
-            sag_m(
-                at.body,
-                at.theta,
-                support_dofs=at.likely_support_dofs,
-                axis=axis,
-            )
+            sag_m(at.body, at.theta, support_dofs=at.likely_support_dofs, axis=axis)
         )
     )
 
@@ -951,7 +835,7 @@ def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
     a smooth random field, in units of the thickness; grasped nodes move with the surface.
     """
     moved_m = at.surface_modes_m[mode]
-    prescribed_motion = at.iterate.segment.prescribed_motion
+    prescribed_motion = at.iterate.transcription.prescribed_motion
     rotations: Array = np.nan_to_num(prescribed_motion.pose_rows[0])
     offsets_m = moved_m.ravel()[
         3 * (at.iterate.equations.prescribed.dofs // 3)[:, None] + np.arange(3)
@@ -1045,8 +929,7 @@ ASSUMPTIONS = (
         "stiffness_drift",
         "1",
         sigma=0.02,
-        description="relative change of the stiffness from the beginning to the end of a "
-        "recording",
+        description="relative change of the stiffness from the beginning to the end of a recording",
         remedy="repeat the first recording at the end",
         effect=_drift,
         of_specimens=True,
@@ -1059,9 +942,7 @@ ASSUMPTIONS = (
         "each relaxation time that the recording can show",
         remedy="add a branch of memory to the material, and estimate its share",
         effect=_memory,
-        component_names=" ".join(
-            f"{RELAXATION_TIME}{tau_s:g}s" for tau_s in RELAXATION_TIMES_S
-        ),
+        component_names=" ".join(f"{RELAXATION_TIME}{tau_s:g}s" for tau_s in RELAXATION_TIMES_S),
     ),
     Assumption(
         "time_scale",
@@ -1099,8 +980,7 @@ ASSUMPTIONS = (
         sigma=None,
         description="effect of Rayleigh damping, as a fraction of the complete difference of "
         "its damping force from that of the stated law",
-        remedy="compare the laws with compare-models --damping on motions that rotate "
-        "the body",
+        remedy="compare the laws with compare-models --damping on motions that rotate the body",
         effect=_rayleigh_damping,
     ),
     Assumption(
@@ -1425,9 +1305,7 @@ class Assumptions:
         """Return a new table with all assumptions exactly true ("none"), as for a simulated
         recording.
         """
-        exact: dict[str, Literal["none"]] = dict.fromkeys(
-            vars(Assumptions()), "none"
-        )
+        exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
         return Assumptions(**exact)
 
     def collect_deviations(self) -> dict[str, float | None]:
@@ -1436,11 +1314,7 @@ class Assumptions:
         """
         by_name: dict[str, float | None] = {}
         for name, deviation in vars(self).items():
-            known = (
-                deviation.deviation
-                if isinstance(deviation, KnownEffect)
-                else deviation
-            )
+            known = deviation.deviation if isinstance(deviation, KnownEffect) else deviation
             by_name[name] = None if known == "none" else known
         return by_name
 
@@ -1462,9 +1336,7 @@ class ExactIfNone:
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         """Return the schema of the table with "none" replaced by `Assumptions.exact`."""
-        return core_schema.no_info_before_validator_function(
-            self._exact_if_none, handler(source)
-        )
+        return core_schema.no_info_before_validator_function(self._exact_if_none, handler(source))
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
@@ -1474,13 +1346,7 @@ class ExactIfNone:
 
     @staticmethod
     def _exact_if_none(value: Any) -> Any:
-        """Return the values of all assumptions in place of "none"; other values unchanged.
-
-        Raises
-        ------
-        ValueError
-            If the value is another text.
-        """
+        """Return the values of all assumptions in place of "none"; other values unchanged."""
         if isinstance(value, str) and value != "none":
             raise ValueError(
                 f'found "{value}"; expected a table, or "none" if all assumptions are exact'

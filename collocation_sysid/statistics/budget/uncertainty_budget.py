@@ -83,10 +83,7 @@ class BudgetLine:
         low, high = map(coordinate.from_value, self.combined95)
         known_variance = ((high - low) / 2 / NORMAL_95) ** 2
         total = known_variance + deviation**2
-        shares = {
-            name: share * known_variance / total
-            for name, share in self.shares.items()
-        }
+        shares = {name: share * known_variance / total for name, share in self.shares.items()}
         shares[source] = deviation**2 / total
         least, most = widened_interval(
             (low, high), coordinate.from_value(self.value), deviation=deviation
@@ -95,10 +92,7 @@ class BudgetLine:
             self.value,
             _ranked(shares),
             combined95=(coordinate.to_value(least), coordinate.to_value(most)),
-            combined_std_error=(most - least)
-            / 2
-            / NORMAL_95
-            / coordinate.derivative(self.value),
+            combined_std_error=(most - least) / 2 / NORMAL_95 / coordinate.derivative(self.value),
             systematic=float(np.hypot(self.systematic, deviation)),
             known_effect=self.known_effect,
         )
@@ -174,14 +168,10 @@ class VarianceSources:
         """
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared_count]
-        all_free, known = (
-            np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2)
-        )
+        all_free, known = (np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2))
         information = least_squares_of_fit(fit).compute_information()
         for own, here in ((all_free, free), (known, shared)):
-            inverse = np.linalg.pinv(
-                information[np.ix_(here, here)], hermitian=True
-            )
+            inverse = np.linalg.pinv(information[np.ix_(here, here)], hermitian=True)
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
         moved = estimate_changes(fit, assumed.blocks)[: fit.shared_count]
         by_q = _estimate_derivatives(fit, parameters, q=q)
@@ -226,16 +216,10 @@ class VarianceSources:
         )
         if not all_free > 0:
             return 1.0, 1.0
-        agreed = (
-            1.0
-            if (self.widening == 1).all()
-            else all_free / all_scaled_by_noise
-        )
+        agreed = 1.0 if (self.widening == 1).all() else all_free / all_scaled_by_noise
         return float(np.clip(known / all_free, 0.0, 1.0)), agreed
 
-    def variance_between_recordings(
-        self, by_q: Array, others: float, counted: float
-    ) -> float:
+    def variance_between_recordings(self, by_q: Array, others: float, counted: float) -> float:
         """Return the variance due to differences of parameters between recordings, beyond what is
         counted already.
 
@@ -255,10 +239,7 @@ class VarianceSources:
         float
             The excess over `counted`, enlarged; 0 if there is none.
         """
-        more = max(
-            0.0,
-            float(np.sum((by_q @ self.recording_sensitivities) ** 2)) - counted,
-        )
+        more = max(0.0, float(np.sum((by_q @ self.recording_sensitivities) ** 2)) - counted)
         if not more:
             return 0.0
         freedom = self.freedom * ((others + more) / more) ** 2
@@ -269,9 +250,7 @@ class VarianceSources:
         to first order; 0 without known effects. Of an assumption with several components each
         has the effect.
         """
-        sizes = [
-            self.means.get(name.partition(" ")[0], 0.0) for name in self.names
-        ]
+        sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
         return float(by_q @ self.sensitivities @ sizes)
 
     def variances_of_assumptions(self, by_q: Array) -> dict[str, float]:
@@ -279,9 +258,7 @@ class VarianceSources:
         derivative `by_q` (nq,), by the assumption's name.
         """
         variances: dict[str, float] = {}
-        for name, way in zip(
-            self.names, by_q @ self.sensitivities, strict=True
-        ):
+        for name, way in zip(self.names, by_q @ self.sensitivities, strict=True):
             row = name.partition(" ")[0]
             variances[row] = variances.get(row, 0.0) + float(way) ** 2
         return variances
@@ -311,18 +288,11 @@ def budget(
     Estimates that do not depend on q, such as fixed ones, are left out.
     """
     lines = {}
-    for name, estimate in {
-        **uncertainty.estimates,
-        **uncertainty.derived,
-    }.items():
+    for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
         by_q = sources.derivatives[name]
         if estimate.statistical95 is not None and by_q.any():
             lines[name] = _line(
-                name,
-                estimate,
-                sources=sources,
-                error=numerical.get(name),
-                parameters=parameters,
+                name, estimate, sources=sources, error=numerical.get(name), parameters=parameters
             )
     return lines
 
@@ -334,25 +304,7 @@ def _line(
     error: DiscretisationError | None,
     parameters: Parameters,
 ) -> BudgetLine:
-    """Return the budget of one estimate that has a statistical interval.
-
-    Parameters
-    ----------
-    name : str
-        Name of the estimate.
-    estimate : Estimate
-    sources : VarianceSources
-        Covariances and sensitivities of the fit.
-    error : DiscretisationError or None
-        None if the discretisation error is not known.
-    parameters : Parameters
-        Provides scale and bounds.
-
-    Notes
-    -----
-    Sources without variance have no share. The variance for noise is divided into noise, nuisance
-    parameters and differences between recordings.
-    """
+    """Return the budget of one estimate that has a statistical interval."""
     assert estimate.statistical95 is not None
     linear, bounds = parameters.scale_and_bounds(name)
     ends = estimate.statistical95
@@ -371,9 +323,7 @@ def _line(
     by_coordinate = by_q * at.derivative(estimate.value)
     by_assumption = sources.variances_of_assumptions(by_coordinate)
     others = sum(parts.values()) + sum(by_assumption.values())
-    between = sources.variance_between_recordings(
-        by_coordinate, others, counted=excess
-    )
+    between = sources.variance_between_recordings(by_coordinate, others, counted=excess)
     systematic = float(np.sqrt(sum(by_assumption.values()) + between))
     variances = parts | {BETWEEN: excess + between} | by_assumption
     total = sum(variances.values())
@@ -391,13 +341,7 @@ def _line(
     assert combined.combined_std_error is not None
     return BudgetLine(
         combined.value,
-        _ranked(
-            {
-                source: part / total
-                for source, part in variances.items()
-                if part > 0
-            }
-        ),
+        _ranked({source: part / total for source, part in variances.items() if part > 0}),
         combined95=combined.combined95,
         combined_std_error=combined.combined_std_error,
         systematic=systematic,
@@ -410,27 +354,12 @@ def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
 
     If both sides are equal, half the interval counts as 1.96 standard deviations; else, as where
     one end is cut off by a bound, it is the mean of the variances of both sides.
-
-    Parameters
-    ----------
-    at : IntervalCoordinate
-    middle : float
-        Value between the ends.
-    ends : (lower, upper)
-        Interval, as values.
     """
     centre = at.from_value(middle)
     low, high = map(at.from_value, ends)
     if np.isclose(centre - low, high - centre, rtol=1e-6):
         return ((high - low) / 2 / NORMAL_95) ** 2
-    return float(
-        np.mean(
-            [
-                ((centre - low) / NORMAL_95) ** 2,
-                ((high - centre) / NORMAL_95) ** 2,
-            ]
-        )
-    )
+    return float(np.mean([((centre - low) / NORMAL_95) ** 2, ((high - centre) / NORMAL_95) ** 2]))
 
 
 def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
@@ -438,9 +367,7 @@ def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
     return dict(sorted(shares.items(), key=lambda part: -part[1]))
 
 
-def _estimate_derivatives(
-    fit: LinearisedFit, parameters: Parameters, q: Array
-) -> dict[str, Array]:
+def _estimate_derivatives(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:
     """Return the derivatives (nq,) of each estimate by q, by name: parameters, tied ones and
     derived moduli; zero for fixed ones.
     """
@@ -454,9 +381,7 @@ def _estimate_derivatives(
     return slopes | dict(fit.derived.derivatives)
 
 
-def main_sources(
-    shares: Mapping[str, Mapping[str, float]], minimum_share: float
-) -> list[str]:
+def main_sources(shares: Mapping[str, Mapping[str, float]], minimum_share: float) -> list[str]:
     """Return the sources whose share in the variance of at least one estimate is `minimum_share` or
     more, by their largest share, the largest first.
 
@@ -468,28 +393,16 @@ def main_sources(
         Smallest share of interest.
     """
     largest: dict[str, float] = {}
-    for source, share in (
-        each for line in shares.values() for each in line.items()
-    ):
+    for source, share in (each for line in shares.values() for each in line.items()):
         largest[source] = max(share, largest.get(source, 0.0))
-    return sorted(
-        (s for s in largest if largest[s] >= minimum_share),
-        key=lambda s: -largest[s],
-    )
+    return sorted((s for s in largest if largest[s] >= minimum_share), key=lambda s: -largest[s])
 
 
 def source_label(source: str) -> str:
     """Return the name of a source as text for messages: without a unit suffix such as "_rad", with
     spaces for underscores, and with a relaxation time in parentheses.
     """
-    unit = next(
-        (
-            u
-            for u in ("_m_n", "_1_m2", "_rad", "_m", "_s")
-            if source.endswith(u)
-        ),
-        "",
-    )
+    unit = next((u for u in ("_m_n", "_1_m2", "_rad", "_m", "_s") if source.endswith(u)), "")
     label = source.removesuffix(unit).replace("_", " ")
     name, _, time = label.partition(f" {RELAXATION_TIME}")
     return f"{name} (τ = {time.removesuffix('s')} s)" if time else label

@@ -26,11 +26,7 @@ from ...program.modes.modal_prediction import DeclaredMotion
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.poses import PoseSequence
-from .misspecification_hypothesis import (
-    Hypothesis,
-    HypothesisTest,
-    clock_hypothesis,
-)
+from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis
 from .modal_misspecifications import (
     ModalComparison,
     find_misspecifications_by_modes,
@@ -66,9 +62,7 @@ SHORTEST = 4
 
 
 def motion_misspecifications(
-    solution: Solution,
-    known: Sequence[Hypothesis],
-    budget: int | None = None,
+    solution: Solution, known: Sequence[Hypothesis], budget: int | None = None
 ) -> list[Hypothesis]:
     """Return hypotheses about the motion of the experiment with the largest misfit, by natural
     modes and refits; empty if its markers miss by at most `NOISE` σ.
@@ -84,13 +78,8 @@ def motion_misspecifications(
         Largest number of sweeps over the first samples for all refits together; by default three
         times the work of the fit, at most 150.
     """
-    fitted = [
-        segment.experiment for segment in solution.collocation.transcriptions
-    ]
-    misfits = [
-        _misfit(e, read)
-        for e, read in zip(fitted, solution.readings_m, strict=True)
-    ]
+    fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
+    misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
     if max(misfits) <= NOISE:
         return []
     worst = fitted[int(np.argmax(misfits))]
@@ -99,9 +88,7 @@ def motion_misspecifications(
             worst, solution.parameters, huber=solution.collocation.huber
         )
     )
-    certainty = max(
-        (each.strength for each in (*known, *hypotheses)), default=0.0
-    )
+    certainty = max((each.strength for each in (*known, *hypotheses)), default=0.0)
     if certainty < CERTAIN:
         hypotheses += _refit_hypotheses(solution, worst, budget=budget)
     return hypotheses
@@ -112,21 +99,6 @@ def _refit_hypotheses(
 ) -> list[Hypothesis]:
     """Return the hypotheses whose correction lets the first samples of an experiment fit far
     better; empty if these cannot be fitted.
-
-    Parameters
-    ----------
-    solution : Solution
-        The fit; refits begin at the guess of its problem.
-    experiment : Experiment
-    budget : int or None
-        Largest number of sweeps for all refits together; None for the default, see
-        `motion_misspecifications`.
-
-    Notes
-    -----
-    Only the first `MOST_SAMPLES` samples are fitted. Tested are a clock lag (not in a static
-    experiment), a marker that slips, directions of gravity, and grasps one layer deeper or less
-    deep.
     """
     first = first_samples(experiment, MOST_SAMPLES)
     alone = _Refitter(solution, first, sweeps=budget)
@@ -141,15 +113,9 @@ def _refit_hypotheses(
         noise_level=NOISE,
     )
     of = f"'{experiment.name}'"
-    lags = (
-        []
-        if first.is_static
-        else _clock_hypotheses(alone, first, fitted_m=fitted_m, of=of)
-    )
+    lags = [] if first.is_static else _clock_hypotheses(alone, first, fitted_m=fitted_m, of=of)
     comparison = ModalComparison.from_experiment(first, solution.parameters)
-    turned = (
-        [] if comparison is None else _gravity_hypotheses(first, comparison)
-    )
+    turned = [] if comparison is None else _gravity_hypotheses(first, comparison)
     return [
         *trial.accepted(
             [
@@ -162,74 +128,45 @@ def _refit_hypotheses(
     ]
 
 
-def _gravity_hypotheses(
-    declared: Experiment, comparison: ModalComparison
-) -> Iterator[Hypothesis]:
+def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
     """Yield the direction of gravity that suits the natural modes best, as a hypothesis with the
     experiment `declared` in it as its correction; nothing if there is no other direction.
     """
     others = gravity_hypotheses(comparison.declared)
-    nearest = min(
-        others,
-        key=lambda each: comparison.misfit_m(each.corrected),
-        default=None,
-    )
+    nearest = min(others, key=lambda each: comparison.misfit_m(each.corrected), default=None)
     if nearest is not None:
         gravity_m_s2 = nearest.corrected.gravity_m_s2
-        yield replace(
-            nearest, corrected=replace(declared, gravity_m_s2=gravity_m_s2)
-        )
+        yield replace(nearest, corrected=replace(declared, gravity_m_s2=gravity_m_s2))
 
 
-def _grasp_layer_hypotheses(
-    declared: Experiment, of: str
-) -> Iterator[Hypothesis]:
+def _grasp_layer_hypotheses(declared: Experiment, of: str) -> Iterator[Hypothesis]:
     """Yield hypotheses, about the subject `of`, of all grasps one layer of elements deeper, and one
     less deep, where that is possible; `corrected` is the changed experiment.
     """
     for deeper, deep in ((True, "more"), (False, "fewer")):
         if (layered := _with_shifted_grasps(declared, deeper)) is not None:
-            yield Hypothesis(
-                "grasp-layer", of, data={"deep": deep}, corrected=layered
-            )
+            yield Hypothesis("grasp-layer", of, data={"deep": deep}, corrected=layered)
 
 
-def _slip_hypotheses(
-    declared: Experiment, fitted_m: Array, of: str
-) -> Iterator[Hypothesis]:
+def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator[Hypothesis]:
     """Yield the hypothesis that the marker whose residuals change most abruptly slipped;
     `corrected` is the experiment without it.
 
     Nothing is yielded if two means explain no marker's residuals better than one by the factor
     `SLIP`, or for a single marker.
-
-    Parameters
-    ----------
-    declared : Experiment
-    fitted_m : (T, M, 3) array
-        Markers of its fit [m].
-    of : str
-        Subject of the hypothesis.
     """
     residual = _residual(declared, fitted_m)
     described = DeclaredMotion.from_experiment(declared)
     if described is not None:
-        residual = np.einsum(
-            "tji,tmj->tmi", described.rotations, residual[: len(described.t_s)]
-        )
+        residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
     clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
     m = int(np.argmax([ratio for ratio, _ in clearest]))
     if clearest[m][0] < SLIP or residual.shape[1] < 2:
         return
     tracks = np.array(declared.markers.positions_m)
     tracks[:, m] = np.nan
-    data = {
-        "marker": declared.markers.names[m],
-        "t_s": declared.t_s[clearest[m][1]],
-    }
-    without = replace(
-        declared, markers=replace(declared.markers, positions_m=tracks)
-    )
+    data = {"marker": declared.markers.names[m], "t_s": declared.t_s[clearest[m][1]]}
+    without = replace(declared, markers=replace(declared.markers, positions_m=tracks))
     yield Hypothesis("marker-slip", of, data=data, corrected=without)
 
 
@@ -267,13 +204,9 @@ class _Refitter:
         at most `BUDGET`.
     """
 
-    def __init__(
-        self, solution: Solution, declared: Experiment, sweeps: int | None
-    ) -> None:
+    def __init__(self, solution: Solution, declared: Experiment, sweeps: int | None) -> None:
         self.collocation = solution.collocation
-        fitted = [
-            segment.experiment for segment in self.collocation.transcriptions
-        ]
+        fitted = [transcription.experiment for transcription in self.collocation.transcriptions]
         rows = sum(len(experiment.t_s) for experiment in fitted)
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
         work = EFFORT * self.each * rows // len(declared.t_s)
@@ -302,29 +235,17 @@ class _Refitter:
         those allowed.
 
         None if none are left, or the fit fails; a fit that reaches its limit of iterations counts.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            If the fit is interrupted.
         """
         if self.sweeps <= 0:
             return None
-        method = ReducedSpace(
-            max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE
-        )
+        method = ReducedSpace(max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE)
         try:
-            solution = method(
-                replace(self.collocation, experiments=(experiment,))
-            )
+            solution = method(replace(self.collocation, experiments=(experiment,)))
         except (InputError, SimulationError):
             return None
         self.sweeps -= solution.iterations
         solution.unless_interrupted()
-        ended = (
-            solution.status.converged
-            or solution.status is Status.ITERATION_LIMIT
-        )
+        ended = solution.status.converged or solution.status is Status.ITERATION_LIMIT
         return solution.readings_m[0] if ended else None
 
 
@@ -333,16 +254,6 @@ def _clock_hypotheses(
 ) -> Iterator[Hypothesis]:
     """Yield the clock lag for which residuals and velocities agree best, after a few refits, as one
     hypothesis; nothing if no lag decreases the misfit.
-
-    Parameters
-    ----------
-    alone : _Refitter
-    declared : Experiment
-        Experiment as stated.
-    fitted_m : (T, M, 3) array
-        Markers of its fit [m].
-    of : str
-        Subject of the hypothesis.
     """
     least = _misfit(declared, fitted_m)
     lag_s = 0.0
@@ -381,8 +292,7 @@ def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
             experiment,
             t_s=t_s[is_covered],
             grasps=[
-                replace(g, poses=_delayed_poses(g, t_s, lag_s=lag_s))
-                for g in experiment.grasps
+                replace(g, poses=_delayed_poses(g, t_s, lag_s=lag_s)) for g in experiment.grasps
             ],
             markers=at_times(markers, is_covered),
         )
@@ -407,12 +317,8 @@ def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
     return replace(
         poses,
         t_s=np.r_[min(t_s[0], poses.t_s[0]), times],
-        positions_m=np.concatenate(
-            [poses.positions_m[first], poses.positions_m]
-        ),
-        quaternions_xyzw=np.concatenate(
-            [poses.quaternions_xyzw[first], poses.quaternions_xyzw]
-        ),
+        positions_m=np.concatenate([poses.positions_m[first], poses.positions_m]),
+        quaternions_xyzw=np.concatenate([poses.quaternions_xyzw[first], poses.quaternions_xyzw]),
     )
 
 
@@ -425,17 +331,13 @@ def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
     """
     v = np.gradient(predicted_m, experiment.timestep_s, axis=0)
     residual = np.where(
-        np.isfinite(experiment.markers.positions_m),
-        _residual(experiment, predicted_m),
-        0.0,
+        np.isfinite(experiment.markers.positions_m), _residual(experiment, predicted_m), 0.0
     )
     moving = np.where(experiment.markers.is_present[..., None], v, 0.0)
     return float(np.sum(residual * moving) / max(np.sum(moving**2), 1e-300))
 
 
-def _with_shifted_grasps(
-    experiment: Experiment, deeper: bool
-) -> Experiment | None:
+def _with_shifted_grasps(experiment: Experiment, deeper: bool) -> Experiment | None:
     """Return the experiment with every grasp one layer of elements deeper or less deep; None if
     that is impossible, or leaves a grasp fewer than three nodes or all nodes.
 
@@ -474,7 +376,5 @@ def _misfit(experiment: Experiment, predicted_m: Array) -> float:
     """Return the root mean square of the residuals of predicted markers (T, M, 3) [m] in standard
     deviations; missing samples are ignored; 0 without samples.
     """
-    scaled = (
-        _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
-    )
+    scaled = _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
     return root_mean(scaled[experiment.markers.is_present] ** 2)

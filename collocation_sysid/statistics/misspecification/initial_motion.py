@@ -132,9 +132,7 @@ def initial_motion_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
                 "within_ms": 1e3 * motion.duration_s,
                 "grasp_mm": 1e3 * motion.grasp_m,
             },
-            strength=float(
-                motion.markers_m / max(limit_m, motion.markers_m / 10)
-            ),
+            strength=float(motion.markers_m / max(limit_m, motion.markers_m / 10)),
         )
 
 

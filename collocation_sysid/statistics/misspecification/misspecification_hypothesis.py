@@ -64,19 +64,13 @@ class Hypothesis:
         """
         tried = {} if self.corrected is None else {"nearer": self.strength}
         of = {"of": self.subject} if self.subject else {}
-        return Concern(
-            f"description/{self.code}", grade, data={**of, **self.data, **tried}
-        )
+        return Concern(f"description/{self.code}", grade, data={**of, **self.data, **tried})
 
     def as_dict(self) -> dict[str, Any]:
         """Return cause, message and strength under the keys "cause", "sentence" and "strength", for
         JSON and tables.
         """
-        return {
-            "cause": self.cause,
-            "sentence": self.message,
-            "strength": self.strength,
-        }
+        return {"cause": self.cause, "sentence": self.message, "strength": self.strength}
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +97,7 @@ class HypothesisTest:
     smallest_misfit: float = 0.0
     noise_level: float = 0.0
 
-    def accepted(
-        self, hypotheses: Iterable[Hypothesis]
-    ) -> Iterator[Hypothesis]:
+    def accepted(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
         """Yield copies of those hypotheses, with their strength, whose correction decreases the
         misfit by more than the required factor, or from above the noise to below it.
 
@@ -118,13 +110,8 @@ class HypothesisTest:
                 misfit = self.misfit_of(each.corrected)
             if misfit is None:
                 continue
-            strength = (
-                self.misfit / max(self.smallest_misfit, misfit) / each.handicap
-            )
-            if (
-                strength > self.required_factor
-                or misfit < self.noise_level < self.misfit
-            ):
+            strength = self.misfit / max(self.smallest_misfit, misfit) / each.handicap
+            if strength > self.required_factor or misfit < self.noise_level < self.misfit:
                 yield replace(each, strength=strength)
 
 
@@ -151,9 +138,7 @@ def clock_hypothesis(
         "by_ms": 1e3 * abs(lag_s),
         "do": "add this to" if is_late else "subtract this from",
     }
-    return Hypothesis(
-        "clock", subject, data=data, corrected=corrected, handicap=handicap
-    )
+    return Hypothesis("clock", subject, data=data, corrected=corrected, handicap=handicap)
 
 
 def rank(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:

@@ -18,21 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...errors import SimulationError
-from ...program.modes.modal_prediction import (
-    DeclaredMotion,
-    ModalResponse,
-    delayed_tracks,
-)
+from ...program.modes.modal_prediction import DeclaredMotion, ModalResponse, delayed_tracks
 from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, place_markers
 from ..axes import OTHER_AXES
 from .initial_motion import initial_motion_hypotheses
-from .misspecification_hypothesis import (
-    Hypothesis,
-    HypothesisTest,
-    clock_hypothesis,
-    rank,
-)
+from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
 from .plausibility import (
     load_sign_hypotheses,
     name_exchange_hypotheses,
@@ -75,9 +66,7 @@ FRAME_CAUSES = (
 
 
 def find_misspecifications_by_modes(
-    experiment: Experiment,
-    constants: Mapping[str, float],
-    huber: float | None = None,
+    experiment: Experiment, constants: Mapping[str, float], huber: float | None = None
 ) -> tuple[Hypothesis, ...]:
     """Return hypotheses about a recording's description, likeliest first; mostly empty.
 
@@ -100,15 +89,9 @@ def find_misspecifications_by_modes(
     if not experiment.markers.names:
         return rank(load_sign_hypotheses(experiment))
     if experiment.is_static:
-        return rank(
-            [*load_sign_hypotheses(experiment), *_rigid_axes(experiment)]
-        )
+        return rank([*load_sign_hypotheses(experiment), *_rigid_axes(experiment)])
     comparison = ModalComparison.from_experiment(experiment, constants)
-    tried = (
-        _rigid_axes(experiment)
-        if comparison is None
-        else comparison.hypotheses()
-    )
+    tried = _rigid_axes(experiment) if comparison is None else comparison.hypotheses()
     hypotheses = [
         *tried,
         *name_exchange_hypotheses(experiment, huber),
@@ -122,16 +105,12 @@ def find_misspecifications_by_modes(
     return rank(_with_stated_frames(experiment, hypotheses))
 
 
-def _with_stated_frames(
-    experiment: Experiment, hypotheses: list[Hypothesis]
-) -> list[Hypothesis]:
+def _with_stated_frames(experiment: Experiment, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     """Return the hypotheses with those that another frame causes (`FRAME_CAUSES`) replaced by the
     contradiction of the frames that the files state, with the largest strength; the hypotheses
     unchanged if none is of these, or files do not contradict each other.
     """
-    strengths = [
-        each.strength for each in hypotheses if each.code in FRAME_CAUSES
-    ]
+    strengths = [each.strength for each in hypotheses if each.code in FRAME_CAUSES]
     if not experiment.frames_fault or not strengths:
         return hypotheses
     stated = Hypothesis(
@@ -150,9 +129,7 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
     """
     markers = experiment.markers
     body = experiment.body
-    places_m = markers.predict_positions(
-        experiment.rigid_positions(experiment.t_s)
-    )
+    places_m = markers.predict_positions(experiment.rigid_positions(experiment.t_s))
     size_m = float(np.linalg.norm(np.ptp(body.mesh.compute_bounds_m(), axis=0)))
 
     def remaining_misfit(tracks_m: Array) -> float:
@@ -168,9 +145,7 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
             remaining_misfit,
             required_factor=LEAST_IMPROVEMENT,
         )
-        yield from trial.accepted(
-            _axes(f"'{experiment.name}'", markers.positions_at_samples_m)
-        )
+        yield from trial.accepted(_axes(f"'{experiment.name}'", markers.positions_at_samples_m))
 
 
 def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
@@ -180,11 +155,7 @@ def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
     for axes, (order, signs) in OTHER_AXES.items():
         turned = np.array(signs) * tracks_m[..., list(order)]
         yield Hypothesis(
-            "markers-axes",
-            name,
-            data={"axes": axes},
-            corrected=turned,
-            handicap=ONE_OF_MANY,
+            "markers-axes", name, data={"axes": axes}, corrected=turned, handicap=ONE_OF_MANY
         )
 
 
@@ -221,11 +192,7 @@ class ModalComparison:
             None if the body has no modes, no single grasp carries it, there are fewer than three
             samples of markers, or tendons or pressures drive it.
         """
-        declared = (
-            None
-            if experiment.actuators
-            else DeclaredMotion.from_experiment(experiment)
-        )
+        declared = None if experiment.actuators else DeclaredMotion.from_experiment(experiment)
         if declared is None or np.isfinite(declared.tracks_m[..., 0]).sum() < 3:
             return None
         try:
@@ -254,21 +221,13 @@ class ModalComparison:
         grasp carries it; poses with a mistake attach it to a wrong place, and correct poses alone
         would not fit there.
         """
-        return self._misfit_with(
-            self._response_at_implied_places(declared), declared
-        )
+        return self._misfit_with(self._response_at_implied_places(declared), declared)
 
-    def _misfit_with(
-        self, response: ModalResponse, declared: DeclaredMotion
-    ) -> float:
+    def _misfit_with(self, response: ModalResponse, declared: DeclaredMotion) -> float:
         """Return the misfit [m] of a description as predicted by a response."""
-        return float(
-            self._misfits_m(declared, response.predict(declared)).min()
-        )
+        return float(self._misfits_m(declared, response.predict(declared)).min())
 
-    def _response_at_implied_places(
-        self, declared: DeclaredMotion
-    ) -> ModalResponse:
+    def _response_at_implied_places(self, declared: DeclaredMotion) -> ModalResponse:
         """Return the response with the markers without a stated place attached to the point of the
         body that is nearest to their first sample in the frame of the grasp.
 
@@ -285,19 +244,11 @@ class ModalComparison:
         first_m = in_grasp_m[first_rows, np.arange(len(first_rows))]
         first_m[markers.located] = np.nan
         implied_m = self._located_body.places_of_points(first_m)
-        places_m = np.where(
-            np.isnan(implied_m), self.response.places_m, implied_m
-        )
+        places_m = np.where(np.isnan(implied_m), self.response.places_m, implied_m)
         placement = place_markers(
-            places_m,
-            body.nodes.points_m,
-            body=body,
-            attach=markers.attach,
-            max_distance_m=np.inf,
+            places_m, body.nodes.points_m, body=body, attach=markers.attach, max_distance_m=np.inf
         )
-        return self.response.with_markers(
-            replace(markers, placement=placement), body
-        )
+        return self.response.with_markers(replace(markers, placement=placement), body)
 
     @cached_property
     def _located_body(self) -> LocatedBody:
@@ -317,9 +268,7 @@ class ModalComparison:
         """
         misfit_m = self.misfit_m(self.declared)
         yield from HypothesisTest(
-            misfit_m,
-            self.misfit_at_implied_places_m,
-            required_factor=LEAST_IMPROVEMENT,
+            misfit_m, self.misfit_at_implied_places_m, required_factor=LEAST_IMPROVEMENT
         ).accepted(simple_hypotheses(self.declared))
         yield from HypothesisTest(
             misfit_m, self.misfit_m, required_factor=LEAST_IMPROVEMENT
@@ -336,9 +285,7 @@ class ModalComparison:
         strength = misfit_m / (LARGEST_MISFIT * size_m)
         if strength > 1:
             data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
-            yield Hypothesis(
-                "unlike", self.declared.name, data=data, strength=strength
-            )
+            yield Hypothesis("unlike", self.declared.name, data=data, strength=strength)
 
     def _other_axes(self) -> Iterator[Hypothesis]:
         """Yield the hypotheses of other axes of the tracks that fit far better by the modes."""
@@ -353,9 +300,7 @@ class ModalComparison:
 
         declared_m = self.declared.tracks_m
         yield from HypothesisTest(
-            remaining_misfit(declared_m),
-            remaining_misfit,
-            required_factor=LEAST_IMPROVEMENT,
+            remaining_misfit(declared_m), remaining_misfit, required_factor=LEAST_IMPROVEMENT
         ).accepted(_axes(self.declared.name, declared_m))
 
     def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
@@ -363,12 +308,8 @@ class ModalComparison:
         distance of the nearest 90 % of the samples plus the squared floor; samples that are NaN
         in either are ignored.
         """
-        present = np.isfinite(declared.tracks_m[..., 0]) & np.isfinite(
-            predicted[0, ..., 0]
-        )
-        distance = np.linalg.norm(predicted - declared.tracks_m, axis=3)[
-            :, present
-        ]
+        present = np.isfinite(declared.tracks_m[..., 0]) & np.isfinite(predicted[0, ..., 0])
+        distance = np.linalg.norm(predicted - declared.tracks_m, axis=3)[:, present]
         squares = np.sort(distance**2, axis=1)
         used = max(1, int(np.ceil(USED * squares.shape[1])))
         return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
@@ -390,28 +331,14 @@ class ModalComparison:
                 else np.broadcast_to(places_m, declared.tracks_m.shape)
             )
             moved_poses = moved_poses.with_prior_motion(
-                *_fit_rigid_motion(
-                    best, moved_poses.to_grasp_frame(moved_poses.tracks_m)
-                )
+                *_fit_rigid_motion(best, moved_poses.to_grasp_frame(moved_poses.tracks_m))
             )
             turn, shift_m = _fit_rigid_motion(
                 moved_tracks.tracks_m, self.best_prediction(moved_tracks)
             )
-            moved_tracks = replace(
-                moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m
-            )
-        yield Hypothesis(
-            "gripper-frame",
-            declared.name,
-            corrected=moved_poses,
-            handicap=FITTED,
-        )
-        yield Hypothesis(
-            "camera-frame",
-            declared.name,
-            corrected=moved_tracks,
-            handicap=FITTED,
-        )
+            moved_tracks = replace(moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m)
+        yield Hypothesis("gripper-frame", declared.name, corrected=moved_poses, handicap=FITTED)
+        yield Hypothesis("camera-frame", declared.name, corrected=moved_tracks, handicap=FITTED)
 
     def _clock_hypotheses(self) -> Iterator[Hypothesis]:
         """Yield the untested hypothesis of that of the `LAGS_S` that fits best; nothing if the
@@ -419,21 +346,13 @@ class ModalComparison:
         """
         declared = self.declared
         predicted = self.response.predict(declared)
-        allowed = LAGS_S[
-            np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)
-        ].tolist()
-        delayed = (
-            delayed_tracks(predicted, declared.t_s, lag_s=lag_s)
-            for lag_s in allowed
-        )
+        allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)].tolist()
+        delayed = (delayed_tracks(predicted, declared.t_s, lag_s=lag_s) for lag_s in allowed)
         misfits = [self._misfits_m(declared, each).min() for each in delayed]
         if misfits:
             lag_s = allowed[int(np.argmin(misfits))]
             yield clock_hypothesis(
-                declared.name,
-                lag_s,
-                corrected=replace(declared, lag_s=lag_s),
-                handicap=FITTED,
+                declared.name, lag_s, corrected=replace(declared, lag_s=lag_s), handicap=FITTED
             )
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
@@ -444,12 +363,7 @@ class ModalComparison:
         declared = self.declared
         names = self.experiment.markers.names
         squares = np.sum(
-            (
-                declared.tracks_m[:, :, None]
-                - self.best_prediction(declared)[:, None]
-            )
-            ** 2,
-            axis=3,
+            (declared.tracks_m[:, :, None] - self.best_prediction(declared)[:, None]) ** 2, axis=3
         )
         is_complete = np.isfinite(squares).any(axis=0).all()
         if not is_complete or len(names) < 2:
@@ -459,28 +373,19 @@ class ModalComparison:
         if not len(exchanged):
             return
         few, renamed = (
-            _with_markers(
-                declared, declared.tracks_m[:, order], markers=exchanged
-            )
+            _with_markers(declared, declared.tracks_m[:, order], markers=exchanged)
             for order in (np.arange(len(chosen)), np.argsort(chosen))
         )
-        listed = ", ".join(
-            f"{names[k]} is {names[chosen[k]]}" for k in exchanged
-        )
+        listed = ", ".join(f"{names[k]} is {names[chosen[k]]}" for k in exchanged)
         hypothesis = Hypothesis(
-            "markers-exchanged",
-            declared.name,
-            data={"names": listed},
-            corrected=renamed,
+            "markers-exchanged", declared.name, data={"names": listed}, corrected=renamed
         )
         yield from HypothesisTest(
             self.misfit_m(few), self.misfit_m, required_factor=LEAST_IMPROVEMENT
         ).accepted([hypothesis])
 
 
-def _with_markers(
-    declared: DeclaredMotion, tracks_m: Array, markers: Index
-) -> DeclaredMotion:
+def _with_markers(declared: DeclaredMotion, tracks_m: Array, markers: Index) -> DeclaredMotion:
     """Return a copy of the description with the tracks `tracks_m` (T, M, 3) [m] of some markers
     (indices) only; the others are missing (NaN).
     """
@@ -496,9 +401,7 @@ def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
     both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
     a = from_m[both]
     b = to_m[both]
-    rotation = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[
-        0
-    ].as_matrix()
+    rotation = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[0].as_matrix()
     return rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
 
 
@@ -524,22 +427,15 @@ def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     gravity.
     """
     moving = (
-        np.ptp(declared.rotations, axis=0).any()
-        or np.ptp(declared.translations_m, axis=0).any()
+        np.ptp(declared.rotations, axis=0).any() or np.ptp(declared.translations_m, axis=0).any()
     )
     if moving or np.abs(declared.translations_m).any():
         yield from _pose_hypotheses(declared)
         yield from _unit_hypotheses(
-            declared,
-            "translations_m",
-            who="the poses would fit if they",
-            section="grasp",
+            declared, "translations_m", who="the poses would fit if they", section="grasp"
         )
     yield from _unit_hypotheses(
-        declared,
-        "tracks_m",
-        who="the markers would fit if they",
-        section="markers",
+        declared, "tracks_m", who="the markers would fit if they", section="markers"
     )
     yield from _unit_hypotheses(
         declared, "mesh_scale", who="the mesh would fit if it", section="object"
@@ -555,11 +451,7 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     inverse = poses.rotations.transpose(0, 2, 1)
     shift = -np.einsum("tij,tj->ti", inverse, poses.translations_m)
     inverted = replace(poses, rotations=inverse, translations_m=shift)
-    yield Hypothesis(
-        "poses-inverted",
-        declared.name,
-        corrected=inverted.with_first_motion(),
-    )
+    yield Hypothesis("poses-inverted", declared.name, corrected=inverted.with_first_motion())
     yield Hypothesis(
         "rotation-inverted",
         declared.name,
@@ -570,42 +462,23 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     quaternions *= np.cumprod(np.r_[1.0, np.where(flips, -1.0, 1.0)])[:, None]
     for order, turn in (("wxyz", -1), ("xyzw", 1)):
-        reordered = Rotation.from_quat(
-            np.roll(quaternions, turn, axis=1)
-        ).as_matrix()
+        reordered = Rotation.from_quat(np.roll(quaternions, turn, axis=1)).as_matrix()
         without = replace(poses, rotations=reordered).with_first_motion()
         yield Hypothesis(
-            "quaternion-order",
-            declared.name,
-            data={"order": order},
-            corrected=without,
+            "quaternion-order", declared.name, data={"order": order}, corrected=without
         )
 
 
 def _unit_hypotheses(
     declared: DeclaredMotion, what: str, who: str, section: str
 ) -> Iterator[Hypothesis]:
-    """Yield untested hypotheses that an attribute of the description is in another unit of length.
-
-    Parameters
-    ----------
-    declared : DeclaredMotion
-        Description as stated.
-    what : str
-        Attribute of the description.
-    who : str
-        Beginning of the message.
-    section : str
-        Section of the problem file.
-    """
+    """Yield untested hypotheses that an attribute of the description is in another unit of length."""
     key = f"{section}.length_unit"
     for factor, unit in UNITS.items():
         remedy = f'set {key} = "{unit}"' if unit else f"check {key}"
         data = {"who": who, "factor": factor, "remedy": remedy}
         without = replace(declared, **{what: factor * getattr(declared, what)})
-        yield Hypothesis(
-            "length-unit", declared.name, data=data, corrected=without
-        )
+        yield Hypothesis("length-unit", declared.name, data=data, corrected=without)
 
 
 def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
@@ -616,15 +489,7 @@ def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     for axis, name in enumerate("xyz"):
         for sign, plus in ((1.0, "+"), (-1.0, "−")):
             other: Array = np.where(np.arange(3) == axis, sign * size, 0.0)
-            if (
-                size
-                and other @ declared.gravity_m_s2 <= SAME_DIRECTION * size**2
-            ):
-                data = {
-                    "axis": plus + name,
-                    "vector": ", ".join(f"{x:g}" for x in other),
-                }
+            if size and other @ declared.gravity_m_s2 <= SAME_DIRECTION * size**2:
+                data = {"axis": plus + name, "vector": ", ".join(f"{x:g}" for x in other)}
                 without = replace(declared, gravity_m_s2=other)
-                yield Hypothesis(
-                    "gravity", declared.name, data=data, corrected=without
-                )
+                yield Hypothesis("gravity", declared.name, data=data, corrected=without)

@@ -45,7 +45,8 @@ CALIBRATION = 0.1
 FEWEST_SAMPLES = 2
 # Distance over the body's diagonal that need not be known.
 PLACE = 0.05
-# Penetration of the undeformed body, over the motion of the obstacle, up to which it does not press.
+# Penetration of the undeformed body, over the motion of the obstacle, up to which it does not
+# press.
 PRESSING = 0.05
 # Motion of an obstacle over the body's diagonal that no static test has.
 LARGEST_STROKE = 10.0
@@ -75,9 +76,7 @@ def signed_distances_m(obstacle: Obstacle, points_m: Array) -> Array:
     """
     point = ca.SX.sym("point", 3)
     gap = ca.Function("gap", [point], [obstacle.shape.signed_distance(point)])
-    return np.asarray(
-        gap.map(len(points_m))(points_m.T), dtype=np.float64
-    ).ravel()
+    return np.asarray(gap.map(len(points_m))(points_m.T), dtype=np.float64).ravel()
 
 
 def _diagonal_m(experiment: Experiment) -> float:
@@ -97,9 +96,7 @@ def _noise_n(experiment: Experiment, forces: ObstacleForces) -> float:
     return LOADED * float(np.hypot(1.0, tare)) * forces.sigma_n
 
 
-def _normal_and_tangential_n(
-    obstacle: Obstacle, forces: ObstacleForces
-) -> tuple[Array, Array]:
+def _normal_and_tangential_n(obstacle: Obstacle, forces: ObstacleForces) -> tuple[Array, Array]:
     """Return the component of the measured force on the body along the normal of a plane, positive
     if the plane pushes, and the magnitude across it, (S,) each [N].
 
@@ -161,9 +158,7 @@ def _load_along_motion_n(
     _, shifts_m = obstacle.poses.at(forces.t_s)
     stroke_m = shifts_m[-1] - shifts_m[0]
     axis = int(np.abs(stroke_m).argmax())
-    monotonic = np.abs(np.diff(shifts_m[:, axis])).sum() <= 1.01 * np.abs(
-        stroke_m[axis]
-    )
+    monotonic = np.abs(np.diff(shifts_m[:, axis])).sum() <= 1.01 * np.abs(stroke_m[axis])
     if not stroke_m[axis] or not monotonic:
         return np.zeros(0)
     load_n = np.sign(stroke_m[axis]) * forces.rotate_to_world_n()[:, axis]
@@ -202,17 +197,9 @@ def _undriven_load(
     does.
     """
     times_s = forces.t_s
-    motions = [
-        part for grasp in experiment.grasps for part in grasp.poses.at(times_s)
-    ]
-    loads = [
-        experiment.declared_node_forces_n(times_s),
-        experiment.point_mass_at_nodes_kg(times_s),
-    ]
-    changes = any(
-        np.ptp(each, axis=0).max(initial=0.0) > 1e-9
-        for each in (*motions, *loads)
-    )
+    motions = [part for grasp in experiment.grasps for part in grasp.poses.at(times_s)]
+    loads = [experiment.declared_node_forces_n(times_s), experiment.point_mass_at_nodes_kg(times_s)]
+    changes = any(np.ptp(each, axis=0).max(initial=0.0) > 1e-9 for each in (*motions, *loads))
     forces_n = forces.forces_n
     measured = np.isfinite(forces_n).all(axis=0)
     change_n = float(np.ptp(forces_n[:, measured], axis=0).max(initial=0.0))
@@ -226,9 +213,7 @@ def _undriven_load(
         )
 
 
-def _long_stroke(
-    experiment: Experiment, obstacle: Obstacle
-) -> Iterator[Hypothesis]:
+def _long_stroke(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
     """Yield the hypothesis that the motion of an obstacle is in another unit, because it is far
     longer than the body; none for a motion.
     """
@@ -239,10 +224,7 @@ def _long_stroke(
     if ratio > LARGEST_STROKE:
         data = {"stroke_m": stroke_m, "size_m": _diagonal_m(experiment)}
         yield Hypothesis(
-            "obstacle-stroke",
-            _subject(experiment, obstacle),
-            data=data,
-            strength=ratio,
+            "obstacle-stroke", _subject(experiment, obstacle), data=data, strength=ratio
         )
 
 
@@ -258,9 +240,7 @@ def _load_without_contact(
     """Yield the hypothesis that an obstacle is elsewhere, because it has loads far from the
     undeformed body, none deep inside, or loads without ever pressing.
     """
-    spread = np.linspace(
-        0, len(forces.t_s) - 1, min(len(forces.t_s), MOST_SAMPLES)
-    )
+    spread = np.linspace(0, len(forces.t_s) - 1, min(len(forces.t_s), MOST_SAMPLES))
     samples = np.unique(spread.astype(int))
     forces_n = forces.forces_n[samples]
     load_n = np.sqrt(np.nansum(forces_n**2, axis=1))
@@ -273,10 +253,7 @@ def _load_without_contact(
     never_presses = bool(-gaps_m.min() < PRESSING * stroke_m)
     cases = {
         "far": (loaded & (gaps_m > far_m), float(gaps_m.max())),
-        "deep": (
-            is_measured & ~loaded & (gaps_m < -far_m),
-            -float(gaps_m.min()),
-        ),
+        "deep": (is_measured & ~loaded & (gaps_m < -far_m), -float(gaps_m.min())),
         "never": (loaded & never_presses, stroke_m),
     }
     for which, (contradicts, distance_m) in cases.items():
@@ -291,9 +268,7 @@ def _load_without_contact(
             return
 
 
-def _smallest_gaps_m(
-    experiment: Experiment, obstacle: Obstacle, times_s: Array
-) -> Array:
+def _smallest_gaps_m(experiment: Experiment, obstacle: Obstacle, times_s: Array) -> Array:
     """Return the smallest signed distance of the undeformed body in its grasps from an obstacle at
     times (S,) [s], as (S,) [m].
 

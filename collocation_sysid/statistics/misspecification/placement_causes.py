@@ -38,10 +38,7 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
     cells = experiment.body.cells
     count = len(experiment.body.nodes_m)
     first = np.repeat(cells[:, 0], cells.shape[1] - 1)
-    edges = coo_array(
-        (np.ones(len(first)), (first, cells[:, 1:].ravel())),
-        shape=(count, count),
-    )
+    edges = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(count, count))
     _, labels = connected_components(edges, directed=False)
     parts, sizes = np.unique(labels[np.unique(cells)], return_counts=True)
     grasped_labels = [labels[grasp.nodes] for grasp in experiment.body_grasps]
@@ -51,22 +48,11 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
         else np.zeros(len(parts), dtype=bool)
     )
     if loose.any() and not experiment.tendons:
-        data = {
-            "parts": len(parts),
-            "loose": int(loose.sum()),
-            "nodes": int(sizes[loose].max()),
-        }
-        yield Hypothesis(
-            "mesh-parts",
-            f"'{experiment.name}'",
-            data=data,
-            strength=float(count),
-        )
+        data = {"parts": len(parts), "loose": int(loose.sum()), "nodes": int(sizes[loose].max())}
+        yield Hypothesis("mesh-parts", f"'{experiment.name}'", data=data, strength=float(count))
 
 
-def _containing(
-    experiment: Experiment, obstacle: Obstacle
-) -> Iterator[Hypothesis]:
+def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
     """Yield the hypothesis that an obstacle contains more than `MOST_INSIDE` of the nodes of the
     undeformed body at the first time.
 
@@ -77,18 +63,12 @@ def _containing(
         0, : len(experiment.body.nodes.points_m)
     ]
     rotations, translations_m = obstacle.poses.at(experiment.t_s[:1])
-    gaps_m = signed_distances_m(
-        obstacle, (nodes_m - translations_m[0]) @ rotations[0]
-    )
+    gaps_m = signed_distances_m(obstacle, (nodes_m - translations_m[0]) @ rotations[0])
     deep_m = DEEP * float(np.linalg.norm(np.ptp(nodes_m, axis=0)))
     share = float((gaps_m < -deep_m).mean())
     if share <= MOST_INSIDE:
         return
-    reversible = (
-        isinstance(obstacle.shape, Plane) and not (gaps_m > deep_m).any()
-    )
+    reversible = isinstance(obstacle.shape, Plane) and not (gaps_m > deep_m).any()
     code = "obstacle-normal" if reversible else "obstacle-place"
     data = {"obstacle": obstacle.name, "percent": 100 * share}
-    yield Hypothesis(
-        code, f"'{experiment.name}'", data=data, strength=100 * share
-    )
+    yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=100 * share)

@@ -76,15 +76,9 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
         else f"probably {density_kg_m3 / 1e3:.4g} kg/m³, if the mass is in g",
     }
     tried = (
+        Hypothesis("length-unit/size", data=size, strength=_excess_factor(size_m, SIZES_M)),
         Hypothesis(
-            "length-unit/size",
-            data=size,
-            strength=_excess_factor(size_m, SIZES_M),
-        ),
-        Hypothesis(
-            "density",
-            data=density,
-            strength=_excess_factor(density_kg_m3, DENSITIES_KG_M3),
+            "density", data=density, strength=_excess_factor(density_kg_m3, DENSITIES_KG_M3)
         ),
     )
     for each in tried:
@@ -110,19 +104,11 @@ def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
 
     Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
-    density_kg_m3 = (
-        float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
-    )
-    young_pa = max(
-        float(engineering_constants(*lame)[0])
-        for lame in body.lame(theta).values()
-    )
+    density_kg_m3 = float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
+    young_pa = max(float(engineering_constants(*lame)[0]) for lame in body.lame(theta).values())
     if density_kg_m3 < METAL_KG_M3 or young_pa > SOFTEST_METAL_PA:
         return None
-    return Hypothesis(
-        "density/metal",
-        data={"density_kg_m3": density_kg_m3, "young_pa": young_pa},
-    )
+    return Hypothesis("density/metal", data={"density_kg_m3": density_kg_m3, "young_pa": young_pa})
 
 
 def _excess_factor(value: float, limits: tuple[float, float]) -> float:
@@ -148,41 +134,28 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     Tested are axes along which a grasp is displaced by a test bench, or along which an obstacle
     moves most. Dynamic experiments are not tested, because of inertia.
     """
-    for k, grasp in enumerate(
-        experiment.grasps if experiment.is_static else (), start=1
-    ):
+    for k, grasp in enumerate(experiment.grasps if experiment.is_static else (), start=1):
         sensor = experiment.sensors_by_grasp.get(k)
         if sensor is None:
             continue
         shifts_m = grasp.poses.at(sensor.t_s)[1]
-        for axis in grasp.zero or _pushing_axis(
-            grasp, shifts_m, frame=sensor.frame
-        ):
+        for axis in grasp.zero or _pushing_axis(grasp, shifts_m, frame=sensor.frame):
             axis_index = "xyz".index(axis)
             displacement_m = shifts_m[:, axis_index]
             load_n = sensor.values[:, axis_index]
             is_measured = np.isfinite(load_n)
             if isinstance(grasp, Obstacle):
                 # Before the obstacle touches the body, the load is noise.
-                is_measured &= np.abs(load_n) > TOUCHING * np.nanmax(
-                    np.abs(load_n), initial=0.0
-                )
+                is_measured &= np.abs(load_n) > TOUCHING * np.nanmax(np.abs(load_n), initial=0.0)
             if is_measured.sum() < FEWEST_SAMPLES or not (
-                np.ptp(displacement_m[is_measured])
-                and np.ptp(load_n[is_measured])
+                np.ptp(displacement_m[is_measured]) and np.ptp(load_n[is_measured])
             ):
                 continue
-            correlation = float(
-                np.corrcoef(displacement_m[is_measured], load_n[is_measured])[
-                    0, 1
-                ]
-            )
+            correlation = float(np.corrcoef(displacement_m[is_measured], load_n[is_measured])[0, 1])
             if correlation < AGAINST:
                 data = {"axis": axis, "grasp": k, "correlation": correlation}
                 strength = 1 / (1 + correlation + 1e-3)
-                yield Hypothesis(
-                    "sign", f"'{experiment.name}'", data=data, strength=strength
-                )
+                yield Hypothesis("sign", f"'{experiment.name}'", data=data, strength=strength)
 
 
 def _pushing_axis(grasp: Grasp, shifts_m: Array, frame: Frame) -> str:
@@ -213,25 +186,15 @@ def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     if len(experiment.markers.positions_m) < FEWEST:
         return
     if (grasp := carrying_grasp(experiment)) is not None:
-        moved_m = grasp.poses.moved_positions(
-            _marker_box_m(experiment), experiment.t_s
-        )
+        moved_m = grasp.poses.moved_positions(_marker_box_m(experiment), experiment.t_s)
         yield from _pose_jump_hypotheses(experiment, moved_m)
         yield from _common_jump(experiment, moved_m)
     yield from _slip_hypotheses(experiment)
 
 
-def _common_jump(
-    experiment: Experiment, moved_m: Array
-) -> Iterator[Hypothesis]:
+def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
     """Yield the hypothesis of the largest step of all markers together that the poses do not have,
     if it is sudden; only samples with all markers are used.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    moved_m : (T, m, 3) array
-        Points carried by the poses [m].
     """
     tracks_m = experiment.markers.positions_at_samples_m
     sigma_m = experiment.markers.sigma_m
@@ -244,15 +207,9 @@ def _common_jump(
     sizes = step_sizes(tracks_m[rows], times_s).min(axis=1)
     k = int(sizes.argmax())
     grasp_step_m = step_sizes(moved_m[rows], times_s).max(axis=1)[k]
-    usual_m = max(
-        _usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m))
-    )
+    usual_m = max(_usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m)))
     yield from _step_hypothesis(
-        "markers-jump",
-        experiment,
-        k=int(rows[k]),
-        size_m=float(sizes[k]),
-        usual_m=usual_m,
+        "markers-jump", experiment, k=int(rows[k]), size_m=float(sizes[k]), usual_m=usual_m
     )
 
 
@@ -271,20 +228,13 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
     """
     t_s = experiment.t_s
     grasps = experiment.grasps
-    if (
-        experiment.start != "equilibrium"
-        or experiment.actuators
-        or experiment.obstacles
-    ):
+    if experiment.start != "equilibrium" or experiment.actuators or experiment.obstacles:
         return
     is_grasped_throughout = (
         grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps
     )
     motions = [part for grasp in grasps for part in grasp.poses.at(t_s)]
-    loads = [
-        experiment.declared_node_forces_n(t_s),
-        experiment.point_mass_at_nodes_kg(t_s),
-    ]
+    loads = [experiment.declared_node_forces_n(t_s), experiment.point_mass_at_nodes_kg(t_s)]
     if (
         not grasps
         or not all(is_grasped_throughout)
@@ -298,15 +248,11 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
         return
     tracks_m = markers.positions_m[:, is_measured]
     motion_m = np.sqrt(np.nanmean(np.nanvar(tracks_m, axis=0).sum(axis=1)))
-    still_m = STILL_OF_SIZE * size_m + STILL_SIGMAS * float(
-        np.median(markers.sigma_m)
-    )
+    still_m = STILL_OF_SIZE * size_m + STILL_SIGMAS * float(np.median(markers.sigma_m))
     if motion_m > still_m:
         data = {"by_mm": 1e3 * motion_m}
         of = f"'{experiment.name}'"
-        yield Hypothesis(
-            "poses-constant", of, data=data, strength=float(motion_m / still_m)
-        )
+        yield Hypothesis("poses-constant", of, data=data, strength=float(motion_m / still_m))
 
 
 def _changes(values: Array) -> bool:
@@ -348,9 +294,7 @@ def step_sizes(x: Array, t_s: Array | None = None) -> Array:
     return np.sqrt(np.maximum(opposite, 0.0))
 
 
-def _pose_jump_hypotheses(
-    experiment: Experiment, moved_m: Array
-) -> Iterator[Hypothesis]:
+def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
     """Yield the hypothesis of the largest jump of points `moved_m` (T, m, 3) [m] carried by the
     poses, if the markers do not follow it; nothing if no marker is measured there.
     """
@@ -360,15 +304,9 @@ def _pose_jump_hypotheses(
     moved = np.linalg.norm(np.diff(moved_m, 2, axis=0), axis=2).max(axis=1)
     sigma_m = float(np.median(experiment.markers.sigma_m))
     if np.isfinite(markers).any():
-        usual_m = max(
-            _usual_change(moved), float(np.nanmedian(markers)), 2 * sigma_m
-        )
+        usual_m = max(_usual_change(moved), float(np.nanmedian(markers)), 2 * sigma_m)
         yield from _step_hypothesis(
-            "pose-jump",
-            experiment,
-            k=k,
-            size_m=float(sizes[k]),
-            usual_m=usual_m,
+            "pose-jump", experiment, k=k, size_m=float(sizes[k]), usual_m=usual_m
         )
 
 
@@ -386,52 +324,22 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
         others = np.delete(sizes[k], m)
         size_m = float(sizes[k, m])
         most_m = float(others[np.isfinite(others)].max(initial=0.0))
-        usual_m = max(
-            _usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m])
-        )
+        usual_m = max(_usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
         if _is_lasting(tracks_m, m, sample=k + 2, step_m=size_m):
             yield from _step_hypothesis(
-                "marker-slip/alone",
-                experiment,
-                k=k,
-                size_m=size_m,
-                usual_m=usual_m,
-                marker=name,
+                "marker-slip/alone", experiment, k=k, size_m=size_m, usual_m=usual_m, marker=name
             )
 
 
 def _step_hypothesis(
-    code: str,
-    experiment: Experiment,
-    k: int,
-    size_m: float,
-    usual_m: float,
-    marker: str = "",
+    code: str, experiment: Experiment, k: int, size_m: float, usual_m: float, marker: str = ""
 ) -> Iterator[Hypothesis]:
     """Yield the hypothesis of a step between samples k + 1 and k + 2 (indices), if it is at least
     `SUDDEN` times as large as usual; its strength is this ratio.
-
-    Parameters
-    ----------
-    code : str
-        Code of the concern.
-    experiment : Experiment
-    k : int
-        Index as in `step_sizes`.
-    size_m, usual_m : float
-        Size of the step, and of usual changes [m].
-    marker : str
-        Name of the marker; empty for all.
     """
-    data = {
-        "marker": marker,
-        "by_mm": 1e3 * size_m,
-        "t_s": experiment.t_s[k + 2],
-    }
+    data = {"marker": marker, "by_mm": 1e3 * size_m, "t_s": experiment.t_s[k + 2]}
     if size_m >= SUDDEN * usual_m:
-        yield Hypothesis(
-            code, f"'{experiment.name}'", data=data, strength=size_m / usual_m
-        )
+        yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=size_m / usual_m)
 
 
 def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
@@ -448,9 +356,7 @@ def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
     before = others[:sample]
     after = others[sample:]
     both = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
-    change = np.nanmedian(after[:, both], axis=0) - np.nanmedian(
-        before[:, both], axis=0
-    )
+    change = np.nanmedian(after[:, both], axis=0) - np.nanmedian(before[:, both], axis=0)
     return bool(np.abs(change).max(initial=0.0) > 0.3 * step_m)
 
 
@@ -483,9 +389,7 @@ def name_exchange_hypotheses(
     """
     order, strength = _marker_identities(experiment)
     kinds, counts = np.unique(order, axis=0, return_counts=True)
-    right = kinds[
-        int(np.argmax(np.where((kinds == order[0]).all(axis=1), 2, 1) * counts))
-    ]
+    right = kinds[int(np.argmax(np.where((kinds == order[0]).all(axis=1), 2, 1) * counts))]
     wrong = order != right
     share = float(wrong.mean(axis=0).max(initial=0.0))
     if not share or (huber is not None and share < TAMED):
@@ -500,39 +404,24 @@ def name_exchange_hypotheses(
         "on" if end == len(t_s) else f"to {t_s[end - 1]:.4g} s"
     )
     real = np.argsort(right)[order[first]]
-    listed = ", ".join(
-        f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first])
-    )
+    listed = ", ".join(f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first]))
     also = ", and at other times" if affected[-1] >= end else ""
     data = {"when": f"{when}{also}", "names": listed}
     return (
-        Hypothesis(
-            "markers-exchanged/later",
-            f"'{experiment.name}'",
-            data=data,
-            strength=strength,
-        ),
+        Hypothesis("markers-exchanged/later", f"'{experiment.name}'", data=data, strength=strength),
     )
 
 
 def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
     """Return the identity of each marker in each sample, and the factor by which exchanged names
     fit better.
-
-    Returns
-    -------
-    ((T, M) array of int, float)
-        Element (t, m) is the index of the marker, by the names of the first samples, that has the
-        name m at sample t. The factor is 0 if no names are exchanged.
     """
     markers = experiment.markers
     grasp = carrying_grasp(experiment)
     in_grasp_m = np.array(markers.positions_at_samples_m)
     if grasp is not None:
         rotations, translations_m = grasp.poses.at(experiment.t_s)
-        in_grasp_m = np.einsum(
-            "tji,tmj->tmi", rotations, in_grasp_m - translations_m[:, None]
-        )
+        in_grasp_m = np.einsum("tji,tmj->tmi", rotations, in_grasp_m - translations_m[:, None])
     order = np.tile(np.arange(len(markers.names)), (len(in_grasp_m), 1))
     strength = 0.0
     last_m = np.full(in_grasp_m.shape[1:], np.nan)
@@ -549,36 +438,23 @@ def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
     return order, strength
 
 
-def _best_assignment(
-    before_m: Array, now_m: Array, sigma_m: Array
-) -> tuple[Index, float]:
+def _best_assignment(before_m: Array, now_m: Array, sigma_m: Array) -> tuple[Index, float]:
     """Return the assignment (M,) of markers to those of the sample before, and the factor by which
     it is nearer than no exchange.
 
     Element k of the assignment is the index in `before_m` of marker k of `now_m`. The factor is the
     ratio of root-sum-square distances of the exchanged markers, without and with the exchange; it
     is 1 if nothing is exchanged. Distances below the noise count as the noise.
-
-    Parameters
-    ----------
-    before_m, now_m : (M, 3) arrays
-        Positions at both samples [m], all present; a common shift does not matter.
-    sigma_m : (M,) array
-        Standard deviation of each marker [m], which gives the noise.
     """
     same = np.arange(len(now_m))
     if len(now_m) < 2:
         return same, 1.0
-    differences_m = (now_m - now_m.mean(axis=0))[:, None] - (
-        before_m - before_m.mean(axis=0)
-    )
+    differences_m = (now_m - now_m.mean(axis=0))[:, None] - (before_m - before_m.mean(axis=0))
     cost = np.sum(differences_m**2, axis=2)
     if (cost.argmin(axis=1) == same).all():
         return same, 1.0
     _, chosen = linear_sum_assignment(cost)
     exchanged = np.flatnonzero(chosen != same)
     noise = 6 * float(np.sum(sigma_m[exchanged] ** 2))
-    remaining = max(
-        float(cost[exchanged, chosen[exchanged]].sum()), noise, 1e-300
-    )
+    remaining = max(float(cost[exchanged, chosen[exchanged]].sum()), noise, 1e-300)
     return chosen, float(np.sqrt(cost[exchanged, exchanged].sum() / remaining))

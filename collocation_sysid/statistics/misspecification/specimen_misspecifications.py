@@ -79,27 +79,19 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
     solution : Solution
         The fit. Its recordings without specimens are not refitted.
     """
-    fitted = [
-        part
-        for part in solution.parts
-        if part.segment.experiment.specimen is not None
-    ]
+    fitted = [part for part in solution.parts if part.transcription.experiment.specimen is not None]
     if not fitted or not solution.status.converged:
         return []
     stated_misfit = _misfit(fitted)
     if stated_misfit <= NOISE_LEVEL:
         return []
     fitted.sort(key=lambda part: -_misfit([part]))
-    originals = [part.segment.experiment for part in fitted]
-    experiments = [
-        _thinned(each, most_samples=REFITTED_SAMPLES) for each in originals
-    ]
+    originals = [part.transcription.experiment for part in fitted]
+    experiments = [_thinned(each, most_samples=REFITTED_SAMPLES) for each in originals]
 
     def misfit_of(corrected: Experiment) -> float | None:
         """Return the misfit of all specimens with one of them corrected; None without a fit."""
-        chosen = [
-            corrected if e.name == corrected.name else e for e in experiments
-        ]
+        chosen = [corrected if e.name == corrected.name else e for e in experiments]
         refit = _refit(solution, chosen, iterations=MOST_ITERATIONS)
         return None if refit is None else _misfit(refit.parts)
 
@@ -119,15 +111,9 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         if len(experiment.t_s) < FEWEST_SAMPLES:
             continue
         other_slopes_pa = slopes_pa[:index] + slopes_pa[index + 1 :]
-        for hypothesis in test.accepted(
-            _hypotheses(experiment, other_slopes_pa)
-        ):
+        for hypothesis in test.accepted(_hypotheses(experiment, other_slopes_pa)):
             if hypothesis.cause != "specimen-unit" and not _is_explained(
-                solution,
-                originals,
-                index=index,
-                code=hypothesis.code,
-                stated_misfit=stated_misfit,
+                solution, originals, index=index, code=hypothesis.code, stated_misfit=stated_misfit
             ):
                 continue
             hypotheses.append(hypothesis)
@@ -144,9 +130,7 @@ def _refit(
     """
     method = ReducedSpace(max_iterations=iterations, tolerance=TOLERANCE)
     try:
-        refit = method(
-            replace(solution.collocation, experiments=tuple(experiments))
-        )
+        refit = method(replace(solution.collocation, experiments=tuple(experiments)))
     except (InputError, SimulationError):
         return None
     return refit.unless_interrupted()
@@ -164,28 +148,9 @@ def _is_explained(
     The residuals of all specimens must be at most `EXPLAINED` times sigma, with the number of
     estimated parameters considered, those of each stress uncorrelated, the nuisance parameters
     plausible (`PLAUSIBLE_NUISANCE`), and χ² smaller by at least `DECISIVE`.
-
-    Parameters
-    ----------
-    solution : Solution
-        The fit of the description as stated.
-    experiments : sequence of Experiment
-        All specimens as stated.
-    index : int
-        Index of the specimen to correct.
-    code : str
-        Code of the mistake.
-    stated_misfit : float
-        Misfit of the fit, see `_misfit`.
     """
-    chosen = [
-        _thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments
-    ]
-    corrected = [
-        each.corrected
-        for each in _hypotheses(chosen[index], ())
-        if each.code == code
-    ]
+    chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
+    corrected = [each.corrected for each in _hypotheses(chosen[index], ()) if each.code == code]
     if not corrected:
         return False
     chosen[index] = corrected[0]
@@ -207,7 +172,9 @@ def _is_explained(
 
 
 def _is_correlated(residuals: Array) -> bool:
-    """Return whether consecutive residuals (n,) are more alike than those of noise (`UNCORRELATED`)."""
+    """Return whether consecutive residuals (n,) are more alike than those of noise
+    (`UNCORRELATED`).
+    """
     squares = float(np.sum(residuals**2))
     products = float(np.sum(residuals[1:] * residuals[:-1]))
     return products > UNCORRELATED / np.sqrt(max(1, len(residuals))) * squares
@@ -218,25 +185,14 @@ def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
     evenly chosen by index, without markers and without sensors that have no value there.
     """
     count = len(experiment.t_s)
-    chosen = np.unique(
-        np.linspace(0, count - 1, min(count, most_samples)).astype(int)
-    )
+    chosen = np.unique(np.linspace(0, count - 1, min(count, most_samples)).astype(int))
     readings = [
-        replace(
-            gauge,
-            t_s=gauge.sample_times_s[chosen],
-            values=gauge.measured_values[chosen],
-        )
+        replace(gauge, t_s=gauge.sample_times_s[chosen], values=gauge.measured_values[chosen])
         for gauge in experiment.readings
         if np.isfinite(gauge.measured_values[chosen]).any()
     ]
     markers = Markers.none(experiment.t_s[chosen])
-    return replace(
-        experiment,
-        t_s=experiment.t_s[chosen],
-        readings=readings,
-        markers=markers,
-    )
+    return replace(experiment, t_s=experiment.t_s[chosen], readings=readings, markers=markers)
 
 
 def _initial_slope(experiment: Experiment) -> float:
@@ -249,9 +205,7 @@ def _initial_slope(experiment: Experiment) -> float:
     if not is_known.any():
         return np.nan
     order = np.argsort(np.abs(strain[is_known]))[: len(strain) // 2 + 1]
-    return float(
-        np.median(np.abs(stress_pa[is_known][order] / strain[is_known][order]))
-    )
+    return float(np.median(np.abs(stress_pa[is_known][order] / strain[is_known][order])))
 
 
 def _misfit(parts: Sequence[ExperimentIterate]) -> float:
@@ -273,30 +227,18 @@ def _residuals(part: ExperimentIterate) -> list[Array]:
     samples and without NaN.
     """
     rows: list[Array] = []
-    for sensor in part.segment.custom_sensors:
+    for sensor in part.transcription.custom_sensors:
         predicted = sensor.without_padding(
             sensor.predict_motion(part.motion_for(sensor.observable), part.phi)
         )
-        residuals = (
-            predicted - sensor.sensor.measured_values
-        ) / sensor.sensor.sigma
+        residuals = (predicted - sensor.sensor.measured_values) / sensor.sensor.sigma
         rows += [row[np.isfinite(row)] for row in residuals.T]
     return rows
 
 
-def _hypotheses(
-    experiment: Experiment, other_slopes_pa: Sequence[float]
-) -> Iterator[Hypothesis]:
+def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Hypothesis]:
     """Yield each common mistake that is possible for a specimen, untested, with the experiment that
     corrects it.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment of a specimen.
-    other_slopes_pa : sequence of float
-        Initial slopes of the stresses of the other specimens, without which a wrong unit cannot be
-        detected.
     """
     deformation = experiment.specimen
     assert deformation is not None
@@ -306,47 +248,24 @@ def _hypotheses(
     # Stresses in unloading are smaller than in loading, like engineering in place of true stresses.
     if areas is not None and np.ptp(areas) and not is_unloading(strain):
         yield Hypothesis(
-            "specimen-true-stress",
-            of,
-            data={},
-            corrected=_with_stress(experiment, areas),
+            "specimen-true-stress", of, data={}, corrected=_with_stress(experiment, areas)
         )
     is_invertible = (strain >= 0).all() and strain.max() < 1.0
-    if (
-        deformation.test in ("uniaxial", "equibiaxial", "planar")
-        and is_invertible
-    ):
-        yield Hypothesis(
-            "specimen-compression",
-            of,
-            data={},
-            corrected=_compressed(experiment),
-        )
+    if deformation.test in ("uniaxial", "equibiaxial", "planar") and is_invertible:
+        yield Hypothesis("specimen-compression", of, data={}, corrected=_compressed(experiment))
     if strain.max() > PERCENT_STRAIN and deformation.test != "volumetric":
-        yield Hypothesis(
-            "specimen-percent",
-            of,
-            data={},
-            corrected=_strained(experiment, 0.01),
-        )
+        yield Hypothesis("specimen-percent", of, data={}, corrected=_strained(experiment, 0.01))
     ratios = [other / _initial_slope(experiment) for other in other_slopes_pa]
     for unit, factor in UNIT_FACTORS.items():
-        decades = (
-            np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
-        )
+        decades = np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
         if (decades > np.log(UNIT_LIKE)).any():
             corrected = _with_stress(experiment, np.full_like(strain, factor))
             yield Hypothesis(
-                "specimen-unit",
-                of,
-                data={"unit": unit, "factor": factor},
-                corrected=corrected,
+                "specimen-unit", of, data={"unit": unit, "factor": factor}, corrected=corrected
             )
 
 
-def area_ratios(
-    deformation: HomogeneousDeformation, strain: Array
-) -> Array | None:
+def area_ratios(deformation: HomogeneousDeformation, strain: Array) -> Array | None:
     """Return the deformed over the undeformed area (T,) of an incompressible specimen at strains
     (T,), 1 / (1 + strain); None for tests other than uniaxial, equibiaxial and planar ones.
     """
@@ -361,8 +280,7 @@ def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
     """
     readings = [
         replace(gauge, values=gauge.measured_values * factors[:, None])
-        if gauge.unit == STRESS_UNIT
-        and len(gauge.sample_times_s) == len(factors)
+        if gauge.unit == STRESS_UNIT and len(gauge.sample_times_s) == len(factors)
         else gauge
         for gauge in experiment.readings
     ]
@@ -377,27 +295,16 @@ def _strained(experiment: Experiment, factor: float) -> Experiment:
     def scaled(grasp: Grasp) -> Grasp:
         """Return a grasp with its positions multiplied by the factor."""
         return replace(
-            grasp,
-            poses=replace(
-                grasp.poses, positions_m=factor * grasp.poses.positions_m
-            ),
+            grasp, poses=replace(grasp.poses, positions_m=factor * grasp.poses.positions_m)
         )
 
-    return replace(
-        experiment, grasps=[scaled(grasp) for grasp in experiment.grasps]
-    )
+    return replace(experiment, grasps=[scaled(grasp) for grasp in experiment.grasps])
 
 
 def _compressed(experiment: Experiment) -> Experiment:
     """Return a copy of the experiment with strains and stresses of the opposite sign, without
     measured lateral strains.
     """
-    reversed_stress = _with_stress(
-        experiment, np.full(len(experiment.t_s), -1.0)
-    )
-    lateral = [
-        gauge
-        for gauge in reversed_stress.readings
-        if gauge.name != LATERAL_NAME
-    ]
+    reversed_stress = _with_stress(experiment, np.full(len(experiment.t_s), -1.0))
+    lateral = [gauge for gauge in reversed_stress.readings if gauge.name != LATERAL_NAME]
     return _strained(replace(reversed_stress, readings=lateral), -1.0)

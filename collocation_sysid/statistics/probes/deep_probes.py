@@ -27,11 +27,7 @@ from ..linearised import (
     least_squares_of_fit,
     linearise_fit,
 )
-from ..residuals.recording_scatter import (
-    blocks_by_recording,
-    fit_part,
-    single_fits,
-)
+from ..residuals.recording_scatter import blocks_by_recording, fit_part, single_fits
 from .relaxed_assumptions import (
     MEMORY,
     Kind,
@@ -75,10 +71,7 @@ def routine_probes_with_steps(fit: SolvedFit) -> tuple[Probe, ...]:
         return probes
     worst = max(alarming, key=lambda probe: probe.chi_squared)
     with_steps = replace(
-        _iterate_probe(
-            fit, worst, limit=significance_limit(fit.changes, worst.name)
-        ),
-        routine=True,
+        _iterate_probe(fit, worst, limit=significance_limit(fit.changes, worst.name)), routine=True
     )
     return tuple(with_steps if probe is worst else probe for probe in probes)
 
@@ -104,9 +97,7 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
     significant = [p for p in relaxed if p.is_beyond(limits[p.name])]
     with counted_phase(StepUnit.ASSUMPTION, len(significant)):
         iterated = {
-            probe.name: _iterate_probe(
-                solved_fit, probe, limit=limits[probe.name]
-            )
+            probe.name: _iterate_probe(solved_fit, probe, limit=limits[probe.name])
             for probe in significant
         }
     return (
@@ -121,10 +112,7 @@ def _window_probes(at: SolvedFit) -> Iterator[Probe]:
     """
     for k, name in enumerate(WINDOWS):
         cuts = [_third(block, k) for block in at.fit.blocks]
-        blocks = [
-            _restrict(block, cut)
-            for block, cut in zip(at.fit.blocks, cuts, strict=True)
-        ]
+        blocks = [_restrict(block, cut) for block, cut in zip(at.fit.blocks, cuts, strict=True)]
         alone = fit_part(at.fit, blocks, columns=np.arange(len(at.fit.names)))
         yield from _part_probe(at, "window", name, *alone)
 
@@ -133,24 +121,16 @@ def _third(block: ResidualBlock, k: int) -> slice:
     """Return the slice of the samples in third k (index 0, 1 or 2) of a block's samples, by their
     number; thirds are as equal as rounding allows.
     """
-    ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(
-        int
-    )
+    ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(int)
     return slice(int(ends[k]), int(ends[k + 1]))
 
 
 def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
     """Return a copy of the block with the samples in the slice `cut` only."""
     own = ("t_s", "is_present", "residual", "jacobian", "misfit", "components")
-    there = {
-        name: each[cut]
-        for name in own
-        if (each := getattr(block, name)) is not None
-    }
+    there = {name: each[cut] for name in own if (each := getattr(block, name)) is not None}
     shaken = block.disturbances
-    return replace(
-        block, **there, disturbances=None if shaken is None else shaken[:, cut]
-    )
+    return replace(block, **there, disturbances=None if shaken is None else shaken[:, cut])
 
 
 def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
@@ -160,43 +140,21 @@ def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
     if len(blocks_by_recording(at.fit)) < 2:
         return
     for alone, step in single_fits(at.fit):
-        yield from _part_probe(
-            at, "recording", name=alone.blocks[0].name, alone=alone, step=step
-        )
+        yield from _part_probe(at, "recording", name=alone.blocks[0].name, alone=alone, step=step)
 
 
 def _part_probe(
     at: SolvedFit, kind: Kind, name: str, alone: LinearisedFit, step: Array
 ) -> Iterator[Probe]:
-    """Yield the probe of a part of the data, unless it has fewer measurements than parameters.
-
-    Parameters
-    ----------
-    at : SolvedFit
-        Fit to all data.
-    kind : str
-        Kind of part: "window" or "recording".
-    name : str
-        Name of the part.
-    alone : LinearisedFit
-        Fit to the part.
-    step : array
-        Parameters of the part's fit less those of the joint one.
-    """
+    """Yield the probe of a part of the data, unless it has fewer measurements than parameters."""
     if alone.count_measurements() <= len(alone.names):
         return
     uncertainty = at.uncertainty_of_refit(
-        alone,
-        at.read_parameters()[: alone.shared_count] + step[: alone.shared_count],
+        alone, at.read_parameters()[: alone.shared_count] + step[: alone.shared_count]
     )
     remaining = least_squares_of_fit(alone)
     falls = remaining.loss(-step) - remaining.loss(np.zeros(len(step)))
-    yield Probe(
-        kind,
-        name,
-        chi_squared=falls,
-        moves=at.changes_of_estimates(uncertainty),
-    )
+    yield Probe(kind, name, chi_squared=falls, moves=at.changes_of_estimates(uncertainty))
 
 
 def _with_significant_moves(probe: Probe, limit: float) -> Probe:
@@ -206,9 +164,7 @@ def _with_significant_moves(probe: Probe, limit: float) -> Probe:
     A part of the data differs from all data with less than its own error bar (Hausman 1978).
     """
     significant = (
-        n
-        for n, move in probe.moves.items()
-        if abs(move.change) > limit * move.std_error
+        n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error
     )
     return replace(probe, sentences=tuple(significant))
 
@@ -223,15 +179,6 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     simulation fails. Memory takes no further step: its effect is not linear in the share, and its
     estimates depend on a relaxation time that is not estimated, so that a branch has to be added to
     the material in any case. `sentences` has the name of the assumption if it is still significant.
-
-    Parameters
-    ----------
-    at : SolvedFit
-        The fit.
-    probe : Probe
-        Significant probe of an assumption after one linear step.
-    limit : float
-        Least significant size, in its standard errors.
     """
     if assumption_name(probe.name) == MEMORY:
         complete_steps(StepUnit.ASSUMPTION)
@@ -239,10 +186,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     first = len(at.fit.names)
     collocation = at.collocation
     accepted_names = assumption_name(probe.name), CORRELATION_KEY
-    alone = {
-        name: size if name in accepted_names else None
-        for name, size in at.deviations.items()
-    }
+    alone = {name: size if name in accepted_names else None for name, size in at.deviations.items()}
     wide = with_relaxed_assumption(
         at.fit, at.changes, name=probe.name, widening=prior_widening(probe.name)
     )
@@ -252,9 +196,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     while steps < STEPS:
         step = gauss_newton_step(wide)[:first]
         p = p + step
-        positions, failure = simulate_trajectories(
-            collocation, p, guess=positions
-        )
+        positions, failure = simulate_trajectories(collocation, p, guess=positions)
         if failure is not None:
             break
         z = collocation.pack(p, positions)
@@ -271,6 +213,4 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         if np.abs(step[: wide.shared_count]).max(initial=0.0) < SETTLED:
             break
     complete_steps(StepUnit.ASSUMPTION, 1 - steps / STEPS)
-    return replace(
-        probe, sentences=(probe.name,) if probe.is_beyond(limit) else ()
-    )
+    return replace(probe, sentences=(probe.name,) if probe.is_beyond(limit) else ())

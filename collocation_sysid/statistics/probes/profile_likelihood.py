@@ -128,28 +128,14 @@ def compute_profile(
             except SimulationError:
                 losses_by_value[trial] = np.inf
         above = (
-            float(
-                np.sqrt(
-                    np.clip(
-                        (losses_by_value[trial] - loss) / threshold,
-                        0.0,
-                        HIGHEST,
-                    )
-                )
-            )
-            - 1.0
+            float(np.sqrt(np.clip((losses_by_value[trial] - loss) / threshold, 0.0, HIGHEST))) - 1.0
         )
         return above if abs(above) > PRECISION / 2 else 0.0
 
     step = 2 * deviation if np.isfinite(deviation) and deviation > 0 else 0.1
     lower, upper = (
         None
-        if (
-            way := _find_end(
-                rise, side * step, bound=float(np.log(bound / value))
-            )
-        )
-        is None
+        if (way := _find_end(rise, side * step, bound=float(np.log(bound / value)))) is None
         else float(value * np.exp(way))
         for side, bound in zip((-1, 1), bounds, strict=True)
     )
@@ -172,21 +158,10 @@ def compute_profile(
     )
 
 
-def _find_end(
-    rise: Callable[[float], float], step: float, bound: float
-) -> float | None:
+def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
     """Return the change of the logarithm of the parameter at which the loss has risen enough, on
     the side to which `step` points; None if it has not at the bound, or after `MOST_DOUBLINGS`
     doublings of the step.
-
-    Parameters
-    ----------
-    rise : callable
-        Function of that change; zero where the loss has risen just enough, negative below.
-    step : float
-        First change that is tried; negative for the lower end.
-    bound : float
-        Change at which the bound is reached, of the same sign or zero.
     """
     inside = 0.0
     closest = min if step > 0 else max
@@ -196,30 +171,17 @@ def _find_end(
         outside = closest(inside + step, bound)
         if rise(outside) >= 0:
             within = PRECISION * abs(outside)
-            return root_scalar(
-                rise, bracket=(inside, outside), xtol=within
-            ).root
+            return root_scalar(rise, bracket=(inside, outside), xtol=within).root
         inside = outside
         step = 2 * step
     return None
 
 
 def _message(
-    parameter: str,
-    interval: tuple[float | None, float | None],
-    bounds: tuple[float, float],
+    parameter: str, interval: tuple[float | None, float | None], bounds: tuple[float, float]
 ) -> str:
     """Return the message for an interval of a parameter: two limits, one limit, or not
     identifiable.
-
-    Parameters
-    ----------
-    parameter : str
-        Name of the parameter.
-    interval : (float or None, float or None)
-        Ends; None for one that lies beyond the bound.
-    bounds : (float, float)
-        Bounds of the parameter.
     """
     lower, upper = interval
     how = "(95 %, profile likelihood)"
@@ -294,44 +256,28 @@ def _loss_of(solution: Solution) -> float:
     """Return the loss of a solution, Σ ((ŷ − h(x)) / σ)² (shortened by Huber's loss), with
     priors.
     """
-    return (
-        solution.collocation.objective(solution.z)
-        / solution.collocation.loss_scale
-    )
+    return solution.collocation.objective(solution.z) / solution.collocation.loss_scale
 
 
-def _loss_with_fixed(
-    solution: Solution, item: Parameter, value: float
-) -> float:
+def _loss_with_fixed(solution: Solution, item: Parameter, value: float) -> float:
     """Return the smallest loss, with all priors, with one parameter fixed at a value, searched from
     the answer by reduced space; infinite if the solve does not converge.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If the solve is interrupted.
     """
     before = solution.collocation
     started = before.parameters.with_estimates(solution.parameters)
     fixed = started.with_fixed({item.name: value})
-    refit = ReducedSpace()(
-        replace(before, parameters=fixed)
-    ).unless_interrupted()
+    refit = ReducedSpace()(replace(before, parameters=fixed)).unless_interrupted()
     if not refit.status.converged:
         return float("inf")
     prior = 0.0
     if item.prior is not None:
         mean, deviation = item.prior
-        deviation_from_prior = (
-            np.log(value / mean) if item.scale == "log" else value - mean
-        )
+        deviation_from_prior = np.log(value / mean) if item.scale == "log" else value - mean
         prior = (deviation_from_prior / deviation) ** 2
     return _loss_of(refit) + float(prior)
 
 
-def _noise_scale(
-    solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int
-) -> float:
+def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
     """Return the variance of the parameter with index k (from 0) over its variance for independent
     errors of the stated σ; 1 if that ratio is not finite.
     """

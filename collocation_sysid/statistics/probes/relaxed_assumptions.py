@@ -22,12 +22,7 @@ from ..budget.consider_analysis import ResidualChanges, changes_of_assumptions
 from ..budget.systematic_effects import ExperimentAtAnswer
 from ..budget.uncertainty_budget import BudgetLine
 from ..estimates import Estimate
-from ..linearised import (
-    DerivedModuli,
-    LinearisedFit,
-    gauss_newton_step,
-    least_squares_of_fit,
-)
+from ..linearised import DerivedModuli, LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..residuals.recording_scatter import TELLING
 from ..uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
@@ -148,17 +143,13 @@ class SolvedFit:
         model of this one. Derived moduli are those at p.
         """
         q = p[: fit.shared_count]
-        constants = (
-            segment.constants for segment in self.collocation.transcriptions
-        )
+        constants = (transcription.constants for transcription in self.collocation.transcriptions)
         fit = replace(fit, derived=DerivedModuli.from_bodies(constants, q))
         return uncertainty_from_fit(
             fit, self.collocation.parameters, q=q, error_model=self.error_model
         )
 
-    def changes_of_estimates(
-        self, uncertainty: Uncertainty
-    ) -> dict[str, EstimateChange]:
+    def changes_of_estimates(self, uncertainty: Uncertainty) -> dict[str, EstimateChange]:
         """Return the changes of the estimates that a refit determines, from those of the joint fit,
         by name; parameters and derived moduli.
 
@@ -166,19 +157,12 @@ class SolvedFit:
         `TELLING`.
         """
         changes = {}
-        for name, each in {
-            **uncertainty.estimates,
-            **uncertainty.derived,
-        }.items():
+        for name, each in {**uncertainty.estimates, **uncertainty.derived}.items():
             error = each.statistical_std_error
             joint = self.statistical[name]
             if error and error < TELLING * abs(each.value):
                 change = each.value - joint.value
-                combined95 = (
-                    self.budget[name].combined95
-                    if name in self.budget
-                    else None
-                )
+                combined95 = self.budget[name].combined95 if name in self.budget else None
                 of_statistical = _share_of_interval(change, joint.statistical95)
                 of_combined = _share_of_interval(change, combined95)
                 changes[name] = EstimateChange(
@@ -195,17 +179,11 @@ class SolvedFit:
         return self.collocation.parameters_from(self.z)
 
 
-def _share_of_interval(
-    change: float, interval: tuple[float, float] | None
-) -> float | None:
+def _share_of_interval(change: float, interval: tuple[float, float] | None) -> float | None:
     """Return a change over the half width of an interval (lower, upper), with the sign of the
     change; None without an interval.
     """
-    return (
-        None
-        if interval is None
-        else 2 * change / max(interval[1] - interval[0], 1e-300)
-    )
+    return None if interval is None else 2 * change / max(interval[1] - interval[0], 1e-300)
 
 
 # Columns of assumptions ---------------------------------------------------------------------------
@@ -250,10 +228,8 @@ def probed_changes(
     blocks = iter(known.blocks)
     masked = []
     for part in collocation.iterates(z):
-        hidden = part.segment.experiment.is_static and has_monotonic_load(
-            part, collocation
-        )
-        for _ in part.segment.residuals:
+        hidden = part.transcription.experiment.is_static and has_monotonic_load(part, collocation)
+        for _ in part.transcription.residuals:
             change = next(blocks)
             if hidden:
                 change = change.copy()
@@ -262,9 +238,7 @@ def probed_changes(
     return ResidualChanges(known.names, masked)
 
 
-def has_monotonic_load(
-    iterate: ExperimentIterate, collocation: Collocation
-) -> bool:
+def has_monotonic_load(iterate: ExperimentIterate, collocation: Collocation) -> bool:
     """Whether the norm of the internal forces of a static recording only grows, or only shrinks, in
     time, but for `RETURN` of its range; true for fewer than `FEWEST_SAMPLES` samples.
     """
@@ -279,10 +253,7 @@ def has_monotonic_load(
 
 
 def with_relaxed_assumption(
-    fit: LinearisedFit,
-    changes: ResidualChanges,
-    name: str,
-    widening: float = 1.0,
+    fit: LinearisedFit, changes: ResidualChanges, name: str, widening: float = 1.0
 ) -> LinearisedFit:
     """Return a fit in which an assumption is one more nuisance parameter, or several of its name.
 
@@ -303,31 +274,20 @@ def with_relaxed_assumption(
     columns = [k for k, other in enumerate(changes.names) if other == name]
     blocks = []
     for block, change in zip(fit.blocks, changes.blocks, strict=True):
-        more = (
-            change[..., columns]
-            * (block.compute_root_weight() * block.is_measured)[..., None]
-        )
-        blocks.append(
-            replace(
-                block, jacobian=np.concatenate([block.jacobian, more], axis=3)
-            )
-        )
+        more = change[..., columns] * (block.compute_root_weight() * block.is_measured)[..., None]
+        blocks.append(replace(block, jacobian=np.concatenate([block.jacobian, more], axis=3)))
     count = len(columns)
     return replace(
         fit,
         blocks=tuple(blocks),
         names=(*fit.names, *(f"{name} {k}" for k in range(count))),
         prior_residual=np.append(fit.prior_residual, np.zeros(count)),
-        prior_jacobian=np.append(
-            fit.prior_jacobian, np.full(count, 1 / widening)
-        ),
+        prior_jacobian=np.append(fit.prior_jacobian, np.full(count, 1 / widening)),
         at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
     )
 
 
-def relaxed_probe(
-    fit: SolvedFit, name: str, wide: LinearisedFit, p: Array
-) -> Probe:
+def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> Probe:
     """Return the optimum of a fit with one assumption relaxed, by one linear step.
 
     Parameters
@@ -354,25 +314,14 @@ def relaxed_probe(
     uncertainty = fit.uncertainty_of_refit(after, p + step[:first])
     before = least_squares_of_fit(fit.fit)
     remaining = least_squares_of_fit(after)
-    decrease = before.loss(np.zeros(first)) - remaining.loss(
-        np.zeros(len(step))
-    )
+    decrease = before.loss(np.zeros(first)) - remaining.loss(np.zeros(len(step)))
     unit = fit.deviations[assumption_name(name)] or 1.0
-    errors = np.array(
-        [*uncertainty.nuisance.values()][first - wide.shared_count :]
-    )
+    errors = np.array([*uncertainty.nuisance.values()][first - wide.shared_count :])
     worst = int(np.argmax(np.nan_to_num(np.abs(own) / errors)))
     probe = Probe(
-        "assumption",
-        name,
-        chi_squared=decrease,
-        moves=fit.changes_of_estimates(uncertainty),
+        "assumption", name, chi_squared=decrease, moves=fit.changes_of_estimates(uncertainty)
     )
-    probe = replace(
-        probe,
-        size=float(unit * own[worst]),
-        size_error=float(unit * errors[worst]),
-    )
+    probe = replace(probe, size=float(unit * own[worst]), size_error=float(unit * errors[worst]))
     return replace(probe, relevance=relevance(fit, probe))
 
 
@@ -391,9 +340,7 @@ def relevance(fit: SolvedFit, probe: Probe) -> float:
         interval = fit.statistical[name].statistical95
         if probe.name == DRIFT and is_modulus(name) and interval is not None:
             half_width = max((interval[1] - interval[0]) / 2, 1e-300)
-            shares.append(
-                abs(0.5 * (probe.size or 0.0) * move.value) / half_width
-            )
+            shares.append(abs(0.5 * (probe.size or 0.0) * move.value) / half_width)
     return max(shares)
 
 

@@ -34,8 +34,8 @@ from .relaxed_assumptions import (
     with_relaxed_assumption,
 )
 
-# Assumptions that are probed in every solve: each can be wrong while the residuals look white, biases
-# the estimates, and is determined by a single recording.
+# Assumptions that are probed in every solve: each can be wrong while the residuals look white,
+# biases the estimates, and is determined by a single recording.
 ROUTINE = (DRIFT, MEMORY, CLOCK_RATE.name)
 # Unit of the share of a branch of memory, which is not in the budget by default.
 MEMORY_SHARE = 0.1
@@ -51,9 +51,7 @@ WIDENING = 10.0
 RELEVANT = 0.25
 
 
-def probed_deviations(
-    deviations: Mapping[str, float | None],
-) -> dict[str, float | None]:
+def probed_deviations(deviations: Mapping[str, float | None]) -> dict[str, float | None]:
     """Return a copy of deviations in which none of the routine probes is None.
 
     A quantity stated as exact (None), or without an entry, is left out of the budget but still
@@ -92,35 +90,23 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
             probe,
             routine=True,
             sentences=(probe.name,)
-            if probe.is_beyond(
-                significance_limit(solved_fit.changes, probe.name)
-            )
+            if probe.is_beyond(significance_limit(solved_fit.changes, probe.name))
             else (),
         )
         for probe in one_step_probes(solved_fit, names)
     )
 
 
-def one_step_probes(
-    solved_fit: SolvedFit, names: Iterable[str]
-) -> Iterator[Probe]:
+def one_step_probes(solved_fit: SolvedFit, names: Iterable[str]) -> Iterator[Probe]:
     """Yield a probe for each of the named assumptions, with components, that changes any residual,
     relaxed by one linear step; a name that occurs several times has one probe.
     """
     for name in dict.fromkeys(names):
         wide = with_relaxed_assumption(
-            solved_fit.fit,
-            solved_fit.changes,
-            name=name,
-            widening=prior_widening(name),
+            solved_fit.fit, solved_fit.changes, name=name, widening=prior_widening(name)
         )
-        if any(
-            block.jacobian[..., len(solved_fit.fit.names) :].any()
-            for block in wide.blocks
-        ):
-            yield relaxed_probe(
-                solved_fit, name, wide=wide, p=solved_fit.read_parameters()
-            )
+        if any(block.jacobian[..., len(solved_fit.fit.names) :].any() for block in wide.blocks):
+            yield relaxed_probe(solved_fit, name, wide=wide, p=solved_fit.read_parameters())
 
 
 def prior_widening(name: str) -> float:
@@ -142,8 +128,8 @@ def significance_limit(changes: ResidualChanges, name: str) -> float:
 
     The probability of a false alarm is divided equally among the routine assumptions, and that of
     an assumption among its amplitudes (Bonferroni): a drift has one, memory one for each relaxation
-    time of the table, also for those that the recording cannot show, and the clock rate one for each
-    recording. The amplitudes of memory are correlated, so that the bound is conservative.
+    time of the table, also for those that the recording cannot show, and the clock rate one for
+    each recording. The amplitudes of memory are correlated, so that the bound is conservative.
 
     Parameters
     ----------
@@ -152,9 +138,7 @@ def significance_limit(changes: ResidualChanges, name: str) -> float:
     name : str
         Name of the assumption, with or without its component.
     """
-    amplitudes = Counter(
-        map(assumption_name, filter(is_routine_assumption, changes.names))
-    )
+    amplitudes = Counter(map(assumption_name, filter(is_routine_assumption, changes.names)))
     tests = max(1, len(amplitudes)) * max(1, amplitudes[assumption_name(name)])
     return float(normal_isf(FALSE_ALARMS / 2 / tests))
 

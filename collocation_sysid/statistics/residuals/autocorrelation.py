@@ -11,9 +11,9 @@ with the autocorrelation ρ of one autoregressive process and the covariance Σ 
 corrected for. The order minimises Schwarz's criterion. Σ is estimated from the innovations, which
 are nearly independent in time.
 
-Compared with it on simulated fits (tests/truths/test_error_coverage.py), a kernel estimate of B from the
-scores of each time (Andrews 1991, prewhitened) covers 83–90 % where 95 % is nominal, and one
-without the correction of the residuals or without Σ fails for short records and shared errors.
+Compared with it on simulated fits (tests/truths/test_error_coverage.py), a kernel estimate of B
+from the scores of each time (Andrews 1991, prewhitened) covers 83–90 % where 95 % is nominal, and
+one without the correction of the residuals or without Σ fails for short records and shared errors.
 
 Autocovariances are estimated from lagged products of the residuals r = M e with M = I − S A⁻¹ Sᵀ =
 I − D Dᵀ (see `linearised`). The lagged products r D_k r have the expectations Σ_l γ_l tr(D_k M D_l
@@ -88,10 +88,7 @@ class LaggedProducts:
         return self.split(solution.astype(np.float64))
 
     def long_lag_products(
-        self,
-        fit: LinearisedFit,
-        information: Information,
-        tails: Sequence[Array],
+        self, fit: LinearisedFit, information: Information, tails: Sequence[Array]
     ) -> Array:
         """Return the contribution (K,) of autocovariances at longer lags to the products; zero if
         all are zero.
@@ -112,16 +109,9 @@ class LaggedProducts:
         overlap = []
         total = np.zeros(self.shifted.shape[1:])
         for block, slope, last, tail in zip(
-            fit.blocks,
-            information.scaled_jacobians,
-            self.lags,
-            tails,
-            strict=True,
+            fit.blocks, information.scaled_jacobians, self.lags, tails, strict=True
         ):
-            smoothed = (
-                toeplitz_product(tail, slope)
-                * block.channels.is_measured[:, :, None]
-            )
+            smoothed = toeplitz_product(tail, slope) * block.channels.is_measured[:, :, None]
             total += np.einsum("tcr,tcs->rs", slope, smoothed, optimize=True)
             overlap += [
                 np.vdot(slope[k:], smoothed[: len(slope) - k])
@@ -129,9 +119,7 @@ class LaggedProducts:
                 for k in range(last + 1)
             ]
             overlap[-last - 1] /= 2  # one diagonal, not two
-        return np.einsum("krs,rs->k", self.shifted, total) - 2 * np.array(
-            overlap
-        )
+        return np.einsum("krs,rs->k", self.shifted, total) - 2 * np.array(overlap)
 
 
 def lagged_products(
@@ -152,22 +140,15 @@ def lagged_products(
     shifted = []
     diagonal_counts = []
     overlaps = []
-    for block, slope, last in zip(
-        fit.blocks, information.scaled_jacobians, lags, strict=True
-    ):
+    for block, slope, last in zip(fit.blocks, information.scaled_jacobians, lags, strict=True):
         residual = block.channels.residual
         present = block.channels.is_measured
         width = slope.shape[2]
         within = np.zeros((last + 1, width, width))
         overlap = np.zeros((last + 1, last + 1))
-        for channel in range(
-            residual.shape[1]
-        ):  # one at a time: all lags at once are large
+        for channel in range(residual.shape[1]):  # one at a time: all lags at once are large
             is_present = present[:, channel]
-            lagged = [
-                _lagged(slope[:, channel], is_present, lag=k)
-                for k in range(last + 1)
-            ]
+            lagged = [_lagged(slope[:, channel], is_present, lag=k) for k in range(last + 1)]
             stacked = np.stack([each.ravel() for each in lagged])
             overlap += stacked @ stacked.T
             for k, each in enumerate(lagged):
@@ -176,12 +157,8 @@ def lagged_products(
             twice = 1 if k == 0 else 2
             lagged_rows = slice(k, None)
             behind = slice(None, len(residual) - k)
-            products.append(
-                twice * np.sum(residual[lagged_rows] * residual[behind])
-            )
-            diagonal_counts.append(
-                twice * np.sum(present[lagged_rows] & present[behind])
-            )
+            products.append(twice * np.sum(residual[lagged_rows] * residual[behind]))
+            diagonal_counts.append(twice * np.sum(present[lagged_rows] & present[behind]))
         shifted.append(within)
         overlaps.append(overlap)
     shifted = np.concatenate(shifted)
@@ -191,9 +168,7 @@ def lagged_products(
     for overlap in overlaps:
         within = slice(first, first := first + len(overlap))
         expected[within, within] -= 2 * overlap
-    return LaggedProducts(
-        tuple(lags), np.array(products), expected=expected, shifted=shifted
-    )
+    return LaggedProducts(tuple(lags), np.array(products), expected=expected, shifted=shifted)
 
 
 def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
@@ -201,9 +176,7 @@ def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
     values (T, …), along their first axis.
     """
     columns = values.reshape(len(values), -1)
-    product = np.asarray(
-        matmul_toeplitz(autocorrelation, columns), dtype=np.float64
-    )
+    product = np.asarray(matmul_toeplitz(autocorrelation, columns), dtype=np.float64)
     return product.reshape(values.shape)
 
 
@@ -248,19 +221,11 @@ def fit_autoregression(autocovariance: Array, samples: float) -> Array:
     best = coefficients
     least = samples * np.log(innovation)
     for order in range(1, len(autocovariance)):
-        remainder = (
-            autocovariance[order] - coefficients @ autocovariance[1:order][::-1]
-        )
-        partial = np.clip(
-            remainder / innovation, -LARGEST_PARTIAL, LARGEST_PARTIAL
-        )
-        coefficients = np.append(
-            coefficients - partial * coefficients[::-1], partial
-        )
+        remainder = autocovariance[order] - coefficients @ autocovariance[1:order][::-1]
+        partial = np.clip(remainder / innovation, -LARGEST_PARTIAL, LARGEST_PARTIAL)
+        coefficients = np.append(coefficients - partial * coefficients[::-1], partial)
         innovation *= 1 - partial**2
-        criterion = samples * np.log(innovation) + order * np.log(
-            max(samples, 2.0)
-        )
+        criterion = samples * np.log(innovation) + order * np.log(max(samples, 2.0))
         if criterion < least:
             best = coefficients
             least = criterion
@@ -378,9 +343,7 @@ class ErrorProcess:
     degrees_of_freedom: float
 
 
-def analyse_dependence(
-    fit: LinearisedFit, information: Information
-) -> Dependence:
+def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependence:
     """Test the residuals of a fit for correlation in time, among channels and in space.
 
     Residuals at the level of rounding count as uncorrelated. Blocks with a floor of noise are not
@@ -395,30 +358,19 @@ def analyse_dependence(
         return Dependence(0.0, np.inf, shared_p=1.0)
     pairs = zip(fit.blocks, information.scaled_jacobians, strict=True)
     tested = (each for each in pairs if not each[0].has_noise_floor)
-    over_space = [
-        moments
-        for each in tested
-        if (moments := estimate_spatial_correlation(*each))
-    ]
-    space_p = min(
-        (len(over_space) * moments.p_value for moments in over_space),
-        default=1.0,
-    )
+    over_space = [moments for each in tested if (moments := estimate_spatial_correlation(*each))]
+    space_p = min((len(over_space) * moments.p_value for moments in over_space), default=1.0)
     moments = lagged_products(fit, information, lags=[1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
     products = pool @ moments.products
     expected = pool @ moments.expected @ pool.T
     if not expected[1, 1] > 0:  # nothing follows on anything
-        return Dependence(
-            0.0, np.inf, shared_p=_channel_correlation_p(fit), space_p=space_p
-        )
+        return Dependence(0.0, np.inf, shared_p=_channel_correlation_p(fit), space_p=space_p)
     variance = products[0] / expected[0, 0]
     lag1_variance = (products[1] - variance * expected[1, 0]) / expected[1, 1]
     return Dependence(
-        lag1=float(
-            np.clip(lag1_variance / variance, -1.0, 1.0)
-        ),  # corrected, it may be beyond
+        lag1=float(np.clip(lag1_variance / variance, -1.0, 1.0)),  # corrected, it may be beyond
         lag1_deviation=float(np.sqrt(2 / expected[1, 1])),
         shared_p=_channel_correlation_p(fit),
         space_p=space_p,
@@ -435,9 +387,7 @@ def _channel_correlation_p(fit: LinearisedFit) -> float:
         residual = block.channels.residual
         present = block.channels.is_measured
         counts = present.T.astype(float) @ present
-        of_channel = np.sqrt(
-            np.sum(residual**2, axis=0) / np.maximum(np.diag(counts), 1)
-        )
+        of_channel = np.sqrt(np.sum(residual**2, axis=0) / np.maximum(np.diag(counts), 1))
         scaled = residual / np.where(of_channel > 0, of_channel, np.inf)
         used = np.triu(counts > 2, 1)
         correlation = (scaled.T @ scaled)[used] / counts[used]
@@ -446,9 +396,7 @@ def _channel_correlation_p(fit: LinearisedFit) -> float:
     return float(chi2_sf(statistic, pairs)) if pairs else 1.0
 
 
-def error_processes(
-    fit: LinearisedFit, information: Information
-) -> tuple[ErrorProcess, ...]:
+def error_processes(fit: LinearisedFit, information: Information) -> tuple[ErrorProcess, ...]:
     """Estimate the error process of each block of a fit, in their order.
 
     The order of the autoregression is at most `MAX_ORDER`, and one per `SAMPLES_PER_ORDER` samples.
@@ -461,64 +409,36 @@ def error_processes(
     information : Information
         Information of the fit.
     """
-    orders = [
-        min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER)
-        for block in fit.blocks
-    ]
-    moments = lagged_products(
-        fit, information, lags=[max(1, order) for order in orders]
-    )
+    orders = [min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER) for block in fit.blocks]
+    moments = lagged_products(fit, information, lags=[max(1, order) for order in orders])
     autocovariances = moments.autocovariances()
     for _ in range(ROUNDS):
         tails = [
             _long_lag_autocovariances(block, gamma, order=order)
-            for block, gamma, order in zip(
-                fit.blocks, autocovariances, orders, strict=True
-            )
+            for block, gamma, order in zip(fit.blocks, autocovariances, orders, strict=True)
         ]
         before, autocovariances = (
             autocovariances,
-            moments.autocovariances(
-                moments.long_lag_products(fit, information, tails=tails)
-            ),
+            moments.autocovariances(moments.long_lag_products(fit, information, tails=tails)),
         )
         if np.allclose(
-            np.concatenate(autocovariances),
-            np.concatenate(before),
-            rtol=SETTLED,
-            atol=0,
+            np.concatenate(autocovariances), np.concatenate(before), rtol=SETTLED, atol=0
         ):
             break
     return tuple(
         _error_process(block, slope, autocovariance=gamma[: order + 1])
         for block, slope, gamma, order in zip(
-            fit.blocks,
-            information.scaled_jacobians,
-            autocovariances,
-            orders,
-            strict=True,
+            fit.blocks, information.scaled_jacobians, autocovariances, orders, strict=True
         )
     )
 
 
-def _long_lag_autocovariances(
-    block: ResidualBlock, autocovariance: Array, order: int
-) -> Array:
+def _long_lag_autocovariances(block: ResidualBlock, autocovariance: Array, order: int) -> Array:
     """Return the autocovariances (T,) of a block's errors by lag, by an autoregression, at lags
     beyond given ones; zero at the given ones.
-
-    Parameters
-    ----------
-    block : ResidualBlock
-    autocovariance : (K,) array
-        Autocovariances at the first lags, K > order; a negative variance counts as zero.
-    order : int
-        Largest order of the autoregression, which is fitted to the first order + 1 of them.
     """
     coefficients = _autoregression_of(block, autocovariance[: order + 1])
-    tail = max(0.0, autocovariance[0]) * process_autocorrelation(
-        coefficients, len(block.t_s)
-    )
+    tail = max(0.0, autocovariance[0]) * process_autocorrelation(coefficients, len(block.t_s))
     tail[: len(autocovariance)] = 0.0
     return tail
 
@@ -530,9 +450,7 @@ def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
     residual = block.channels.residual
     present = block.channels.is_measured
     channels = _effective_channels(_channel_covariance(residual, present))
-    return fit_autoregression(
-        autocovariance, _mean_sample_count(present) * channels
-    )
+    return fit_autoregression(autocovariance, _mean_sample_count(present) * channels)
 
 
 def _mean_sample_count(present: NDArray[np.bool_]) -> float:
@@ -543,23 +461,12 @@ def _mean_sample_count(present: NDArray[np.bool_]) -> float:
     return float(present.sum() / max(1, present.any(axis=0).sum()))
 
 
-def _error_process(
-    block: ResidualBlock, slope: Array, autocovariance: Array
-) -> ErrorProcess:
+def _error_process(block: ResidualBlock, slope: Array, autocovariance: Array) -> ErrorProcess:
     """Return the error process of one block.
 
     If samples are not more than channels, the covariance among channels is that of
     `estimate_spatial_correlation` if there is one; with a floor of noise it is at least that of
     independent errors of the stated σ.
-
-    Parameters
-    ----------
-    block : ResidualBlock
-    slope : (T, 3M, r) array
-        D = S L of the block.
-    autocovariance : (K,) array
-        Autocovariances of its errors at lags 0 … K − 1. If the variance is not positive, the errors
-        count as white, with the mean square of the residuals.
     """
     residual = block.channels.residual
     present = block.channels.is_measured
@@ -570,9 +477,7 @@ def _error_process(
         autocovariance = np.array([raw_variance])
     coefficients = _autoregression_of(block, autocovariance)
     correlation = process_autocorrelation(coefficients, len(residual))
-    innovation, known = _innovations(
-        residual, present, coefficients=coefficients
-    )
+    innovation, known = _innovations(residual, present, coefficients=coefficients)
     channels = _channel_covariance(innovation, known)
     weight = present.sum(axis=0)
     if not weight @ np.diag(channels) > 0:  # no run of samples is long enough
@@ -637,9 +542,7 @@ def score_covariance(
     directions = information.fit.root[:shared].T
     total = information.prior.copy()
     variance_of_variance = np.zeros(directions.shape[1])
-    for slope, process in zip(
-        information.scaled_jacobians, processes, strict=True
-    ):
+    for slope, process in zip(information.scaled_jacobians, processes, strict=True):
         shape = slope.shape[0] * slope.shape[1], slope.shape[2]
         smoothed = toeplitz_product(process.autocorrelation, slope)
         mixed = np.einsum("cd,tdr->tcr", process.channel_covariance, smoothed)
@@ -654,39 +557,17 @@ def score_covariance(
             spread = np.sum(share * share.T)
             if spread > 0:
                 freedom = process.samples * variance**2 / spread
-                variance_of_variance[k] += variance**2 / min(
-                    freedom, process.degrees_of_freedom
-                )
+                variance_of_variance[k] += variance**2 / min(freedom, process.degrees_of_freedom)
     variances = np.sum((directions.T @ total) * directions.T, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        freedom = np.where(
-            variance_of_variance > 0,
-            variances**2 / variance_of_variance,
-            np.inf,
-        )
+        freedom = np.where(variance_of_variance > 0, variances**2 / variance_of_variance, np.inf)
     return total, np.maximum(freedom, 1.0)
 
 
 def _innovations(
     residual: Array, present: NDArray[np.bool_], coefficients: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the part of the residuals that earlier samples do not predict, and where it is known.
-
-    Parameters
-    ----------
-    residual : (T, 3M) array
-        Residuals, zero where missing.
-    present : (T, 3M) array of bool
-        Whether each is measured.
-    coefficients : (order,) array
-        Coefficients of the autoregression.
-
-    Returns
-    -------
-    ((T − order, 3M) array, (T − order, 3M) array of bool)
-        Innovations, zero where unknown, and the mask: known where the sample and all those that
-        predict it are present.
-    """
+    """Return the part of the residuals that earlier samples do not predict, and where it is known."""
     order = len(coefficients)
     innovation = residual[order:].copy()
     is_known = present[order:].copy()
@@ -702,13 +583,6 @@ def _channel_covariance(residual: Array, present: NDArray[np.bool_]) -> Array:
 
     It is made positive semidefinite if samples are missing, and zero for a pair without a common
     sample before that.
-
-    Parameters
-    ----------
-    residual : (T, 3M) array
-        Residuals of the channels, zero where missing.
-    present : (T, 3M) bool
-        Whether each channel is measured in each sample.
     """
     counts = present.T.astype(float) @ present
     covariance = residual.T @ residual / np.maximum(counts, 1)

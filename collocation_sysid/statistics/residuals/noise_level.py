@@ -89,18 +89,12 @@ class NoiseLevel:
         """
         if self.is_unequal():
             return "by-marker"
-        return (
-            "estimated"
-            if self.larger_p < LARGER or self.smaller_p < SMALLER
-            else "given"
-        )
+        return "estimated" if self.larger_p < LARGER or self.smaller_p < SMALLER else "given"
 
     @cached_property
     def factors(self) -> dict[str, float]:
         """Standard deviation of the errors of each marker over σ, by the marker's name."""
-        return dict(
-            zip(self.names, np.sqrt(self.variances).tolist(), strict=True)
-        )
+        return dict(zip(self.names, np.sqrt(self.variances).tolist(), strict=True))
 
     def compute_unevenness(self) -> float:
         """Return the factor by which unequal markers increase the standard deviation of a mean over
@@ -141,26 +135,17 @@ class NoiseLevel:
             return exact + of_data, np.full(shared, max(1.0, self.freedom))
         total = exact + np.tensordot(self.variances, self.shares, 1)
         directions = information.fit.root[:shared]
-        parts = (
-            np.einsum("kr,grs,ks->kg", directions, self.shares, directions)
-            * self.variances
-        )
-        variance_of_variance = np.sum(
-            parts**2 / np.maximum(self.freedoms, 1.0), axis=1
-        )
+        parts = np.einsum("kr,grs,ks->kg", directions, self.shares, directions) * self.variances
+        variance_of_variance = np.sum(parts**2 / np.maximum(self.freedoms, 1.0), axis=1)
         variances = np.einsum("kr,rs,ks->k", directions, total, directions)
         with np.errstate(divide="ignore", invalid="ignore"):
             freedom = np.where(
-                variance_of_variance > 0,
-                variances**2 / variance_of_variance,
-                np.inf,
+                variance_of_variance > 0, variances**2 / variance_of_variance, np.inf
             )
         return total, np.maximum(freedom, 1.0)
 
 
-def estimate_noise_level(
-    fit: LinearisedFit, information: Information
-) -> NoiseLevel:
+def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
     """Return the size of the errors of each marker compared with the stated σ, with tests, from the
     residuals of a fit.
 
@@ -183,9 +168,7 @@ def estimate_noise_level(
     counts = []
     shares = []
     prior_score = np.zeros_like(information.prior)
-    for block, slope in zip(
-        fit.blocks, information.scaled_jacobians, strict=True
-    ):
+    for block, slope in zip(fit.blocks, information.scaled_jacobians, strict=True):
         if block.has_noise_floor:
             prior_score += _prior_score_covariance(block, slope)
             continue
@@ -193,10 +176,7 @@ def estimate_noise_level(
         for m in np.flatnonzero(block.is_present.any(axis=0)).tolist():
             rows = by_marker[:, m].reshape(3 * len(block.t_s), slope.shape[2])
             names.append(f"{block.name}/{block.marker_names[m]}")
-            squares.append(
-                float(np.sum(block.residual[:, m] ** 2))
-                / shortened_power(block)
-            )
+            squares.append(float(np.sum(block.residual[:, m] ** 2)) / shortened_power(block))
             counts.append(int(block.is_measured[:, m].sum()))
             shares.append(rows.T @ rows)
     of_score, besides = _known_error_moments(fit, information)
@@ -209,40 +189,21 @@ def estimate_noise_level(
         prior=information.prior + prior_score,
         of_score=of_score + prior_score,
     )
-    sigma_keys = [
-        b.sigma_key
-        for b in fit.blocks
-        if b.is_present.any() and not b.has_noise_floor
-    ]
+    sigma_keys = [b.sigma_key for b in fit.blocks if b.is_present.any() and not b.has_noise_floor]
     # That of places stands for all.
-    return replace(
-        level,
-        sigma_key=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"),
-    )
+    return replace(level, sigma_key=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"))
 
 
 def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
     """Return the covariance (r, r) of the score due to a block whose noise is at least as stated.
 
     It is DᵀD times the mean square of the residuals per degree of freedom, but at least once.
-
-    Parameters
-    ----------
-    block : ResidualBlock
-        The block.
-    slope : (T, 3M, r) array
-        Its D = S L.
     """
     rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
-    degrees_of_freedom = max(
-        1.0, block.count_measurements() - float(np.trace(share))
-    )
+    degrees_of_freedom = max(1.0, block.count_measurements() - float(np.trace(share)))
     factor = max(
-        1.0,
-        float(np.sum(block.residual**2))
-        / shortened_power(block)
-        / degrees_of_freedom,
+        1.0, float(np.sum(block.residual**2)) / shortened_power(block) / degrees_of_freedom
     )
     return factor * share
 
@@ -256,16 +217,12 @@ def disturbance_samples(fit: LinearisedFit) -> list[Array]:
     count = next((len(each) for each in of_blocks if each is not None), 0)
     samples_of_blocks = []
     for block, each in zip(fit.blocks, of_blocks, strict=True):
-        samples = (
-            np.zeros((count, *block.residual.shape)) if each is None else each
-        )
+        samples = np.zeros((count, *block.residual.shape)) if each is None else each
         samples_of_blocks.append(samples[:count] * block.is_measured)
     return samples_of_blocks
 
 
-def project_errors(
-    information: Information, errors: Sequence[Array]
-) -> tuple[Array, list[Array]]:
+def project_errors(information: Information, errors: Sequence[Array]) -> tuple[Array, list[Array]]:
     """Return the effect of samples of errors on the fit.
 
     Parameters
@@ -282,32 +239,21 @@ def project_errors(
     """
     error_rows = [each.reshape(len(each), each.shape[1], -1) for each in errors]
     pairs = [*zip(error_rows, information.scaled_jacobians, strict=True)]
-    scores = np.sum(
-        [np.einsum("ktc,tcr->kr", e, slope) for e, slope in pairs], axis=0
-    )
-    remaining = [
-        e - np.einsum("tcr,kr->ktc", slope, scores) for e, slope in pairs
-    ]
+    scores = np.sum([np.einsum("ktc,tcr->kr", e, slope) for e, slope in pairs], axis=0)
+    remaining = [e - np.einsum("tcr,kr->ktc", slope, scores) for e, slope in pairs]
     return scores, [
         each.reshape(errors_of_block.shape)
         for each, errors_of_block in zip(remaining, errors, strict=True)
     ]
 
 
-def _known_error_moments(
-    fit: LinearisedFit, information: Information
-) -> tuple[Array, Array]:
+def _known_error_moments(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
     """Return the covariance (r, r) of the score, and the sums of squares (G, K) of each of G
     markers in each of K samples, due to known errors; zeros with K = 1 if there are none.
     """
-    is_used = [
-        block.is_present.any(axis=0) & (not block.has_noise_floor)
-        for block in fit.blocks
-    ]
+    is_used = [block.is_present.any(axis=0) & (not block.has_noise_floor) for block in fit.blocks]
     if not len((samples := disturbance_samples(fit))[0]):
-        return np.zeros_like(information.prior), np.zeros(
-            (int(np.concatenate(is_used).sum()), 1)
-        )
+        return np.zeros_like(information.prior), np.zeros((int(np.concatenate(is_used).sum()), 1))
     scores, remaining = project_errors(information, samples)
     present = [block.is_measured for block in fit.blocks]
     sums = [
@@ -326,25 +272,7 @@ def _solve_noise_level(
     prior: Array,
     of_score: Array,
 ) -> NoiseLevel:
-    """Return the variances of the markers' errors, and tests of them.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Names of the G markers.
-    squares : (G,) array
-        Sum of squared residuals of each marker, in units of σ².
-    counts : (G,) array
-        Number of measured values.
-    besides : (G, K) array
-        Sums of squares due to known errors, in K samples.
-    shares : (G, r, r) array
-        Part of each marker in the information.
-    prior : (r, r) array
-        Information of the priors.
-    of_score : (r, r) array
-        Covariance of the score due to known errors.
-    """
+    """Return the variances of the markers' errors, and tests of them."""
     fitted = np.trace(shares, axis1=1, axis2=2)
     own_freedoms = np.maximum(counts - fitted, 0.0)
     # Sums of squares with these means and twice these "spreads" as variances are tested as χ² of
@@ -353,11 +281,7 @@ def _solve_noise_level(
     means = own_freedoms + known_means
     spreads = own_freedoms + 2 * known_means + besides.var(axis=1) / 2
     freedoms = means**2 / np.maximum(spreads, 1e-300)
-    spread = (
-        own_freedoms.sum()
-        + 2 * known_means.sum()
-        + besides.sum(axis=0).var() / 2
-    )
+    spread = own_freedoms.sum() + 2 * known_means.sum() + besides.sum(axis=0).var() / 2
     freedom = float(means.sum() ** 2 / max(spread, 1e-300))
     of_prior = np.einsum("grs,sr->g", shares, prior)
     overlap = np.einsum("grs,hsr->gh", shares, shares)
@@ -366,10 +290,7 @@ def _solve_noise_level(
     raw = np.maximum(squares - known_means, 0.0)
     least = np.maximum(LEAST_SHARE * raw / np.maximum(counts, 1.0), ROUNDING**2)
     by_marker = np.maximum(np.linalg.lstsq(expected, own)[0], least)
-    pooled = max(
-        own.sum() / max(1.0, expected.sum()),
-        counts @ least / max(1.0, counts.sum()),
-    )
+    pooled = max(own.sum() / max(1.0, expected.sum()), counts @ least / max(1.0, counts.sum()))
     exact = squares.sum() <= ROUNDING**2 * counts.sum()
     tested = not exact and own_freedoms.sum() >= 1
     statistic = float(squares.sum()) * freedom / max(float(means.sum()), 1e-300)
@@ -381,9 +302,7 @@ def _solve_noise_level(
         freedom=freedom,
         larger_p=float(chi2_sf(statistic, freedom)) if tested else 1.0,
         smaller_p=float(chi2_cdf(statistic, freedom)) if tested else 1.0,
-        unequal_p=_bartlett(
-            squares * freedoms / np.maximum(means, 1e-300), freedoms
-        )
+        unequal_p=_bartlett(squares * freedoms / np.maximum(means, 1e-300), freedoms)
         if tested
         else 1.0,
         shares=shares,
@@ -402,9 +321,7 @@ def _bartlett(squares: Array, freedoms: Array) -> float:
         return 1.0
     total = each.sum()
     pooled = squares[used].sum() / total
-    statistic = total * np.log(pooled) - np.sum(
-        each * np.log(squares[used] / each)
-    )
+    statistic = total * np.log(pooled) - np.sum(each * np.log(squares[used] / each))
     correction = 1 + (np.sum(1 / each) - 1 / total) / (3 * (count - 1))
     return float(chi2_sf(statistic / correction, count - 1))
 
@@ -417,7 +334,5 @@ def shortened_power(block: ResidualBlock) -> float:
     """
     if not block.find_outliers().any():
         return 1.0
-    squared = float(
-        np.sum(block.residual[block.find_outliers()] ** 2, axis=1).max()
-    )
+    squared = float(np.sum(block.residual[block.find_outliers()] ** 2, axis=1).max())
     return float(squared * chi2_sf(squared, 3) / 3 + chi2_cdf(squared, 5))

@@ -80,12 +80,8 @@ class RecordingComparison:
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = np.nan_to_num(1 / self.deviations**2)
-            mean = np.nansum(weight * self.differences, axis=0) / weight.sum(
-                axis=0
-            )
-        return np.nansum(
-            weight * np.nan_to_num(self.differences - mean) ** 2, axis=0
-        )
+            mean = np.nansum(weight * self.differences, axis=0) / weight.sum(axis=0)
+        return np.nansum(weight * np.nan_to_num(self.differences - mean) ** 2, axis=0)
 
     def count_degrees_of_freedom(self) -> NDArray[np.int64]:
         """Return the degrees of freedom (nq,) of χ²: the number of recordings that determine the
@@ -106,14 +102,10 @@ class RecordingComparison:
         recordings disagree: to χ²/f times the lesser of the variance and that of the mean of the
         recordings, if that is more. The argument is not modified.
         """
-        ratio = self.compute_chi_squared() / np.maximum(
-            self.count_degrees_of_freedom(), 1
-        )
+        ratio = self.compute_chi_squared() / np.maximum(self.count_degrees_of_freedom(), 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
-            enough = np.maximum(
-                variances, ratio * np.minimum(variances, of_all)
-            )
+            enough = np.maximum(variances, ratio * np.minimum(variances, of_all))
         return np.where(self.find_disagreements(), enough, variances)
 
 
@@ -137,15 +129,10 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
     for name, block_numbers in blocks_by_recording(fit).items():
         # What recordings share they have to find alone, too.
         mine = [
-            other.startswith((f"{name}: ", "shared"))
-            for other in fit.names[fit.shared_count :]
+            other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared_count :]
         ]
-        columns = np.r_[
-            np.arange(fit.shared_count), fit.shared_count + np.flatnonzero(mine)
-        ]
-        yield fit_part(
-            fit, [fit.blocks[k] for k in block_numbers], columns=columns
-        )
+        columns = np.r_[np.arange(fit.shared_count), fit.shared_count + np.flatnonzero(mine)]
+        yield fit_part(fit, [fit.blocks[k] for k in block_numbers], columns=columns)
 
 
 def fit_part(
@@ -172,10 +159,7 @@ def fit_part(
     )
     alone = replace(
         fit,
-        blocks=tuple(
-            replace(each, jacobian=each.jacobian[..., columns])
-            for each in blocks
-        ),
+        blocks=tuple(replace(each, jacobian=each.jacobian[..., columns]) for each in blocks),
         names=tuple(fit.names[k] for k in columns),
         prior_residual=prior_residual,
         prior_jacobian=prior_slope,
@@ -219,9 +203,7 @@ def compare_recordings(
     """
     steps = np.array([each.step for each in alone.values()])
     variances = np.array([each.variances for each in alone.values()])
-    independent = np.array(
-        [each.independent_variances for each in alone.values()]
-    )
+    independent = np.array([each.independent_variances for each in alone.values()])
     deviations = np.sqrt(variances)
     is_determined = deviations < TELLING
     with np.errstate(invalid="ignore"):
@@ -236,25 +218,11 @@ def compare_recordings(
     )
 
 
-def _sensitivities_to_differences(
-    fit: LinearisedFit, names: Sequence[str], excess: Array
-) -> Array:
+def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
     """Return `RecordingComparison.sensitivities` (p, nq n) for n recordings; zero for parameters at
     a bound, and for those without variance between recordings.
-
-    Parameters
-    ----------
-    fit : LinearisedFit
-        The joint fit.
-    names : (n,) sequence of str
-        Names of recordings, those of blocks of the fit.
-    excess : (n, nq) array
-        Variances of q by each recording alone over those for independent errors of the stated σ.
     """
-    own = [
-        least_squares_of_blocks(fit, blocks_by_recording(fit)[name])
-        for name in names
-    ]
+    own = [least_squares_of_blocks(fit, blocks_by_recording(fit)[name]) for name in names]
     each = np.array([o.compute_information() for o in own])
     scores = np.array([o.compute_score() for o in own])
     together = least_squares_of_fit(fit)
@@ -271,27 +239,16 @@ def _sensitivities_to_differences(
             information[np.ix_(others, others)], hermitian=True
         )
         own_s = scores[:, k] - cross @ score[others]
-        by_own = [
-            np.diag(each[:, k, l]) - cross @ each[:, others, l].T
-            for l in shared
-        ]
+        by_own = [np.diag(each[:, k, l]) - cross @ each[:, others, l].T for l in shared]
         remaining = by_own[row]
         if not remaining.sum() > SILENT * information[k, k]:
             continue
-        projection = (
-            np.linalg.pinv(remaining, rcond=SILENT, hermitian=True)
-            - 1 / remaining.sum()
-        )
+        projection = np.linalg.pinv(remaining, rcond=SILENT, hermitian=True) - 1 / remaining.sum()
         noise = remaining * np.sqrt(np.outer(excess[:, k], excess[:, k]))
-        excess_scatter[row] = own_s @ projection @ own_s - np.trace(
-            projection @ noise
-        )
+        excess_scatter[row] = own_s @ projection @ own_s - np.trace(projection @ noise)
         by_each[row] = [np.trace(m.T @ projection @ m) for m in by_own]
     sizes = np.where(np.diag(by_each) > 0, np.diag(by_each), 1.0)
-    variances = nnls(
-        by_each / np.sqrt(np.outer(sizes, sizes)),
-        excess_scatter / np.sqrt(sizes),
-    )[0]
+    variances = nnls(by_each / np.sqrt(np.outer(sizes, sizes)), excess_scatter / np.sqrt(sizes))[0]
     sensitivities = np.zeros((len(fit.names), fit.shared_count, len(names)))
     for k, tau in zip(shared, np.sqrt(variances / np.sqrt(sizes)), strict=True):
         sensitivities[free, k] = -tau * inverse @ each[:, free, k].T

@@ -21,12 +21,7 @@ from numpy.typing import NDArray
 from ...common.array_types import Array
 from ..concerns import Concern
 from ..distributions import beta_sf, chi2_isf, normal_isf
-from ..linearised import (
-    LinearisedFit,
-    Mask,
-    ResidualBlock,
-    factorise_information,
-)
+from ..linearised import LinearisedFit, Mask, ResidualBlock, factorise_information
 from .noise_level import NoiseLevel, estimate_noise_level
 
 # Level of the tests for patterns.
@@ -108,9 +103,7 @@ def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
     are left out.
     """
     level = estimate_noise_level(fit, factorise_information(fit))
-    alone = {
-        outlier.series: outlier for outlier in reversed(remove_outliers(fit)[1])
-    }
+    alone = {outlier.series: outlier for outlier in reversed(remove_outliers(fit)[1])}
     return tuple(
         _diagnose_marker(
             block,
@@ -126,19 +119,12 @@ def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
     )
 
 
-def _estimated_kinds(
-    fit: LinearisedFit, block: ResidualBlock
-) -> tuple[bool, bool]:
+def _estimated_kinds(fit: LinearisedFit, block: ResidualBlock) -> tuple[bool, bool]:
     """Return whether marker offsets, and a time shift, of the block's experiment are among the
     parameters of the fit.
     """
-    kinds = [
-        name.removeprefix(f"{block.name}: ")
-        for name in fit.names[fit.shared_count :]
-    ]
-    return any(k.startswith("offset") for k in kinds), any(
-        k.startswith("time") for k in kinds
-    )
+    kinds = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared_count :]]
+    return any(k.startswith("offset") for k in kinds), any(k.startswith("time") for k in kinds)
 
 
 def _diagnose_marker(
@@ -149,21 +135,7 @@ def _diagnose_marker(
     level: NoiseLevel,
     outliers: Mapping[str, Outlier],
 ) -> MarkerDiagnosis:
-    """Return the diagnosis of one marker of a block.
-
-    Parameters
-    ----------
-    block : ResidualBlock
-    marker : int
-        Index of the marker; it must have a sample.
-    shared : int
-        Number of shared parameters.
-    estimated_kinds : (bool, bool)
-        Whether marker offsets, and a time shift, are estimated.
-    level : NoiseLevel
-    outliers : mapping of str to Outlier
-        Outlier of each marker that has one, by "experiment/marker".
-    """
+    """Return the diagnosis of one marker of a block."""
     present = block.is_present[:, marker]
     name = f"{block.name}/{block.marker_names[marker]}"
     residual = block.residual[:, marker] * block.sigma_m[marker]
@@ -177,9 +149,7 @@ def _diagnose_marker(
     early = np.zeros(len(residual), dtype=bool)
     if not block.is_static:
         frequency, peak = _largest_peak(varying, block.t_s)
-        early = block.t_s <= block.t_s[0] + EARLY_TIME * (
-            block.t_s[-1] - block.t_s[0]
-        )
+        early = block.t_s <= block.t_s[0] + EARLY_TIME * (block.t_s[-1] - block.t_s[0])
     diagnosis = MarkerDiagnosis(
         experiment=block.name,
         marker=block.marker_names[marker],
@@ -197,15 +167,10 @@ def _diagnose_marker(
     )
     if name in outliers:
         message = outliers[name].to_concern().message.removeprefix(f"{name}: ")
-        return replace(
-            diagnosis,
-            sentence=f"{name}: {1e3 * diagnosis.rms_m:.2g} mm RMS; {message}",
-        )
+        return replace(diagnosis, sentence=f"{name}: {1e3 * diagnosis.rms_m:.2g} mm RMS; {message}")
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.jacobian[:, marker, :, :shared].reshape(len(residual), -1)
-    message = _message(
-        diagnosis, pairs, block=block, motion=motion, estimated=estimated_kinds
-    )
+    message = _message(diagnosis, pairs, block=block, motion=motion, estimated=estimated_kinds)
     if diagnosis.wild > MOST_WILD * samples:
         message += (
             f"; {diagnosis.wild} samples are outliers, beyond the threshold of the Huber "
@@ -270,32 +235,16 @@ def _message(
     motion: Array,
     estimated: tuple[bool, bool],
 ) -> str:
-    """Return the message for a marker without outlier: the likely cause of its residuals.
-
-    Parameters
-    ----------
-    diagnosis : MarkerDiagnosis
-    pairs : int
-        Number of pairs of consecutive present samples.
-    block : ResidualBlock
-        Residuals of the experiment's markers.
-    motion : (T, k) array
-        Derivatives of the marker's residuals by the shared parameters, which have the frequency of
-        the motion.
-    estimated : (bool, bool)
-        Whether marker offsets, and a time shift, are estimated.
-    """
+    """Return the message for a marker without outlier: the likely cause of its residuals."""
     t_s = block.t_s
     name = f"{diagnosis.experiment}/{diagnosis.marker}"
     size = f"{1e3 * diagnosis.rms_m:.2g} mm RMS"
     if diagnosis.rms_m < ROUNDING_M:
         return f"{name}: residuals are at the level of rounding errors"
-    persistent = pairs > 0 and abs(diagnosis.lag1) > normal_isf(
-        SIGNIFICANCE / 2
-    ) / np.sqrt(3 * pairs)
-    shifted = diagnosis.constant_share > chi2_isf(SIGNIFICANCE, 3) / (
-        3 * diagnosis.samples
+    persistent = pairs > 0 and abs(diagnosis.lag1) > normal_isf(SIGNIFICANCE / 2) / np.sqrt(
+        3 * pairs
     )
+    shifted = diagnosis.constant_share > chi2_isf(SIGNIFICANCE, 3) / (3 * diagnosis.samples)
     if not persistent and not shifted:
         return f"{name}: {size}, {_white_noise_message(diagnosis)}"
     if diagnosis.constant_share > DOMINANT:
@@ -339,23 +288,11 @@ def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
     return "uncorrelated, consistent with noise"
 
 
-def _oscillation_message(
-    diagnosis: MarkerDiagnosis, t_s: Array, motion: Array
-) -> str:
+def _oscillation_message(diagnosis: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
     """Return the description of oscillating residuals: a slow drift for fewer than `FEWEST_PERIODS`
     periods, else the frequency, compared with that of the motion.
-
-    Parameters
-    ----------
-    diagnosis : MarkerDiagnosis
-    t_s : (T,) array
-        Times [s].
-    motion : (T, k) array
-        Derivatives of the residuals, which have the frequency of the motion.
     """
-    share = (
-        f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
-    )
+    share = f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
     record_s = (t_s[1] - t_s[0]) * len(t_s)
     if diagnosis.frequency_hz * record_s < FEWEST_PERIODS:
         return f"{share} is a slow drift: {DRIFT_CAUSES}"
@@ -413,20 +350,12 @@ class Outlier:
         """Return the concern about this sample, of grade "check": "residuals/first" for a relaxed
         start, else "residuals/outlier".
         """
-        code = (
-            "residuals/first" if self.is_relaxed_start else "residuals/outlier"
-        )
-        data = {
-            "t_s": self.t_s,
-            "deviations": self.deviations,
-            "percent": 100 * self.share,
-        }
+        code = "residuals/first" if self.is_relaxed_start else "residuals/outlier"
+        data = {"t_s": self.t_s, "deviations": self.deviations, "percent": 100 * self.share}
         return Concern(code, data={"of": self.series, **data})
 
 
-def remove_outliers(
-    fit: LinearisedFit,
-) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
+def remove_outliers(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
     """Return the fit without its outliers, which count as missing, and the outliers; the same fit
     and an empty tuple if there are none.
 
@@ -437,28 +366,18 @@ def remove_outliers(
     outliers = []
     for block in fit.blocks:
         for marker in np.flatnonzero(block.is_present.any(axis=0)).tolist():
-            allowed = max(
-                1, int(EXCEPTIONS * block.is_present[:, marker].sum())
-            )
+            allowed = max(1, int(EXCEPTIONS * block.is_present[:, marker].sum()))
             while allowed and (
-                outlier := _find_outlier(
-                    block, marker, significance=RARE / len(fit.blocks)
-                )
+                outlier := _find_outlier(block, marker, significance=RARE / len(fit.blocks))
             ):
                 outliers.append(outlier)
                 block = _without_sample(block, marker, sample=outlier.sample)
                 allowed = allowed - 1
         blocks.append(block)
-    return (
-        (replace(fit, blocks=tuple(blocks)), tuple(outliers))
-        if outliers
-        else (fit, ())
-    )
+    return (replace(fit, blocks=tuple(blocks)), tuple(outliers)) if outliers else (fit, ())
 
 
-def _find_outlier(
-    block: ResidualBlock, marker: int, significance: float
-) -> Outlier | None:
+def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Outlier | None:
     """Return the sample that dominates the residuals of a marker (index); None if none does.
 
     It has at least the share `MOST` of the marker's power, which by chance would occur with a
@@ -472,11 +391,7 @@ def _find_outlier(
     freedom = (
         int(block.is_measured[:, marker].sum()) / count / 2
     )  # half the coordinates of a sample
-    chance = (
-        count
-        * block.is_present.shape[1]
-        * beta_sf(share, freedom, b=(count - 1) * freedom)
-    )
+    chance = count * block.is_present.shape[1] * beta_sf(share, freedom, b=(count - 1) * freedom)
     if count < FEWEST_SAMPLES or share < MOST or chance > significance:
         return None
     return Outlier(
@@ -489,9 +404,7 @@ def _find_outlier(
     )
 
 
-def _without_sample(
-    block: ResidualBlock, marker: int, sample: int
-) -> ResidualBlock:
+def _without_sample(block: ResidualBlock, marker: int, sample: int) -> ResidualBlock:
     """Return a copy of the block without one sample of a marker, both given by index: it counts as
     missing.
     """

@@ -55,9 +55,7 @@ class SpatialCorrelation:
     freedom: float
 
 
-def estimate_spatial_correlation(
-    block: ResidualBlock, slope: Array
-) -> SpatialCorrelation | None:
+def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialCorrelation | None:
     """Estimate the spatial correlation of a block's errors.
 
     Parameters
@@ -82,25 +80,16 @@ def estimate_spatial_correlation(
     present = block.channels.is_measured
     if block.places_m is None or not present.any():
         return None
-    distances_m = np.linalg.norm(
-        block.places_m[:, None] - block.places_m, axis=2
-    )
+    distances_m = np.linalg.norm(block.places_m[:, None] - block.places_m, axis=2)
     contrasts = []
-    samples = np.unique(
-        np.linspace(0, len(residual) - 1, MOST_SAMPLES).astype(int)
-    )
+    samples = np.unique(np.linspace(0, len(residual) - 1, MOST_SAMPLES).astype(int))
     for t in samples:
         present_channels = np.flatnonzero(present[t])
-        directions, singular_values, _ = np.linalg.svd(
-            slope[t, present_channels]
-        )
+        directions, singular_values, _ = np.linalg.svd(slope[t, present_channels])
         free = directions[
             :,
             np.concatenate(
-                [
-                    singular_values,
-                    np.zeros(len(present_channels) - len(singular_values)),
-                ]
+                [singular_values, np.zeros(len(present_channels) - len(singular_values))]
             )
             < LEAST_CORRELATION,
         ]
@@ -109,25 +98,17 @@ def estimate_spatial_correlation(
                 _Contrasts(
                     free.T @ residual[t, present_channels],
                     free,
-                    distances_m=distances_m[
-                        np.ix_(present_channels, present_channels)
-                    ],
+                    distances_m=distances_m[np.ix_(present_channels, present_channels)],
                 )
             )
     if not contrasts:
         return None
     count = sum(len(each.values) for each in contrasts)
-    nearest = float(
-        np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1))
-    )
+    nearest = float(np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1)))
     longest = max(LONGEST * float(distances_m.max()), 2 * nearest)
     white, _ = _restricted_likelihood(contrasts, 0.0, length_m=1.0)
     candidates = [
-        (
-            *_restricted_likelihood(contrasts, share, length_m=length),
-            share,
-            length,
-        )
+        (*_restricted_likelihood(contrasts, share, length_m=length), share, length)
         for share in SHARES
         for length in np.geomspace(nearest / 2, longest, LENGTHS)
     ]
@@ -136,26 +117,16 @@ def estimate_spatial_correlation(
     shape = _correlation_matrix(distances_m, share, length_m=float(length))
     share_known = count / max(1, sum(len(each.matrix) for each in contrasts))
     freedom = max(
-        1.0,
-        len(contrasts)
-        * share_known
-        * np.trace(shape) ** 2
-        / float(np.sum(shape**2)),
+        1.0, len(contrasts) * share_known * np.trace(shape) ** 2 / float(np.sum(shape**2))
     )
-    return SpatialCorrelation(
-        level * shape, float(length), p_value=p, freedom=freedom
-    )
+    return SpatialCorrelation(level * shape, float(length), p_value=p, freedom=freedom)
 
 
-def _correlation_matrix(
-    distances_m: Array, share: float, length_m: float
-) -> Array:
+def _correlation_matrix(distances_m: Array, share: float, length_m: float) -> Array:
     """Return the correlation matrix (n, n) of distances `distances_m` (n, n) for a share a and a
     length [m].
     """
-    return (1 - share) * np.eye(len(distances_m)) + share * np.exp(
-        -distances_m / length_m
-    )
+    return (1 - share) * np.eye(len(distances_m)) + share * np.exp(-distances_m / length_m)
 
 
 class _Contrasts(NamedTuple):
@@ -179,24 +150,12 @@ class _Contrasts(NamedTuple):
 def _restricted_likelihood(
     contrasts: list[_Contrasts], share: float, length_m: float
 ) -> tuple[float, float]:
-    """Return −2 log-likelihood up to a constant, and the variance s² that maximises the likelihood.
-
-    Parameters
-    ----------
-    contrasts : list of _Contrasts
-        Contrasts of each sample, at least one.
-    share : float
-        Share a of the variance that is correlated.
-    length_m : float
-        Correlation length [m].
-    """
+    """Return −2 log-likelihood up to a constant, and the variance s² that maximises the likelihood."""
     squares = 0.0
     logarithms = 0.0
     count = 0
     for each in contrasts:
-        correlation = _correlation_matrix(
-            each.distances_m, share, length_m=length_m
-        )
+        correlation = _correlation_matrix(each.distances_m, share, length_m=length_m)
         root = np.linalg.cholesky(each.matrix.T @ correlation @ each.matrix)
         squares += float(np.sum(np.linalg.solve(root, each.values) ** 2))
         logarithms += 2 * float(np.log(np.diag(root)).sum())

@@ -23,21 +23,9 @@ hand = cs.Grasp(cs.Box((-1, -1, 0.179), (1, 1, 1)), poses)
 # %%
 # The recording is simulated here, in steps of 1 ms by another integrator than the fit's, and gets
 # the noise of a camera.
-truth = {
-    "young_pa": 1500.0,
-    "poisson": 0.3,
-    "gamma_r_s": 0.004,
-    "gamma_m_1_s": 0.5,
-}
-places_m = [
-    (0.0, 0.0, 0.0),
-    (0.06, 0.0, 0.0),
-    (0.06, 0.06, 0.045),
-    (0.0, 0.06, 0.09),
-]
-seen = cs.Markers(
-    t_s, np.zeros((len(t_s), 4, 3)), sigma_m=1e-3, places_m=places_m
-)
+truth = {"young_pa": 1500.0, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
+places_m = [(0.0, 0.0, 0.0), (0.06, 0.0, 0.0), (0.06, 0.06, 0.045), (0.0, 0.06, 0.09)]
+seen = cs.Markers(t_s, np.zeros((len(t_s), 4, 3)), sigma_m=1e-3, places_m=places_m)
 swing = cs.Experiment(block, t_s, [hand], seen, name="swing")
 clean_m = cs.simulate(swing, truth, timestep_s=0.001).markers_m
 noise_m = np.random.default_rng(1).normal(scale=1e-3, size=clean_m.shape)
@@ -46,15 +34,9 @@ recording = cs.with_markers(swing, clean_m + noise_m)
 # %%
 # Poisson's ratio is taken as known; the rest is found, without a guess. Of a simulated recording
 # nothing but the noise is uncertain; of a real one leave the last argument out.
-unknown = {
-    "young_pa": cs.Unknown(),
-    "gamma_r_s": cs.Unknown(),
-    "gamma_m_1_s": cs.Unknown(),
-}
+unknown = {"young_pa": cs.Unknown(), "gamma_r_s": cs.Unknown(), "gamma_m_1_s": cs.Unknown()}
 exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
-run = cs.run(
-    cs.Problem([recording], {"poisson": 0.3, **unknown}, uncertainty=exact)
-)
+run = cs.run(cs.Problem([recording], {"poisson": 0.3, **unknown}, uncertainty=exact))
 print(run.table())
 low, high = run.interval("young_pa")
 assert low < truth["young_pa"] < high

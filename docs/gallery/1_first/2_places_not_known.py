@@ -17,20 +17,8 @@ t_s = 0.01 * np.arange(60)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
 poses[:, 0, 3] = 0.04 * np.sin(14 * t_s) * np.minimum(1, t_s / 0.2) ** 2
 hand = cs.Grasp(cs.Box((-1, -1, 0.179), (1, 1, 1)), poses)
-truth = {
-    "young_pa": 1500.0,
-    "poisson": 0.3,
-    "gamma_r_s": 0.004,
-    "gamma_m_1_s": 0.5,
-}
-places_m = np.array(
-    [
-        (0.0, 0.02, 0.01),
-        (0.06, 0.03, 0.02),
-        (0.03, 0.06, 0.05),
-        (0.0, 0.03, 0.09),
-    ]
-)
+truth = {"young_pa": 1500.0, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
+places_m = np.array([(0.0, 0.02, 0.01), (0.06, 0.03, 0.02), (0.03, 0.06, 0.05), (0.0, 0.03, 0.09)])
 blank = np.zeros((len(t_s), 4, 3))
 seen = cs.Markers(t_s, blank, sigma_m=1e-3, places_m=places_m)
 swing = cs.Experiment(block, t_s, [hand], seen, name="swing")
@@ -54,10 +42,7 @@ runs["not known"].plot(field="det_f", count=4)
 # %%
 # The places come out to a millimetre, and E is as good as before.
 found = runs["not known"].places["swing"].values()
-off_mm = [
-    1e3 * np.linalg.norm(p.position_m - q)
-    for p, q in zip(found, places_m, strict=True)
-]
+off_mm = [1e3 * np.linalg.norm(p.position_m - q) for p, q in zip(found, places_m, strict=True)]
 print("places are off by", np.round(off_mm, 2), "mm")
 assert max(off_mm) < 2.0
 for k, (label, run) in enumerate(runs.items()):

@@ -35,29 +35,13 @@ np.savetxt(
 )
 body = cs.Body(mesh, density_kg_m3=40.0)
 hand = cs.Grasp(cs.Box((-1, -1, 0.179), (1, 1, 1)), poses)
-places_m = [
-    (0.0, 0.0, 0.0),
-    (0.06, 0.0, 0.0),
-    (0.06, 0.06, 0.045),
-    (0.0, 0.06, 0.09),
-]
-seen = cs.Markers(
-    t_s, np.zeros((len(t_s), 4, 3)), sigma_m=1e-3, places_m=places_m
-)
-truth = {
-    "young_pa": 1500.0,
-    "poisson": 0.3,
-    "gamma_r_s": 0.004,
-    "gamma_m_1_s": 0.5,
-}
+places_m = [(0.0, 0.0, 0.0), (0.06, 0.0, 0.0), (0.06, 0.06, 0.045), (0.0, 0.06, 0.09)]
+seen = cs.Markers(t_s, np.zeros((len(t_s), 4, 3)), sigma_m=1e-3, places_m=places_m)
+truth = {"young_pa": 1500.0, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 swing = cs.Experiment(body, t_s, [hand], seen)
 tracks_m = cs.simulate(swing, truth, timestep_s=0.001).markers_m
 tracks_m += np.random.default_rng(5).normal(scale=1e-3, size=tracks_m.shape)
-columns = [
-    f"{name}_{axis}"
-    for name in ("tip_1", "tip_2", "low", "middle")
-    for axis in "xyz"
-]
+columns = [f"{name}_{axis}" for name in ("tip_1", "tip_2", "low", "middle") for axis in "xyz"]
 np.savetxt(
     folder / "markers.csv",
     np.column_stack([t_s, tracks_m.reshape(len(t_s), -1)]),

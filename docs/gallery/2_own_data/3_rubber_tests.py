@@ -30,16 +30,12 @@ LARGEST_STRETCH = 2.5
 
 def specimens(*tests):
     """Return Kawabata's specimens of some kinds of test."""
-    return cs.datasets.kawabata_1981(
-        LAW, tests=tests, largest_stretch=LARGEST_STRETCH
-    )
+    return cs.datasets.kawabata_1981(LAW, tests=tests, largest_stretch=LARGEST_STRETCH)
 
 
 def fit(*tests, **fixed):
     """Fit the law to some kinds of test, with some constants fixed."""
-    return cs.run(
-        cs.Problem(specimens(*tests), {**MODULI, **EXPONENTS, **KNOWN, **fixed})
-    )
+    return cs.run(cs.Problem(specimens(*tests), {**MODULI, **EXPONENTS, **KNOWN, **fixed}))
 
 
 # %%
@@ -59,9 +55,7 @@ measured_pa = equibiaxial.readings[0].measured_values[:, 0]
 
 def predict(run):
     """Return the stress of the equibiaxial test [Pa] with the estimates of a run."""
-    return cs.simulate(equibiaxial, run.parameters).custom_sensor_values[0][
-        :, 0
-    ]
+    return cs.simulate(equibiaxial, run.parameters).custom_sensor_values[0][:, 0]
 
 
 def rms_error(prediction_pa):
@@ -90,19 +84,10 @@ assert rms_error(predict(both)) < 15e3
 # The equibiaxial test, which neither fit contains.
 stretch = 1 + specimen_strains(equibiaxial)[0]
 plt.fill_between(
-    stretch,
-    *(end_pa / 1e6 for end_pa in ends_pa),
-    alpha=0.2,
-    label="ends of the interval of μ₂",
+    stretch, *(end_pa / 1e6 for end_pa in ends_pa), alpha=0.2, label="ends of the interval of μ₂"
 )
-plt.plot(
-    stretch, failed_pa / 1e6, "--", label="predicted from uniaxial tension"
-)
-plt.plot(
-    stretch,
-    predict(both) / 1e6,
-    label="predicted from uniaxial and planar tension",
-)
+plt.plot(stretch, failed_pa / 1e6, "--", label="predicted from uniaxial tension")
+plt.plot(stretch, predict(both) / 1e6, label="predicted from uniaxial and planar tension")
 plt.plot(stretch, measured_pa / 1e6, "k.", label="measured")
 plt.xlabel("stretch")
 plt.ylabel("nominal stress [MPa]")

@@ -15,11 +15,7 @@ import numpy as np
 
 import collocation_sysid as cs
 
-problems = next(
-    p / "problems"
-    for p in Path.cwd().resolve().parents
-    if (p / "problems").is_dir()
-)
+problems = next(p / "problems" for p in Path.cwd().resolve().parents if (p / "problems").is_dir())
 problem = cs.Problem.read(problems / "srl_beam" / "memory.toml")
 run = cs.run(problem, seek_causes=False)
 print(run.table())
@@ -31,18 +27,11 @@ run.plot(problem.experiments[-1].name, count=4)
 
 # %%
 # Its tip, as measured and as fitted.
-for experiment, fitted_m in zip(
-    problem.experiments, run.solution.readings_m, strict=True
-):
-    (line,) = plt.plot(
-        experiment.t_s, 1e3 * fitted_m[:, 0, 2], label=experiment.name
-    )
+for experiment, fitted_m in zip(problem.experiments, run.solution.readings_m, strict=True):
+    (line,) = plt.plot(experiment.t_s, 1e3 * fitted_m[:, 0, 2], label=experiment.name)
     seen_m = experiment.markers.positions_m[:, 0, 2]
     plt.plot(experiment.t_s, 1e3 * seen_m, ".", ms=2, color=line.get_color())
-    print(
-        experiment.name,
-        f"{1e3 * np.nanstd(fitted_m[:, 0, 2] - seen_m):.2f} mm off",
-    )
+    print(experiment.name, f"{1e3 * np.nanstd(fitted_m[:, 0, 2] - seen_m):.2f} mm off")
 plt.xlabel("time [s]")
 plt.ylabel("height of the tip [mm]")
 plt.legend()

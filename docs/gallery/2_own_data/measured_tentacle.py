@@ -14,11 +14,7 @@ import matplotlib.pyplot as plt
 
 import collocation_sysid as cs
 
-problems = next(
-    p / "problems"
-    for p in Path.cwd().resolve().parents
-    if (p / "problems").is_dir()
-)
+problems = next(p / "problems" for p in Path.cwd().resolve().parents if (p / "problems").is_dir())
 problem = cs.Problem.read(problems / "soft_tentacle" / "problem.toml")
 run = cs.run(problem, seek_causes=False)
 print(run.table())
@@ -31,14 +27,10 @@ run.plot(problem.experiments[3].name)
 # %%
 # The tentacle from the side at the four tensions of the first tendon, its markers as measured, and
 # how far the model misses them.
-for experiment, positions_m in zip(
-    problem.experiments[:4], run.solution.positions_m, strict=False
-):
+for experiment, positions_m in zip(problem.experiments[:4], run.solution.positions_m, strict=False):
     (tendon,) = experiment.tendons
     _, y_mm, z_mm = 1e3 * positions_m[0].reshape(-1, 3).T
-    (dots,) = plt.plot(
-        y_mm, z_mm, ".", ms=2, label=f"{tendon.tension_n[0]:.1f} N"
-    )
+    (dots,) = plt.plot(y_mm, z_mm, ".", ms=2, label=f"{tendon.tension_n[0]:.1f} N")
     _, y_mm, z_mm = 1e3 * experiment.markers.positions_m[0].T
     plt.plot(y_mm, z_mm, "o", mfc="none", color=dots.get_color())
 for name, rms_m in run.solution.rms_by_experiment_m.items():

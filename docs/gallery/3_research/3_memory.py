@@ -17,31 +17,19 @@ t_s = 0.01 * np.arange(120)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
 poses[:, 2, 3] = 0.02 * np.sin(np.pi * np.minimum(t_s / 0.4, 1)) ** 2
 hand = cs.Grasp(cs.Box((-1, -1, -1), (0.001, 1, 1)), poses)
-places_m = [
-    (0.1, 0.0, 0.0),
-    (0.1, 0.03, 0.03),
-    (0.075, 0.0, 0.03),
-    (0.05, 0.03, 0.0),
-]
+places_m = [(0.1, 0.0, 0.0), (0.1, 0.03, 0.03), (0.075, 0.0, 0.03), (0.05, 0.03, 0.0)]
 
 
 def swung(body: cs.Body, tracks_m: np.ndarray) -> cs.Experiment:
     """The recording of a body."""
     seen = cs.Markers(t_s, tracks_m, sigma_m=2e-4, places_m=places_m)
-    return cs.Experiment(
-        body, t_s, [hand], seen, name="swing", start="undeformed"
-    )
+    return cs.Experiment(body, t_s, [hand], seen, name="swing", start="undeformed")
 
 
 # %%
 # The truth relaxes by a quarter within some tenths of a second.
 silicone = cs.Body(mesh, density_kg_m3=100.0, prony=["prony_1"])
-elastic = {
-    "young_pa": 2e4,
-    "poisson": 0.3,
-    "gamma_r_s": 0.003,
-    "gamma_m_1_s": 0.5,
-}
+elastic = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.003, "gamma_m_1_s": 0.5}
 truth = {**elastic, "prony_1.share": 0.33, "prony_1.tau_s": 0.15}
 tracks_m = cs.simulate(
     swung(silicone, np.zeros((len(t_s), 4, 3))), truth, timestep_s=0.001
@@ -55,9 +43,7 @@ start = {"young_pa": cs.Unknown(1e4), "gamma_r_s": cs.Unknown(), **known}
 branch = {"prony_1.share": cs.Unknown(0.1), "prony_1.tau_s": cs.Unknown(0.5)}
 plain = cs.Body(mesh, density_kg_m3=100.0)
 without = cs.run(cs.Problem([swung(plain, tracks_m)], start))
-with_branch = cs.run(
-    cs.Problem([swung(silicone, tracks_m)], {**start, **branch})
-)
+with_branch = cs.run(cs.Problem([swung(silicone, tracks_m)], {**start, **branch}))
 print(without.trust.verdict, *without.trust.reasons, sep="\n  ")
 print(with_branch.table())
 low, high = with_branch.interval("young_pa")

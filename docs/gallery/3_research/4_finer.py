@@ -16,24 +16,15 @@ t_s = 0.01 * np.arange(50)
 poses = np.tile(np.eye(4), (len(t_s), 1, 1))
 poses[:, 2, 3] = 0.03 * np.sin(14 * t_s) * np.minimum(1, t_s / 0.2) ** 2
 hand = cs.Grasp(cs.Box((-1, -1, -1), (0.001, 1, 1)), poses)
-places_m = [
-    (0.12, 0.0, 0.0),
-    (0.12, 0.04, 0.04),
-    (0.08, 0.0, 0.04),
-    (0.04, 0.04, 0.0),
-]
+places_m = [(0.12, 0.0, 0.0), (0.12, 0.04, 0.04), (0.08, 0.0, 0.04), (0.04, 0.04, 0.0)]
 known = {"poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 
 
 def bar(divisions: tuple[int, int, int], tracks_m: np.ndarray) -> cs.Experiment:
     """A swung bar of so many cells."""
-    body = cs.Body(
-        cs.box_mesh((0.12, 0.04, 0.04), divisions), density_kg_m3=60.0
-    )
+    body = cs.Body(cs.box_mesh((0.12, 0.04, 0.04), divisions), density_kg_m3=60.0)
     seen = cs.Markers(t_s, tracks_m, sigma_m=2e-4, places_m=places_m)
-    return cs.Experiment(
-        body, t_s, [hand], seen, name="swing", nuisance=cs.Nuisance.none()
-    )
+    return cs.Experiment(body, t_s, [hand], seen, name="swing", nuisance=cs.Nuisance.none())
 
 
 # %%
@@ -43,9 +34,7 @@ tracks_m = cs.simulate(
     bar((12, 4, 4), blank), {"young_pa": 2e4, **known}, timestep_s=0.001
 ).markers_m
 tracks_m += np.random.default_rng(10).normal(scale=2e-4, size=tracks_m.shape)
-problem = cs.Problem(
-    [bar((6, 2, 2), tracks_m)], {"young_pa": cs.Unknown(1e4), **known}
-)
+problem = cs.Problem([bar((6, 2, 2), tracks_m)], {"young_pa": cs.Unknown(1e4), **known})
 run = cs.refine(cs.run(problem))
 print(run.table())
 run.plot(count=3)
@@ -54,10 +43,7 @@ run.plot(count=3)
 # The interval of the noise alone misses the truth by far; the one that holds the discretisation
 # does not.
 error, noise = run.refinement.errors["young_pa"], run.optimum["young_pa"]
-intervals = {
-    "noise": noise.statistical95,
-    "noise, mesh and step": run.interval("young_pa"),
-}
+intervals = {"noise": noise.statistical95, "noise, mesh and step": run.interval("young_pa")}
 held = {label: low < 2e4 < high for label, (low, high) in intervals.items()}
 assert held == {"noise": False, "noise, mesh and step": True}
 for k, (label, (low, high)) in enumerate(intervals.items()):

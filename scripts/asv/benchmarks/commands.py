@@ -33,9 +33,7 @@ class Commands:
         """Return the wall time of a solve with compiled kernels [s]."""
         return times["solve"].wall_s
 
-    def track_first_text_of_solve_s(
-        self, times: dict[str, WaitingTimes]
-    ) -> float:
+    def track_first_text_of_solve_s(self, times: dict[str, WaitingTimes]) -> float:
         """Return the time to the first text of a solve with compiled kernels [s]."""
         return times["solve"].first_s
 

@@ -21,11 +21,10 @@ class Assembly:
         return medians["jacobian"]["simd_1_ms"]
 
     def track_ratio_to_casadi_map(self, medians: dict) -> float:
-        """Return the time of the Jacobian by casadi.Function.map, divided by that of the compiled kernels."""
-        return (
-            medians["jacobian"]["casadi_map_ms"]
-            / medians["jacobian"]["simd_1_ms"]
-        )
+        """Return the time of the Jacobian by casadi.Function.map, divided by that of the compiled
+        kernels.
+        """
+        return medians["jacobian"]["casadi_map_ms"] / medians["jacobian"]["simd_1_ms"]
 
 
 class Contact:
@@ -53,17 +52,14 @@ class Sensitivities:
     def setup(self) -> None:
         """Evaluate the first experiment at the guess, with the body moving rigidly."""
         collocation = Problem.read(PROBLEM).collocation()
-        shapes = [
-            s.experiment.rigid_positions(s.dynamics.t_s)
-            for s in collocation.transcriptions
-        ]
+        shapes = [s.experiment.rigid_positions(s.dynamics.t_s) for s in collocation.transcriptions]
         z = collocation.pack(collocation.parameters.guess_q, shapes)
         self.part = next(iter(collocation.iterates(z)))
 
     def time_sweep(self) -> None:
         """Time a forward sweep with the columns of all parameters."""
-        Sweep(self.part.segment).forward(self.part.x, self.part.equations)
+        Sweep(self.part.transcription).forward(self.part.x, self.part.equations)
 
     def peakmem_sweep(self) -> None:
         """Measure the peak memory of the sweep that `time_sweep` times."""
-        Sweep(self.part.segment).forward(self.part.x, self.part.equations)
+        Sweep(self.part.transcription).forward(self.part.x, self.part.equations)
