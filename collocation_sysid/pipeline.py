@@ -26,7 +26,7 @@ from .problem import Problem
 from .program.collocation import Collocation
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import simulate_experiments, step_error
-from .runs.misspecifications import find_misspecifications
+from .runs.misspecifications import cause_notes, find_misspecifications
 from .runs.numerical_error import refine
 from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
@@ -62,7 +62,7 @@ class Run(SolvedProblem):
 
     def __str__(self) -> str:
         """Return the summary of the run as text, as printed in the terminal after a solve."""
-        from .result.run_sections import run_summary
+        from .result.run_summary import run_summary
 
         return plain_text(run_summary(self.result))
 
@@ -248,7 +248,9 @@ def run(
             return timed(answer)
         if seek_causes:
             say("testing possible causes of the misfit")
-            answer = replace(answer, causes=find_misspecifications(answer.solution))
+            causes = find_misspecifications(answer.solution)
+            tested = cause_notes(answer.solution, causes)
+            answer = replace(answer, causes=causes, notes=(*answer.notes, *tested))
         if problem.uncertainty.numerical and answer.uncertainty is not None:
             answer = refine(answer, report_progress=say, watch=watch)
         return timed(answer)

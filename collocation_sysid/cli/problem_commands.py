@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,6 +57,8 @@ class SolveCommand(ProblemOptions, OutputOptions):
         Print a line per iteration.
     strict : bool
         Exit code 1 if the verdict is doubtful.
+    details : bool
+        Show everything: statistical parts, corrections, notes, probes, residuals, times.
     budget : bool
         Show the contributions to the variance of each estimate.
     probe : bool
@@ -70,6 +73,7 @@ class SolveCommand(ProblemOptions, OutputOptions):
     scheduler: str | None = None
     verbose: bool = False
     strict: bool = False
+    details: bool = False
     budget: bool = False
     probe: bool = False
     pictures: bool = True
@@ -96,7 +100,7 @@ def solve(options: SolveCommand) -> None:
     The exit code is 0 if the search converged, 1 if it did not, or if the verdict is doubtful with
     --strict, 2 for bad input, and 130 after an interrupt.
     """
-    from ..result.run_sections import run_summary
+    from ..result.run_summary import next_step, run_summary
     from ..result.solve_progress import SolveProgress
 
     if options.method is not None:
@@ -125,7 +129,9 @@ def solve(options: SolveCommand) -> None:
                 ) from None
             until_shown.enter_context(INTERRUPTS.deferred())
         if not options.as_json:
-            print_result(run_summary(finished.result, budget=options.budget))
+            print_result(
+                run_summary(finished.result, details=options.details, budget=options.budget)
+            )
         # Notes of the problem were shown before.
         with SolveProgress(
             error_console,
@@ -142,8 +148,11 @@ def solve(options: SolveCommand) -> None:
     )
     if options.as_json:
         typer.echo(as_json(result))
-    elif result.elapsed_s.pictures is not None:
-        print_result(f"pictures drawn in {result.elapsed_s.pictures:.1f} s")
+    else:
+        if options.details and result.elapsed_s.pictures is not None:
+            print_result(f"pictures drawn in {result.elapsed_s.pictures:.1f} s")
+        again = shlex.join(["collocation-sysid", *sys.argv[1:]])
+        print_result(f"next: {next_step(result, folder, again)}")
     status = finished.solution.status
     if options.pictures and result.elapsed_s.pictures is None:
         raise typer.Exit(EXIT_INTERRUPTED)

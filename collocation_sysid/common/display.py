@@ -189,6 +189,36 @@ def short(value: float) -> str:
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
+def two_digits(deviation: float) -> str:
+    """Return a standard deviation with two significant digits, also where the second one is zero."""
+    return rounded(deviation, deviation)
+
+
+def rounded(value: float, deviation: float | None) -> str:
+    """Return a value to the place of the second significant digit of its standard deviation.
+
+    Without a positive, finite deviation the value has five significant digits.
+    """
+    if deviation is None or not isfinite(deviation) or deviation <= 0:
+        return f"{value:.5g}"
+    place = 1 - int(f"{deviation:.1e}".partition("e")[2])
+    if place <= 6:
+        return f"{round(value, place) + 0.0:.{max(0, place)}f}"
+    if not value:
+        return "0"
+    digits = int(f"{value:.1e}".partition("e")[2]) + place + 1
+    return f"{value:.{min(15, max(1, digits))}g}"
+
+
+def readable_stress(values_pa: Iterable[float]) -> tuple[float, str]:
+    """Return factor and name of the unit in which stresses [Pa] of one table read best: the largest
+    is below 10,000 of it.
+    """
+    largest = max((abs(each) for each in values_pa if isfinite(each)), default=0.0)
+    units = ((1.0, "Pa"), (1e-3, "kPa"), (1e-6, "MPa"))
+    return next((each for each in units if each[0] * largest < 1e4), (1e-9, "GPa"))
+
+
 def number(value: float | None, digits: int = 5) -> str:
     """Return a number with at most `digits` significant digits; a dash for None, NaN and infinity.
     Exponents have no leading zero.

@@ -145,7 +145,8 @@ def fit_rms(solution: Solution) -> dict[str, float | None]:
 def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
     """Yield RMS and largest distance in words; nothing without markers."""
     if error.rms_m:
-        yield (f"{1e3 * error.rms_m:.3f} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm")
+        largest = "" if error.max_m is None else f", at most {1e3 * error.max_m:.2f} mm"
+        yield f"{1e3 * error.rms_m:.3f} mm RMS{largest}"
 
 
 MARKERS = Feature(

@@ -76,19 +76,6 @@ def probe_lines(result: Result) -> list[str | Table]:
     return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
 
 
-def _size_and_ratio(probe: Probe) -> str:
-    """Return the size of a relaxed assumption with its standard error, and their ratio, which
-    decides on the significance; a size or error that is None counts as zero.
-
-    The standard error is that of the residuals, and χ² that of the stated σ: residuals larger than
-    σ allow a large decrease of χ² that is not significant.
-    """
-    size = probe.size or 0.0
-    error = probe.size_error or 0.0
-    ratio = f", {_ratio(probe):.1f} standard errors" if error else ""
-    return f"{source_label(probe.name)} ({short(size)} ± {short(error)}{ratio})"
-
-
 def _largest_probes(result: Result) -> list[Probe]:
     """Return the probe with the most significant size of each assumption, in the order of the
     assumptions; others are components of the same assumption.
@@ -193,9 +180,8 @@ def _conclusions(result: Result) -> Iterator[str]:
         if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
             yield f"alternative explanations with similar effects: {listed(others)}"
     elif not significant and is_routine(result):
-        *others, last = map(_size_and_ratio, _largest_probes(result))
-        tested = f"{', '.join(others)} or {last}" if others else last
-        yield f"no significant {tested}"
+        tested = listed(source_label(probe.name) for probe in _largest_probes(result))
+        yield f"tested without a finding: {tested}"
     elif not significant:
         yield "no subset of the data and no relaxed assumption changes the fit significantly"
     if not is_routine(result):

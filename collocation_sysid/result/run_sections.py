@@ -1,7 +1,8 @@
-"""Description of a run in words and tables, for the terminal and for an HTML page.
+"""Description of a run in words and tables: the sections of its report, which the summary in the
+terminal shares.
 
-`run_summary` is the text after a solve; `run_report` describes a run folder completely, with
-pictures. Both are made from the content of ``result.json``.
+`run_report` describes a run folder completely, with pictures. All sections are made from the
+content of ``result.json``.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ from ..common.display import (
     flattened_parts,
     millimetres,
     number,
-    short,
+    readable_stress,
+    rounded,
+    two_digits,
 )
 from ..common.files import is_own
 from ..common.pages import explain_command, page_url
@@ -43,7 +46,6 @@ from .probe_sections import (
     DEEPER_CHECK_ADVICE,
     STIFFNESS_NAMES,
     is_deeper_check_worthwhile,
-    probe_lines,
     probe_section,
 )
 from .replay import LARGEST_NUMBER, damaged_run_refused, read_arrays
@@ -57,8 +59,6 @@ VERDICT_MEANINGS = {
 SHOWN_ERRORS = 8
 # Samples between two shown errors of a marker: neighbouring errors have the same cause.
 ERROR_SPACING_SAMPLES = 5
-# Markers whose residuals are diagnosed in the summary.
-SHOWN_DIAGNOSES = 2
 # Estimates whose main sources of uncertainty are named.
 SHOWN_BUDGETS = 3
 # Sources named for each of these estimates.
@@ -71,39 +71,13 @@ SMALLEST_SHOWN_SHARE = 0.01
 SYSTEMATIC_RATIO = 1.5
 
 
-def run_summary(result: Result, folder: Path | None = None, budget: bool = False) -> list[Shown]:
-    """Return the description of a run that fits on one screen: outcome, verdict, estimates, fit,
-    notes, probes, and the diagnoses of the largest residuals.
-
-    Parameters
-    ----------
-    result : Result
-        Content of ``result.json``.
-    folder : Path, optional
-        The run folder, which the last line names; no such line by default.
-    budget : bool
-        Whether to add the complete table of contributions to each variance, if there is a budget.
-    """
-    largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
-    ended = [f"residuals: {each.sentence}" for each in largest]
-    sections = (
-        _outcome_section(result),
-        *estimate_sections(result),
-        _fit_section(result),
-        _notes_section(result),
-    )
-    tables = [budget_table(result)] if budget and result.budget else []
-    written = [] if folder is None else [f"written to {folder}"]
-    return [*flattened_parts(sections), *tables, *probe_lines(result), *ended, *written]
-
-
 def estimate_sections(result: Result) -> list[Shown]:
     """Return the verdict, the command that explains its remedies if there is a concern, the advice
     of a deeper check where that is worthwhile, and the table of parameters with their intervals,
     each as a part without title.
     """
     sections = [verdict_section(result.trust), *remedy_command(result.trust.concerns)]
-    sections += [*_deeper_check_advice(result), _parameter_section(result)]
+    sections += [*_deeper_check_advice(result), parameter_section(result)]
     return [*flattened_parts(sections)]
 
 
@@ -130,16 +104,16 @@ def run_report(run: str | Path) -> TitledParts:
             Line((badge, Span(took)), "quiet"),
             replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
             _cards(result),
-            *flattened_parts([_outcome_section(result)]),
+            *flattened_parts([outcome_section(result)]),
             *pictures[:1],
             TitledParts(
                 "What to do", (*remedy_lines(result.trust.concerns), *_deeper_check_advice(result))
             ),
-            _parameter_section(result),
+            parameter_section(result),
             TitledParts("Error bars", tuple(_error_bars(result))),
             probe_section(result),
-            _fit_section(result),
-            _notes_section(result),
+            fit_section(result),
+            notes_section(result),
             *_marker_place_sections(result),
             *_nuisance_sections(result),
             TitledParts("Residuals", tuple(_residual_tables(result, run))),
@@ -153,7 +127,7 @@ def run_report(run: str | Path) -> TitledParts:
 # What terminal and page show ----------------------------------------------------------------------
 
 
-def _outcome_section(result: Result) -> TitledParts:
+def outcome_section(result: Result) -> TitledParts:
     """Return the message with which the solve ended, in the colour of the verdict, followed by the
     largest violations of the equations of motion if it did not converge; the title is empty.
     """
@@ -200,7 +174,7 @@ def remedy_command(concerns: Iterable[Concern]) -> list[Line]:
     return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
 
 
-def _parameter_section(result: Result) -> TitledParts:
+def parameter_section(result: Result) -> TitledParts:
     """Return the section "Parameters": the table of all estimates with corrected values, combined
     and statistical uncertainties and guesses, and remarks on it.
 
@@ -208,7 +182,7 @@ def _parameter_section(result: Result) -> TitledParts:
     not determined, and on the largest contributions; each is left out if it does not apply.
     """
     values = result.collect_estimates()
-    rows = tuple((symbol_with_unit(name), *_estimate_row(result, name)) for name in values)
+    rows = tuple(estimate_row(result, name) for name in values)
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
     parts: list[Shown] = [Table("", heads, rows=rows, texts=1, faint=faint, note_column=1)]
@@ -239,19 +213,22 @@ def _parameter_section(result: Result) -> TitledParts:
     return TitledParts("Parameters", (*parts, *_largest_contributions(result), *result.basis))
 
 
-def _undetermined_sentence(result: Result) -> list[str]:
-    """Return a sentence that names the estimates whose interval is wider than their value, without
-    those that a reason of the verdict names.
-
-    The largest contribution to each variance is named too; the list is empty if there is no such
-    estimate.
-    """
-    stated = {
+def stated_as_undetermined(result: Result) -> set[str]:
+    """Return the names of the estimates that a reason of the verdict calls undetermined."""
+    return {
         name
         for concern in result.trust.concerns
         if concern.code in ("information/none", "information/combined", "specimen/none")
         for name in concern.data.get("names", [concern.data.get("name")])
     }
+
+
+def _undetermined_sentence(result: Result) -> list[str]:
+    """Return a sentence that names the estimates whose interval is wider than their value, without
+    those that a reason of the verdict names, with the largest contribution to each variance; empty
+    if there is no such estimate.
+    """
+    stated = stated_as_undetermined(result)
     sources = []
     for name, shares in result.budget.items():
         if name in stated or name not in result.collect_estimates():
@@ -330,39 +307,57 @@ def budget_table(result: Result) -> Table:
     return Table("", ("% of the variance", *map(symbol_of, lines)), rows=tuple(rows))
 
 
-def _estimate_row(result: Result, name: str) -> tuple[str, ...]:
-    """Return the seven cells of an estimate after its name: value, combined standard uncertainty
+def estimate_row(result: Result, name: str) -> tuple[str, ...]:
+    """Return the eight cells of an estimate: name with unit, value, combined standard uncertainty
     and interval, statistical and systematic standard uncertainty, guess, and a remark.
 
-    Numbers are in the unit of the name and without it; unknown ones are empty. Instead of an
-    interval the cell is "at its bound"; if the estimate has a `reason`, which is the remark, it is
-    "not identifiable", or "not determined" without a statistical interval. Instead of the guess of
-    a fixed or tied parameter the cell is "fixed" or "tied".
+    All numbers have the place of the second significant digit of the combined uncertainty; unknown
+    ones are empty. Instead of an interval the cell is "at its bound"; if the estimate has a
+    `reason`, which is the remark, it is "not identifiable", or "not determined" without a
+    statistical interval. An interval that is wider than the value is followed by "not determined",
+    and the value has no ±. Instead of the guess of a fixed or tied parameter the cell is "fixed" or
+    "tied".
     """
-    each = result.collect_estimates()[name]
-    interval = _interval_text(each.combined95)
-    remark = each.reason or ""
+    values = result.collect_estimates()
+    each = values[name]
+    factor, unit = 1.0, unit_of(name)
+    if unit == "Pa":
+        factor, unit = readable_stress(e.value for n, e in values.items() if unit_of(n) == "Pa")
+    deviation, statistical, systematic = (
+        None if size is None else factor * size
+        for size in (
+            each.combined_std_error,
+            each.statistical_std_error,
+            each.compute_systematic_std_error(),
+        )
+    )
+    place = statistical if deviation is None else deviation
+    interval = _interval_text(each.combined95, factor, place)
+    is_vague = each.combined95 is not None and not each.is_determined
     if each.at_bound:
         interval = "at its bound"
     elif each.reason:
         interval = "not determined" if each.statistical95 is None else "not identifiable"
-    guess = "" if each.guess is None else f"{each.guess:.5g}"
+    elif is_vague:
+        interval = f"not determined ({interval})"
+    guess = "" if each.guess is None else f"{factor * each.guess:.5g}"
     if each.fixed:
         guess = "tied" if each.tied else "fixed"
     return (
-        f"{each.value:.5g}",
-        _deviation_text(each.combined_std_error),
+        f"{symbol_of(name)} {unit}".strip(),
+        rounded(factor * each.value, place),
+        "" if is_vague else _deviation_text(deviation),
         interval,
-        _deviation_text(each.statistical_std_error),
-        _deviation_text(each.compute_systematic_std_error()),
+        _deviation_text(statistical),
+        _deviation_text(systematic),
         guess,
-        remark,
+        each.reason or "",
     )
 
 
 def _deviation_text(deviation: float | None) -> str:
     """Return a standard deviation as text; "" if it is None, that is unknown."""
-    return "" if deviation is None else short(deviation)
+    return "" if deviation is None else two_digits(deviation)
 
 
 def refinement_table(result: Result) -> Table | Line:
@@ -387,8 +382,8 @@ def refinement_table(result: Result) -> Table | Line:
                 "" if error.step_order is None else f"{error.step_order:.1f}",
                 "" if error.mesh is None else f"{error.mesh:+.3g}",
                 "" if error.mesh_order is None else f"{error.mesh_order:.1f}",
-                f"{each.value:.5g}",
-                _interval_text(each.combined95),
+                rounded(each.value, each.combined_std_error),
+                _interval_text(each.combined95, 1.0, each.combined_std_error),
             )
         )
     return Table(
@@ -398,20 +393,25 @@ def refinement_table(result: Result) -> Table | Line:
     )
 
 
-def _interval_text(ends: tuple[float, float] | None) -> str:
-    """Return the ends of an interval as text; "" for None."""
-    return "" if ends is None else "{:.5g} … {:.5g}".format(*ends)
+def _interval_text(ends: tuple[float, float] | None, factor: float, deviation: float | None) -> str:
+    """Return the ends of an interval, multiplied by a factor, to the place of a deviation; "" for
+    None.
+    """
+    if ends is None:
+        return ""
+    low, high = (rounded(factor * end, deviation) for end in ends)
+    return f"{low} … {high}"
 
 
-def _fit_section(result: Result) -> TitledParts:
+def fit_section(result: Result) -> TitledParts:
     """Return the section "Fit": misfit of the measurements, violation of the equations of motion,
     errors of each forward simulation, elapsed times, iterations, and notes on nuisance parameters.
     """
     fit = result.fit
     experiments = result.fit.experiments
     marked = any(each.samples for each in experiments.values())
-    markers = f"markers: {_millimetres(fit.rms_m)} mm RMS, "
-    markers += f"{_millimetres(fit.noise_rms_m)} mm expected from noise alone; "
+    markers = f"markers: {millimetres_text(fit.rms_m)} mm RMS, "
+    markers += f"{millimetres_text(fit.noise_rms_m)} mm expected from noise alone; "
     dynamics = (
         f"equations of motion violated by at most {result.dynamics.max_violation_n:.1e} N "
         f"({result.dynamics.max_violation_relative:.1e} of the largest force)"
@@ -468,23 +468,23 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
         return
     own = copy_fields(PredictionErrors, simulated)
     units = simulated.reading_unit
-    yield f"{kind} '{name}': {_errors_text(own, units) or 'no measurements to compare with'}"
+    yield f"{kind} '{name}': {errors_text(own, units) or 'no measurements to compare with'}"
     if simulated.fitted:
         return
     if simulated.blind is not None:
-        blind = _errors_text(simulated.blind, units)
+        blind = errors_text(simulated.blind, units)
         yield f"  with the nuisance parameters of the fitted recordings (blind): {blind}"
     if simulated.copied is not None:
         copied = simulated.copied
         yield (
             f"  for comparison, the measurements of '{copied.copied}' as the prediction: "
-            f"{_errors_text(copied.error, units)}"
+            f"{errors_text(copied.error, units)}"
         )
     elif simulated.not_copied:
         yield f"  no comparison with measurements of another recording: {simulated.not_copied}"
 
 
-def _errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
+def errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
     """Return the errors of a prediction in words; "" if nothing is compared.
 
     Errors that are None, and errors of markers and forces that are zero, are left out.
@@ -492,12 +492,12 @@ def _errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> st
     return "; ".join(text for feature in FEATURES for text in feature.error_texts(error, units))
 
 
-def _millimetres(metres: float) -> str:
+def millimetres_text(metres: float) -> str:
     """Return a length [m] as text in millimetres, without the unit."""
     return f"{1e3 * metres:.3f}"
 
 
-def _notes_section(result: Result) -> TitledParts:
+def notes_section(result: Result) -> TitledParts:
     """Return the notes of a run as a section."""
     return TitledParts("Notes", tuple(f"note: {note}" for note in result.notes))
 

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ..features.registry import FEATURES
 from ..methods.solution import Solution
-from ..statistics.misspecification.fit_misspecifications import motion_misspecifications
+from ..statistics.misspecification.fit_misspecifications import (
+    markers_miss,
+    motion_misspecifications,
+)
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
 from ..statistics.misspecification.specimen_misspecifications import find_specimen_misspecifications
+
+# Note on tests of hypotheses without a result.
+NO_CAUSE = (
+    "possible causes of the misfit were tested (clock, slip in the grasp, gravity, layer of the "
+    "grasp): none explains it"
+)
 
 
 def find_misspecifications(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
@@ -35,3 +46,10 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     hypotheses += find_specimen_misspecifications(solution)
     hypotheses += motion_misspecifications(solution, hypotheses, budget=budget)
     return rank(hypotheses)
+
+
+def cause_notes(solution: Solution, causes: Sequence[Hypothesis]) -> tuple[str, ...]:
+    """Return a note that refits found no cause of a misfit; empty if there is a cause, or if the
+    markers do not miss.
+    """
+    return () if causes or not markers_miss(solution) else (NO_CAUSE,)

@@ -22,7 +22,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 
 
 def only(*rows: cs.NuisanceRow, **others) -> cs.Nuisance:
@@ -78,7 +78,7 @@ def test_a_run_tells_of_it_and_the_verdict_judges_it():
     assert told[1].prior == 0.02
     assert abs(told[1].value - far * 0.02) < 3.5 * told[1].std_error < 0.01
     assert any("camera scale" in reason for reason in finished.trust.reasons)
-    said = " ".join(plain_text(run_summary(finished.result, Path("run"))).split())
+    said = " ".join(plain_text(run_summary(finished.result, Path("run"), details=True)).split())
     assert re.search(r"camera scale (9\.\d|10) % \(prior ±2 %\)", said)
 
 

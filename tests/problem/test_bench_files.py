@@ -23,7 +23,8 @@ from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.time_tables import read_pressure
-from collocation_sysid.result.run_sections import run_report, run_summary
+from collocation_sysid.result.run_sections import run_report
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.result.synthesis import write_data
 from collocation_sysid.statistics.misspecification.modal_misspecifications import (
     find_misspecifications_by_modes,

@@ -47,7 +47,7 @@ from collocation_sysid.recording import (
     read_displacement,
 )
 from collocation_sysid.result.check_sections import full_check_tables
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors
 from collocation_sysid.runs.forward_simulation import ForwardSimulation
@@ -442,7 +442,7 @@ def test_a_test_bench_without_markers_is_checked(tmp_path):
 
 def test_a_run_without_markers_speaks_of_forces(tmp_path):
     found = run(cs.Problem.read(bench(tmp_path)), seek_causes=False)
-    said = plain_text(run_summary(found.result, tmp_path))
+    said = plain_text(run_summary(found.result, tmp_path, details=True))
     assert " mm RMS" not in said
     assert re.search(r"wrench of 'press': \S+ N RMS \(sigma 0.01 N\)", said)
     assert re.search(r"forward simulation 'press': \S+ N RMS", said)

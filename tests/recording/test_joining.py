@@ -22,7 +22,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.recording.loads import smooth_ramp
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
@@ -168,7 +168,7 @@ def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
 
 def test_the_time_is_told_with_its_error(tmp_path: Path):
     found = run(Problem([with_noise(seen(0.0634, 0.06), 1)], GUESS), seek_causes=False)
-    said = " ".join(plain_text(run_summary(found.result, tmp_path)).split())
+    said = " ".join(plain_text(run_summary(found.result, tmp_path, details=True)).split())
     assert re.search(
         r"joining of mass 1 [\d.]+ ± [\d.]+ ms later than 0.06 s \(prior ±10 ms\)", said
     )

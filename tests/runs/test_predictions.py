@@ -18,7 +18,7 @@ from collocation_sysid.common.serialisation import as_json, read
 from collocation_sysid.program.depth.depth_comparison import DepthError
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.prediction import CopyError, nearest_recording_error
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.assessment import prediction_concerns
@@ -238,7 +238,7 @@ def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
     assert copied.copied == "fitted"
     assert copied.error.rms_m == pytest.approx(np.sqrt(6) * 2e-4, rel=0.1)  # the noise of both
     assert stored(alike)["rollout"]["new"]["copied"]["copied"] == "fitted"
-    assert "the measurements of 'fitted' as the prediction: " in shown(alike)
+    assert "(measurements of 'fitted' as the prediction: " in shown(alike)
 
 
 @pytest.mark.long

@@ -17,10 +17,12 @@ from kit.problems import EDGE_M, TRUTH, box, hung_cube, measured, noisy, smooth_
 from matplotlib.collections import PolyCollection
 
 import collocation_sysid as cs
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.validated_classes import validated
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.method_options import MethodOptions
 from collocation_sysid.result.element_fields import ElementFields
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.check import check_problem
 
 UNKNOWN = {
@@ -160,11 +162,12 @@ def test_intervals_of_a_run_that_has_not_converged_are_nan():
     assert np.isnan([low, high, run.std_error("mu_pa")]).all()
 
 
-def test_a_printed_run_has_all_that_the_terminal_shows():
+def test_a_printed_run_is_the_summary_of_the_terminal():
     noted = cs.run(
         cs.Problem([noisy(hung_cube())], UNKNOWN, notes=("seen through glass",)), seek_causes=False
     )
-    shown = str(noted)
+    assert str(noted) == plain_text(run_summary(noted.result))
+    shown = plain_text(run_summary(noted.result, details=True))
     assert noted.table() in shown
     assert noted.solution.message in shown
     for line in (

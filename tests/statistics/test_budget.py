@@ -31,7 +31,7 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.recording.nuisance import KINDS
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.combined_intervals import combine
 from collocation_sysid.statistics.budget.consider_analysis import (

@@ -15,7 +15,7 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.features.contact_feature import contact_concerns
 from collocation_sysid.model.contact.contact_summary import ContactSummary, contact_summaries
 from collocation_sysid.recording import Experiment
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.result_content import Result
 
@@ -197,7 +197,9 @@ def test_what_several_recordings_share_is_said_once():
 def test_what_friction_did_is_told_in_a_line_and_kept_in_the_result(tmp_path):
     run = answer(poked(friction=0.3, place_sigma_m=None))
     said = " ".join(
-        plain_text(run_summary(run.result, run.save(tmp_path / "run", frames=False))).split()
+        plain_text(
+            run_summary(run.result, run.save(tmp_path / "run", frames=False), details=True)
+        ).split()
     )
     assert said.count("friction of ball in 'poke': at most") == 1
     (rubbed,) = run.result.fit.experiments["poke"].friction.values()

@@ -24,7 +24,7 @@ from collocation_sysid import (
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.problem.problem_options import UncertaintyOptions
 from collocation_sysid.program.simulation import with_wrenches
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
 
@@ -135,7 +135,7 @@ def test_the_combined_interval_contains_the_modulus_although_the_faces_slid(slid
     assert low < YOUNG_PA < high
     assert next(iter(fitted.budget["young_pa"].shares)) == "platen_slip"
     text = str(run_summary(fitted.result))
-    assert "to reduce the contribution of platen slip: " in text
+    assert "; to reduce platen slip, " in text
     assert 'platen_slip = "none"' in text
 
 

@@ -27,7 +27,7 @@ from collocation_sysid import (
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.step_counting import listen_to_shares
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.probes.deep_probes import WINDOWS, Probe
@@ -177,7 +177,9 @@ def test_a_solve_makes_the_routine_probes_and_all_of_them_where_asked_to(tmp_pat
     names = [p.name.partition(" ")[0] for p in routine]
     assert [*dict.fromkeys(names)] == ["stiffness_drift", "memory_share", "clock_rate"]
     assert all(p.routine for p in routine)
-    assert "no significant stiffness drift (" in plain.out
+    assert "without a finding" not in plain.out
+    told = plain_text(run_summary(Result.read(tmp_path / "plain"), details=True))
+    assert "tested without a finding: stiffness drift, memory share" in told
     probing = run_command("solve", file, "--out", tmp_path / "probed", "--quiet", "--probe")
     deep = Result.read(tmp_path / "probed").probes
     assert not any(p.routine for p in deep)

@@ -27,12 +27,8 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.result.probe_sections import (
-    DEEPER_CHECK_ADVICE,
-    _size_and_ratio,
-    is_deeper_check_worthwhile,
-)
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.probe_sections import DEEPER_CHECK_ADVICE, is_deeper_check_worthwhile
+from collocation_sysid.result.run_summary import next_step, run_summary
 from collocation_sysid.statistics.assessment import Assessment, probe_concerns
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS
@@ -131,7 +127,8 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(faul
         if name in TRUTH:  # the corrected estimates are right
             assert abs(move.value - TRUTH[name]) < 3.5 * move.std_error
     assert is_deeper_check_worthwhile(wrongly.result)
-    assert DEEPER_CHECK_ADVICE in plain_text(run_summary(wrongly.result, Path("runs")))
+    assert DEEPER_CHECK_ADVICE in plain_text(run_summary(wrongly.result, details=True))
+    assert next_step(wrongly.result, Path("runs"), "solve").startswith("solve --probe ")
 
 
 # Level of significance ----------------------------------------------------------------------------
@@ -276,21 +273,6 @@ def test_a_significant_routine_probe_recommends_the_comparison_of_laws():
     assert "compare-models" not in concern.message
     remedy = TOPICS["assumption"].remedy
     assert "compare-models --damping" in remedy
-
-
-def test_an_insignificant_probe_shows_what_decides():
-    """Residuals far larger than sigma allow a large decrease of χ²."""
-    probe = Probe(
-        "assumption",
-        "clock_rate",
-        chi_squared=12355.8,
-        moves={},
-        size=0.015,
-        size_error=0.0051,
-        routine=True,
-    )
-    text = _size_and_ratio(probe)
-    assert text == "clock rate (0.015 ± 0.0051, 2.9 standard errors)"
 
 
 def test_the_advice_names_the_command_and_the_argument():

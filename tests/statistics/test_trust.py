@@ -21,7 +21,8 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.run_sections import remedy_command, run_summary
+from collocation_sysid.result.run_sections import remedy_command
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.statistics.assessment import (
     GROSS_MISFIT,
     MISFIT,

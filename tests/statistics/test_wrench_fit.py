@@ -140,7 +140,8 @@ def test_a_run_tells_of_the_wrench(tmp_path: Path):
     from collocation_sysid.common.display import plain_text
     from collocation_sysid.result.pictures.album import redraw_pictures
     from collocation_sysid.result.report import report_html
-    from collocation_sysid.result.run_sections import run_report, run_summary
+    from collocation_sysid.result.run_sections import run_report
+    from collocation_sysid.result.run_summary import run_summary
 
     said = plain_text(run_summary(run.result, folder))
     assert "wrench of 'hung cube'" in said

@@ -24,7 +24,7 @@ from ...errors import InputError
 from ...result.animation import experiment_named
 from ...result.interactive_view import DEFAULT_FIELD, field_on_faces
 from ...result.replay import MotionRecord, read_run
-from ...result.run_sections import run_summary
+from ...result.run_summary import run_summary
 from ...result.run_writers import replaced_folder
 from ...runs.result_content import Result
 

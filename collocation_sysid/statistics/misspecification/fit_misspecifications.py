@@ -78,10 +78,10 @@ def motion_misspecifications(
         Largest number of sweeps over the first samples for all refits together; by default three
         times the work of the fit, at most 150.
     """
-    fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
-    misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
+    misfits = _misfits(solution)
     if max(misfits) <= NOISE:
         return []
+    fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
     worst = fitted[int(np.argmax(misfits))]
     hypotheses = list(
         find_misspecifications_by_modes(
@@ -92,6 +92,16 @@ def motion_misspecifications(
     if certainty < CERTAIN:
         hypotheses += _refit_hypotheses(solution, worst, budget=budget)
     return hypotheses
+
+
+def markers_miss(solution: Solution) -> bool:
+    """Return whether the markers of an experiment miss by more than `NOISE` σ."""
+    return max(_misfits(solution)) > NOISE
+
+
+def _misfits(solution: Solution) -> list[float]:
+    fitted = (transcription.experiment for transcription in solution.collocation.transcriptions)
+    return [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
 
 
 def _refit_hypotheses(

@@ -1,0 +1,242 @@
+"""Summary of a run for the terminal: what a person acts on, in about sixteen lines."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from ..common.display import Line, Shown, Table, flattened_parts, number
+from ..common.serialisation import copy_fields
+from ..errors import listed
+from ..features.measurement_results import FittedExperiment, PredictionErrors, SimulatedExperiment
+from ..fem.laws.constants import symbol_of, unit_of
+from ..runs.misspecifications import NO_CAUSE
+from ..runs.result_content import Result
+from ..statistics.budget.uncertainty_budget import source_label
+from ..statistics.remedies import remedy_for
+from .probe_sections import (
+    STIFFNESS_NAMES,
+    is_deeper_check_worthwhile,
+    is_routine,
+    probe_lines,
+    probe_section,
+)
+from .run_sections import (
+    budget_table,
+    errors_text,
+    estimate_row,
+    estimate_sections,
+    fit_section,
+    millimetres_text,
+    notes_section,
+    outcome_section,
+    remedy_command,
+    stated_as_undetermined,
+    verdict_section,
+)
+
+# Derived moduli in the summary; others are in the details.
+SHOWN_MODULI = ("young_pa", "poisson")
+# Sources of uncertainty in the summary, and the smallest share of a variance that counts.
+SHOWN_SOURCES = 3
+SMALLEST_SHOWN_SHARE = 0.01
+
+
+def run_summary(
+    result: Result, folder: Path | None = None, details: bool = False, budget: bool = False
+) -> list[Shown]:
+    """Return verdict with reasons, estimates, what limits them, what they are relative to, and the
+    quality of the fit.
+
+    Parameters
+    ----------
+    result : Result
+        Content of ``result.json``.
+    folder : Path, optional
+        The run folder, which the last line names; no such line by default.
+    details : bool
+        Whether everything that the report has in words and tables follows: statistical and
+        systematic parts, corrections, notes, probes, residuals, and times.
+    budget : bool
+        Whether to add the complete table of contributions to each variance, if there is a budget.
+    """
+    tables = [budget_table(result)] if budget and result.budget else []
+    written = [] if folder is None else [f"written to {folder}"]
+    return [*(_details(result) if details else _brief(result)), *tables, *written]
+
+
+def next_step(result: Result, folder: Path, solve_command: str) -> str:
+    """Return the command that makes most sense after a solve, with its purpose.
+
+    Parameters
+    ----------
+    result : Result
+        Content of ``result.json``.
+    folder : Path
+        The run folder.
+    solve_command : str
+        The command with which it was solved.
+    """
+    program = "collocation-sysid"
+    run = shlex.quote(str(folder))
+    if result.converged and is_deeper_check_worthwhile(result):
+        return f"{solve_command} --probe (refits parts of the data and relaxes each assumption)"
+    meshed = any(each.test is None for each in result.fit.experiments.values())
+    refinable = meshed and result.budget and result.provenance.problem_file is not None
+    if (
+        result.trust.verdict == "good"
+        and refinable
+        and "mesh" not in (result.list_discretisation_kinds())
+    ):
+        return (
+            f"{program} refine {run} (measures the mesh error, which the intervals do not contain)"
+        )
+    return f"{program} report {run} (everything on one page, with the pictures)"
+
+
+def _brief(result: Result) -> list[Shown]:
+    outcome = [] if result.converged else [outcome_section(result)]
+    probes = probe_lines(result)
+    if is_routine(result) and not any(probe.sentences for probe in result.probes):
+        probes = []
+    sections = (*outcome, verdict_section(result.trust))
+    return [
+        *flattened_parts(sections),
+        *remedy_command(result.trust.concerns),
+        *(Line(note, "quiet") for note in result.notes if note == NO_CAUSE),
+        *_estimates(result),
+        *_limit(result),
+        *_basis(result),
+        *_fit(result),
+        *probes,
+    ]
+
+
+def _details(result: Result) -> list[Shown]:
+    sections = (
+        outcome_section(result),
+        *estimate_sections(result),
+        fit_section(result),
+        notes_section(result),
+        probe_section(result),
+    )
+    ended = [f"residuals: {each.sentence}" for each in result.residuals]
+    return [*flattened_parts(sections), *ended]
+
+
+def _estimates(result: Result) -> Iterator[Shown]:
+    """Yield the table of estimates, a line with the fixed parameters, and one for each field."""
+    values = result.collect_estimates()
+    shown = [name for name in values if name in result.parameters or name in SHOWN_MODULI]
+    fixed = [name for name in shown if values[name].fixed and not values[name].tied]
+    free = [name for name in shown if name not in fixed]
+    if free:
+        rows = []
+        for name in free:
+            symbol, value, deviation, interval, statistical, _, guess, _ = estimate_row(
+                result, name
+            )
+            rows.append(
+                (symbol, value, deviation, interval or guess * (guess == "tied"), statistical)
+            )
+        yield Table("", ("", "value", "±", "95 % interval", "± stat"), rows=tuple(rows))
+    if fixed:
+        stated = (
+            f"{symbol_of(name)} {number(values[name].value)} {unit_of(name)}".strip()
+            for name in fixed
+        )
+        yield f"fixed: {', '.join(stated)}"
+    yield from (field.sentence(name) for name, field in result.fields.items())
+
+
+def _limit(result: Result) -> Iterator[str]:
+    """Yield a sentence on what limits the answer and what to measure: for the estimates that are
+    not determined, or else for the most important stiffness.
+    """
+    values = result.collect_estimates()
+    known = [name for name in result.budget if name in values and result.budget[name]]
+    if not known:
+        return
+    stated = stated_as_undetermined(result)
+    vague = [name for name in known if name not in stated and not values[name].is_determined]
+    shown = [name for name in vague if name in result.parameters or name in SHOWN_MODULI]
+    stiffness = next((name for name in STIFFNESS_NAMES if name in known), known[0])
+    name = next(iter(shown), stiffness)
+    largest = next(iter(result.budget[name]))
+    sources = [
+        f"{source_label(source)} {share:.0%}"
+        for source, share in [*result.budget[name].items()][:SHOWN_SOURCES]
+        if share > SMALLEST_SHOWN_SHARE
+    ]
+    subject = f"variance of {symbol_of(name)}: {', '.join(sources)}"
+    if shown:
+        symbols = listed(map(symbol_of, shown))
+        subject = f"not determined: {symbols}; {subject}"
+    yield f"{subject}; to reduce {source_label(largest)}, {remedy_for(largest)}"
+
+
+def _basis(result: Result) -> list[str]:
+    """Return one line on what the values refer to."""
+    return ["; ".join(result.basis)] if result.basis else []
+
+
+def _fit(result: Result) -> Iterator[Shown]:
+    """Yield the quality of the fit and of the forward simulations: a line for one recording, a
+    table with a row for each of several.
+    """
+    fitted = result.fit.experiments
+    simulated = result.rollout.experiments
+    quality = []
+    if any(each.samples for each in fitted.values()):
+        noise = millimetres_text(result.fit.noise_rms_m)
+        quality.append(
+            f"markers {millimetres_text(result.fit.rms_m)} mm RMS ({noise} mm expected from noise)"
+        )
+    if result.uncertainty is not None:
+        quality.append(f"reduced χ² {number(result.uncertainty.reduced_chi_squared, 3)}")
+    if len(simulated) == 1:
+        (name,) = simulated
+        errors = _fit_errors(replace(fitted[name], samples=0))
+        own = [errors] if errors else []
+        prediction = _simulation_text(simulated[name])
+        yield f"fit: {', '.join([*quality, *own])}; forward simulation: {prediction}"
+        return
+    if quality:
+        yield f"fit: {', '.join(quality)}"
+    rows = tuple(
+        (
+            name,
+            _fit_errors(fitted[name]) if name in fitted else "validation",
+            _simulation_text(each),
+        )
+        for name, each in simulated.items()
+    )
+    yield Table("", ("recording", "fit", "forward simulation"), rows=rows, names=3)
+
+
+def _fit_errors(fitted: FittedExperiment) -> str:
+    """Return the residuals of a recording in words."""
+    errors = PredictionErrors(
+        rms_m=fitted.rms_m if fitted.samples else None,
+        wrench_rms_n=fitted.wrench_rms_n,
+        wrench_rms_nm=fitted.wrench_rms_nm,
+        reading_rms=fitted.reading_rms,
+        depth=fitted.depth,
+    )
+    return errors_text(errors, fitted.reading_unit)
+
+
+def _simulation_text(simulated: SimulatedExperiment) -> str:
+    """Return the errors of a forward simulation in words; of a validation, those of the blind
+    prediction and beside it those of a copy of the nearest measurements.
+    """
+    if simulated.failed is not None:
+        return f"failed: {simulated.failed}"
+    own = simulated.blind or copy_fields(PredictionErrors, simulated)
+    text = errors_text(own, simulated.reading_unit) or "no measurements to compare with"
+    if simulated.copied is not None:
+        copied = errors_text(simulated.copied.error, simulated.reading_unit)
+        text += f" (measurements of '{simulated.copied.copied}' as the prediction: {copied})"
+    return text

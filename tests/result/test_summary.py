@@ -1,0 +1,132 @@
+"""The summary in the terminal: in proportion, with consistent digits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kit.problems import TRUTH, hung_cube
+
+import collocation_sysid as cs
+from collocation_sysid.common.display import plain_text, readable_stress, rounded, two_digits
+from collocation_sysid.result.run_summary import next_step, run_summary
+from collocation_sysid.runs.misspecifications import NO_CAUSE
+from collocation_sysid.runs.result_content import Result
+
+MOST_LINES = 16
+
+
+@cache
+def solved(recordings: int = 1) -> Result:
+    """A swinging cube, once or as several recordings with the same residuals."""
+    if recordings > 1:
+        one = solved()
+        names = [f"swing {k + 1}" for k in range(recordings)]
+        (fitted,) = one.fit.experiments.values()
+        (simulated,) = one.rollout.experiments.values()
+        return replace(
+            one,
+            fit=replace(one.fit, experiments=dict.fromkeys(names, fitted)),
+            rollout=replace(one.rollout, experiments=dict.fromkeys(names, simulated)),
+        )
+    hung = hung_cube(10)
+    exact_m = cs.simulate(hung, TRUTH, "midpoint", substeps=1).markers_m
+    noise_m = 1e-4 * np.random.default_rng(0).standard_normal(exact_m.shape)
+    sigma_m = np.full(exact_m.shape[1], 1e-4)
+    seen = replace(hung.markers, positions_m=exact_m + noise_m, sigma_m=sigma_m)
+    unknown = TRUTH | {"mu_pa": cs.Unknown(250.0), "lambda_pa": cs.Unknown(300.0)}
+    problem = cs.Problem([replace(hung, markers=seen)], unknown, substeps=1)
+    return cs.run(problem, seek_causes=False).result
+
+
+def lines(result: Result, **options: bool) -> list[str]:
+    return plain_text(run_summary(result, Path("runs/swing"), **options), width=10_000).splitlines()
+
+
+def test_one_recording_takes_one_screen():
+    shown = lines(solved())
+    reasons = solved().trust.concerns
+    assert len(shown) <= MOST_LINES
+    assert shown[0] == f"Verdict: {solved().trust.verdict}"
+    assert shown[-1] == "written to runs/swing"
+    assert sum(line.startswith("fit: ") for line in shown) == 1
+    assert sum("to reduce " in line for line in shown) == 1 + sum(
+        "to reduce " in concern.message for concern in reasons
+    )
+    assert not any(line.startswith(("note: ", "residuals: ", "time: ")) for line in shown)
+
+
+def test_each_recording_takes_one_line():
+    one, three = lines(solved()), lines(solved(3))
+    rows = [line for line in three if line.startswith("swing ")]
+    assert [row.split("  ")[0] for row in rows] == ["swing 1", "swing 2", "swing 3"]
+    assert len(three) <= len(one) + len(rows) + 1 + len(solved(3).trust.concerns)
+
+
+def test_everything_else_is_in_the_details():
+    told = "\n".join(lines(solved(), details=True))
+    for words in ("Converged", "± syst", "guess", "note: ", "residuals: ", "time: search"):
+        assert words in told
+    for note in solved().notes:
+        assert note in told
+
+
+def test_tests_of_causes_state_that_they_found_none():
+    tested = replace(solved(), notes=(*solved().notes, NO_CAUSE))
+    assert NO_CAUSE in lines(tested)
+
+
+def test_a_probe_without_a_finding_is_not_called_insignificant_beside_its_ratio():
+    told = "\n".join(lines(solved(), details=True))
+    assert "no significant" not in told
+
+
+@pytest.mark.parametrize(
+    ("value", "deviation", "texts"),
+    [
+        (24948.0, 1407.0, ("24900", "1400")),
+        (24.948, 1.407, ("24.9", "1.4")),
+        (0.30089, 0.0996, ("0.30", "0.10")),
+        (0.30089, 0.1004, ("0.30", "0.10")),
+        (100.81, 5.5, ("100.8", "5.5")),
+        (2e-9, 3e-11, ("2e-09", "3e-11")),
+        (-0.0004, 0.02, ("0.000", "0.020")),
+        (7.0, 0.0, ("7", "0")),
+    ],
+)
+def test_a_value_ends_with_the_second_digit_of_its_uncertainty(value, deviation, texts):
+    assert (rounded(value, deviation), two_digits(deviation)) == texts
+
+
+def test_digits_do_not_depend_on_the_last_bits():
+    for k in range(-50, 50):
+        assert two_digits(0.1 * (1 + k * 1e-12)) == "0.10"
+
+
+def test_stresses_of_a_table_have_one_readable_unit():
+    assert readable_stress([700.0, 300.0]) == (1.0, "Pa")
+    assert readable_stress([24948.0, 9588.0]) == (1e-3, "kPa")
+    assert readable_stress([4e5, 2e9]) == (1e-6, "MPa")
+
+
+def test_the_table_has_the_unit_of_its_values():
+    result = solved()
+    stiff = replace(result.parameters["mu_pa"], value=3e5, combined_std_error=2e4)
+    parameters = {**result.parameters, "mu_pa": replace(stiff, combined95=(2.6e5, 3.4e5))}
+    (row,) = (
+        line for line in lines(replace(result, parameters=parameters)) if line.startswith("μ ")
+    )
+    assert row.split()[:7] == ["μ", "kPa", "300", "20", "260", "…", "340"]
+
+
+def test_the_next_command_suits_the_result():
+    result = solved()
+    folder = Path("runs/a swing")
+    assert "report 'runs/a swing' (" in next_step(result, folder, "collocation-sysid solve p.toml")
+    file = replace(result.provenance, problem_file="p.toml")
+    good = replace(result, provenance=file, trust=replace(result.trust, concerns=()))
+    assert good.trust.verdict == "good"
+    assert "refine 'runs/a swing' (" in next_step(good, folder, "collocation-sysid solve p.toml")
