@@ -25,8 +25,8 @@ from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from ..statistics.assessment import forward_simulation_concerns
 from ..statistics.concerns import Concern, concern_if
+from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
 from .camera_clock_misspecifications import MESSAGES_OF_TIMES, camera_clock_hypotheses
 from .camera_image_misspecifications import MESSAGES_OF_IMAGES, camera_image_hypotheses
@@ -34,7 +34,6 @@ from .camera_misspecifications import MESSAGES_OF_POSES, camera_hypotheses, requ
 from .feature import Feature, SimulatedCheck, Units
 from .measurement_results import (
     FittedExperiment,
-    InstrumentMisfit,
     InstrumentPrediction,
     PictureKind,
     PredictionErrors,
@@ -96,6 +95,11 @@ def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) ->
             for reading in camera_residuals(transcription)
         }
     }
+
+
+def fitted(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
+    """Return the comparison of each camera with the fitted surface, by name."""
+    return {"surfaces": fitted_surfaces(part)}
 
 
 def reason_against_copy(experiment: Experiment, _: Experiment) -> str:
@@ -311,28 +315,6 @@ def simulation_concerns(name: str, error: PredictionErrors) -> Iterator[Concern]
             yield Concern("prediction/unseen", "doubtful", data=data)
 
 
-def validation_concerns(
-    name: str, error: PredictionErrors, solution: Solution
-) -> Iterator[Concern]:
-    """Yield concerns about the predicted distances, in stated σ without outliers, against the
-    larger of the fitted residuals of all cameras and the noise.
-    """
-    fitted = [
-        distances.tame_sigmas
-        for part in solution.parts
-        for distances in fitted_errors(part).values()
-    ]
-    yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
-    for camera, distances in (error.depth or {}).items():
-        yield from forward_simulation_concerns(
-            f"{name}/{camera}",
-            distances.tame_sigmas,
-            fit_rms_m=yardstick,
-            noise_rms_m=0.0,
-            is_fitted=False,
-        )
-
-
 def live_limitations(experiment: Experiment) -> list[tuple[str, object, str]]:
     """Return that frames of a live recording contain no images."""
     return [
@@ -451,6 +433,7 @@ CAMERAS = Feature(
     instruments=instruments,
     require_valid=require_depth_units,
     predict=predict,
+    fitted=fitted,
     reason_against_copy=reason_against_copy,
     errors=errors,
     misfits=misfits,
@@ -460,7 +443,6 @@ CAMERAS = Feature(
     fit_hypotheses=fit_hypotheses,
     part_concerns=part_concerns,
     simulation_concerns=simulation_concerns,
-    validation_concerns=validation_concerns,
     live_limitations=live_limitations,
     notes=notes,
     excluded_loss=excluded_loss,

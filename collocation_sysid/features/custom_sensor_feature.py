@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..common.array_types import Array
+from ..common.array_types import Array, root_mean
 from ..common.display import number, short
 from ..methods.solution import Solution, custom_sensor_rms
 from ..program.collocation import ExperimentIterate
@@ -18,17 +18,16 @@ from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
 from ..recording.specimen import STRESS_UNIT
+from ..statistics.instrument_misfit import InstrumentMisfit, misfit
 from .feature import Feature, Units
 from .measurement_results import (
     FittedExperiment,
-    InstrumentMisfit,
     InstrumentPrediction,
     PictureKind,
     PredictionErrors,
     PredictionResiduals,
     SensorSeries,
     comparison_columns,
-    misfit,
 )
 
 
@@ -52,6 +51,11 @@ def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) ->
             for gauge, values in zip(transcription.custom_sensors, predicted, strict=True)
         }
     }
+
+
+def fitted(part: ExperimentIterate, solution: Solution) -> dict[str, Any]:
+    """Return the fitted values (S, m) by name."""
+    return {"readings": solution.readings[part.transcription.experiment.name]}
 
 
 def copied(_: Experiment, other: Experiment) -> dict[str, Any]:
@@ -82,7 +86,9 @@ def misfits(experiment: Experiment, predicted: InstrumentPrediction) -> Iterator
     """Yield the differences of each sensor over its σ."""
     for gauge in experiment.readings:
         difference = predicted.readings[gauge.name] - gauge.measured_values
-        yield misfit(gauge.name, "its sigma", ratio=difference / gauge.sigma)
+        known = difference[np.isfinite(difference)]
+        size = f"{root_mean(known**2):.3g} {gauge.unit}".rstrip() + " RMS" if known.size else ""
+        yield misfit(gauge.name, "its sigma", ratio=difference / gauge.sigma, size=size)
 
 
 def step_differences(
@@ -260,6 +266,7 @@ CUSTOM_SENSORS = Feature(
     ],
     instruments=instruments,
     predict=predict,
+    fitted=fitted,
     copied=copied,
     copied_times_s=copied_times_s,
     reason_against_copy=reason_against_copy,

@@ -22,10 +22,10 @@ from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording.experiment import Experiment
 from ..statistics.concerns import Concern, Topic
+from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 from .measurement_results import (
     FittedExperiment,
-    InstrumentMisfit,
     InstrumentPrediction,
     PictureKind,
     PredictionErrors,
@@ -121,6 +121,8 @@ class Feature:
     predict : callable
         ``predict(transcription, trajectory, phi)``: fields of `InstrumentPrediction` for a
         simulated motion and nuisance parameters φ (k,).
+    fitted : callable
+        ``fitted(part, solution)``: the same fields for the fit.
     copied : callable
         ``copied(experiment, other)``: the same fields from the measurements of another recording.
     copied_times_s : callable
@@ -163,9 +165,6 @@ class Feature:
         and of all.
     simulation_concerns : callable
         ``simulation_concerns(name, error)``: concerns about any forward simulation.
-    validation_concerns : callable
-        ``validation_concerns(name, error, solution)``: concerns about a prediction of an experiment
-        that was not fitted, compared with the fit of the others.
     live_limitations : callable
         ``live_limitations(experiment)``: parts of an experiment that live estimation does not
         support, each as its description, a value that is true if the experiment has it, and the
@@ -209,6 +208,7 @@ class Feature:
     instruments: Callable[[Experiment], Iterable[str]] = _nothing
     require_valid: Callable[[Experiment], object] = _nothing
     predict: Callable[[Transcription, Trajectory, Array], Fields] = _no_fields
+    fitted: Callable[[ExperimentIterate, Solution], Fields] = _no_fields
     copied: Callable[[Experiment, Experiment], Fields] = _no_fields
     copied_times_s: Callable[[Experiment, Experiment], Iterable[tuple[Array, Array]]] = _nothing
     reason_against_copy: Callable[[Experiment, Experiment], str] = _no_reason
@@ -234,7 +234,6 @@ class Feature:
     part_concerns: Callable[[ExperimentIterate], Iterable[Concern]] = _nothing
     concerns: Callable[[Sequence[ExperimentIterate]], Iterable[Concern]] = _nothing
     simulation_concerns: Callable[[str, PredictionErrors], Iterable[Concern]] = _nothing
-    validation_concerns: Callable[[str, PredictionErrors, Solution], Iterable[Concern]] = _nothing
     live_limitations: Callable[[Experiment], Iterable[tuple[str, object, str]]] = _nothing
     write_predicted: Callable[[Experiment, Trajectory, Path], object] = _nothing
     read_predicted: Callable[[dict[str, Any]], object] = _nothing

@@ -15,14 +15,13 @@ from ..program.simulation import Trajectory
 from ..program.transcription import Transcription
 from ..recording import write_markers_csv
 from ..recording.experiment import Experiment
+from ..statistics.instrument_misfit import InstrumentMisfit, misfit
 from .feature import Feature, Units
 from .measurement_results import (
-    InstrumentMisfit,
     InstrumentPrediction,
     PictureKind,
     PredictionErrors,
     PredictionResiduals,
-    misfit,
 )
 
 # File of predicted tracks.
@@ -42,6 +41,11 @@ KEYS_OF_FILE = (
 def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
     """Return the predicted marker positions (T, M, 3) [m]."""
     return {"markers_m": transcription.markers.predict_samples(trajectory.positions_m, phi)}
+
+
+def fitted(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
+    """Return the fitted marker positions (T, M, 3) [m]."""
+    return {"markers_m": part.transcription.markers.predict_positions(part.x, part.phi)}
 
 
 def copied(experiment: Experiment, other: Experiment) -> dict[str, Any]:
@@ -160,6 +164,7 @@ MARKERS = Feature(
         )
     ],
     predict=predict,
+    fitted=fitted,
     copied=copied,
     copied_times_s=copied_times_s,
     reason_against_copy=reason_against_copy,

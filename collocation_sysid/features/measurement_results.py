@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..common.serialisation import optional
 from ..model.contact.contact_summary import FrictionSummary
 from ..program.depth.depth_comparison import DepthError, SurfaceComparison
@@ -56,34 +56,6 @@ class CopyError:
 
     copied: str
     error: PredictionErrors
-
-
-@dataclass(frozen=True)
-class InstrumentMisfit:
-    """Differences between a prediction and the measurements of one kind, in stated σ.
-
-    Attributes
-    ----------
-    what : str
-        What is measured, for people.
-    sigma_key : str
-        Key of σ in the problem, for people.
-    sigmas : float
-        Root mean square of the differences over σ.
-    robust_sigmas : float
-        The same without outliers of depth, see `DepthError`; predictions are judged by it.
-    count : int
-        Number of measured values.
-    size : str
-        Root mean square in a unit, for people; empty if units differ.
-    """
-
-    what: str
-    sigma_key: str
-    sigmas: float
-    robust_sigmas: float
-    count: int
-    size: str = ""
 
 
 @dataclass(frozen=True)
@@ -207,13 +179,20 @@ class SimulatedExperiment:
     reading_unit : mapping of name to str, or None
         Units of the custom sensors that state one; None if none does.
     nuisance, places_m : mapping or None
-        Nuisance parameters and marker places that were fitted to a recording for validation; empty
+        Nuisance parameters and marker places with which a recording for validation was predicted:
+        those of the fitted recordings, and its own onsets where they are declared as unknown; empty
         for fitted experiments.
     depth : mapping of depth camera to DepthError, or None
         Distances of its points from the simulated surface; None without depth cameras.
-    blind : PredictionErrors or None
-        Of an experiment for validation, with the nuisance parameters of the fitted recordings in
-        place of its own; None where that cannot be simulated, and for fitted experiments.
+    own : PredictionErrors or None
+        Of an experiment for validation, the errors that remain if its nuisance parameters are
+        fitted to it, whatever they absorb; None without any, and for fitted experiments.
+    own_deviations : mapping of name to float, or None
+        These nuisance parameters less those of the prediction, in standard deviations of their
+        priors.
+    own_onsets : mapping of name to float, or None
+        Times that the prediction takes from its own recording because they are declared as
+        unknown, in standard deviations of their priors.
     copied : CopyError or None
         Of an experiment for validation, with the measurements of the nearest fitted recording as
         the prediction; None if there is no such copy.
@@ -232,7 +211,9 @@ class SimulatedExperiment:
     wrench_rms_nm: float | None = optional()
     reading_rms: Mapping[str, float] | None = optional()
     depth: Mapping[str, DepthError] | None = optional()
-    blind: PredictionErrors | None = optional()  # noqa: RUF009, it returns a field
+    own: PredictionErrors | None = optional()  # noqa: RUF009, it returns a field
+    own_deviations: Mapping[str, float] | None = optional()
+    own_onsets: Mapping[str, float] | None = optional()
     copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
     not_copied: str | None = optional()
 
@@ -359,27 +340,6 @@ class PredictionResiduals:
             is_counted=np.asarray(np.isfinite(in_order).any(axis=2)),
             unit=unit,
         )
-
-
-def misfit(what: str, declared_size: str, ratio: Array, size: str = "") -> InstrumentMisfit:
-    """Return the misfit of one instrument; its RMS is that of the values that are finite.
-
-    Parameters
-    ----------
-    what : str
-        The instrument, for messages.
-    declared_size : str
-        Name of its stated σ, for messages.
-    ratio : array
-        Differences over σ; NaN is ignored.
-    size : str
-        RMS with its unit, for messages; "" if there is none.
-    """
-    known = ratio[np.isfinite(ratio)]
-    sigmas = root_mean(known**2)
-    return InstrumentMisfit(
-        what, declared_size, sigmas=sigmas, robust_sigmas=sigmas, count=known.size, size=size
-    )
 
 
 def main_error(error: PredictionErrors) -> float:

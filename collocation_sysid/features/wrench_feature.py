@@ -18,14 +18,12 @@ from ..program.wrench_residual import predict_wrenches
 from ..recording import write_wrench_csv
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import COMPONENTS, UNITS
-from ..statistics.assessment import forward_simulation_concerns
-from ..statistics.concerns import Concern
+from ..statistics.instrument_misfit import InstrumentMisfit, misfit
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
 from ..statistics.misspecification.plausibility import load_sign_hypotheses
 from .feature import Feature, SimulatedCheck, Units
 from .measurement_results import (
     FittedExperiment,
-    InstrumentMisfit,
     InstrumentPrediction,
     PictureKind,
     PredictionErrors,
@@ -33,7 +31,6 @@ from .measurement_results import (
     SensorSeries,
     SeriesKind,
     comparison_columns,
-    misfit,
 )
 from .wrench_at_guess import MESSAGE_OF_OFFSET, wrench_deviations
 from .wrench_causes import CHECKED_SAMPLES, MESSAGES, wrench_causes, wrench_mistakes
@@ -63,6 +60,11 @@ def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) ->
     }
 
 
+def fitted(part: ExperimentIterate, solution: Solution) -> dict[str, Any]:
+    """Return the fitted force and torque (S, 6) of each sensor."""
+    return {"wrenches": solution.wrenches.get(part.transcription.experiment.name, ())}
+
+
 def copied(_: Experiment, other: Experiment) -> dict[str, Any]:
     """Return the measured wrenches of another recording."""
     return {"wrenches": [each.values for each in other.wrenches]}
@@ -89,9 +91,16 @@ def errors(experiment: Experiment, predicted: InstrumentPrediction) -> dict[str,
 def misfits(experiment: Experiment, predicted: InstrumentPrediction) -> Iterator[InstrumentMisfit]:
     """Yield the differences of each sensor over its σ."""
     pairs = zip(predicted.wrenches, experiment.wrenches, strict=True)
-    for values, sensor in pairs:
-        ratio = (values - sensor.values) / sensor.stack_sigmas()
-        yield misfit("the wrench", "sigma_n", ratio=ratio)
+    for k, (values, sensor) in enumerate(pairs, 1):
+        what = "the wrench" if len(experiment.wrenches) == 1 else f"wrench {k}"
+        difference = values - sensor.values
+        force_n = sensor.symmetry * difference[:, :3]
+        size = (
+            f"{root_mean(force_n[np.isfinite(force_n)] ** 2):.3g} N RMS"
+            if np.isfinite(force_n).any()
+            else ""
+        )
+        yield misfit(what, "sigma_n", ratio=difference / sensor.stack_sigmas(), size=size)
 
 
 def step_differences(
@@ -234,16 +243,6 @@ def fit_rms(solution: Solution) -> dict[str, float | None]:
     return {"N": pooled_wrench_rms(solution)[0]}
 
 
-def validation_concerns(name: str, error: PredictionErrors, solution: Solution) -> list[Concern]:
-    """Return a concern if the predicted force is much worse than the forces of the fit."""
-    fit_n = pooled_wrench_rms(solution)[0]
-    if error.wrench_rms_n is None or fit_n is None:
-        return []
-    return forward_simulation_concerns(
-        f"{name}/force", error.wrench_rms_n, fit_rms_m=fit_n, noise_rms_m=0.0, is_fitted=False
-    )
-
-
 def fit_fields(part: ExperimentIterate, solution: Solution) -> dict[str, Any]:
     """Return RMS residuals and stated σ of force [N] and torque [N m], of the whole specimen."""
     name = part.transcription.experiment.name
@@ -312,6 +311,7 @@ WRENCH = Feature(
     series_kind=SERIES_KIND,
     instruments=instruments,
     predict=predict,
+    fitted=fitted,
     copied=copied,
     copied_times_s=copied_times_s,
     reason_against_copy=reason_against_copy,
@@ -320,7 +320,6 @@ WRENCH = Feature(
     step_differences=step_differences,
     simulated_hypotheses=simulated_hypotheses,
     fit_hypotheses=fit_hypotheses,
-    validation_concerns=validation_concerns,
     recorded=recorded,
     simulated_series=simulated_series,
     write_predicted=write_predicted,

@@ -459,21 +459,28 @@ def _iterations_text(result: Result) -> str:
 def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
     """Yield lines on how far a forward simulation is from the measurements.
 
-    If it failed, the only line says why. For a validation experiment, the errors of a blind
-    prediction and of copied measurements follow for comparison.
+    If it failed, the only line says why. For a validation experiment, the errors with nuisance
+    parameters fitted to it and of copied measurements follow for comparison.
     """
     kind = "forward simulation" if simulated.fitted else "validation"
     if simulated.failed is not None:
         yield f"{kind} '{name}': failed: {simulated.failed}"
         return
-    own = copy_fields(PredictionErrors, simulated)
+    error = copy_fields(PredictionErrors, simulated)
     units = simulated.reading_unit
-    yield f"{kind} '{name}': {errors_text(own, units) or 'no measurements to compare with'}"
+    onsets = _deviations_text(simulated.own_onsets)
+    yield (
+        f"{kind} '{name}': {errors_text(error, units) or 'no measurements to compare with'}"
+        + (f", with {onsets} from this recording" if onsets else "")
+    )
     if simulated.fitted:
         return
-    if simulated.blind is not None:
-        blind = errors_text(simulated.blind, units)
-        yield f"  with the nuisance parameters of the fitted recordings (blind): {blind}"
+    if simulated.own is not None and simulated.own_deviations:
+        largest = max(simulated.own_deviations.items(), key=lambda each: abs(each[1]))
+        yield (
+            f"  if nuisance parameters are fitted to it: {errors_text(simulated.own, units)}, "
+            f"with {_deviations_text(dict([largest]))}"
+        )
     if simulated.copied is not None:
         copied = simulated.copied
         yield (
@@ -482,6 +489,13 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
         )
     elif simulated.not_copied:
         yield f"  no comparison with measurements of another recording: {simulated.not_copied}"
+
+
+def _deviations_text(deviations: Mapping[str, float] | None) -> str:
+    """Return nuisance parameters with their size in standard deviations in words; "" if none."""
+    return listed(
+        f"'{name}' at {size:+.2g} standard deviations" for name, size in (deviations or {}).items()
+    )
 
 
 def errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> str:

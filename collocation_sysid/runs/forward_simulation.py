@@ -11,12 +11,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
-from ..features.measurement_results import (
-    CopyError,
-    InstrumentMisfit,
-    InstrumentPrediction,
-    PredictionErrors,
-)
+from ..features.measurement_results import CopyError, InstrumentPrediction, PredictionErrors
 from ..features.registry import FEATURES, merged_fields
 from ..fem.kernels import map_experiments
 from ..methods.reduced_space import ReducedSpace
@@ -26,22 +21,54 @@ from ..problem import Problem
 from ..program.simulation import Trajectory, simulate
 from ..program.transcription import Transcription
 from ..recording import Experiment
+from ..statistics.assessment import largest_deviation
 from ..statistics.budget.discretisation_error import (
     Refinement,
     change_in_observations,
     discretisation_errors,
 )
 from ..statistics.estimates import Estimate
+from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.linearised import LinearisedFit, parameter_values
 from .prediction import (
     instrument_misfits,
     nearest_recording_error,
     nuisance_of_fitted_recordings,
     prediction_error,
+    unknown_onsets,
 )
 
 # Least ratio of grid step and simulation step for an estimate of the step's error: half, rounded.
 LEAST_STEP_RATIO = 1.99
+
+
+@dataclass(frozen=True, eq=False)
+class OwnFit:
+    """Simulation of a recording for validation with nuisance parameters that are fitted to it.
+
+    Attributes
+    ----------
+    error : PredictionErrors
+        Its errors, which the nuisance parameters decrease whatever their cause.
+    misfits : tuple of InstrumentMisfit
+        Differences of each instrument over its stated σ.
+    deviations : mapping of name to float
+        Nuisance parameters less those of the prediction, in standard deviations of their priors.
+    onsets : mapping of name to float
+        Times that the description declares as unknown, and the prediction has from this fit, in
+        standard deviations of their priors.
+    """
+
+    error: PredictionErrors
+    misfits: tuple[InstrumentMisfit, ...]
+    deviations: Mapping[str, float]
+    onsets: Mapping[str, float]
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether no deviation is larger than chance allows for so many."""
+        sizes = [abs(each) for each in (*self.deviations.values(), *self.onsets.values())]
+        return max(sizes, default=0.0) <= largest_deviation(len(sizes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +82,20 @@ class ForwardSimulation:
     trajectory : Trajectory
         Its markers are predicted with the experiment's nuisance parameters.
     nuisance : mapping of name to value
-        Nuisance parameters of an experiment for validation, fitted to it at the estimated material;
+        Nuisance parameters with which an experiment for validation is predicted: those of the
+        fitted recordings, and its own onsets where the description says that they are unknown;
         those of places are displacements from their start. Empty for fitted experiments.
     places_m : mapping of marker to place [x, y, z]
-        Marker places on the undeformed body, fitted likewise; empty for fitted experiments.
+        Marker places on the undeformed body, likewise; empty for fitted experiments.
     predicted : InstrumentPrediction
         Predictions of all instruments.
     error : PredictionErrors
         Their RMS and largest differences from the measurements.
     misfits : tuple of InstrumentMisfit
         Differences of each instrument over its stated σ.
-    blind_error : PredictionErrors or None
-        Of an experiment for validation: the error with the nuisance parameters of the fitted
-        recordings in place of its own; None where that cannot be simulated.
+    own : OwnFit or None
+        Of an experiment for validation: the errors that remain if all its nuisance parameters are
+        fitted to it; None without any, or where that fails.
     copy_error : CopyError or str
         Of an experiment for validation: the error of a fitted recording's measurements, or why
         there is none. Empty for fitted experiments.
@@ -81,7 +109,7 @@ class ForwardSimulation:
     predicted: InstrumentPrediction
     error: PredictionErrors
     misfits: tuple[InstrumentMisfit, ...] = ()
-    blind_error: PredictionErrors | None = None
+    own: OwnFit | None = None
     copy_error: CopyError | str = ""
 
 
@@ -134,8 +162,8 @@ def simulate_experiment(
     """Simulate an experiment with the parameters of a solution, and compare it with the
     measurements; return the reason as text if that fails.
 
-    For a validation experiment the nuisance parameters are fitted to it first, and the result has
-    these, and the errors of a blind prediction and of a copy of the nearest recording.
+    A validation experiment is predicted blind, see `predicted_nuisance`; the result also has the
+    errors with its own nuisance parameters, and of a copy of the nearest recording.
 
     Parameters
     ----------
@@ -154,15 +182,16 @@ def simulate_experiment(
         If the fit of the nuisance parameters is interrupted.
     """
     try:
-        transcription, phi = transcription_and_nuisance(experiment, solution)
-        rollout = simulate_with_parameters(
+        transcription, own_phi = fitted_nuisance(experiment, solution)
+        phi = predicted_nuisance(transcription, own_phi, solution=solution)
+        simulated = partial(
+            simulate_with_parameters,
             problem,
             experiment,
             transcription=transcription,
-            phi=phi,
             parameters=solution.parameters,
-            report=report,
         )
+        rollout = simulated(phi=phi, report=report)
     except (InputError, SimulationError) as error:
         # An InputError here is, for example, an estimated density that leaves a node without mass.
         return str(error)
@@ -171,11 +200,31 @@ def simulate_experiment(
     nuisance = transcription.nuisance
     places_m = transcription.marker_places_m(phi).tolist()
     fitted = [part.transcription.experiment for part in solution.parts]
+    own = None
+    if nuisance.size:
+        try:
+            with_own = simulated(phi=own_phi)
+        except (InputError, SimulationError):
+            pass
+        else:
+            onsets = unknown_onsets(transcription)
+            own = OwnFit(
+                with_own.error,
+                with_own.misfits,
+                deviations={
+                    name: float(change)
+                    for k, (name, change) in enumerate(
+                        zip(nuisance.names, own_phi - phi, strict=True)
+                    )
+                    if k not in onsets
+                },
+                onsets={nuisance.names[k]: float(own_phi[k]) for k in onsets},
+            )
     return replace(
         rollout,
         nuisance=dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)),
         places_m=dict(zip(experiment.markers.names, places_m, strict=True)),
-        blind_error=_blind_error(problem, transcription, solution=solution),
+        own=own,
         copy_error=nearest_recording_error(experiment, fitted),
     )
 
@@ -210,7 +259,7 @@ def simulate_with_parameters(
     Returns
     -------
     ForwardSimulation
-        `nuisance`, `places_m`, `blind_error` and `copy_error` are empty or None.
+        `nuisance`, `places_m`, `own` and `copy_error` are empty or None.
 
     Raises
     ------
@@ -245,35 +294,45 @@ def simulate_with_parameters(
     )
 
 
-def _blind_error(
-    problem: Problem, transcription: Transcription, solution: Solution
-) -> PredictionErrors | None:
-    """Return the errors of a prediction of a recording with the nuisance parameters of the fitted
-    recordings; None if the simulation fails.
-    """
-    phi = nuisance_of_fitted_recordings(transcription, solution)
-    try:
-        simulation = simulate_with_parameters(
-            problem,
-            transcription.experiment,
-            transcription=transcription,
-            phi=phi,
-            parameters=solution.parameters,
-        )
-    except (InputError, SimulationError):
-        return None
-    return simulation.error
-
-
 def transcription_and_nuisance(
     experiment: Experiment, solution: Solution
 ) -> tuple[Transcription, Array]:
-    """Return an experiment's transcription and its nuisance parameters φ (k,) in units of their
-    prior standard deviations; k is 0 without any.
+    """Return an experiment's transcription and the nuisance parameters φ (k,) with which it is
+    simulated, in units of their prior standard deviations.
 
-    For a fitted experiment φ is the estimate; for validation φ is fitted to its measurements in
-    reduced space, with the material at its estimate. Whether that solve converged is not checked.
-    `experiment` must belong to the problem of `solution`.
+    For a fitted experiment φ is the estimate, for validation see `predicted_nuisance`. `experiment`
+    must belong to the problem of `solution`.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If a solve for an onset is interrupted.
+    """
+    transcription, own_phi = fitted_nuisance(experiment, solution)
+    return transcription, predicted_nuisance(transcription, own_phi, solution=solution)
+
+
+def predicted_nuisance(transcription: Transcription, own_phi: Array, solution: Solution) -> Array:
+    """Return the nuisance parameters φ (k,) with which a recording is simulated: `own_phi`, which
+    are fitted to it, of a fitted recording.
+
+    One for validation is predicted blind, with those of the fitted recordings, because its own
+    would absorb the error that the prediction is to show. Only its onsets that the description
+    declares as unknown are its own.
+    """
+    if solution.part_of(transcription.experiment.name) is not None:
+        return own_phi
+    phi = nuisance_of_fitted_recordings(transcription, solution)
+    onsets = unknown_onsets(transcription)
+    phi[onsets] = own_phi[onsets]
+    return phi
+
+
+def fitted_nuisance(experiment: Experiment, solution: Solution) -> tuple[Transcription, Array]:
+    """Return an experiment's transcription and nuisance parameters φ (k,) that are fitted to it:
+    the estimate, or for validation by a solve in reduced space with the material at its estimate.
+
+    k is 0 without any. Whether that solve converged is not checked.
 
     Raises
     ------

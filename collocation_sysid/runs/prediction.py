@@ -12,10 +12,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..common.array_types import Array
+from ..common.array_types import Array, Index
 from ..features.measurement_results import (
     CopyError,
-    InstrumentMisfit,
     InstrumentPrediction,
     PredictionErrors,
     main_error,
@@ -24,7 +23,9 @@ from ..features.registry import FEATURES, merged_fields
 from ..methods.solution import Solution
 from ..program.transcription import Transcription
 from ..recording import Experiment
+from ..recording.nuisance import CLOCK_RATE, DEPTH_TIME, JOINING, OBSTACLE_TIME, SENSOR_TIME, TIME
 from ..recording.sample_times import TIME_TOLERANCE_S
+from ..statistics.instrument_misfit import InstrumentMisfit
 
 
 def prediction_error(experiment: Experiment, predicted: InstrumentPrediction) -> PredictionErrors:
@@ -63,6 +64,19 @@ def instrument_misfits(
         Prediction at the same samples and for the same instruments, in the same order.
     """
     return [misfit for feature in FEATURES for misfit in feature.misfits(experiment, predicted)]
+
+
+def fit_misfits(solution: Solution) -> dict[str, list[InstrumentMisfit]]:
+    """Return the same of the fit, by name of the fitted recording."""
+    return {
+        part.transcription.experiment.name: instrument_misfits(
+            part.transcription.experiment,
+            InstrumentPrediction(
+                **merged_fields(feature.fitted(part, solution) for feature in FEATURES)
+            ),
+        )
+        for part in solution.parts
+    }
 
 
 # Blind predictions --------------------------------------------------------------------------------
@@ -114,6 +128,20 @@ def nuisance_of_fitted_recordings(transcription: Transcription, solution: Soluti
             way_m = np.mean(places_m, axis=0) - start_m[number]
             phi[places[number]] = np.linalg.pinv(directions_m) @ way_m
     return phi
+
+
+# Times of a recording that are its own: when it, a load or an obstacle began, and by which clock.
+ONSETS = (TIME, CLOCK_RATE, OBSTACLE_TIME, JOINING, SENSOR_TIME, DEPTH_TIME)
+
+
+def unknown_onsets(transcription: Transcription) -> Index:
+    """Return the indices in φ, ascending, of onsets and clocks that the description of a recording
+    declares as unknown: their prior is stated, and is not the default.
+    """
+    stated = transcription.experiment.nuisance
+    own = [row for row in stated.own if row.clock is not None]
+    declared = [row for row in ONSETS if stated.sigma(row) not in (None, row.sigma)]
+    return transcription.nuisance.indices_of_rows(*declared, *own)
 
 
 # Copies of other recordings -----------------------------------------------------------------------

@@ -301,6 +301,7 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
     errors = {
         key: value for key, value in vars(simulated.error).items() if key not in ("rms_m", "max_m")
     }
+    own = simulated.own
     return copy_fields(
         SimulatedExperiment,
         simulated,
@@ -308,7 +309,9 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
         failed=None,
         **errors,
         reading_unit=units_by_name(experiment),
-        blind=simulated.blind_error,
+        own=own.error if own else None,
+        own_deviations=own.deviations if own else None,
+        own_onsets=own.onsets if own else None,
         copied=simulated.copy_error if isinstance(simulated.copy_error, CopyError) else None,
         not_copied=simulated.copy_error if isinstance(simulated.copy_error, str) else None,
     )

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from ..common.array_types import root_mean
 from ..errors import SimulationError
 from ..features.registry import FEATURES
 from ..methods.solution import Solution, Status
@@ -20,6 +21,7 @@ from ..statistics.assessment import (
     fit_concerns,
     forward_simulation_concerns,
     nuisance_concerns,
+    onset_concerns,
     outlier_share_concerns,
     parameter_concerns,
     prediction_concerns,
@@ -27,9 +29,11 @@ from ..statistics.assessment import (
     rotation_step_concerns,
     scheme_concerns,
     stability_concerns,
+    validation_concerns,
 )
 from ..statistics.budget.uncertainty_budget import source_label
 from ..statistics.concerns import Concern
+from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
@@ -42,6 +46,7 @@ from ..statistics.stability_concerns import strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
 from .check.modes_check import ModesCheck, check_modes
 from .forward_simulation import ForwardSimulation
+from .prediction import fit_misfits
 from .result_content import ReportedEstimate
 
 # Largest noise of cameras, relative to the size of the body.
@@ -112,14 +117,13 @@ def solution_concerns(
     for feature in FEATURES:
         yield from feature.concerns(solution.parts)
     if not solution.collocation.nq:
-        yield from _prediction_concerns(rollouts)
+        yield from _prediction_concerns(solution, rollouts)
+    fitted = fit_misfits(solution)
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation):
             for feature in FEATURES:
                 yield from feature.simulation_concerns(name, rollout.error)
-        yield from _forward_concerns(
-            name, rollout, solution=solution, noise_m=expected_rms_m(solution, uncertainty)
-        )
+        yield from _forward_concerns(name, rollout, fitted)
     collocation = solution.collocation
     for transcription in collocation.transcriptions:
         yield from rotation_step_concerns(
@@ -215,40 +219,48 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
             yield Concern("noise/allowance", data={"sigma_mm": 1e3 * sigma_m, "share": share})
 
 
-def _prediction_concerns(rollouts: Mapping[str, ForwardSimulation | str]) -> Iterator[Concern]:
-    """Yield concerns about forward simulations that differ from the measurements by more than the
-    noise; failed simulations, given by their reason, are ignored. `rollouts` are by name of the
-    experiment.
+def _prediction_concerns(
+    solution: Solution, rollouts: Mapping[str, ForwardSimulation | str]
+) -> Iterator[Concern]:
+    """Yield concerns about forward simulations of fitted recordings that differ from the
+    measurements by more than the noise; failed simulations, given by their reason, are ignored.
     """
     for name, rollout in rollouts.items():
-        for misfit in rollout.misfits if isinstance(rollout, ForwardSimulation) else ():
-            yield from prediction_concerns(name, **vars(misfit))
+        if isinstance(rollout, ForwardSimulation) and solution.part_of(name) is not None:
+            for misfit in rollout.misfits:
+                yield from prediction_concerns(name, **vars(misfit))
 
 
 def _forward_concerns(
-    name: str, rollout: ForwardSimulation | str, solution: Solution, noise_m: float
-) -> list[Concern]:
-    """Return concerns about the forward simulation of an experiment: that it failed, or that its
-    errors are larger than the noise and the residuals of the fit.
-
-    Other measurements than markers are compared only for experiments that were not fitted, and only
-    if their markers give no concern.
+    name: str, rollout: ForwardSimulation | str, fitted: Mapping[str, Sequence[InstrumentMisfit]]
+) -> Iterator[Concern]:
+    """Yield concerns about the forward simulation of an experiment: that it failed, or that it
+    misses measurements of any kind by more than the noise and the fit, of this experiment or, for
+    validation, of all. `fitted` are the misfits of the fitted experiments.
     """
-    fit_rms_m = solution.rms_by_experiment_m
     if not isinstance(rollout, ForwardSimulation):
-        return [Concern("roll-out/failed", "doubtful", data={"experiment": name, "why": rollout})]
-    fitted = name in fit_rms_m
-    fit_m = fit_rms_m.get(name, solution.rms_m)
-    of_markers = forward_simulation_concerns(
-        name, rollout.rms_m, fit_rms_m=fit_m, noise_rms_m=noise_m, is_fitted=fitted
-    )
-    if fitted or of_markers:
-        return of_markers
-    return [
-        concern
-        for feature in FEATURES
-        for concern in feature.validation_concerns(name, rollout.error, solution)
-    ]
+        yield Concern("roll-out/failed", "doubtful", data={"experiment": name, "why": rollout})
+        return
+    if name in fitted:
+        of_fit = {each.what: each for each in fitted[name]}
+        for simulated in rollout.misfits:
+            # The simulated surface may be near points of a camera that the fitted one is not.
+            if simulated.what in of_fit:
+                yield from forward_simulation_concerns(name, simulated, of_fit[simulated.what])
+        return
+    own = rollout.own
+    for label, deviation in (own.onsets if own else {}).items():
+        yield from onset_concerns(name, label, deviation)
+    # An error within what the description leaves open is no contradiction.
+    judged = own.misfits if own is not None and own.is_plausible else rollout.misfits
+    levels: dict[str, list[float]] = {}
+    for misfit in (each for row in fitted.values() for each in row):
+        levels.setdefault(misfit.what, []).append(misfit.robust_sigmas)
+    for misfit in judged:
+        level = root_mean(np.square(levels.get(misfit.what, [1.0])))
+        yield from validation_concerns(
+            name, misfit, level=level, deviations=own.deviations if own else {}
+        )
 
 
 def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:

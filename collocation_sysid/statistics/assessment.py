@@ -26,6 +26,7 @@ from .budget.uncertainty_budget import source_label
 from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name
+from .instrument_misfit import InstrumentMisfit
 from .misspecification.misspecification_hypothesis import Hypothesis
 from .probes.relaxed_assumptions import DRIFT, MEMORY, Probe, assumption_name
 from .probes.routine_probes import is_alarming, is_routine_assumption
@@ -51,15 +52,16 @@ MARKER_MISFIT = 2.0
 # Autocorrelation of residuals of more than `GROSS_MISFIT` that are not noise, although the samples
 # are too few for a test at the level `RARE`.
 CLEARLY_PERSISTENT = 0.8
-# Additional distance of a forward simulation, over the RMS distance of the fit or of noise:
-# "check".
+# Additional misfit of a forward simulation, over that of the fit or of noise: "check".
 ROLLOUT = 0.35
 # The same for "doubtful".
 GROSS_ROLLOUT = 2.0
-# Distance of a prediction over that of the fit: "check".
+# Misfit of a prediction over that of the fit or of noise: "check".
 PREDICTION = 3.0
 # The same for "doubtful".
 GROSS_PREDICTION = 10.0
+# Onset of a validation recording in standard deviations of its prior: "check".
+OWN_ONSET = 2.0
 # Nuisance parameters in standard deviations of their priors: "doubtful".
 ABSURD = 6.0
 # Time shift in standard deviations of its prior: "check".
@@ -454,7 +456,7 @@ def nuisance_concerns(
     "doubtful". Limits may be infinite.
     """
     items = [*zip(names, deviations, low, high, strict=True)]
-    limit = float(normal_isf(RARE / 2 / max(1, len(items))))
+    limit = largest_deviation(len(items))
     concerns: list[Concern] = []
     for name, phi, lowest, highest in items:
         deviation = abs(float(phi))
@@ -495,47 +497,87 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
     )
 
 
-def forward_simulation_concerns(
-    name: str, rms_m: float, fit_rms_m: float, noise_rms_m: float, is_fitted: bool
-) -> list[Concern]:
-    """Return one concern, as a list, if the forward simulation of an experiment is much worse than
-    the fit; else empty.
-
-    With the larger of `fit_rms_m` and `noise_rms_m` as unit: a fitted experiment is "check" where
-    √(rms² − fit²) exceeds `ROLLOUT` and "doubtful" above `GROSS_ROLLOUT`; a prediction where
-    `rms_m` exceeds `PREDICTION` and `GROSS_PREDICTION`.
-
-    Parameters
-    ----------
-    name : str
-        Name of the experiment.
-    rms_m : float
-        Root mean square distance of the simulated markers from the measurements [m].
-    fit_rms_m : float
-        The same distance of the fit, or for a prediction of the fits of other experiments [m].
-    noise_rms_m : float
-        Distance that noise alone would give [m]; if this and `fit_rms_m` are zero there is no
-        concern.
-    is_fitted : bool
-        Whether the experiment was fitted; if not, the simulation is a prediction.
+def largest_deviation(count: int) -> float:
+    """Return the deviation from a prior, in its standard deviations, that is exceeded with the
+    probability `RARE` by any of `count` parameters (Bonferroni): 3.9 for one, 4.6 for 20.
     """
-    yardstick_m = max(fit_rms_m, noise_rms_m)
-    if not yardstick_m:  # nothing of the kind is measured
-        return []
-    if not is_fitted:
-        times = rms_m / yardstick_m
-        gross = times > GROSS_PREDICTION
-        return concern_if(
-            times > PREDICTION, gross, code="roll-out/predicted", experiment=name, times=times
-        )
-    missed = float(np.sqrt(max(0.0, rms_m**2 - fit_rms_m**2))) / yardstick_m
+    return float(normal_isf(RARE / 2 / max(1, count)))
+
+
+def forward_simulation_concerns(
+    name: str, simulated: InstrumentMisfit, fitted: InstrumentMisfit
+) -> list[Concern]:
+    """Return one concern, as a list, if the forward simulation of a fitted experiment misses the
+    measurements of an instrument by much more than the fit; else empty.
+
+    With the larger of the fit's misfit and the noise as unit, √(simulated² − fitted²) is "check"
+    above `ROLLOUT`, and "doubtful" above `GROSS_ROLLOUT`.
+    """
+    unit = max(1.0, fitted.robust_sigmas)
+    squares = simulated.robust_sigmas**2 - fitted.robust_sigmas**2
+    missed = float(np.sqrt(max(0.0, squares))) / unit
     return concern_if(
         missed > ROLLOUT,
         missed > GROSS_ROLLOUT,
         code="roll-out/misses",
         experiment=name,
-        rms_mm=1e3 * rms_m,
-        fit_mm=1e3 * fit_rms_m,
+        what=simulated.what,
+        simulated=simulated.size_text,
+        fitted=fitted.size_text,
+    )
+
+
+def validation_concerns(
+    name: str, misfit: InstrumentMisfit, level: float, deviations: Mapping[str, float]
+) -> list[Concern]:
+    """Return one concern, as a list, if the prediction of an experiment that was not fitted misses
+    the measurements of an instrument; else empty.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    misfit : InstrumentMisfit
+        Misfit of the prediction: "check" above `PREDICTION`, "doubtful" above `GROSS_PREDICTION`
+        times the larger of `level` and the noise; none if χ² is as large by chance (p > `RARE`).
+    level : float
+        Misfit of such instruments in the fits of the other experiments, in σ.
+    deviations : mapping of name to float
+        Changes of the nuisance parameters that would fit the experiment best, in standard
+        deviations of their priors; the message names the largest if it is implausible.
+    """
+    times = misfit.robust_sigmas / max(1.0, level)
+    is_chance = float(chi2_sf(misfit.count * times**2, misfit.count)) > RARE
+    label = max(deviations, key=lambda each: abs(deviations[each]), default="")
+    is_absorbed = label and abs(deviations[label]) > largest_deviation(len(deviations))
+    return concern_if(
+        times > PREDICTION and not is_chance,
+        times > GROSS_PREDICTION,
+        code="roll-out/predicted",
+        experiment=name,
+        what=misfit.what,
+        size=misfit.size_text,
+        sigmas=misfit.sigmas,
+        stated=misfit.sigma_key,
+        times=times,
+        absorbed=f" (to explain it by '{label}' would take {deviations[label]:.3g} standard "
+        "deviations of its prior)"
+        if is_absorbed
+        else "",
+    )
+
+
+def onset_concerns(name: str, label: str, deviation: float) -> list[Concern]:
+    """Return one concern, as a list, if an onset or a clock that a prediction takes from its own
+    recording is more than `OWN_ONSET` standard deviations of its prior from zero; else empty.
+    """
+    return concern_if(
+        abs(deviation) > OWN_ONSET,
+        False,
+        code="roll-out/onset",
+        experiment=name,
+        name=label,
+        deviations=abs(deviation),
     )
 
 

@@ -370,12 +370,16 @@ TOPICS: dict[str, Topic] = {
         "predicted badly, the model lacks an effect that this recording contains.",
         messages={
             "failed": "the forward simulation of '{experiment}' failed: {why}",
-            "misses": "the forward simulation of '{experiment}' deviates from the measurements by "
-            "{rms_mm:.2g} mm, but the fit only by {fit_mm:.2g} mm: the time step is too long; raise "
+            "misses": "the forward simulation of '{experiment}' deviates from {what} by "
+            "{simulated}, but the fit only by {fitted}: the time step is too long; raise "
             "transcription.substeps",
-            "predicted": "the prediction error of '{experiment}' is {times:.2g} times the fit "
-            "error of the other recordings: the model lacks an effect that this recording "
-            "contains",
+            "predicted": "the prediction of '{experiment}' misses {what} by {size}, which is "
+            "{sigmas:.3g} times {stated} and {times:.2g} times what noise and the fit of the other "
+            "recordings explain{absorbed}: the model lacks an effect that this recording contains, "
+            "or the recording is described wrongly",
+            "onset": "'{name}' of the validation recording '{experiment}' is estimated from that "
+            "recording, as its description asks, {deviations:.2g} standard deviations from zero: "
+            "the prediction may owe its fit to this time",
         },
     ),
     "prediction": Topic(

@@ -33,10 +33,12 @@ from collocation_sysid.statistics.assessment import (
     parameter_concerns,
     rms_expected_from_noise_m,
     scheme_concerns,
+    validation_concerns,
 )
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS, Concern, topics_of
 from collocation_sysid.statistics.estimates import correlation_notes
+from collocation_sysid.statistics.instrument_misfit import InstrumentMisfit
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
 from collocation_sysid.statistics.residuals.autocorrelation import Dependence
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
@@ -216,22 +218,30 @@ def test_nuisance_parameters_far_from_their_prior():
         assert found.grade == "doubtful"
 
 
+def off(sigmas: float, count: int = 1000) -> InstrumentMisfit:
+    return InstrumentMisfit("stress", "its sigma", sigmas, sigmas, count)
+
+
 def test_a_roll_out_is_measured_by_the_fit_and_the_noise():
-    assert not forward_simulation_concerns("a", 1.05, 1.0, 1.0, is_fitted=True)
-    assert not forward_simulation_concerns(
-        "a", 0.1, 0.001, 1.0, is_fitted=True
-    )  # far below the noise
-    strengths = [
-        forward_simulation_concerns("a", rms, 1.0, 1.0, is_fitted=True)[0].grade
-        for rms in (1.5, 4.0)
+    assert not forward_simulation_concerns("a", off(1.05), off(1.0))
+    assert not forward_simulation_concerns("a", off(0.1), off(0.001))  # far below the noise
+    found = [forward_simulation_concerns("a", off(sigmas), off(1.0))[0] for sigmas in (1.5, 4.0)]
+    assert [each.grade for each in found] == ["check", "doubtful"]
+    assert "from stress by 1.5 times its sigma" in found[0].message
+
+
+def test_a_validation_is_measured_by_the_fits_and_the_noise():
+    assert not validation_concerns("a", off(2.0), level=0.1, deviations={})
+    assert not validation_concerns("a", off(8.0), level=4.0, deviations={})
+    assert not validation_concerns("a", off(3.5, count=1), level=1.0, deviations={})  # chance
+    deviations = {"area": -66.0, "zero": 1.0}
+    found = [
+        validation_concerns("a", off(s), level=1.0, deviations=deviations)[0] for s in (4.0, 20.0)
     ]
-    assert strengths == ["check", "doubtful"]
-    assert not forward_simulation_concerns("a", 2.0, 1.0, 1.0, is_fitted=False)
-    strengths = [
-        forward_simulation_concerns("a", rms, 1.0, 1.0, is_fitted=False)[0].grade
-        for rms in (4.0, 20.0)
-    ]
-    assert strengths == ["check", "doubtful"]
+    assert [each.grade for each in found] == ["check", "doubtful"]
+    assert "'area' would take -66 standard deviations" in found[0].message
+    (plain,) = validation_concerns("a", off(4.0), level=1.0, deviations={"area": -1.0})
+    assert "area" not in plain.message
 
 
 def test_a_scheme_that_damps_or_slows_is_a_concern():
