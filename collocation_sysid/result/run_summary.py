@@ -234,7 +234,7 @@ def _simulation_text(simulated: SimulatedExperiment) -> str:
     """
     if simulated.failed is not None:
         return f"failed: {simulated.failed}"
-    own = simulated.blind or copy_fields(PredictionErrors, simulated)
+    own = copy_fields(PredictionErrors, simulated)
     text = errors_text(own, simulated.reading_unit) or "no measurements to compare with"
     if simulated.copied is not None:
         copied = errors_text(simulated.copied.error, simulated.reading_unit)
