@@ -36,6 +36,7 @@ from .runs.warm_start import WarmStart
 from .statistics.assessment import rotation_step_concerns
 from .statistics.budget.consider_analysis import ResidualChanges, changes_of_assumptions
 from .statistics.budget.discretisation_error import MOST_SUBSTEPS
+from .statistics.budget.systematic_effects import ASSUMPTIONS
 from .statistics.budget.uncertainty_budget import VarianceSources
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
@@ -354,7 +355,7 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
     """
     say("computing the effects of assumptions")
     solution = answer.solution
-    deviations = probed_deviations(answer.problem.uncertainty.collect_considered())
+    deviations = _evaluated_deviations(answer.problem)
     # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
     with counted_phase(StepUnit.TIME_STEP, 2 * _row_count(solution)):
         return changes_of_assumptions(solution.collocation, solution.z, deviations=deviations)
@@ -368,17 +369,31 @@ def _row_count(solution: Solution) -> int:
 def _sources(
     answer: Run, fit: LinearisedFit, known: Uncertainty, changes: ResidualChanges
 ) -> VarianceSources:
-    """Return the systematic contributions to the uncertainty, without effects stated as exact (a
-    deviation of None).
+    """Return the systematic contributions to the uncertainty, without effects of a deviation of
+    None, and the alternatives to assumptions.
     """
     solution = answer.solution
-    deviations = answer.problem.uncertainty.assumptions.collect_deviations()
-    parameters = solution.collocation.parameters
-    budgeted = changes.without(name for name, deviation in deviations.items() if deviation is None)
-    means = answer.problem.uncertainty.assumptions.collect_means()
+    problem = answer.problem
     return VarianceSources.from_fit(
-        fit, budgeted, parameters=parameters, q=solution.q, uncertainty=known, means=means
+        fit,
+        changes,
+        parameters=solution.collocation.parameters,
+        q=solution.q,
+        uncertainty=known,
+        deviations=problem.assumed_deviations,
+        evaluated=_evaluated_deviations(problem),
+        means=problem.uncertainty.assumptions.collect_means(),
     )
+
+
+def _evaluated_deviations(problem: Problem) -> dict[str, float | None]:
+    """Return the deviations of all assumptions that are evaluated: those of the budget, of the
+    routine probes, and one unit of those whose alternative is reported, unless stated exact.
+    """
+    deviations = probed_deviations(problem.assumed_deviations)
+    stated = vars(problem.uncertainty.assumptions)
+    unstated = (row.name for row in ASSUMPTIONS if row.alternative and stated[row.name] is None)
+    return deviations | {name: 1.0 for name in unstated if deviations[name] is None}
 
 
 def _probes(
@@ -389,7 +404,7 @@ def _probes(
     """
     solution = answer.solution
     options = answer.problem.uncertainty
-    deviations = probed_deviations(options.collect_considered())
+    deviations = _evaluated_deviations(answer.problem)
     collocation = solution.collocation
     z = solution.z
     solved_fit = SolvedFit(

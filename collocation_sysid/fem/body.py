@@ -21,7 +21,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import accumulate
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import scipy.sparse as sp
@@ -106,6 +106,27 @@ class SecondDerivatives:
     velocity_velocity: Array
 
 
+# How a body was made, and where its mesh comes from.
+Made = Literal["cast", "foam", "printed", "tissue"]
+MeshOrigin = Literal["cad", "scan"]
+
+
+def _require_origin(made: object, mesh_from: object, rest_shape: object) -> None:
+    """Raise `InputError` for unknown words, or for a drawing whose shape is that under gravity."""
+    for key, word, words in (
+        ("made", made, get_args(Made)),
+        ("mesh_from", mesh_from, get_args(MeshOrigin)),
+    ):
+        if word is not None and word not in words:
+            raise InputError(f"found {word!r}; expected one of {', '.join(words)}", where=key)
+    if mesh_from == "cad" and isinstance(rest_shape, UnderGravity):
+        raise InputError(
+            "found 'cad' with a rest shape under gravity; expected 'scan', because a drawing is free "
+            "of stress",
+            where="mesh_from",
+        )
+
+
 class Body(Discretisation):
     """Deformable body of tetrahedral finite elements.
 
@@ -135,9 +156,17 @@ class Body(Discretisation):
         Constant that varies in space, outside all regions.
     rest_shape : UnderGravity or "stress_free", optional
         UnderGravity: how the body was held while its mesh was made; the stress-free shape is then
-        computed, see `rest_shape`. "stress_free": the mesh is the stress-free shape. None: as
-        "stress_free", but the budget of the intervals includes that the mesh may be a shape under
-        gravity, unless it was generated from stated lengths.
+        computed, see `rest_shape`. "stress_free": the mesh is the stress-free shape. None: not
+        stated; the mesh counts as stress-free, and the result states how much the estimates would
+        change if the mesh had been scanned under gravity. Generated meshes and those of drawings
+        (`mesh_from` "cad") are stress-free.
+    made : {"cast", "foam", "printed", "tissue"}, optional
+        How the body was made: cast in a mould, cut from or moulded as foam, printed, or grown. It
+        selects the default deviations of the uncertainty budget.
+    mesh_from : {"cad", "scan"}, optional
+        Origin of the mesh: the drawing from which the body was made, or a scan of the body. It
+        selects defaults of the budget, too; a scan without a stated `rest_shape` counts as made
+        in an unknown orientation to gravity.
     evaluator : {"auto", "simd", "casadi"}
         Evaluator of the element kernels, see `kernels`. "auto" uses CasADi's map, with a note, for
         a material that vector code cannot evaluate.
@@ -185,6 +214,8 @@ class Body(Discretisation):
         forces: Sequence[NodeForce] = (),
         field: Field | None = None,
         rest_shape: UnderGravity | Literal["stress_free"] | None = None,
+        made: Made | None = None,
+        mesh_from: MeshOrigin | None = None,
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
@@ -198,7 +229,11 @@ class Body(Discretisation):
             prony=prony,
             field=field,
         )
-        generated: Literal["stress_free"] | None = "stress_free" if mesh.is_generated else None
+        _require_origin(made, mesh_from, rest_shape=rest_shape)
+        self.made: Made | None = made
+        self.mesh_from: MeshOrigin | None = mesh_from
+        is_drawn = mesh.is_generated or mesh_from == "cad"
+        generated: Literal["stress_free"] | None = "stress_free" if is_drawn else None
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
             generated if rest_shape is None else rest_shape
         )

@@ -175,6 +175,8 @@ def _with_properties(body: Body, meshes: CoarseMesh, groups: Index) -> CoarseBod
         prony=rest.prony,
         forces=[_coarse_force(each, meshes, nodes) for each in body.placed_forces],
         rest_shape=_coarse_rest_shape(body, meshes, nodes),
+        made=body.made,
+        mesh_from=body.mesh_from,
         evaluator=body.evaluator,
         threads=body.threads,
     )

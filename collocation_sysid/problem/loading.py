@@ -198,6 +198,7 @@ class SpecimenCells:
                 material,
                 prony=tuple(b.name for b in self._section.prony if b.region is None),
                 damping=self._section.damping,
+                made=self._section.made,
             )
         return self._bodies[has_inner_node]
 
@@ -380,6 +381,8 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
         field=field(section.field, "field"),
         rest_shape=_rest_shape(section),
+        made=section.made,
+        mesh_from=section.mesh_from,
         evaluator=section.evaluator,
     )
 

@@ -184,6 +184,13 @@ class Problem:
         """Bodies of the experiments, each object once, in the order of the experiments."""
         return tuple({id(e.body): e.body for e in self.experiments}.values())
 
+    @property
+    def assumed_deviations(self) -> dict[str, float | None]:
+        """Standard deviations of all systematic effects by name, None for what is exact: the stated
+        ones, and the defaults of bodies that were made like those of the problem.
+        """
+        return self.uncertainty.collect_considered(self.bodies)
+
     def collect_lengths_m(self) -> dict[str, float]:
         """Return the correlation lengths of spatially varying constants [m], by name of the
         constant with its region; empty without fields.

@@ -4,14 +4,21 @@ problem.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Text
+from ..fem.body import Body
 from ..statistics.budget.shape_error import CORRELATION
-from ..statistics.budget.systematic_effects import CORRELATION_KEY, Assumptions, ExactIfNone
+from ..statistics.budget.systematic_effects import (
+    CORRELATION_KEY,
+    Assumptions,
+    ExactIfNone,
+    usual_deviations,
+)
 from ..statistics.uncertainty import ErrorModel
 
 
@@ -53,11 +60,12 @@ class UncertaintyOptions(ErrorModel):
     assumptions: Annotated[Assumptions, ExactIfNone()] = field(default_factory=Assumptions)
     surface_correlation: Positive = CORRELATION
 
-    def collect_considered(self) -> dict[str, float | None]:
-        """Return the standard deviations of systematic effects by name (None for exact ones), and
-        the surface's correlation length under `CORRELATION_KEY`.
+    def collect_considered(self, bodies: Iterable[Body] = ()) -> dict[str, float | None]:
+        """Return the standard deviations of systematic effects by name (None for exact ones), with
+        the defaults for `bodies`, and the surface's correlation length under `CORRELATION_KEY`.
         """
-        return self.assumptions.collect_deviations() | {CORRELATION_KEY: self.surface_correlation}
+        deviations = self.assumptions.collect_deviations(usual_deviations(bodies))
+        return deviations | {CORRELATION_KEY: self.surface_correlation}
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 from ..common.schema_tables import Among, ByForm, Section, Unit, Vector, require_one, used_keys
 from ..common.validated_types import AtLeastOne, Count, Finite, Flag, NotNegative, Positive, Text
 from ..errors import InputError
+from ..fem.body import Made, MeshOrigin
 from ..fem.elements import ELEMENTS
 from ..fem.laws.constants import Scale
 from ..fem.laws.materials import DAMPINGS, MATERIALS
@@ -219,8 +220,15 @@ class ObjectSection(Section):
     rest_shape : {"stress_free", "under_gravity"}, optional
         "stress_free": the mesh has the shape without stress. "under_gravity": the mesh has the
         shape in which the object hung or stood under its own weight while it was scanned. By
-        default the mesh counts as stress-free, but the intervals for a mesh from a file include the
-        possibility that it is not.
+        default the mesh counts as stress-free, and the result states how much the estimates would
+        change if it is not.
+    made : Made, optional
+        How the object was made, which selects default deviations of [uncertainty.assumptions] and
+        the plausible densities: "cast" in a mould, cut from or moulded as "foam", "printed", or
+        grown ("tissue").
+    mesh_from : MeshOrigin, optional
+        Origin of the mesh: the drawing from which the object was made ("cad"), or a "scan" of the
+        object. A scan without rest_shape counts as made in an unknown orientation to gravity.
     scan : ScanSection, optional
         Gravity and held nodes during the scan: gravity_m_s2, nodes.
     evaluator : {"auto", "simd", "casadi"}
@@ -244,6 +252,8 @@ class ObjectSection(Section):
     force: list[NodeForceSection] = Field(default_factory=list)
     field: FieldSection | None = None
     rest_shape: Literal["stress_free", "under_gravity"] | None = None
+    made: Made | None = None
+    mesh_from: MeshOrigin | None = None
     scan: ScanSection | None = None
     evaluator: Literal["auto", "simd", "casadi"] = "auto"
 

@@ -16,7 +16,7 @@ from ..common.array_types import Array
 from ..common.declarations import declaration, key
 from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
-from ..fem.body import Body
+from ..fem.body import Body, Made
 from ..fem.laws.materials import DampingLaw, Energy, Material, Prony
 from .checked_arrays import float_converter
 from .custom_sensor import Gauge, GraspQuantities, PointQuantities
@@ -363,6 +363,7 @@ def cell_body(
     material: str | Energy | Material = "neo-hookean",
     prony: tuple[str | Prony, ...] = (),
     damping: str | DampingLaw = "kelvin-voigt",
+    made: Made | None = None,
 ) -> Body:
     """Return the homogeneous cell of a kind of test, one of `TESTS`; other arguments as of `Body`.
 
@@ -377,4 +378,5 @@ def cell_body(
         damping=damping,
         prony=prony,
         rest_shape="stress_free",
+        made=made,
     )

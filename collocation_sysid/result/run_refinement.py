@@ -19,7 +19,6 @@ from ..model.parameters import Parameters
 from ..problem import Problem
 from ..runs.numerical_error import solve_refined
 from ..runs.result_content import ReportedEstimate, Result
-from ..runs.verdict import combined_concerns
 from ..runs.warm_start import WarmStart
 from ..statistics.assessment import NUMERICAL, Assessment, numerical_concerns
 from ..statistics.budget.combined_intervals import combine
@@ -32,9 +31,6 @@ from ..statistics.budget.uncertainty_budget import NUMERICAL as DISCRETISATION
 from ..statistics.estimates import Estimate
 from .replay import damaged_run_refused
 from .run_record import REFINEMENT_FILE
-
-# Code of the concern that is derived again from the new budget.
-COMBINED_INFORMATION = "information/combined"
 
 
 def refine_run(
@@ -166,16 +162,8 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
     uncertainties = {
         name: each.combined_std_error for name, each in after.collect_estimates().items()
     }
-    others = [
-        each
-        for each in before.trust.concerns
-        if each.code not in (*NUMERICAL, COMBINED_INFORMATION)
-    ]
-    concerns = (
-        *others,
-        *numerical_concerns(optimum, uncertainties, refinement=refinement),
-        *combined_concerns(parameters, after.collect_estimates(), shares=budget),
-    )
+    others = [each for each in before.trust.concerns if each.code not in NUMERICAL]
+    concerns = (*others, *numerical_concerns(optimum, uncertainties, refinement=refinement))
     return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
 
 

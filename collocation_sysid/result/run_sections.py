@@ -42,6 +42,7 @@ from ..statistics.budget.uncertainty_budget import main_sources, source_label
 from ..statistics.concerns import Concern, topics_of
 from ..statistics.remedies import remedy_for
 from .picture_captions import captioned_pictures
+from .precision_sentences import alternative_sentences, origin_sentences
 from .probe_sections import (
     DEEPER_CHECK_ADVICE,
     STIFFNESS_NAMES,
@@ -210,7 +211,10 @@ def parameter_section(result: Result) -> TitledParts:
             f"corrected for the stated grip layer and machine compliance: {', '.join(known)}"
         )
     parts += _undetermined_sentence(result)
-    return TitledParts("Parameters", (*parts, *_largest_contributions(result), *result.basis))
+    parts += alternative_sentences(result)
+    parts += _largest_contributions(result)
+    parts += origin_sentences(result)
+    return TitledParts("Parameters", (*parts, *result.basis))
 
 
 def stated_as_undetermined(result: Result) -> set[str]:
@@ -218,7 +222,7 @@ def stated_as_undetermined(result: Result) -> set[str]:
     return {
         name
         for concern in result.trust.concerns
-        if concern.code in ("information/none", "information/combined", "specimen/none")
+        if concern.code in ("information/none", "specimen/none")
         for name in concern.data.get("names", [concern.data.get("name")])
     }
 

@@ -16,6 +16,7 @@ from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
 from ..statistics.remedies import remedy_for
+from .precision_sentences import alternative_sentences
 from .probe_sections import (
     STIFFNESS_NAMES,
     is_deeper_check_worthwhile,
@@ -108,6 +109,7 @@ def _brief(result: Result) -> list[Shown]:
         *(Line(note, "quiet") for note in result.notes if note == NO_CAUSE),
         *_estimates(result),
         *_limit(result),
+        *alternative_sentences(result),
         *_basis(result),
         *_fit(result),
         *probes,

@@ -32,7 +32,7 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE, in_readable_unit
 from ..statistics.field_estimates import FieldEstimate
 from ..statistics.identifiability import identifiability_sentences
-from ..statistics.scale_identifiability import relative_scale_note
+from ..statistics.scale_identifiability import ScaleReference, scale_reference
 from ..statistics.uncertainty import MarkerPlace
 from .forward_simulation import ForwardSimulation
 from .result_content import (
@@ -76,6 +76,9 @@ def build_result(answer: SolvedProblem) -> Result:
         derived={name: values[name] for name in answer.derived},
         basis=tuple(_reference_sentences(problem)),
         budget={name: line.shares for name, line in answer.budget.items()},
+        alternatives=answer.alternatives,
+        origin_answers=answer.origin_answers,
+        scale=_scale(problem),
         probes=answer.probes,
         places=answer.places,
         nuisance=_nuisance(answer),
@@ -129,6 +132,13 @@ def _provenance(problem: Problem) -> Provenance:
     )
 
 
+def _scale(problem: Problem) -> ScaleReference | None:
+    """Return what sets the scale of the moduli if no force is measured, else None."""
+    return scale_reference(
+        problem.experiments, problem.parameters, deviation=problem.assumed_deviations["mass"]
+    )
+
+
 def _reference_sentences(problem: Problem) -> Iterator[str]:
     """Yield up to two sentences on what the values refer to: the damping law of γ_r if a body has
     it, and how moduli are scaled if no force is measured.
@@ -140,8 +150,8 @@ def _reference_sentences(problem: Problem) -> Iterator[str]:
     ]
     if law_names:
         yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
-    if (relative := relative_scale_note(problem.experiments, problem.parameters)) is not None:
-        yield relative
+    if (scale := _scale(problem)) is not None:
+        yield scale.sentence
 
 
 def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 from ..common.array_types import Array
 from ..common.display import short
@@ -18,10 +19,13 @@ from ..fem.two_phase import PhaseSummary
 from ..methods.solution import Iteration, Timing
 from ..methods.stiffness_scan import ScanSummary
 from ..statistics.assessment import Assessment
+from ..statistics.budget.alternatives import Alternative, OriginAnswer
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.probes.relaxed_assumptions import Probe
+from ..statistics.remedies import remedy_for
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
+from ..statistics.scale_identifiability import ScaleReference
 from ..statistics.uncertainty import MarkerPlace
 
 
@@ -127,6 +131,28 @@ class ReportedEstimate(Estimate):
             return None
         difference = self.combined_std_error**2 - self.statistical_std_error**2
         return max(0.0, difference) ** 0.5
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What limits the precision of an estimate.
+
+    Attributes
+    ----------
+    determined : bool
+        Whether the combined interval is not wider than the value.
+    source : str
+        Largest source of the variance in the budget.
+    share : float
+        Its share of the variance.
+    remedy : str
+        What to measure or to state in order to reduce it, an imperative phrase.
+    """
+
+    determined: bool
+    source: str
+    share: float
+    remedy: str
 
 
 @dataclass(frozen=True)
@@ -428,6 +454,13 @@ class Result:
     budget : mapping of name to mapping of source to float
         Share of each source in the variance of each estimate, largest first; empty without error
         bars.
+    alternatives : tuple of Alternative
+        Estimates under other assumptions, whose effect the intervals do not contain.
+    origin_answers : tuple of OriginAnswer
+        Intervals for each answer to the open questions how the body was made and where its mesh
+        comes from.
+    scale : ScaleReference or None
+        The stated mass to which moduli are relative; None if a force or a prior sets their scale.
     probes : tuple of Probe
         Refits with an assumption relaxed and, where requested, of parts of the data.
     places : mapping of experiment to mapping of marker to MarkerPlace
@@ -463,6 +496,8 @@ class Result:
         Software and files.
     """
 
+    SERIALISED_PROPERTIES: ClassVar = ("limits",)
+
     schema: int
     status: str
     converged: bool
@@ -475,6 +510,9 @@ class Result:
     derived: Mapping[str, ReportedEstimate]
     basis: tuple[str, ...]
     budget: Mapping[str, Mapping[str, float]]
+    alternatives: tuple[Alternative, ...]
+    origin_answers: tuple[OriginAnswer, ...]
+    scale: ScaleReference | None
     probes: tuple[Probe, ...]
     places: Mapping[str, Mapping[str, MarkerPlace]]
     nuisance: Mapping[str, Mapping[str, NuisanceResult]]
@@ -514,6 +552,17 @@ class Result:
         content = read_json(folder / RESULT_FILE, expected)
         with damage_refused(folder, RESULT_FILE, remedy="solve the problem again"):
             return read(cls, content)
+
+    @property
+    def limits(self) -> dict[str, Limit]:
+        """What limits the precision of each estimate with a budget, by name."""
+        estimates = self.collect_estimates()
+        return {
+            name: Limit(estimates[name].is_determined, source, share, remedy_for(source))
+            for name, shares in self.budget.items()
+            if name in estimates
+            for source, share in [*shares.items()][:1]
+        }
 
     def collect_estimates(self) -> dict[str, ReportedEstimate]:
         """Return the scalar parameters, then derived moduli, by name."""

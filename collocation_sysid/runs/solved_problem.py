@@ -15,6 +15,12 @@ from ..fem.laws.constants import unit_of
 from ..methods.solution import Solution
 from ..problem import Problem
 from ..statistics.assessment import Assessment, cause_concerns, numerical_concerns, probe_concerns
+from ..statistics.budget.alternatives import (
+    Alternative,
+    OriginAnswer,
+    find_alternatives,
+    origin_answers,
+)
 from ..statistics.budget.combined_intervals import combine
 from ..statistics.budget.discretisation_error import DiscretisationError, Refinement
 from ..statistics.budget.uncertainty_budget import BudgetLine, VarianceSources, budget
@@ -33,7 +39,7 @@ from .check.modes_check import ModesCheck
 from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
 from .result_content import Elapsed, ReportedEstimate
-from .verdict import combined_concerns, expected_rms_m, modes_by_experiment, solution_concerns
+from .verdict import expected_rms_m, modes_by_experiment, solution_concerns
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +180,34 @@ class SolvedProblem:
             parameters=self.solution.collocation.parameters,
         )
 
+    @cached_property
+    def alternatives(self) -> tuple[Alternative, ...]:
+        """Estimates under other assumptions, whose effect the intervals do not contain; empty
+        without systematic effects.
+        """
+        if self.systematic_effects is None:
+            return ()
+        return find_alternatives(
+            self.systematic_effects, self.estimates, parameters=self.solution.collocation.parameters
+        )
+
+    @cached_property
+    def origin_answers(self) -> tuple[OriginAnswer, ...]:
+        """Intervals for each answer to the open questions how the first body was made and where its
+        mesh comes from; empty without systematic effects.
+        """
+        if self.systematic_effects is None:
+            return ()
+        return tuple(
+            origin_answers(
+                self.systematic_effects,
+                self.budget,
+                parameters=self.solution.collocation.parameters,
+                body=self.problem.bodies[0],
+                stated=self.problem.uncertainty.assumptions,
+            )
+        )
+
     def collect_discretisation_errors(self) -> Mapping[str, DiscretisationError]:
         """Return the known discretisation errors, by name of the estimate; empty without
         `refinement`.
@@ -222,10 +256,6 @@ class SolvedProblem:
         )
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
         numerical = numerical_concerns(self.optimum, uncertainties, refinement=self.refinement)
-        shares = {name: line.shares for name, line in self.budget.items()}
-        vague = combined_concerns(
-            self.solution.collocation.parameters, self.estimates, shares=shares
-        )
         of_fields = [concern for field in self.fields.values() for concern in field.list_concerns()]
         if not self.omitted_checks:
             probed = probe_concerns(
@@ -242,7 +272,6 @@ class SolvedProblem:
                     *of_fields,
                     *probed,
                     *numerical,
-                    *vague,
                     *meshes,
                     *grasp_extent_concerns(self.problem),
                 )

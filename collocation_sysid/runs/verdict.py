@@ -10,7 +10,6 @@ from ..common.array_types import root_mean
 from ..errors import SimulationError
 from ..features.registry import FEATURES
 from ..methods.solution import Solution, Status
-from ..model.parameters import Parameters
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.modes.stability import find_instabilities
@@ -31,14 +30,12 @@ from ..statistics.assessment import (
     stability_concerns,
     validation_concerns,
 )
-from ..statistics.budget.uncertainty_budget import source_label
 from ..statistics.concerns import Concern
 from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
 )
-from ..statistics.remedies import remedy_for
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.specimen_concerns import as_specimen_concerns
@@ -47,7 +44,6 @@ from ..statistics.uncertainty import Uncertainty
 from .check.modes_check import ModesCheck, check_modes
 from .forward_simulation import ForwardSimulation
 from .prediction import fit_misfits
-from .result_content import ReportedEstimate
 
 # Largest noise of cameras, relative to the size of the body.
 LARGEST_CAMERA_NOISE = 0.01
@@ -140,48 +136,6 @@ def solution_concerns(
                 added_ratio=motion.first_mode.numerical_damping_ratio,
                 period_error=motion.first_mode.period_error,
             )
-
-
-def combined_concerns(
-    parameters: Parameters,
-    estimates: Mapping[str, ReportedEstimate],
-    shares: Mapping[str, Mapping[str, float]],
-) -> list[Concern]:
-    """Return a concern for each estimated parameter that has a budget and whose combined interval
-    is wider than its value or missing.
-
-    Derived moduli give none: λ of a nearly incompressible material is rarely determined. Parameters
-    without a statistical standard error give none either, because "information/none" names them.
-
-    Parameters
-    ----------
-    parameters : Parameters
-        Parameters, of which the estimated ones count.
-    estimates : mapping of name to ReportedEstimate
-        Estimates of all of them.
-    shares : mapping of name to mapping of source to float
-        Shares of the variance in the budget, largest first; parameters without an entry are left
-        out.
-    """
-    return [
-        _undetermined_concern(item.name, estimates[item.name], shares=shares[item.name])
-        for item in parameters.free
-        if item.name in shares
-        and estimates[item.name].statistical_std_error is not None
-        and not estimates[item.name].is_determined
-    ]
-
-
-def _undetermined_concern(
-    name: str, estimate: ReportedEstimate, shares: Mapping[str, float]
-) -> Concern:
-    """Return the concern about the undetermined estimate `name`, with the first, largest share of
-    its budget `shares`, which must not be empty.
-    """
-    source, share = next(iter(shares.items()))
-    low, high = estimate.combined95 or (np.nan, np.nan)
-    data = {"name": name, "low": low, "high": high, "source": source_label(source), "share": share}
-    return Concern("information/combined", "check", data={**data, "remedy": remedy_for(source)})
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:

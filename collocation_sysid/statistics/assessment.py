@@ -263,12 +263,12 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
 
 
 def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Return concerns about estimated parameters at their bounds, and about those without a
-    standard error.
+    """Return concerns about estimated parameters at their bounds, and one, "doubtful", if no
+    parameter has a standard error, so that there is no answer.
 
-    Several parameters at bounds are one concern, "doubtful"; a single one is "check". Parameters
-    without standard error are one concern, "doubtful" if it is all of the estimated parameters,
-    else "check". Mode coefficients of fields do not count.
+    Several parameters at bounds are one concern, "doubtful"; a single one is "check". Mode
+    coefficients of fields do not count. That some parameters are not determined contradicts nothing
+    and is no concern: the table of the estimates shows it.
     """
     known = uncertainty.estimates
     estimates = {name: known[name] for name in uncertainty.names if name in known}
@@ -283,8 +283,8 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     return [
         *concern_if(bool(bounded), several, code=code, names=bounded),
         *concern_if(
-            bool(undetermined),
-            len(undetermined) == len(estimates),
+            bool(undetermined) and len(undetermined) == len(estimates),
+            True,
             code="information/none",
             names=undetermined,
         ),

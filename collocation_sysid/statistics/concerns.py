@@ -221,9 +221,6 @@ TOPICS: dict[str, Topic] = {
             "bounds": "{names} ended at their bounds: widen the bounds, or fix the parameters",
             "none": "the data do not determine {names}: state known values or priors, or record a "
             "motion on which these parameters have a larger influence",
-            "combined": "{name} is not determined: its combined 95 % interval, {low:.3g} to "
-            "{high:.3g}, is wider than its value; largest contribution "
-            "{source} ({share:.0%}): {remedy}",
             "at-bound": "{name} is at a bound: widen the bound, or fix the parameter",
             "not-yet": "{name} is not known yet, because {reason}: wait for more frames",
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",

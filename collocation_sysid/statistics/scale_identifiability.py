@@ -8,6 +8,8 @@ unless a force or mass is known. Slow or static experiments determine stiffness 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -64,19 +66,55 @@ def scale_concerns(
     return [Concern("scale/unknown", grade, data={"names": names})] if names else []
 
 
-def relative_scale_note(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
-    """Return the note that moduli are relative to the stated density; None if a force or a prior
-    sets the scale, or if the scale is open (`parameters_of_open_scale`).
+@dataclass(frozen=True)
+class ScaleReference:
+    """The stated mass, to which the moduli of a motion without measured forces are relative.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters of which only the ratio to the density is determined.
+    density_kg_m3 : float
+        Mass of all fitted bodies over their volume, as stated.
+    deviation : float or None
+        Relative standard deviation of the mass, which the intervals contain; None if the mass
+        counts as exact.
     """
-    names = relative_moduli(experiments, parameters)
-    if not names or parameters_of_open_scale(experiments, parameters):
+
+    SERIALISED_PROPERTIES: ClassVar = ("sentence",)
+
+    names: tuple[str, ...]
+    density_kg_m3: float
+    deviation: float | None
+
+    @property
+    def sentence(self) -> str:
+        """What the moduli rest on, in one sentence."""
+        symbols = listed([symbol_of(name) for name in self.names])
+        verb = "is" if len(self.names) == 1 else "are"
+        share = (
+            "no error" if self.deviation is None else f"an error of {100 * self.deviation:.2g} %"
+        )
+        return (
+            f"{symbols} {verb} relative to the stated density of {self.density_kg_m3:.4g} kg/m³: no "
+            "force was measured, so an error of the mass changes these values by the same share and "
+            f"leaves no trace in the data; the intervals contain {share} of the mass"
+        )
+
+
+def scale_reference(
+    experiments: Iterable[Experiment], parameters: Parameters, deviation: float | None
+) -> ScaleReference | None:
+    """Return the mass to which moduli are relative; None if a force or a prior sets the scale, or
+    if the scale is open (`parameters_of_open_scale`). `deviation` is that of the mass.
+    """
+    fitted = [each for each in experiments if not each.validation]
+    names = relative_moduli(fitted, parameters)
+    if not names or parameters_of_open_scale(fitted, parameters):
         return None
-    verb = "the value assumes" if len(names) == 1 else "the values assume"
-    symbols = [symbol_of(name) for name in names]
-    return (
-        f"no known force sets the scale: the data determine {listed(symbols)} only relative "
-        f"to the density; {verb} the stated density"
-    )
+    bodies = {id(each.body): each.body for each in fitted}.values()
+    density = sum(body.mass_kg for body in bodies) / sum(body.mesh.volume_m3 for body in bodies)
+    return ScaleReference(names, float(density), deviation)
 
 
 def _scaled_parameters(

@@ -22,6 +22,7 @@ from kit.rest_shapes import (
 )
 
 import collocation_sysid as cs
+from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Indices
@@ -33,6 +34,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.result.element_fields import ElementFields
+from collocation_sysid.result.run_sections import run_summary
 from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.linearised import linearise_fit
@@ -208,13 +210,30 @@ def test_with_the_scan_described_the_interval_contains_the_truth(described):
     assert "rest_shape" not in significant(run)
 
 
-def test_without_the_key_the_budget_contains_the_error():
-    run = cs.run(problem_of(measured(None), **ONE_STEP), seek_causes=False)
+def test_of_a_scan_in_an_unknown_orientation_the_budget_contains_the_error():
+    run = cs.run(problem_of(measured(None, mesh_from="scan"), **ONE_STEP), seek_causes=False)
     estimate = run.estimates["young_pa"]
     assert abs(estimate.value / TRUTH["young_pa"] - 1) > 0.3
     low, high = combined(estimate)
     assert low < TRUTH["young_pa"] < high
     assert next(iter(run.budget["young_pa"].shares)) == "rest_shape"
+    assert not any(each.assumption == "rest_shape" for each in run.alternatives)
+
+
+def test_without_a_statement_one_line_says_how_much_a_scan_under_gravity_would_change():
+    run = cs.run(problem_of(measured(None), **ONE_STEP), seek_causes=False)
+    assert "rest_shape" not in run.budget["young_pa"].shares
+    (hanging,) = (each for each in run.alternatives if each.assumption == "rest_shape")
+    assert hanging.condition.startswith("if the mesh was scanned while the body hung along its ")
+    value = run.estimates["young_pa"].value
+    change = abs(hanging.values["young_pa"] / value - 1)
+    assert change > 0.5  # of a true one of 220 %, beyond first order
+    (line,) = (line for line in lines_of(run) if line.startswith(hanging.condition))
+    assert line.endswith(f"E would change by about {change:.0%} (object.rest_shape is not stated)")
+
+
+def lines_of(run) -> list[str]:
+    return plain_text(run_summary(run.result)).splitlines()
 
 
 def combined(estimate) -> tuple[float, float]:
@@ -305,7 +324,7 @@ def test_a_generated_mesh_and_one_that_is_said_to_be_free_of_stress_have_no_such
     copy = TetMesh(bar.mesh.points_m, bar.mesh.tetrahedra)
     stated = cs.Body(copy, mass_kg=bar.mass_kg, rest_shape="stress_free")
     for body in (bar, stated):
-        found = changes_of(recorded(body, np.pi / 2))
+        found = changes_of(recorded(body, np.pi / 2), rest_shape=1.0)
         assert not any(found[f"rest_shape {axis}"].any() for axis in "xyz")
         assert found["surface 1"].any()
 
@@ -399,4 +418,15 @@ def test_a_finer_mesh_keeps_what_is_stated():
     held = finer.scan_conditions.grasped_nodes(finer.nodes)
     assert np.abs(finer.nodes.points_m[held, 0]).max() < 1e-9
     assert len(held) == 25
-    assert UncertaintyOptions().assumptions.collect_deviations()["rest_shape"] == 0.58
+
+
+def test_an_unstated_rest_shape_counts_as_stress_free_unless_the_mesh_is_a_scan():
+    options = UncertaintyOptions()
+    assert options.collect_considered([scanned_body()])["rest_shape"] is None
+    box = box_mesh((0.12, 0.03, 0.03), (2, 1, 1))
+    mesh = TetMesh(box.points_m, box.tetrahedra)  # not generated from stated lengths
+    assert cs.Body(mesh, density_kg_m3=100.0).rest_shape is None
+    for origin, stated, deviation in (("scan", None, 0.58), ("cad", "stress_free", None)):
+        body = cs.Body(mesh, density_kg_m3=100.0, mesh_from=origin)
+        assert body.rest_shape == stated
+        assert options.collect_considered([body])["rest_shape"] == deviation

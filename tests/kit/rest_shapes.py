@@ -90,6 +90,7 @@ def measured(
     static: bool = False,
     seed: int | None = 0,
     steps: int = 25,
+    mesh_from: str | None = None,
 ) -> Experiment:
     """A recording of the bar, straight when free of stress, described by the mesh of the scan."""
     truth = recorded(straight_bar(), turn_rad, static, steps)
@@ -99,7 +100,7 @@ def measured(
     mesh = hung_mesh()
     # Mass is that of the bar, whatever the volume of the mesh.
     mass_kg = straight_bar().mass_kg
-    body = Body(mesh, mass_kg=mass_kg, rest_shape=rest_shape)
+    body = Body(mesh, mass_kg=mass_kg, rest_shape=rest_shape, mesh_from=mesh_from)
     return with_markers(recorded(body, turn_rad, static, steps), tracks)
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import re
 from dataclasses import fields
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import pytest
 from pydantic_core import PydanticUndefined
 
 from collocation_sysid import Nuisance
 from collocation_sysid.common.field_descriptions import documented
+from collocation_sysid.fem.body import Made, MeshOrigin
 from collocation_sysid.problem.nuisance_schema import KEYS, NuisanceSection
 from collocation_sysid.problem.validation_messages import table_models
 from collocation_sysid.recording.nuisance import KINDS, NuisanceRow
@@ -88,11 +89,22 @@ def test_assumptions_have_a_field_for_each_row():
     assert Assumptions().collect_deviations() == defaults
 
 
+BY_ORIGIN = {row.name for row in ASSUMPTIONS if row.usual}
+
+
+def test_defaults_by_origin_name_ways_of_making_a_body_or_origins_of_its_mesh():
+    ways, origins = set(get_args(Made)), set(get_args(MeshOrigin))
+    for row in ASSUMPTIONS:
+        assert set(row.usual) <= ways or set(row.usual) <= origins
+        assert row.sigma not in row.usual.values()
+
+
 def test_only_effects_of_known_sign_have_a_mean():
     forms = get_type_hints(Assumptions, include_extras=True)
     for field in fields(Assumptions):
         known = field.name in OF_KNOWN_SIGN
-        assert forms[field.name] == (KnownDeviation if known else Deviation)
+        usual = Deviation | None if field.name in BY_ORIGIN else Deviation
+        assert forms[field.name] == (KnownDeviation if known else usual)
 
 
 def test_fields_of_assumptions_are_described_as_the_rows():

@@ -18,7 +18,7 @@ from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.scale_identifiability import (
     parameters_of_open_scale,
     relative_moduli,
-    relative_scale_note,
+    scale_reference,
 )
 
 STIFF = {"lambda_pa": Unknown(300.0), "mu_pa": Unknown(200.0)}
@@ -120,15 +120,19 @@ def test_where_a_mass_sets_the_scale_the_density_is_found_and_nothing_said():
 def test_moduli_relative_to_a_density_as_stated_are_called_so():
     found = problem(STIFF | DAMPED)
     assert relative_moduli(found.experiments, found.parameters) == ("lambda_pa", "mu_pa")
-    said = relative_scale_note(found.experiments, found.parameters)
-    assert said == (
-        "no known force sets the scale: the data determine λ and μ only relative to "
-        "the density; the values assume the stated density"
+    scale = scale_reference(found.experiments, found.parameters, 0.02)
+    assert scale.density_kg_m3 == pytest.approx(30.0)
+    assert scale.sentence == (
+        "λ and μ are relative to the stated density of 30 kg/m³: no force was measured, so an error "
+        "of the mass changes these values by the same share and leaves no trace in the data; the "
+        "intervals contain an error of 2 % of the mass"
     )
+    exact = scale_reference(found.experiments, found.parameters, None)
+    assert exact.sentence.endswith("the intervals contain no error of the mass")
     cube = hung_cube()
     loaded = problem(STIFF | DAMPED, masses=[PointMass(tip(cube), 0.01)])
-    assert relative_scale_note(loaded.experiments, loaded.parameters) is None
-    assert relative_scale_note(problem(OPEN).experiments, problem(OPEN).parameters) is None
+    assert scale_reference(loaded.experiments, loaded.parameters, 0.01) is None
+    assert scale_reference(problem(OPEN).experiments, problem(OPEN).parameters, 0.01) is None
 
 
 # In a problem file ----------------------------------------------------------------------------
@@ -207,4 +211,4 @@ def test_densities_that_cannot_be_are_refused(tiny, edits, words):
 
 def test_the_terminal_says_what_moduli_rest_on(tiny):
     shown = run_command("solve", "problem.toml")
-    assert "only relative to the density" in " ".join(shown.out.split())
+    assert "relative to the stated density of" in " ".join(shown.out.split())

@@ -641,7 +641,7 @@ def _budget_record(problem: Problem, solution: Solution, fit: LinearisedFit) -> 
     try:
         known = uncertainty_from_fit(fit, parameters, q=solution.q, error_model=options)
         changes = changes_of_assumptions(
-            solution.collocation, solution.z, deviations=options.collect_considered()
+            solution.collocation, solution.z, deviations=problem.assumed_deviations
         )
     except (InputError, SimulationError):
         return {}  # without error bars there is none

@@ -102,6 +102,8 @@ def refine_body(body: Body) -> Body:
         prony=rest.prony,
         forces=[_refined_force(placed, mesh, body=body) for placed in body.placed_forces],
         rest_shape=_refined_rest_shape(body, mesh),
+        made=body.made,
+        mesh_from=body.mesh_from,
         evaluator=body.evaluator,
         threads=body.threads,
     )

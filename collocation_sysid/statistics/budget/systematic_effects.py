@@ -10,8 +10,8 @@ state standard deviations.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -25,7 +25,7 @@ from ...common.schema_tables import ByForm, Section
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive
 from ...fem.body import Body
-from ...fem.laws.constants import GAMMA_R, without_region
+from ...fem.laws.constants import GAMMA_M, GAMMA_R, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.rest_shape import RestShape
@@ -68,6 +68,8 @@ AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
 # Poisson's ratio of an incompressible material.
 INCOMPRESSIBLE_POISSON = 0.5
+# Deviation of each component of a vector of length one with an unknown direction.
+UNKNOWN_ORIENTATION = 0.58
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
 # Differences by a displacement: its largest entry over the length of an edge.
@@ -392,6 +394,16 @@ class Assumption:
         Names of components with independent errors, separated by spaces; empty if there is one.
     of_specimens : bool
         Whether it concerns homogeneous specimens too, which have neither a mesh nor grips.
+    usual : mapping of str to float
+        Default standard deviations in place of `sigma`, by `Body.made` or `Body.mesh_from`.
+    redefines : tuple of str
+        Constants, without a region, that another answer to the assumption would define differently.
+        Their intervals are conditional on the assumption, and do not contain its effect; the values
+        under the alternative are reported instead.
+    alternative : str
+        Condition under which the assumption is wrong by one unit, with the placeholder "component",
+        for an assumption whose alternative is reported. An alternative is also evaluated if the
+        budget does not contain the assumption, unless the assumption is stated to be exact.
     """
 
     name: str
@@ -402,6 +414,9 @@ class Assumption:
     effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
     of_specimens: bool = False
+    usual: Mapping[str, float] = field(default_factory=dict)
+    redefines: tuple[str, ...] = ()
+    alternative: str = ""
 
     def list_components(self) -> tuple[str, ...]:
         """Return the names of the components, each after that of the assumption and a space; the
@@ -854,17 +869,20 @@ ASSUMPTIONS = (
         description="relative error of the size of the mesh",
         remedy="measure two lengths of the real body and scale the mesh to them",
         effect=_size,
+        usual={"cast": 0.005, "printed": 0.005, "tissue": 0.02},
     ),
     Assumption(
         "rest_shape",
         "1",
-        sigma=0.58,
+        sigma=None,
         description="share of the weight of the body under which the mesh was deformed when "
         "it was made, along each axis, if object.rest_shape is not stated",
         remedy="state object.rest_shape: whether the mesh is free of stress, or the shape in "
         "which the body hung or stood during its scan",
         effect=_rest_shape,
         component_names="x y z",
+        usual={"scan": UNKNOWN_ORIENTATION},
+        alternative="if the mesh was scanned while the body hung along its {component} axis",
     ),
     Assumption(
         "surface",
@@ -875,6 +893,7 @@ ASSUMPTIONS = (
         remedy="measure the thickness of the real body at several places",
         effect=_surface,
         component_names=_MODES,
+        usual={"scan": 0.01},
     ),
     Assumption(
         "mass",
@@ -903,6 +922,7 @@ ASSUMPTIONS = (
         remedy="weigh two halves of a specimen",
         effect=_density_gradient,
         component_names="x y z",
+        usual={"cast": 0.01, "printed": 0.02, "tissue": 0.02},
     ),
     Assumption(
         "stiffness_gradient",
@@ -913,6 +933,7 @@ ASSUMPTIONS = (
         remedy="press specimens from both ends of the body, or estimate a field of the stiffness",
         effect=_stiffness_gradient,
         component_names="x y z",
+        usual={"cast": 0.015, "foam": 0.1, "printed": 0.03, "tissue": 0.15},
     ),
     Assumption(
         "anisotropy",
@@ -924,6 +945,7 @@ ASSUMPTIONS = (
         effect=_anisotropy,
         component_names="x y z",
         of_specimens=True,
+        usual={"cast": 0.015, "foam": 0.2, "printed": 0.15, "tissue": 0.3},
     ),
     Assumption(
         "stiffness_drift",
@@ -933,6 +955,7 @@ ASSUMPTIONS = (
         remedy="repeat the first recording at the end",
         effect=_drift,
         of_specimens=True,
+        usual={"tissue": 0.05},
     ),
     Assumption(
         "memory_share",
@@ -973,6 +996,8 @@ ASSUMPTIONS = (
         'or state damping_law = "none" where the law is known',
         effect=_objective_damping,
         component_names=" ".join(OBJECTIVE_DAMPINGS),
+        redefines=(GAMMA_R.name, GAMMA_M.name),
+        alternative="with the damping law {component}",
     ),
     Assumption(
         "rayleigh_damping",
@@ -982,6 +1007,8 @@ ASSUMPTIONS = (
         "its damping force from that of the stated law",
         remedy="compare the laws with compare-models --damping on motions that rotate the body",
         effect=_rayleigh_damping,
+        redefines=(GAMMA_R.name, GAMMA_M.name),
+        alternative="with the damping law rayleigh",
     ),
     Assumption(
         "grip_layer_m",
@@ -1077,6 +1104,23 @@ ASSUMPTIONS = (
 )
 
 
+def usual_deviations(bodies: Iterable[Body]) -> dict[str, float | None]:
+    """Return the default standard deviation of each assumption for bodies, by name; None for an
+    assumption that does not count by default. Of several bodies the largest deviation counts.
+    """
+    origins = {(body.made, body.mesh_from) for body in bodies} or {(None, None)}
+
+    def usual(row: Assumption) -> float | None:
+        """Return the largest default of an assumption."""
+        known = [
+            next((row.usual[each] for each in origin if each and each in row.usual), row.sigma)
+            for origin in origins
+        ]
+        return max((each for each in known if each is not None), default=None)
+
+    return {row.name: usual(row) for row in ASSUMPTIONS}
+
+
 class KnownEffect(Section):
     """Systematic effect of known sign and size, for which estimates are corrected to first order.
 
@@ -1093,6 +1137,8 @@ class KnownEffect(Section):
 
 
 Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
+# A deviation whose default follows from how the body and its mesh were made, see `Assumption.usual`.
+UsualDeviation = Deviation | None
 KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
 # Rows that are never negative, of which a mean may be stated: what gives way does not push.
 OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n", "marker_mass_kg")
@@ -1104,29 +1150,31 @@ class Assumptions:
 
     An effect that is known to exist, such as the compliance of a machine, has a table of mean and
     deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
-    There is a field for each row of `ASSUMPTIONS` and of `recording.nuisance.KINDS`.
+    There is a field for each row of `ASSUMPTIONS` and of `recording.nuisance.KINDS`. Fields that are
+    None have the default of bodies that were made like those of the problem, see
+    `usual_deviations`.
 
     Attributes
     ----------
-    body_scale : float or "none"
+    body_scale : float or "none", optional
         Relative error of the size of the mesh [1].
-    rest_shape : float or "none"
+    rest_shape : float or "none", optional
         Share of the weight of the body under which the mesh was deformed when it was made, along
         each axis, if object.rest_shape is not stated [1].
-    surface : float or "none"
+    surface : float or "none", optional
         Displacement of the surface of the body from that of the mesh along its normal, relative to
         the thickness [1].
     mass : float or "none"
         Relative error of the mass of the body, if the mass is not estimated [1].
     marker_mass_kg : float, "none" or table
         Mass of each marker, which is not part of the mass of the body [kg].
-    density_gradient : float or "none"
+    density_gradient : float or "none", optional
         Relative difference of the density at one end of the body from that in its middle [1].
-    stiffness_gradient : float or "none"
+    stiffness_gradient : float or "none", optional
         Relative difference of the stiffness at one end of the body from that in its middle [1].
-    anisotropy : float or "none"
+    anisotropy : float or "none", optional
         Relative difference of the stiffness along one axis from that across it [1].
-    stiffness_drift : float or "none"
+    stiffness_drift : float or "none", optional
         Relative change of the stiffness from the beginning to the end of a recording [1].
     memory_share : float or "none"
         Share of a branch of viscoelastic memory (Prony term) that the material lacks, for each
@@ -1242,15 +1290,15 @@ class Assumptions:
         the body, in pixels [px].
     """
 
-    body_scale: Deviation = 0.01
-    rest_shape: Deviation = 0.58
-    surface: Deviation = 0.005
+    body_scale: UsualDeviation = None
+    rest_shape: UsualDeviation = None
+    surface: UsualDeviation = None
     mass: Deviation = 0.01
     marker_mass_kg: KnownDeviation = "none"
-    density_gradient: Deviation = 0.05
-    stiffness_gradient: Deviation = 0.05
-    anisotropy: Deviation = 0.05
-    stiffness_drift: Deviation = 0.02
+    density_gradient: UsualDeviation = None
+    stiffness_gradient: UsualDeviation = None
+    anisotropy: UsualDeviation = None
+    stiffness_drift: UsualDeviation = None
     memory_share: Deviation = "none"
     time_scale: Deviation = 0.0001
     poisson: Deviation = 0.02
@@ -1308,14 +1356,22 @@ class Assumptions:
         exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
         return Assumptions(**exact)
 
-    def collect_deviations(self) -> dict[str, float | None]:
+    def collect_deviations(
+        self, usual: Mapping[str, float | None] | None = None
+    ) -> dict[str, float | None]:
         """Return the standard deviations by name, of all fields; None for what is exact, the
         deviation about the mean for a known effect.
+
+        Parameters
+        ----------
+        usual : mapping of str to float or None, optional
+            Deviations of the fields that are None, by default those of bodies of unknown origin.
         """
+        defaults = usual_deviations(()) if usual is None else usual
         by_name: dict[str, float | None] = {}
         for name, deviation in vars(self).items():
             known = deviation.deviation if isinstance(deviation, KnownEffect) else deviation
-            by_name[name] = None if known == "none" else known
+            by_name[name] = defaults[name] if known is None else None if known == "none" else known
         return by_name
 
     def collect_means(self) -> dict[str, float]:

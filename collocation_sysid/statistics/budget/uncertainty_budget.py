@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...common.array_types import Array
+from ...fem.laws.constants import without_region
 from ...model.parameters import Parameters
 from ..distributions import student_ppf
 from ..estimates import Estimate, IntervalCoordinate
@@ -26,11 +27,22 @@ from .combined_intervals import NORMAL_95, Interval, combine, widened_interval
 from .consider_analysis import ResidualChanges
 from .discretisation_error import DiscretisationError, estimate_changes
 from .memory_effect import RELAXATION_TIME
+from .systematic_effects import ASSUMPTIONS
 
 NOISE = "noise"
 NUISANCES = "nuisance parameters"
 NUMERICAL = "step and mesh"
 BETWEEN = "between recordings"
+# Rows of assumptions whose alternative is reported, by name.
+ALTERNATIVES = {row.name: row for row in ASSUMPTIONS if row.alternative}
+
+
+def is_definition(row: str, estimate: str) -> bool:
+    """Return whether an assumption, by its name, defines an estimate: under the alternative the
+    constant would be another quantity, see `Assumption.redefines`.
+    """
+    known = ALTERNATIVES.get(row)
+    return known is not None and without_region(estimate) in known.redefines
 
 
 @dataclass(frozen=True)
@@ -123,6 +135,9 @@ class VarianceSources:
         Degrees of freedom of these deviations: recordings less one.
     means : mapping of str to float
         Known effects over their standard deviations, for which estimates are corrected.
+    alternatives : mapping of str to (nq,) array
+        Changes of q if an assumption with an alternative (`Assumption.alternative`) is wrong by one
+        unit, by its name with its component.
     """
 
     names: tuple[str, ...]
@@ -134,6 +149,7 @@ class VarianceSources:
     recording_sensitivities: Array
     freedom: int = 0
     means: Mapping[str, float] = field(default_factory=dict)
+    alternatives: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
     def from_fit(
@@ -143,6 +159,9 @@ class VarianceSources:
         parameters: Parameters,
         q: Array,
         uncertainty: Uncertainty,
+        *,
+        deviations: Mapping[str, float | None] | None = None,
+        evaluated: Mapping[str, float | None] | None = None,
         means: Mapping[str, float] | None = None,
     ) -> VarianceSources:
         """Compute the sources of a fit.
@@ -159,6 +178,12 @@ class VarianceSources:
             Estimates in the solver's coordinates.
         uncertainty : Uncertainty
             Statistical uncertainty of the fit.
+        deviations : mapping of str to float or None, optional
+            Standard deviations in the budget; assumptions that are None do not contribute. By
+            default all of `assumed` contribute.
+        evaluated : mapping of str to float or None, optional
+            Standard deviations for which `assumed` was computed, without which no alternatives are
+            known.
         means : mapping of str to float, optional
             Known effects over their standard deviations; None if there are none.
 
@@ -174,6 +199,15 @@ class VarianceSources:
             inverse = np.linalg.pinv(information[np.ix_(here, here)], hermitian=True)
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
         moved = estimate_changes(fit, assumed.blocks)[: fit.shared_count]
+        rows = [name.partition(" ")[0] for name in assumed.names]
+        units = evaluated or {}
+        alternatives = {
+            name: moved[:, k] / (units[row] or 1.0)
+            for k, (name, row) in enumerate(zip(assumed.names, rows, strict=True))
+            if row in units and row in ALTERNATIVES
+        }
+        known_deviations = deviations or {}
+        budgeted = [k for k, row in enumerate(rows) if known_deviations.get(row, 1.0) is not None]
         by_q = _estimate_derivatives(fit, parameters, q=q)
         scatter = uncertainty.scatter
         between = np.zeros((fit.shared_count, 0))
@@ -184,8 +218,8 @@ class VarianceSources:
         wider = uncertainty.widening
         known_effects = dict(means or {})
         return cls(
-            assumed.names,
-            moved,
+            tuple(assumed.names[k] for k in budgeted),
+            moved[:, budgeted],
             covariance_free=all_free,
             covariance_known=known,
             derivatives=by_q,
@@ -193,6 +227,7 @@ class VarianceSources:
             recording_sensitivities=between,
             freedom=freedom,
             means=known_effects,
+            alternatives=alternatives,
         )
 
     def noise_shares(self, by_q: Array) -> tuple[float, float]:
@@ -253,15 +288,21 @@ class VarianceSources:
         sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
         return float(by_q @ self.sensitivities @ sizes)
 
-    def variances_of_assumptions(self, by_q: Array) -> dict[str, float]:
+    def variances_of_assumptions(self, estimate: str, by_q: Array) -> dict[str, float]:
         """Return the variance by each assumption, its components summed, of an estimate with the
-        derivative `by_q` (nq,), by the assumption's name.
+        derivative `by_q` (nq,), by the assumption's name; without those that define the estimate.
         """
         variances: dict[str, float] = {}
         for name, way in zip(self.names, by_q @ self.sensitivities, strict=True):
             row = name.partition(" ")[0]
-            variances[row] = variances.get(row, 0.0) + float(way) ** 2
+            if not is_definition(row, estimate):
+                variances[row] = variances.get(row, 0.0) + float(way) ** 2
         return variances
+
+    def covers(self, row: str, estimate: str) -> bool:
+        """Return whether the interval of an estimate contains the effect of an assumption."""
+        counted = any(name.partition(" ")[0] == row for name in self.names)
+        return counted and not is_definition(row, estimate)
 
 
 def budget(
@@ -321,7 +362,7 @@ def _line(
     parts = {NOISE: noise * agreed * own, NUISANCES: noise * agreed * (1 - own)}
     parts[NUMERICAL] = max(0.0, _variance(at, middle, ends=ends) - noise)
     by_coordinate = by_q * at.derivative(estimate.value)
-    by_assumption = sources.variances_of_assumptions(by_coordinate)
+    by_assumption = sources.variances_of_assumptions(name, by_coordinate)
     others = sum(parts.values()) + sum(by_assumption.values())
     between = sources.variance_between_recordings(by_coordinate, others, counted=excess)
     systematic = float(np.sqrt(sum(by_assumption.values()) + between))

@@ -1,0 +1,55 @@
+"""Sentences on the precision of the estimates, which the intervals alone do not show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from ..errors import listed
+from ..fem.laws.constants import is_modulus, symbol_of, unit_of
+from ..runs.result_content import Result
+from ..statistics.budget.uncertainty_budget import is_definition
+
+
+def alternative_sentences(result: Result) -> Iterator[str]:
+    """Yield a sentence on each alternative: the values of constants that it defines differently, or
+    else the change of a modulus, whose sign is that of an unknown direction.
+    """
+    known = result.collect_estimates()
+    for each in result.alternatives:
+        defined = [name for name in each.values if is_definition(each.assumption, name)]
+        if defined:
+            values = [
+                f"{symbol_of(name)} about {each.values[name]:.3g} {unit_of(name)}".strip()
+                for name in defined
+            ]
+            yield f"{each.condition}: {listed(values)}"
+        elif (name := _shown_modulus(each.values)) is not None and known[name].value:
+            change = abs(each.values[name] / known[name].value - 1)
+            yield (
+                f"{each.condition}, {symbol_of(name)} would change by about {change:.0%} "
+                f"(object.{each.assumption} is not stated)"
+            )
+
+
+def origin_sentences(result: Result) -> Iterator[str]:
+    """Yield a sentence for each open question about the origin of the body: the half width of the
+    interval of a modulus for each answer.
+    """
+    known = result.collect_estimates()
+    for key in dict.fromkeys(each.key for each in result.origin_answers):
+        answers = [each for each in result.origin_answers if each.key == key]
+        name = _shown_modulus(answers[0].half_widths)
+        if name is None or (interval := known[name].combined95) is None or not known[name].value:
+            continue
+        now = (interval[1] - interval[0]) / 2 / abs(known[name].value)
+        widths = [f'{each.half_widths[name]:.0%} for "{each.answer}"' for each in answers]
+        yield (
+            f"object.{key} is not stated: the 95 % interval of {symbol_of(name)} is ±{now:.0%}; it "
+            f"would be ±{', ±'.join(widths)}"
+        )
+
+
+def _shown_modulus(names: Iterable[str]) -> str | None:
+    """Return Young's modulus among some estimates, or else the first modulus; None without one."""
+    moduli = [name for name in names if is_modulus(name)]
+    return next((name for name in moduli if name.endswith("young_pa")), next(iter(moduli), None))
