@@ -92,13 +92,11 @@ class ScaleReference:
         """What the moduli rest on, in one sentence."""
         symbols = listed([symbol_of(name) for name in self.names])
         verb = "is" if len(self.names) == 1 else "are"
-        share = (
-            "no error" if self.deviation is None else f"an error of {100 * self.deviation:.2g} %"
-        )
+        share = "none" if self.deviation is None else f"{100 * self.deviation:.2g} %"
         return (
-            f"{symbols} {verb} relative to the stated density of {self.density_kg_m3:.4g} kg/m³: no "
-            "force was measured, so an error of the mass changes these values by the same share and "
-            f"leaves no trace in the data; the intervals contain {share} of the mass"
+            f"{symbols} {verb} relative to the stated density of {self.density_kg_m3:.4g} kg/m³, "
+            "because no force was measured: an error of the mass is an equal error of the moduli that "
+            f"no test shows (contained in the intervals: {share})"
         )
 
 

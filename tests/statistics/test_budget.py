@@ -109,7 +109,7 @@ def test_a_parameter_with_an_interval_wider_than_its_value_is_not_determined():
     assert (limit.determined, limit.source) == (False, "air_drag")
     assert limit.remedy == REMEDIES["air_drag"]
     assert "not determined" in airy.table()
-    assert f"γ_m and ν (air drag): {limit.remedy}" in plain_text(run_summary(airy.result))
+    assert f"to reduce air drag, {limit.remedy}" in plain_text(run_summary(airy.result))
     # A wide interval contradicts nothing.
     assert airy.trust.verdict == "good"
 
