@@ -50,7 +50,6 @@ from .statistics.specimen_offsets import stress_offset_notes
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 if TYPE_CHECKING:
-    from ipywidgets import Widget  # an extra
     from matplotlib.figure import Figure  # which takes a while to import
 
 Log = Callable[[str], None]
@@ -116,32 +115,6 @@ class Run(SolvedProblem):
         return field_shapes(
             replay, bodies[replay.name], constants=self.parameters, field=field, count=count
         )
-
-    def interactive(self, experiment: str | None = None) -> Widget:
-        """Return sliders over the estimated parameters beside the recording, for a notebook.
-
-        Whenever a slider is released, the experiment is simulated forward with its values, and the
-        result is drawn over the measurements and the fit. Nothing of the run is changed.
-
-        Parameters
-        ----------
-        experiment : str, optional
-            Name; the first experiment by default.
-
-        Returns
-        -------
-        Widget
-            A box of ipywidgets, which a notebook displays.
-
-        Raises
-        ------
-        InputError
-            Without ipywidgets (``pip install 'collocation-sysid[interactive]'``), for an unknown
-            experiment, or if no parameter was estimated.
-        """
-        from .result.parameter_sliders import ParameterSliders
-
-        return ParameterSliders.from_run(self, experiment).widget
 
     def save(self, folder: str | Path, frames: bool = True, pictures: bool = True) -> Path:
         """Write the run folder, completely or not at all, and return its path.

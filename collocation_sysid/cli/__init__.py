@@ -1,12 +1,11 @@
 """Command line of the package: results on stdout, progress and messages on stderr.
 
 Each command is a function in one of the modules `FAMILIES`: `problem_commands` (solve, simulate,
-check), `run_commands` (refine, export, plot, report, animate, view), `study_commands`
+check), `run_commands` (refine, export, plot, report, animate), `study_commands`
 (compare-methods, compare-models, sweep), `design_commands` (design), `stream_commands` (live,
-replay), `benchmark_commands` (benchmark), `installation_commands` (doctor, completion) and `texts`
+replay), `benchmark_commands` (benchmark), `installation_commands` (doctor) and `texts`
 (methods, schema, explain, log, new). `command_options` makes command-line options from dataclasses,
-`common` has exit codes and output, `shell_completion` scripts that complete commands in a shell,
-and `markdown` shows documentation on a terminal.
+`common` has exit codes and output, and `markdown` shows documentation on a terminal.
 
 Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
 130 interrupted.
@@ -45,10 +44,10 @@ FAMILIES = (
 # Groups of commands in the help, in the order in which a user needs them.
 COMMAND_GROUPS = {
     "Identify parameters": ("new", "check", "solve", "refine", "live", "replay"),
-    "Inspect a run": ("report", "plot", "animate", "view"),
+    "Inspect a run": ("report", "plot", "animate"),
     "Extend a study": ("simulate", "compare-models", "compare-methods", "sweep", "design"),
     "Exchange data": ("log", "export", "benchmark"),
-    "Reference and installation": ("explain", "methods", "schema", "doctor", "completion"),
+    "Reference and installation": ("explain", "methods", "schema", "doctor"),
 }
 # Commands that were replaced, with the message to who types their old name.
 REPLACED_COMMANDS = {
@@ -141,7 +140,6 @@ app = typer.Typer(
     "  collocation-sysid solve my_object/problem.toml     parameters with error bars\n"
     "  collocation-sysid report runs/my_object            all results as a web page",
     no_args_is_help=True,
-    add_completion=False,  # see the command `completion`
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )

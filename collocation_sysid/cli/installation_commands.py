@@ -1,10 +1,6 @@
-"""Commands about the installation: its check, and completion in shells."""
+"""Command that checks the installation."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from enum import StrEnum
-from typing import Annotated
 
 import typer
 
@@ -37,50 +33,6 @@ def doctor(options: DoctorCommand) -> None:
         report = check_installation()
     options.print_result(report, installation_sections(report))
     raise typer.Exit(0 if report.is_working else EXIT_BAD_INPUT)
-
-
-class Shell(StrEnum):
-    """Shells for which a completion script can be printed."""
-
-    BASH = "bash"
-    ZSH = "zsh"
-    FISH = "fish"
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompletionCommand:
-    """Options of `completion`.
-
-    Attributes
-    ----------
-    shell : SHELL
-        bash, zsh or fish.
-    """
-
-    shell: Annotated[Shell, typer.Argument()]
-
-
-@command(
-    commands,
-    "completion bash > ~/.local/share/bash-completion/completions/collocation-sysid",
-    "completion zsh > ~/.zfunc/_collocation-sysid",
-    "completion fish > ~/.config/fish/completions/collocation-sysid.fish",
-)
-def completion(options: CompletionCommand) -> None:
-    """Print a script for completion in bash, zsh or fish.
-
-    The script completes commands, options, their values and files.
-
-    Write the script to the file that the example for your shell names; new shells read it from
-    there. For zsh, add the folder ~/.zfunc to fpath before compinit. Print the script again after
-    an upgrade.
-    """
-    from typer.main import get_command
-
-    from . import app
-    from .shell_completion import completion_script
-
-    typer.echo(completion_script(options.shell.value, get_command(app)))
 
 
 def installation_sections(report: InstallationReport) -> list[Shown]:

@@ -1,4 +1,4 @@
-"""Commands that take a run folder: refine, export, plot, report, animate and view."""
+"""Commands that take a run folder: refine, export, plot, report and animate."""
 
 from __future__ import annotations
 
@@ -312,43 +312,3 @@ def animate(options: AnimateCommand) -> None:
             experiment=options.experiment,
         )
     typer.echo(file)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewCommand(RunFolderOptions):
-    """Options of `view_run`.
-
-    Attributes
-    ----------
-    field : str
-        Field of the frames that colours the body; von_mises_pa by default, strain on a web page.
-    html : FILE
-        Write a web page; no window opens.
-    """
-
-    field: str | None = None
-    html: Path | None = None
-    experiment: OneExperiment = None
-
-
-@command(commands, "view runs/swing", "view runs/swing --html swing.html")
-def view(options: ViewCommand) -> None:
-    """Show a run in 3-D.
-
-    The command opens a window, which needs pyvista, or writes a web page, which needs no further
-    package.
-    """
-    from ..result.interactive_view import DEFAULT_FIELD, export_page
-    from ..result.interactive_view import view_run as opened
-    from ..result.solve_progress import SolveProgress
-
-    run = options.run_folder
-    html = options.html
-    field = options.field
-    if html is None:
-        opened(run, field or DEFAULT_FIELD, experiment=options.experiment)
-        return
-    require_possible(html.parent)
-    with SolveProgress(error_console, activity="writing the page"):
-        page = export_page(run, html, experiment=options.experiment, field=field)
-    typer.echo(page)

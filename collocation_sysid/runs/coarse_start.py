@@ -232,7 +232,7 @@ def interrupted_solution(start: CoarseStart, problem: Problem, coarse: Solution)
     coarse : Solution
         Solution of `start.problem`, interrupted.
     """
-    collocation = start.given_collocation(problem, coarse, undetermined=undetermined_names(coarse))
+    collocation = start.given_collocation(problem, coarse, undetermined=())
     collocation = WarmStart.of(coarse).apply_to_places(collocation)
     z = start.variables(collocation, coarse)
     recorder = Recorder(ReducedSpace.name, collocation)

@@ -721,7 +721,7 @@ def test_an_unknown_command_is_refused_with_the_likely_one(word, hint):
     assert f"No such command {word!r}{hint}\n" in outcome.err
 
 
-@pytest.mark.parametrize("command", ["report", "plot", "export", "animate", "view", "refine"])
+@pytest.mark.parametrize("command", ["report", "plot", "export", "animate", "refine"])
 def test_the_result_in_place_of_its_run_folder_leads_to_the_folder(tiny, command):
     (tiny / "run").mkdir()
     (tiny / "run" / "result.json").write_text("{}")

@@ -15,7 +15,7 @@ import pytest
 from kit.problem_files import run_command, settings, write_problem
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.result.interactive_view import frame_files
+from collocation_sysid.result.frame_fields import frame_files
 from collocation_sysid.runs.warm_start import WarmStart
 
 Damage = Callable[[Path], object]
@@ -124,7 +124,6 @@ def test_every_reader_refuses_a_damaged_result(run: Path, tmp_path: Path, damage
     damage(run)
     refused("report", run)
     refused("plot", run)
-    refused("view", run, "--html", tmp_path / "page.html")
     refused("animate", run, "--to", tmp_path / "film.gif")
     refused("refine", run)
     assert not (tmp_path / "page.html").exists()
@@ -141,7 +140,6 @@ def test_the_page_refuses_entries_of_another_kind(run: Path, damage: Damage):
 def test_every_reader_of_arrays_refuses_damaged_ones(run: Path, tmp_path: Path, damage: Damage):
     damage(run)
     refused("plot", run)
-    refused("view", run, "--html", tmp_path / "page.html")
     refused("animate", run, "--to", tmp_path / "film.gif")
 
 

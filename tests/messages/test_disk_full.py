@@ -65,7 +65,6 @@ def test_a_page_is_there_whole_or_as_before(run: Path, tmp_path: Path):
     refused(tmp_path, "report.html", "report", run)
     (tmp_path / "page.html").write_text("an earlier page")
     refused(tmp_path, "page.html", "report", run, "--to", tmp_path / "page.html")
-    refused(tmp_path, "view.html", "view", run, "--html", tmp_path / "view.html")
 
 
 @pytest.mark.long

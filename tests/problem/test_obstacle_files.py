@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +19,6 @@ from collocation_sysid.model.force_term import States
 from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
 from collocation_sysid.result.pictures.shapes import obstacle_pictures
 from collocation_sysid.result.replay import MotionRecord
-from collocation_sysid.result.web_page import write_page
 
 PROBLEM = """
 [object]
@@ -209,10 +206,6 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path:
     kept = MotionRecord.from_arrays(cube.name, seen.to_arrays())
     assert set(obstacle_pictures(kept)) == {"pressure", "gap"}
     assert obstacle_pictures(MotionRecord.from_experiment(cube)) == {}
-    page = write_page(kept, tmp_path / "page.html").read_text()
-    (packed,) = re.findall('"outlines": "([^"]*)"', page)
-    drawn = np.frombuffer(base64.b64decode(packed), dtype="<f4").reshape(seen.obstacles_m.shape)
-    np.testing.assert_allclose(drawn, seen.obstacles_m, rtol=1e-6)
 
 
 def test_recordings_with_other_obstacles_are_of_one_body():

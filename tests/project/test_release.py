@@ -114,7 +114,7 @@ def test_the_conda_recipe_has_the_same_dependencies():
 def test_every_dependency_has_its_licence_told():
     page = (ROOT / "docs" / "licences.md").read_text()
     extras = PROJECT["optional-dependencies"]
-    told = ["surface", "c3d", "logs", "cluster", "view", "film", "usd", "mujoco", "large"]
+    told = ["surface", "c3d", "logs", "cluster", "film", "usd", "mujoco", "large"]
     for requirement in [
         *PROJECT["dependencies"],
         *(each for extra in told for each in extras[extra]),

@@ -22,7 +22,7 @@ from ...common.array_types import Array
 from ...common.display import as_markdown
 from ...errors import InputError
 from ...result.animation import experiment_named
-from ...result.interactive_view import DEFAULT_FIELD, field_on_faces
+from ...result.frame_fields import field_on_faces
 from ...result.replay import MotionRecord, read_run
 from ...result.run_summary import run_summary
 from ...result.run_writers import replaced_folder
@@ -104,7 +104,7 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
     try:
-        return field_on_faces(run, replay, field=DEFAULT_FIELD)
+        return field_on_faces(run, replay, field="von_mises_pa")
     except InputError:
         return None
 
