@@ -32,6 +32,7 @@ from ..program.forward.newton_solver import NewtonOptions
 from ..program.transcription import Transcription
 from .initial_trajectories import simulate_trajectories
 from .method_options import SHARES, samples_in_share
+from .power_law_start import power_law_start
 
 # Largest Young's modulus of the scan [Pa].
 STIFFEST_PA = 1e7
@@ -126,8 +127,12 @@ class Scan(ScanSummary):
 
 def start_problem(
     collocation: Collocation, is_complete: bool = False
-) -> tuple[Collocation, Scan | None]:
-    """Return the problem with a guess of every parameter, and the scan; None if there was no scan.
+) -> tuple[Collocation, Scan | None, str]:
+    """Return the problem with a guess of every parameter, the scan, and a note for people; None and
+    "" if there was none.
+
+    Specimens of laws in powers of the stretches without a guess start from `power_law_start`; the
+    note states which constants their measurements do not determine, which are then fixed.
 
     Given guesses are kept, unless the body cannot be simulated with them, or it fits worse than an
     undeformed one and the scan finds initial values that fit clearly better (`CLEARLY_BETTER`).
@@ -147,18 +152,22 @@ def start_problem(
         `is_complete` to the end at none from the best one on.
     """
     unguessed = collocation.parameters.list_names_without_guess()
+    start = power_law_start(collocation) if unguessed else None
+    if start is not None:
+        usual = typical_parameters(start.parameters, start.young_pa)
+        return collocation.with_parameters(usual), None, start.note
     if any(is_modulus(name) for name in unguessed):
         result = scan_stiffness(collocation, is_complete=is_complete)
-        return collocation.with_parameters(result.parameters), result
+        return collocation.with_parameters(result.parameters), result, ""
     if unguessed:
         usual = typical_parameters(collocation.parameters, STIFFEST_PA)
         collocation = collocation.with_parameters(usual)
     if not _has_free_modulus(collocation):
-        return collocation, None
+        return collocation, None, ""
     trial = TrialSimulation(collocation)
     misfit, failure = trial.evaluate_guess(is_complete)
     if failure is None and misfit <= trial.rigid_misfit:
-        return collocation, None
+        return collocation, None, ""
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
         reason = (
@@ -167,17 +176,17 @@ def start_problem(
         )
     result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
-        return collocation, None  # the method reports what it needs
+        return collocation, None, ""  # the method reports what it needs
     best = float(result.misfit[result.best])
     if failure is None and misfit <= CLEARLY_BETTER * best:
-        return collocation, None
+        return collocation, None, ""
     if failure is None:
         result = replace(
             result,
             reason=f"{reason} (misfit {misfit:.3g} standard deviations at the guess, {best:.3g} at "
             "the initial values of the scan, which replace all guesses)",
         )
-    return collocation.with_parameters(result.parameters), result
+    return collocation.with_parameters(result.parameters), result, ""
 
 
 def rescue(collocation: Collocation, reason: str, is_complete: bool = False) -> Scan | None:

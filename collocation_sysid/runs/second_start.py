@@ -1,11 +1,10 @@
 """Starts of a second search, where the first one may have ended in the worse of several optima.
 
 - *Poisson's ratio near one half*: linear elements lock towards ν = ½, so that with a smaller
-  modulus
-  and a ratio near one half a body can move almost like a stiffer, compressible one.
-- *Exponents of two terms in powers of the stretches*: the two exponents have the same sign in one
-  optimum and opposite signs in another, and no search crosses an exponent of zero, at which the
-  term vanishes.
+  modulus and a ratio near one half a body can move almost like a stiffer, compressible one.
+- *Laws in powers of the stretches*: with every order and every sign of the exponents there is
+  another optimum, and no search crosses an exponent of zero, at which a term vanishes. The closed
+  forms of specimens tell whether there is a better one, see `methods.power_law_start`.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ..fem.laws.constants import usual_value, without_region
+from ..methods.power_law_start import power_law_start
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..statistics.linearised import parameter_values
@@ -25,12 +25,10 @@ NEARLY_INCOMPRESSIBLE = 0.42
 USUAL_POISSON = 0.3
 # Names of the constants that determine Young's modulus and Poisson's ratio, two of them at a time.
 LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
-# Factor and exponent of the second term, and the exponent of the third one.
-SECOND_FACTOR = "mu_2_pa"
-SECOND_EXPONENT = "alpha_2"
-THIRD_EXPONENT = "alpha_3"
-# Second exponent of the other start; rubber in tension and compression needs a negative one.
-NEGATIVE_EXPONENT = -2.0
+# Least difference of an exponent, relative to one plus its size, of another optimum, and least
+# share of χ² by which that is better.
+OTHER_EXPONENT = 0.05
+LEAST_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -50,10 +48,8 @@ class SecondStart:
 
 
 def second_start(solution: Solution) -> SecondStart | None:
-    """Return the start of a second search after a converged solution; None if a worse optimum is
-    unlikely.
-    """
-    return _usual_poisson_start(solution) or _negative_exponent_start(solution)
+    """Return the start of a second search after a solution; None if a worse optimum is unlikely."""
+    return _usual_poisson_start(solution) or _power_law_start(solution)
 
 
 def _usual_poisson_start(solution: Solution) -> SecondStart | None:
@@ -100,37 +96,29 @@ def _usual_modulus(name: str, young_pa: float) -> float:
     return value
 
 
-def _negative_exponent_start(solution: Solution) -> SecondStart | None:
-    """Return the guesses of a solution with a negative second exponent.
-
-    The second factor keeps the contribution μ₂ α₂ of its term to the shear modulus in Ogden's law.
-    None unless all recordings are tests of homogeneous specimens, in which a search takes seconds,
-    the law has two terms of which the second is estimated, and its exponent began and ended
-    positive; also if the new guesses are not within their bounds.
+def _power_law_start(solution: Solution) -> SecondStart | None:
+    """Return the start of `power_law_start`; None where there is none, and where the solution has
+    the same exponents or fits as well by the closed forms.
     """
     collocation = solution.collocation
-    free = {item.name: item for item in collocation.parameters.free}
-    names = [item.name for item in collocation.parameters.components]
-    if (
-        any(each.specimen is None for each in collocation.experiments)
-        or not {SECOND_FACTOR, SECOND_EXPONENT} <= free.keys()
-        or THIRD_EXPONENT in names
-    ):
+    start = power_law_start(collocation)
+    if start is None:
         return None
-    guesses = collocation.parameters.guesses
-    ended = parameter_values(collocation, solution.q)[SECOND_EXPONENT]
-    if min(guesses[SECOND_EXPONENT], ended) <= 0:
+    values = parameter_values(collocation, solution.q)
+    guesses = start.parameters.guesses
+    exponents = [
+        sorted(value for name, value in each.items() if name.startswith("alpha_"))
+        for each in (values, guesses)
+    ]
+    is_same = all(
+        abs(ended - other) <= OTHER_EXPONENT * (1 + abs(other))
+        for ended, other in zip(*exponents, strict=True)
+    )
+    if is_same or solution.history[-1].loss <= (1 + LEAST_SHARE) * start.loss:
         return None
-    changed = {SECOND_EXPONENT: NEGATIVE_EXPONENT}
-    if "beta_1" not in names:  # in foam the factors alone are shear moduli
-        changed[SECOND_FACTOR] = (
-            guesses[SECOND_FACTOR] * guesses[SECOND_EXPONENT] / NEGATIVE_EXPONENT
-        )
-    return _changed_start(
-        collocation.parameters,
-        guesses,
-        changed,
-        reason=f"the exponent α₂ ended at {ended:.3g}; a second start, from {NEGATIVE_EXPONENT:g},",
+    found = ", ".join(f"{exponent:.3g}" for exponent in exponents[1])
+    return SecondStart(
+        start.parameters, f"a second start, from the exponents {found} of the closed forms,"
     )
 
 

@@ -52,6 +52,14 @@ FAILED_STATUSES = (
     Status.NUMERICAL_FAILURE,
     Status.NOT_SIMULABLE,
 )
+# Outcomes after which no other start is tried.
+FINAL_STATUSES = (
+    Status.INTERRUPTED,
+    Status.REFUSED,
+    Status.TIME_LIMIT,
+    Status.CLUSTER_DISCONNECTED,
+    Status.NOT_SIMULABLE,
+)
 # Least decrease of χ² for which the solution from a second start is preferred.
 LEAST_GAIN = 1e-3
 # Least tolerance of a solve on a coarser mesh: below the difference between both meshes.
@@ -70,8 +78,8 @@ def solve(
     """Solve a problem, without the checks of `run`.
 
     There may be several searches, one after another: from the results of a scan, if guesses are
-    missing or a search from guesses fails; a second one in reduced space, if the first converges
-    where a worse optimum is likely, see `second_start`; with correspondences of measurements that
+    missing or a search from guesses fails; a second one in reduced space, where the first may have
+    ended in a worse optimum or on the way, see `second_start`; with correspondences of measurements that
     the estimates change; with other correlation lengths or phases of fields; and, of a large body,
     one on a coarser mesh first, see `coarse_start`. `watch` receives the iterations of all of them,
     and one of them gives the solution: its history and counts are of that search alone, and its
@@ -291,7 +299,9 @@ def _solve_once(
     if warm_start is not None:
         problem = warm_start.apply_to_problem(problem)
     try:
-        collocation, scan, variables = _program_and_start(problem, solver, warm_start=warm_start)
+        collocation, scan, variables, note = _program_and_start(
+            problem, solver, warm_start=warm_start
+        )
         solver = with_workers(solver, workers)
         solution = None
         comparison = ""
@@ -313,11 +323,7 @@ def _solve_once(
             )
         if scan is None and solution.status in FAILED_STATUSES:
             scan, solution = _solve_from_scan(solver, solution, watch=watch)
-        if (
-            solution.status.converged
-            and warm_start is None
-            and solution.method == ReducedSpace.name
-        ):
+        if warm_start is None and solution.method == ReducedSpace.name:
             solution = best_of_second_start(solver, solution, watch=watch)
     except InputError as error:
         raise error.located(problem.path) from error
@@ -326,8 +332,7 @@ def _solve_once(
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, where="solver")
     if scan is not None:
         notes.append(scan.sentence)
-    if comparison:
-        notes.append(comparison)
+    notes += [each for each in (comparison, note) if each]
     return replace(
         solution,
         scan=scan or solution.scan,
@@ -386,8 +391,10 @@ def _solve_by_thinned_start(
 
 def _program_and_start(
     problem: Problem, solver: Method, warm_start: WarmStart | None
-) -> tuple[Collocation, Scan | None, Array | None]:
-    """Return the nonlinear program of a problem with complete guesses, and the start of its search."""
+) -> tuple[Collocation, Scan | None, Array | None, str]:
+    """Return the nonlinear program of a problem with complete guesses, the start of its search, and
+    a note on it.
+    """
     collocation = problem.collocation()
     for experiment in collocation.experiments:
         for feature in FEATURES:
@@ -397,16 +404,18 @@ def _program_and_start(
     has_guesses = not collocation.parameters.list_names_without_guess()
     if has_guesses:
         require_memory(problem, collocation, method=solver)
-    collocation, scan = start_problem(collocation, getattr(solver, "needs_complete_start", False))
+    collocation, scan, note = start_problem(
+        collocation, getattr(solver, "needs_complete_start", False)
+    )
     if not has_guesses:  # the estimate evaluates the program at a guess
         require_memory(problem, collocation, method=solver)
     if scan is not None:
-        return collocation, scan, None
+        return collocation, scan, None, note
     collocation = associated_at_guess(collocation)
     if warm_start is None:
-        return collocation, None, None
+        return collocation, None, None, note
     collocation = warm_start.apply_to_places(collocation)
-    return collocation, None, warm_start.simulated_variables(collocation)
+    return collocation, None, warm_start.simulated_variables(collocation), note
 
 
 def _feature_notes(solution: Solution) -> list[str]:
@@ -448,21 +457,25 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
     """Return the better of a solution and of the solution from its `second_start`, with a note if
     that is the second one.
 
-    The second is better if it converges with a χ² that is lower by more than `LEAST_GAIN`, an
-    absolute difference. If it is not, or there is no second start, `first` itself is returned;
-    after an interrupt of the second search a copy of it with the status and message of the
-    interrupt. The history, counts and times of the result are those of its own search alone.
-    Exceptions of the method are not caught.
+    The second is better if it converges, and the first did not or has a χ² that is higher by more
+    than `LEAST_GAIN`, an absolute difference. There is no second search after a first one that was
+    interrupted, refused, or ended at the limit of time.
+
+    Otherwise `first` itself is returned; after an interrupt of the second search a copy of it with
+    the status and message of the interrupt. The history, counts and times of the result are those
+    of its own search alone. Exceptions of the method are not caught.
 
     Parameters
     ----------
     solver : Method
         Method to use, also with workers, see `with_workers`.
     first : Solution
-        Converged solution.
+        Solution of the first search.
     watch : callable or None
         Called with every iteration of the second search.
     """
+    if first.status in FINAL_STATUSES or not first.history:
+        return first
     try:
         other = second_start(first)
         if other is None:
@@ -474,9 +487,11 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
     gain = first.history[-1].loss - second.history[-1].loss
     if second.status is Status.INTERRUPTED:
         return replace(first, status=second.status, message=second.message)
-    if not second.status.converged or gain <= LEAST_GAIN:
+    if not second.status.converged or (first.status.converged and gain <= LEAST_GAIN):
         return first
     note = f"{other.reason} found a better fit (χ² lower by {gain:.3g})"
+    if not first.status.converged:
+        note = f"{other.reason} converged, after a first search that did not"
     return replace(second, notes=(note, *second.notes))
 
 

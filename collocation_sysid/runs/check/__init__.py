@@ -273,9 +273,9 @@ def check_problem(
     notes = []
     if problem.parameters.list_names_without_guess():
         report_progress("searching for initial values, because no guess is given")
-        collocation, scan = start_problem(collocation)
+        collocation, scan, note = start_problem(collocation)
         problem = replace(problem, parameters=collocation.parameters)
-        notes = [scan.sentence] if scan else []
+        notes = [each for each in (scan.sentence if scan else "", note) if each]
     report_progress("simulating the first samples at the guess")
     started_s = time.perf_counter()
     first = shortened_problem(problem).collocation()

@@ -1,0 +1,646 @@
+"""Start of laws in powers of the stretches, from the closed forms of homogeneous specimens.
+
+For given exponents the stress of Ogden's law is linear in its factors, and that of a foam too if
+all its terms have the same β. So the factors follow from linear least squares for every combination
+of exponents of a grid (variable projection, Golub and Pereyra 1973), and the best combinations are
+improved in all constants. This takes a fraction of a second, and does not stop where two terms run
+together, as a search from a single guess does.
+
+Laws with fewer terms, and with one β for all terms, are fitted in the same way. Of the laws that
+explain the measurements equally well the one with the fewest constants counts; the measurements do
+not determine the constants of the stated law that it lacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, least_squares
+
+from ..common.array_types import Array
+from ..fem.laws.constants import constant_named, symbol_of
+from ..fem.laws.ogden import is_power_law, term_numbers
+from ..model.parameters import Parameter, Parameters, Tied
+from ..program.collocation import Collocation
+from ..recording.experiment import Experiment
+from ..recording.homogeneous_deformation import AXES, CELL_SIZE_M
+from ..recording.specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
+
+# Sizes of the exponents of the grid, each with both signs.
+GRID = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 18.0, 22.0)
+# β of the grid; the largest one is nearly incompressible.
+BETA_GRID = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 20.0)
+# Least distance of two exponents: nearer ones are one term and its derivative by the exponent,
+# with factors of opposite signs that grow without bound.
+SEPARATION = 0.5
+# Combinations of the grid that are improved, and their least relative distance.
+MOST_IMPROVED = 4
+DISTINCT = 0.4
+# Most evaluations of an improvement.
+MOST_EVALUATIONS = 100
+# Difference of χ², over χ² of one measurement, up to which fits count as equal: smaller exponents
+# are then preferred.
+EQUAL_LOSS = 4.0
+# Least decrease of χ² per constant that a larger law has more, over χ² of one measurement: normal
+# noise exceeds it in 1 of 1000 fits.
+LEAST_GAIN = 10.8
+# Exponents nearer to zero are replaced by this one: the quotients by α lose digits.
+SMALLEST_EXPONENT = 1e-5
+# Largest exponent of e in a power of a stretch.
+LARGEST_LOGARITHM = 300.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Stress:
+    """Measured nominal stresses of one direction.
+
+    Attributes
+    ----------
+    axis : int
+        Direction; in simple shear that of the larger principal stretch.
+    values : (T,) array
+    sigma : float
+    deviations : (2,) array
+        Prior standard deviations of the relative error of the area and of the zero; 0 if exact.
+    """
+
+    axis: int
+    values: Array
+    sigma: float
+    deviations: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Test:
+    """Measurements of one specimen.
+
+    Attributes
+    ----------
+    gradient : (T, 3, 3) array
+        Prescribed deformation gradients, 1 where the specimen is free.
+    per_strain : (3, 3) array
+        Derivative of the gradient by the first strain.
+    free : int
+        Number of directions in which the specimen is free to contract.
+    is_shear : bool
+        Whether the test is simple shear.
+    strain_zero : float
+        Prior standard deviation of a constant offset of the first strain; 0 if exact.
+    stresses : list of _Stress
+    lateral : (values (T,), sigma) or None
+        Measured free stretch.
+    """
+
+    gradient: Array
+    per_strain: Array
+    free: int
+    is_shear: bool
+    strain_zero: float
+    stresses: list[_Stress]
+    lateral: tuple[Array, float] | None
+
+    @property
+    def measurements(self) -> int:
+        values = [stress.values for stress in self.stresses]
+        values += [self.lateral[0]] if self.lateral is not None else []
+        return sum(int(np.isfinite(each).sum()) for each in values)
+
+    def log_stretches(self, offset: float) -> Array:
+        """Return the logarithms (T, 3) of the stretches, 0 where free, with an offset of the
+        strain; in simple shear those of the principal stretches.
+        """
+        gradient = self.gradient + offset * self.per_strain
+        if self.is_shear:
+            larger = np.arcsinh(0.5 * gradient[:, 0, 2])
+            return np.column_stack([-larger, np.zeros_like(larger), larger])
+        return np.log(np.einsum("tii->ti", gradient))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Fit of a law with n terms, whose exponents ascend.
+
+    Attributes
+    ----------
+    loss : float
+        χ² of the measurements.
+    alpha, shear_pa : (n,) array
+        Exponents, and shares of the shear modulus.
+    beta : (n,) array or None
+        None for an incompressible law.
+    has_one_beta : bool
+        Whether all terms share one estimated β.
+    constants : int
+        Number of fitted constants of the law.
+    """
+
+    loss: float
+    alpha: Array
+    shear_pa: Array
+    beta: Array | None
+    has_one_beta: bool
+    constants: int
+
+
+@dataclass(frozen=True, eq=False)
+class PowerLawStart:
+    """Start of a law in powers of the stretches.
+
+    Attributes
+    ----------
+    parameters : Parameters
+        With the start as guesses of the factors, exponents and β; those that are not determined are
+        fixed or tied.
+    young_pa : float
+        Young's modulus of an incompressible body with these constants, for the other guesses.
+    note : str
+        What the measurements do not determine; empty if they determine all constants.
+    loss : float
+        χ² of the closed form at the start.
+    """
+
+    parameters: Parameters
+    young_pa: float
+    note: str
+    loss: float
+
+
+def power_law_start(collocation: Collocation) -> PowerLawStart | None:
+    """Return the start of a law in powers of the stretches; None unless all recordings are tests of
+    homogeneous specimens of one such law, without memory, whose factors and exponents are all
+    estimated without ties and priors.
+
+    Guesses are replaced, bounds are kept, except that the default bounds of the first term admit
+    exponents of both signs. No constant is fixed if one of the law has a guess: who states a guess
+    asks for this term.
+    """
+    fits = _PowerLawFits.of(collocation)
+    return None if fits is None else fits.start()
+
+
+class _PowerLawFits:
+    """Closed forms of the tests of one law, and their least-squares fits.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    tests : sequence of _Test
+    is_foam : bool
+        Whether the law is the compressible foam, else Ogden's with incompressible specimens.
+    """
+
+    def __init__(self, parameters: Parameters, tests: Sequence[_Test], is_foam: bool) -> None:
+        self.parameters = parameters
+        self.tests = tests
+        self.is_foam = is_foam
+        self.items = {item.name: _widened(item) for item in parameters.components}
+        self.terms = len(term_numbers(self.items))
+        self.measurements = sum(test.measurements for test in tests)
+        sigmas = [
+            np.append(test.strain_zero, np.ravel([each.deviations for each in test.stresses]))
+            for test in tests
+        ]
+        self.prior_sigmas = np.array([each for each in np.concatenate(sigmas) if each])
+        alphas = [self.items[f"alpha_{p}"] for p in self._numbers()]
+        self.lowest = min(item.lower for item in alphas)
+        self.highest = max(item.upper for item in alphas)
+        betas = [self.items[f"beta_{p}"] for p in self._numbers()] if is_foam else []
+        self.beta_is_free = np.array([not b.is_fixed and b.tied is None for b in betas], dtype=bool)
+        self.stated_beta = np.array([b.guess if b.is_fixed else np.nan for b in betas], dtype=float)
+        self.beta_bounds = (
+            max((item.lower for item in betas if not item.is_fixed), default=0.0),
+            min((item.upper for item in betas if not item.is_fixed), default=1.0),
+        )
+
+    @classmethod
+    def of(cls, collocation: Collocation) -> _PowerLawFits | None:
+        """Return the fits of a problem; None if it has none, see `power_law_start`."""
+        parts = [part for each in collocation.experiments for part in each.body.parts]
+        laws = {part.material.name for part in parts}
+        parameters = collocation.parameters
+        estimated = {item.name for item in parameters.free if item.prior is None}
+        own = [name for name in parameters.names if name.startswith(("mu_", "alpha_"))]
+        if (
+            len(laws) != 1
+            or not is_power_law(law := laws.pop())
+            or any(each.specimen is None for each in collocation.experiments)
+            or any(part.prony for part in parts)
+            or not set(own) <= estimated
+            or any(item.tied is not None for item in parameters.components)
+        ):
+            return None
+        is_foam = law.startswith("hyperfoam-")
+        tests = [test for each in collocation.experiments if (test := _test(each, is_foam))]
+        fits = cls(parameters, tests, is_foam)
+        return fits if own and fits.measurements > len(own) else None
+
+    def _numbers(self) -> range:
+        return range(1, self.terms + 1)
+
+    # Closed forms -------------------------------------------------------------------------------
+
+    def _system(self, alpha: Array, beta: Array | None) -> tuple[Array, Array]:
+        """Return the matrix (m, n) of the predictions by the shares of the shear modulus, and the
+        measured values (m,), both in standard deviations, of terms with the same β.
+
+        Measured lateral stretches have rows of zeros; their values are the measured minus the free
+        stretch.
+        """
+        rows, right = [], []
+        for test in self.tests:
+            logs = test.log_stretches(0.0)
+            free = _free_stretch(test, logs, alpha, np.ones(len(alpha)), beta)
+            for stress in test.stresses:
+                matrix = _nominal_stresses(test, logs, stress.axis, free, alpha, beta)
+                rows.append(matrix / stress.sigma)
+                right.append(stress.values / stress.sigma)
+            if test.lateral is not None:
+                values, sigma = test.lateral
+                rows.append(np.zeros((len(values), len(alpha))))
+                right.append((values - np.exp(free)) / sigma)
+        matrix, measured = np.concatenate(rows), np.concatenate(right)
+        known = np.isfinite(measured)
+        return matrix[known], measured[known]
+
+    def _residuals(
+        self, alpha: Array, shear_pa: Array, beta: Array | None, deviations: Array
+    ) -> Array:
+        """Return the residuals of all measurements and priors in standard deviations; `deviations`
+        are the `_deviations` over their prior standard deviations.
+        """
+        parts = [deviations]
+        values = iter(deviations * self.prior_sigmas)
+        for test in self.tests:
+            logs = test.log_stretches(next(values) if test.strain_zero else 0.0)
+            free = _free_stretch(test, logs, alpha, shear_pa, beta)
+            for stress in test.stresses:
+                predicted = _nominal_stresses(test, logs, stress.axis, free, alpha, beta) @ shear_pa
+                area, zero = (next(values) if sigma else 0.0 for sigma in stress.deviations)
+                residual = ((1 + area) * predicted + zero - stress.values) / stress.sigma
+                parts.append(residual[np.isfinite(residual)])
+            if test.lateral is not None:
+                residual = (np.exp(free) - test.lateral[0]) / test.lateral[1]
+                parts.append(residual[np.isfinite(residual)])
+        return np.concatenate(parts)
+
+    def _exponents(self, distances: Array) -> Array:
+        """Return exponents from the first one and the distances of the others, none of them 0."""
+        alpha = np.minimum(np.cumsum(distances), self.highest)
+        return np.where(np.abs(alpha) < SMALLEST_EXPONENT, SMALLEST_EXPONENT, alpha)
+
+    # Fits ---------------------------------------------------------------------------------------
+
+    def _may_be_first(self, alpha: Array, shear_pa: Array) -> NDArray[np.bool_]:
+        """Return whether terms may be the first one, by the bounds of its exponent and factor."""
+        first = self.items["alpha_1"]
+        factor = shear_pa if self.is_foam else shear_pa * alpha
+        is_positive = (factor > 0) | (_has_default_bounds(self.items["mu_1_pa"]))
+        return (alpha >= first.lower) & (alpha <= first.upper) & is_positive
+
+    def _starts(self, terms: int) -> list[tuple[Array, float | None]]:
+        """Return the best exponents, with β, of the grid."""
+        grid = np.array(sorted(sign * size for size in GRID for sign in (1, -1)))
+        grid = grid[(grid >= self.lowest) & (grid <= self.highest)]
+        chosen = np.array(list(combinations(range(len(grid)), terms)))
+        betas: Sequence[float | None] = (None,)
+        if self.is_foam:
+            stated = self.stated_beta[np.isfinite(self.stated_beta)]
+            betas = BETA_GRID if not len(stated) else [float(np.mean(stated))]
+        found = []
+        for beta in betas:
+            own = None if beta is None else np.full(len(grid), beta)
+            matrix, measured = self._system(grid, own)
+            matrix = matrix / np.linalg.norm(matrix, axis=0)
+            gram, right = matrix.T @ matrix, matrix.T @ measured
+            blocks = gram[chosen[:, :, None], chosen[:, None, :]] + 1e-12 * np.eye(terms)
+            sides = right[chosen]
+            shares = np.linalg.solve(blocks, sides[:, :, None])[:, :, 0]
+            loss = measured @ measured - (shares * sides).sum(axis=1)
+            loss[~self._may_be_first(grid[chosen], shares).any(axis=1)] = np.inf
+            best = np.argsort(loss)[: 4 * MOST_IMPROVED]
+            found += [(loss[k], grid[chosen[k]], beta) for k in best if np.isfinite(loss[k])]
+        starts: list[tuple[Array, float | None]] = []
+        for _, alpha, beta in sorted(found, key=lambda each: each[0]):
+            if all(
+                (np.abs(alpha - other) > DISTINCT * (1 + np.abs(other))).any()
+                for other, _ in starts
+            ):
+                starts.append((alpha, beta))
+        return starts[:MOST_IMPROVED]
+
+    def _fit(self, terms: int) -> _Fit | None:
+        """Return the best fit of a law with a number of terms and one β; None if there is none."""
+        projected = [self._project(alpha, beta) for alpha, beta in self._starts(terms)]
+        fits = [fit for fit in projected if fit]
+        if not fits:
+            return None
+        least = min(fit.loss for fit in fits)
+        equal = least + EQUAL_LOSS * max(1.0, least / self.measurements)
+        # A uniaxial test alone hardly distinguishes α from −2α.
+        best = min(
+            (fit for fit in fits if fit.loss <= equal), key=lambda fit: np.abs(fit.alpha).sum()
+        )
+        return self._improve(best)
+
+    def _project(self, alpha: Array, beta: float | None) -> _Fit | None:
+        """Return the fit with one β and without deviations from a start with ascending exponents;
+        None if none of its terms may be the first one.
+
+        Variables are the first exponent, the distances of the others, and β if it is estimated;
+        the shares of the shear modulus follow from linear least squares.
+        """
+        n = len(alpha)
+        count = int(beta is not None and self.beta_is_free[:n].any())
+
+        def linear(x: Array) -> tuple[Array, Array | None, Array, Array]:
+            """Return exponents, β, shares, and residuals."""
+            exponents = self._exponents(x[:n])
+            betas = None if beta is None else np.full(n, x[-1] if count else beta)
+            matrix, measured = self._system(exponents, betas)
+            scale = np.linalg.norm(matrix, axis=0)
+            shares = np.linalg.lstsq(matrix / scale, measured, rcond=1e-12)[0] / scale
+            return exponents, betas, shares, matrix @ shares - measured
+
+        low, high = self.beta_bounds
+        lower = np.r_[self.lowest, np.full(n - 1, SEPARATION), np.full(count, low)]
+        upper = np.r_[self.highest, np.full(n - 1, np.inf), np.full(count, high)]
+        start = np.r_[alpha[0], np.diff(alpha), np.full(count, beta or 0.0)]
+        result = _least_squares(lambda x: linear(x)[-1], start, lower, upper)
+        alpha, betas, shares, _ = linear(result.x)
+        if not self._may_be_first(alpha, shares).any():
+            return None
+        return _Fit(2 * float(result.cost), alpha, shares, betas, True, 2 * n + count)
+
+    def _improve(self, fit: _Fit, has_one_beta: bool = True) -> _Fit | None:
+        """Return the fit with the deviations of the measurements, and with a β of each term unless
+        `has_one_beta`, from a fit without; None if none of its terms may be the first one.
+        """
+        n = len(fit.alpha)
+        size, beta = fit.shear_pa, fit.beta
+        is_free = self.beta_is_free[:n]
+        count = int(min(1, is_free.sum()) if has_one_beta else is_free.sum())
+        fixed = None if beta is None else np.where(is_free, beta, self.stated_beta[:n])
+
+        def unpacked(x: Array) -> tuple[Array, Array, Array | None, Array]:
+            """Return exponents, shares, β and deviations."""
+            betas = None if fixed is None else fixed.copy()
+            if betas is not None and count:
+                betas[is_free] = x[2 * n : 2 * n + count]
+            return self._exponents(x[:n]), x[n : 2 * n] * size, betas, x[2 * n + count :]
+
+        low, high = self.beta_bounds
+        infinite, others = np.full(n, np.inf), np.full(len(self.prior_sigmas), np.inf)
+        lower = np.r_[
+            self.lowest, np.full(n - 1, SEPARATION), -infinite, np.full(count, low), -others
+        ]
+        upper = np.r_[self.highest, infinite[1:], infinite, np.full(count, high), others]
+        free_beta = np.zeros(0) if beta is None else beta[is_free][:count]
+        start = np.r_[
+            fit.alpha[0], np.diff(fit.alpha), np.ones(n), free_beta, np.zeros(len(others))
+        ]
+        result = _least_squares(lambda x: self._residuals(*unpacked(x)), start, lower, upper)
+        alpha, shares, betas, _ = unpacked(result.x)
+        if not self._may_be_first(alpha, shares).any():
+            return None
+        return _Fit(2 * float(result.cost), alpha, shares, betas, has_one_beta, 2 * n + count)
+
+    def _smallest_sufficient(self, fits: Sequence[_Fit]) -> _Fit:
+        """Return the fit with the fewest constants that no larger law improves clearly."""
+        fits = sorted(fits, key=lambda fit: fit.constants)
+        freedom = max(1, self.measurements - fits[-1].constants)
+        unit = max(1.0, min(fit.loss for fit in fits) / freedom)
+        for k, fit in enumerate(fits):
+            gains = [
+                (fit.loss - larger.loss) / unit / max(1, larger.constants - fit.constants)
+                for larger in fits[k + 1 :]
+            ]
+            if max(gains, default=0.0) <= LEAST_GAIN:
+                return fit
+        return fits[-1]
+
+    def start(self) -> PowerLawStart | None:
+        """Return the start; None if the law cannot be fitted."""
+        names = [f"{key}_{p}{unit}" for p in self._numbers() for key, unit in _KEYS]
+        has_guess = any(
+            item.guess is not None and not item.is_fixed
+            for item in self.parameters.components
+            if item.name in names
+        )
+        fits = []
+        for terms in [self.terms] if has_guess else self._numbers():
+            fit = self._fit(terms)
+            own = None
+            if fit and terms > 1 and self.beta_is_free.sum() > 1:
+                own = self._improve(fit, has_one_beta=False)
+            fits += [each for each in (own or fit, fit if own and not has_guess else None) if each]
+        if not fits:
+            return None
+        return self._with_fit(self._smallest_sufficient(fits), may_fix=not has_guess)
+
+    def _with_fit(self, fit: _Fit, may_fix: bool) -> PowerLawStart:
+        """Return the start from a fit; constants that it lacks are fixed or tied if `may_fix`."""
+        may_be_first = self._may_be_first(fit.alpha, fit.shear_pa)
+        order = sorted(
+            range(len(fit.alpha)), key=lambda k: (not may_be_first[k], -abs(fit.shear_pa[k]))
+        )
+        # The first term comes first, the others follow by their size.
+        order = [order[0], *sorted(order[1:], key=lambda k: -abs(fit.shear_pa[k]))]
+        guesses: dict[str, float] = {}
+        fixed: dict[str, float] = {}
+        tied: dict[str, Tied] = {}
+        for p, k in enumerate(order, start=1):
+            shear_pa, alpha = float(fit.shear_pa[k]), float(fit.alpha[k])
+            guesses[f"alpha_{p}"] = alpha
+            guesses[f"mu_{p}_pa"] = shear_pa if self.is_foam else 2 * shear_pa / alpha
+            if fit.beta is not None and self.beta_is_free[p - 1]:
+                guesses[f"beta_{p}"] = float(fit.beta[k])
+                if p > 1 and fit.has_one_beta and may_fix and self.beta_is_free[0]:
+                    tied[f"beta_{p}"] = Tied("beta_1")
+        near = [
+            order.index(max(pair, key=order.index)) + 1
+            for pair in pairwise(range(len(fit.alpha)))
+            if np.diff(fit.alpha[[*pair]])[0] < 1.01 * SEPARATION
+        ]
+        notes = []
+        if may_fix:
+            fixed |= {f"alpha_{p}": guesses.pop(f"alpha_{p}") for p in near}
+            for p in range(len(order) + 1, self.terms + 1):
+                fixed |= {
+                    f"mu_{p}_pa": 0.0,
+                    f"alpha_{p}": constant_named(f"alpha_{p}").usual or 1.0,
+                }
+                if self.is_foam and self.beta_is_free[p - 1]:
+                    fixed[f"beta_{p}"] = 0.0
+            notes = self._notes(len(order), near=near, tied=tied, fixed=fixed)
+        young_pa = 3 * max(abs(float(fit.shear_pa.sum())), 1e-3 * float(np.abs(fit.shear_pa).max()))
+        parameters = self.parameters.map_components(
+            lambda item: _started(self.items[item.name], guesses, fixed=fixed, tied=tied)
+        )
+        return PowerLawStart(parameters, young_pa, note="; ".join(notes), loss=fit.loss)
+
+    def _notes(
+        self, terms: int, near: Sequence[int], tied: Mapping[str, Tied], fixed: Mapping[str, float]
+    ) -> list[str]:
+        """Return what the measurements do not determine, for people."""
+        notes = []
+        if terms < self.terms:
+            zero = ", ".join(symbol_of(f"mu_{p}_pa") for p in range(terms + 1, self.terms + 1))
+            notes.append(
+                f"the measurements determine {terms} of {self.terms} terms of the law: {zero} = 0"
+            )
+        for p in near:
+            name = f"alpha_{p}"
+            notes.append(
+                f"two exponents run together: {symbol_of(name)} is held at {fixed[name]:.3g}, at a "
+                f"distance of {SEPARATION:g} from the next one"
+            )
+        if tied:
+            names = ", ".join(symbol_of(name) for name in tied)
+            notes.append(
+                f"the measurements determine one β only: {names} "
+                f"{'equals' if len(tied) == 1 else 'equal'} {symbol_of('beta_1')}"
+            )
+        return notes
+
+
+# Beginning and end of the names of the constants of a term.
+_KEYS = (("mu", "_pa"), ("alpha", ""), ("beta", ""))
+
+
+def _has_default_bounds(item: Parameter) -> bool:
+    is_free = not item.is_fixed and item.tied is None
+    return is_free and (item.lower, item.upper) == constant_named(item.name).bounds
+
+
+def _widened(item: Parameter) -> Parameter:
+    """Return the first exponent with bounds that admit both signs in place of its default bounds;
+    any other parameter itself.
+    """
+    if item.name != "alpha_1" or not _has_default_bounds(item):
+        return item
+    return replace(item, lower=-item.upper)
+
+
+def _with_factor(item: Parameter, value: float) -> Parameter:
+    """Return a factor with its start as guess; the first one on a linear scale if it is negative or
+    below its default bound, as that of a high power is.
+    """
+    if item.scale == "log" and _has_default_bounds(item) and value < 10 * item.lower:
+        item = replace(item, scale="linear", lower=-item.upper)
+    value = float(np.clip(value, item.lower, item.upper))
+    unit = abs(value) if item.scale == "linear" and value else item.unit
+    return replace(item, guess=value, unit=unit)
+
+
+def _least_squares(
+    residuals: Callable[[Array], Array], start: Array, lower: Array, upper: Array
+) -> OptimizeResult:
+    """Return the bounded least-squares solution from a start near it."""
+    inside = np.clip(start, lower, upper)
+    return least_squares(
+        residuals, inside, bounds=(lower, upper), x_scale="jac", max_nfev=MOST_EVALUATIONS
+    )
+
+
+def _started(
+    item: Parameter,
+    guesses: Mapping[str, float],
+    fixed: Mapping[str, float],
+    tied: Mapping[str, Tied],
+) -> Parameter:
+    """Return a parameter with its start, fixed, or tied, by what is known of its name."""
+    if item.name in tied:
+        return Parameter(item.name, 0.0, tied=tied[item.name])
+    if item.name in fixed:
+        scale = item.scale if fixed[item.name] else "linear"
+        return Parameter(item.name, fixed[item.name], is_fixed=True, scale=scale)
+    if item.name in guesses and item.name.startswith("mu_"):
+        return _with_factor(item, guesses[item.name])
+    if item.name in guesses:
+        return replace(item, guess=float(np.clip(guesses[item.name], item.lower, item.upper)))
+    return item
+
+
+def _free_stretch(
+    test: _Test, logs: Array, alpha: Array, shear_pa: Array, beta: Array | None
+) -> Array:
+    """Return the logarithm (T,) of the free stretch, at which the stress across the free surface
+    vanishes; zeros if there is none.
+    """
+    prescribed = logs.sum(axis=1)
+    if not test.free or beta is None:
+        return -prescribed / max(1, test.free) * (test.free > 0)
+    mean = float(np.mean(beta))
+    free = -mean / (1 + test.free * mean) * prescribed
+    if np.ptp(beta) < 1e-12:
+        return free
+    weights = shear_pa / alpha
+    for _ in range(20):  # Newton's method for Σ g/α (λ^α − J^(−αβ)) = 0 in ln λ
+        stretched = _power(free, alpha)
+        pressed = _power(prescribed + test.free * free, -alpha * beta)
+        value = (stretched - pressed) @ weights
+        slope = (stretched + test.free * beta * pressed) @ (weights * alpha)
+        step = np.divide(value, slope, out=np.zeros_like(value), where=slope != 0)
+        free = free - np.clip(step, -0.3, 0.3)
+        if np.abs(step).max(initial=0.0) < 1e-12:
+            break
+    return free
+
+
+def _nominal_stresses(
+    test: _Test, logs: Array, axis: int, free: Array, alpha: Array, beta: Array | None
+) -> Array:
+    """Return the nominal stress (T, n) of each term with a share of the shear modulus of 1:
+    (2/α) (λ^α − v^α) / λ, where v is the free stretch of an incompressible specimen, or J^(−β).
+
+    In simple shear it is (2/α) (λ^α − λ^(−α)) λ / (1 + λ²) with the larger principal stretch λ.
+    """
+    stretch = logs[:, axis]
+    size = np.exp(stretch)
+    if test.is_shear:
+        pressed, size = _power(-stretch, alpha), 2 * np.cosh(stretch)
+    elif beta is None:
+        pressed = _power(free, alpha)
+    else:
+        pressed = _power(logs.sum(axis=1) + test.free * free, -alpha * beta)
+    return 2 / alpha * (_power(stretch, alpha) - pressed) / size[:, None]
+
+
+def _power(logarithm: Array, exponent: Array) -> Array:
+    """Return e^(l a) as (T, n) for logarithms (T,) and exponents (n,)."""
+    return np.exp(np.clip(np.outer(logarithm, exponent), -LARGEST_LOGARITHM, LARGEST_LOGARITHM))
+
+
+def _test(experiment: Experiment, is_foam: bool) -> _Test | None:
+    """Return the measurements of a specimen; None without a stress, and for tests of nearly
+    incompressible specimens that determine κ.
+    """
+    deformation = experiment.specimen
+    assert deformation is not None
+    is_shear = deformation.test == "simple-shear"
+    if not (deformation.free or is_shear or is_foam):
+        return None
+    gradient = np.tile(np.eye(3), (len(experiment.t_s), 1, 1))
+    per_strain = np.zeros((3, 3))
+    for node, (by_first, _) in deformation.displaced_nodes().items():
+        gradient[:, :, node - 1] += experiment.grasps[node].poses.positions_m / CELL_SIZE_M
+        per_strain[:, node - 1] = by_first / CELL_SIZE_M
+    axes = {STRESS_NAME: AXES.index("z"), SECOND_STRESS_NAME: AXES.index("x")}
+    stresses, lateral = [], None
+    for gauge in experiment.readings:
+        assert gauge.values is not None
+        values = np.asarray(gauge.values, dtype=float)[:, 0]
+        if gauge.name == LATERAL_NAME:
+            lateral = values, gauge.sigma
+        elif gauge.name in axes:
+            sigmas = [gauge.unknowns.get(name, 0.0) for name in ("area_error", "stress_zero_pa")]
+            stresses.append(_Stress(axes[gauge.name], values, gauge.sigma, np.array(sigmas)))
+    if not stresses:
+        return None
+    zero = experiment.nuisance.strain_zero or 0.0
+    free = len(deformation.free)
+    return _Test(gradient, per_strain, free, is_shear, zero, stresses, lateral)
