@@ -260,7 +260,7 @@ def test_a_force_that_is_felt_late_is_waited_for():
 
 def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
     bench = unseen(block("z"))
-    collocation, found = start_problem(Problem([bench], guessed(mu_pa=9e3)).collocation())
+    collocation, found, _ = start_problem(Problem([bench], guessed(mu_pa=9e3)).collocation())
     assert found is not None
     assert (
         "the simulation is farther from the measurements than a body that moves" in found.sentence
@@ -284,12 +284,12 @@ def test_it_is_solved_without_a_guess(method):
 
 def test_a_guess_that_can_be_simulated_is_kept():
     collocation = cube(GUESS).collocation()
-    assert start_problem(collocation) == (collocation, None)
+    assert start_problem(collocation) == (collocation, None, "")
 
 
 def test_damping_alone_needs_no_scan():
     given = {**{name: TRUTH[name] for name in ("lambda_pa", "mu_pa")}, "gamma_m_1_s": 1.0}
-    collocation, found = start_problem(cube({**given, "gamma_r_s": Unknown()}).collocation())
+    collocation, found, _ = start_problem(cube({**given, "gamma_r_s": Unknown()}).collocation())
     assert found is None
     assert collocation.parameters.guesses["gamma_r_s"] == pytest.approx(0.003)
 
@@ -306,7 +306,7 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     monkeypatch.setattr(
         "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit", 1e-3
     )
-    collocation, found = start_problem(cube(guessed(mu_pa=1e4)).collocation())
+    collocation, found, _ = start_problem(cube(guessed(mu_pa=1e4)).collocation())
     assert found is not None
     assert found.sentence.startswith(
         "at the guess, the simulation is farther from the measurements"
@@ -346,7 +346,7 @@ def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
     assert failure is None
     # The scan is better, but hardly.
     assert 1.0 < misfit / result.misfit[result.best] < CLEARLY_BETTER
-    assert start_problem(blurred) == (blurred, None)
+    assert start_problem(blurred) == (blurred, None, "")
 
 
 def too_soft() -> dict[str, Unknown | float]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
+from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
 
 VIDEO = "Tensile strain (Video axial) (%)"
@@ -112,3 +113,41 @@ def test_a_number_behind_a_named_column_is_no_unit(tmp_path):
         table = read_specimen(path, SpecimenLayout(**of_test(columns)))
         np.testing.assert_allclose(table.strain, strains)
         np.testing.assert_allclose(table.stress_pa, [1e5, 2e5])
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [
+        *(("kgf/cm2", 98066.5), ("kgf/cm^2", 98066.5), ("ksi", 6894757.293), ("psi", 6894.757293)),
+        *(("mmHg", 133.322387), ("cmH2O", 98.0665), ("N/m2", 1.0), ("MN/m2", 1e6)),
+    ],
+)
+def test_units_of_stress_of_real_files(unit, factor):
+    assert si_factor(unit, "pressure") == pytest.approx(factor, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("unit", "dimension", "factor"),
+    [
+        *(("gf", "force", 9.80665e-3), ("µN", "force", 1e-6), ("nN", "force", 1e-9)),
+        *(("nm", "length", 1e-9), ("µm", "length", 1e-6), ("Nm", "torque", 1.0)),
+    ],
+)
+def test_small_units_of_real_files(unit, dimension, factor):
+    assert si_factor(unit, dimension) == pytest.approx(factor, rel=1e-6)
+
+
+def test_an_unknown_unit_is_to_be_converted_not_renamed(tmp_path):
+    path = tmp_path / "pull.csv"
+    path.write_text("stretch,stress (furlong)\n1.1,2\n1.2,3\n")
+    with pytest.raises(cs.InputError, match="convert its values, then call it stress_pa") as caught:
+        read_specimen(path, SpecimenLayout(test="uniaxial", columns={}))
+    assert "kgf/cm²" in caught.value.message
+
+
+@pytest.mark.parametrize("header", ["volume ratio", "volume_ratio", "volume ratio (1)"])
+def test_the_volume_ratio_is_read_under_its_documented_name(tmp_path, header):
+    path = tmp_path / "swell.csv"
+    path.write_text(f"{header},pressure (kPa)\n0.975,1.5\n0.95,2.9\n")
+    table = read_specimen(path, SpecimenLayout(test="volumetric", columns={}))
+    assert (1 + table.strain) ** 3 == pytest.approx([0.975, 0.95])

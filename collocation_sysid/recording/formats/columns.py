@@ -360,7 +360,7 @@ def _name_fits(column: str, quantity: Quantity) -> bool:
     called = words & set(quantity.words.split())
     qualifiers = {key for key, of_key in QUALIFIERS.items() if words & of_key}
     own = {quantity.qualifier} if quantity.qualifier else set()
-    return name.lower() == quantity.key or bool(called and qualifiers == own)
+    return _key_of(name) == quantity.key or bool(called and qualifiers == own)
 
 
 def name_and_unit(column: str) -> tuple[str, str | None]:
@@ -368,9 +368,13 @@ def name_and_unit(column: str) -> tuple[str, str | None]:
     one, or if the brackets are empty.
     """
     parts = _NAMED.fullmatch(column)
-    if parts is None:
+    if parts is None or _key_of(column) in {quantity.key for quantity in KNOWN_QUANTITIES}:
         return column, None
     return parts["name"], parts["bracketed"] or parts["behind"]
+
+
+def _key_of(name: str) -> str:
+    return name.strip().lower().replace(" ", "_")
 
 
 def _words(name: str) -> set[str]:
@@ -416,8 +420,13 @@ def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quanti
     """Return the error for a column without a unit (`unit` is None), or with a unit of another
     dimension than `quantity` has.
     """
+    name = name_and_unit(column)[0] or column
     has = f"has the unit {unit}" if unit else "names no unit"
-    remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"
+    remedy = (
+        f"convert its values, then call it {quantity.column}"
+        if unit
+        else f"add the unit that it has, for example {name} ({quantity.unit})"
+    )
     return grid.error_at(
         f"column {column} {has}; expected {expected_units(unit or '', quantity.dimension)}: "
         f"{remedy}"

@@ -10,12 +10,18 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 # that is another unit.
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0},
-    "length": {**METRES_PER_UNIT, "µm": 1e-6, "um": 1e-6, '"': 0.0254},
-    "force": {"n": 1.0, "mn": 1e-3, "MN": 1e6, "kn": 1e3, "kgf": 9.80665, "lbf": 4.4482216},
+    "length": {**METRES_PER_UNIT, "µm": 1e-6, "um": 1e-6, "nm": 1e-9, '"': 0.0254},
+    "force": {
+        **{"n": 1.0, "mn": 1e-3, "MN": 1e6, "kn": 1e3, "µn": 1e-6, "un": 1e-6, "nn": 1e-9},
+        **{"kgf": 9.80665, "kp": 9.80665, "gf": 9.80665e-3, "lbf": 4.4482216152605},
+    },
     "torque": {"nm": 1.0, "nmm": 1e-3, "mnm": 1e-3},
     "pressure": {
         **{"pa": 1.0, "mPa": 1e-3, "hpa": 1e2, "kpa": 1e3, "mpa": 1e6, "gpa": 1e9},
-        **{"n/mm²": 1e6, "n/mm2": 1e6, "n/mm^2": 1e6, "bar": 1e5, "mbar": 1e2, "psi": 6894.757},
+        **{"n/m²": 1.0, "n/cm²": 1e4, "n/mm²": 1e6, "kn/m²": 1e3, "MN/m²": 1e6, "mn/m²": 1e-3},
+        **{"kgf/cm²": 98066.5, "kp/cm²": 98066.5, "kg/cm²": 98066.5, "kgf/mm²": 9806650.0},
+        **{"bar": 1e5, "mbar": 1e2, "atm": 101325.0, "psi": 6894.757293, "ksi": 6894757.293},
+        **{"mmhg": 133.322387, "cmh2o": 98.0665, "cmh₂o": 98.0665, "dyn/cm²": 0.1},
     },
     "ratio": {"-": 1.0, "1": 1.0, "mm/mm": 1.0, "m/m": 1.0, "%": 1e-2},
 }
@@ -39,6 +45,8 @@ def si_factor(unit_text: str, dimension: str) -> float | None:
     units, such as "MN" and "mn" or "mPa" and "mpa".
     """
     bare = unit_text.replace("·", "").replace("*", "").replace(" ", "").replace("μ", "µ")
+    bare = bare.replace("^2", "²")
+    bare = bare[:-1] + "²" if bare.endswith(("/m2", "/cm2", "/mm2")) else bare
     known = UNITS[dimension]
     if bare not in known and dimension == "length":
         bare = _SPELLINGS.get(bare.lower(), bare)
