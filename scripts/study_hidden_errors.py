@@ -16,6 +16,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from assumed_twins import _anisotropic_law
+from scipy.signal import butter, filtfilt
 from script_arguments import make_parser
 from twins import random_poses
 
@@ -41,6 +43,16 @@ MEMORY = {"prony_1.share": 0.3, "prony_1.tau_s": 0.1}
 HELD_M = 1e-3
 LACKING_M = 1e-2
 GRADIENT = 0.1
+# Bent bar: edges and bend at its end [m], elements and density. Errors of its description: relative
+# width, frequency of a low-pass filter [Hz], and relative stiffness of fibres.
+BAR_M = (0.04, 0.04, 0.12)
+BEND_M = (0.03, 0.012, 0.0)
+BAR_DIVISIONS = (2, 2, 6)
+BAR_DENSITY_KG_M3 = 100.0
+WIDE = 0.04
+LOW_PASS_HZ = 6.0
+FIBRES = 0.3
+SCAN_GRAVITY_M_S2 = (0.0, -9.81, 0.0)
 
 
 @dataclass(frozen=True)
@@ -57,12 +69,15 @@ class HiddenError:
         Constants of the simulated body beside `TRUTH`.
     assumptions : Assumptions
         Assumptions of the budget.
+    recorded : function of an array (T, M, 3)
+        Returns the recorded tracks from those with noise [m].
     """
 
     actual: cs.Experiment
     described: cs.Experiment
     more_constants: Mapping[str, float] = field(default_factory=dict)
     assumptions: cs.Assumptions = field(default_factory=cs.Assumptions)
+    recorded: Callable[[np.ndarray], np.ndarray] = field(default=lambda tracks_m: tracks_m)
 
 
 def block(height_m: float = SIZE_M[2], **options) -> cs.Body:
@@ -141,6 +156,111 @@ def with_gradient(seed: int) -> HiddenError:
     return HiddenError(actual, recording(body, seed))
 
 
+def bent_bar(shape: np.ndarray | None = None, **options) -> cs.Body:
+    """Return a bar that is bent along x and y, so that it differs from its mirror images; a diagonal
+    `shape` (3,) multiplies its coordinates.
+    """
+    mesh = cs.box_mesh(BAR_M, BAR_DIVISIONS)
+    bend = (mesh.points_m[:, 2] / BAR_M[2]) ** 2
+    points_m = mesh.points_m + np.outer(bend, BEND_M)
+    points_m[:, :2] -= np.array(BAR_M[:2]) / 2
+    points_m = points_m * (np.ones(3) if shape is None else shape)
+    cells = (
+        mesh.tetrahedra if shape is None or np.prod(shape) > 0 else mesh.tetrahedra[:, [0, 2, 1, 3]]
+    )
+    return cs.Body(cs.TetMesh(points_m, cells), density_kg_m3=BAR_DENSITY_KG_M3, **options)
+
+
+def bar_recording(seed: int, body: cs.Body | None = None) -> cs.Experiment:
+    """Return the bent bar, held at its lower face and moved at random, with markers on the same
+    nodes whose places are estimated.
+    """
+    rng = np.random.default_rng(seed)
+    body = bent_bar(rest_shape="stress_free") if body is None else body
+    t_s = STEP_S * np.arange(SAMPLES)
+    high = np.flatnonzero(body.nodes_m[:, 2] > 0.3 * BAR_M[2])
+    places_m = body.nodes_m[rng.choice(high, MARKERS, replace=False)]
+    markers = cs.Markers(t_s, np.zeros((SAMPLES, MARKERS, 3)), NOISE_M, places_m=places_m)
+    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    poses = random_poses(t_s, rng)
+    # The gripper begins upright, as in a laboratory, and turns within the bounds of its motion.
+    return cs.Experiment(body, t_s, [cs.Grasp(held, poses)], markers, name="swing")
+
+
+def without_places(experiment: cs.Experiment) -> cs.Experiment:
+    """Return the experiment with markers at unknown places."""
+    markers = experiment.markers
+    unplaced = replace(markers, placement=None, located=None, places_m=None)
+    return replace(experiment, markers=unplaced)
+
+
+def bar_without_error(seed: int) -> HiddenError:
+    """Return a correct description of the bent bar."""
+    actual = bar_recording(seed)
+    return HiddenError(actual, without_places(actual))
+
+
+def mirrored(seed: int) -> HiddenError:
+    """Return the bent bar, with the mirror image of its mesh in the description."""
+    return scaled(np.array([-1.0, 1.0, 1.0]), seed)
+
+
+def wide(seed: int) -> HiddenError:
+    """Return the bent bar, with a mesh in the description that is too wide along x."""
+    return scaled(np.array([1 + WIDE, 1.0, 1.0]), seed)
+
+
+def scaled(shape: np.ndarray, seed: int) -> HiddenError:
+    """Return the bent bar, with its mesh multiplied by factors (3,) in the description."""
+    described = bar_recording(seed, bent_bar(shape, rest_shape="stress_free"))
+    return HiddenError(bar_recording(seed), without_places(described))
+
+
+def scanned_while_hanging(seed: int) -> HiddenError:
+    """Return the bent bar, whose mesh is the shape that it has under its weight."""
+    held = np.flatnonzero(bent_bar().nodes_m[:, 2] < 1e-9)
+    scanned = bent_bar(rest_shape=cs.UnderGravity(held, gravity_m_s2=SCAN_GRAVITY_M_S2))
+    return HiddenError(bar_recording(seed, scanned), without_places(bar_recording(seed)))
+
+
+def filtered(seed: int) -> HiddenError:
+    """Return the bent bar, whose tracks were low-passed by the software of the cameras."""
+    actual = bar_recording(seed)
+    filter_ba = butter(2, LOW_PASS_HZ, fs=1 / STEP_S)
+    return HiddenError(
+        actual, without_places(actual), recorded=lambda x: filtfilt(*filter_ba, x, axis=0)
+    )
+
+
+def twice(seed: int) -> HiddenError:
+    """Return the bent bar, with one track in place of that of another marker."""
+    actual = bar_recording(seed)
+
+    def doubled(tracks_m: np.ndarray) -> np.ndarray:
+        noise = np.random.default_rng((seed, 2)).normal(
+            scale=NOISE_M / 5, size=tracks_m[:, 0].shape
+        )
+        return np.concatenate([(tracks_m[:, 1] + noise)[:, None], tracks_m[:, 1:]], axis=1)
+
+    return HiddenError(actual, actual, recorded=doubled)
+
+
+def with_other_law(seed: int) -> HiddenError:
+    """Return the bent bar of another material and damping law."""
+    options = {"material": "st-venant-kirchhoff", "damping": "material"}
+    actual = bar_recording(seed, bent_bar(rest_shape="stress_free", **options))
+    return HiddenError(actual, without_places(bar_recording(seed)))
+
+
+def fibrous(seed: int) -> HiddenError:
+    """Return the bent bar, stiffer along its axis."""
+    described = bar_recording(seed)
+    body = bent_bar(
+        rest_shape="stress_free", material=_anisotropic_law([0.0, 0.0, FIBRES]), evaluator="casadi"
+    )
+    return HiddenError(bar_recording(seed, body), without_places(described))
+
+
 ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "none": ("none", no_error),
     "markers": ("8 markers of 0.5 g on the body of 25 g", with_heavy_markers),
@@ -148,6 +268,17 @@ ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "memory": ("memory: share 0.3, 0.1 s", with_memory),
     "grasp": ("the gripper holds 1 mm more", held_higher),
     "mesh": ("the mesh lacks 10 mm at the free end", with_lacking_end),
+    "bar": ("none, a bent bar of foam", bar_without_error),
+    "mirrored": ("the same, mesh mirrored", mirrored),
+    "wide": ("the same, mesh 4 % too wide along x", wide),
+    "hanging": (
+        "the same, mesh scanned under its weight and declared stress-free",
+        scanned_while_hanging,
+    ),
+    "filtered": ("the same, tracks low-passed at 6 Hz", filtered),
+    "twice": ("the same, one track in place of another", twice),
+    "law": ("the same, another material and damping law", with_other_law),
+    "fibres": ("the same, stiffer by 30 % along the axis", fibrous),
     "gradient": ("stiffness ± 10 % at the ends", with_gradient),
 }
 
@@ -163,11 +294,14 @@ class Outcome:
     contains_truth : bool
         Whether the combined interval contains the true modulus.
     verdict : str
+    cause : str
+        Beginning of the first reason.
     """
 
     young_ratio: float
     contains_truth: bool
     verdict: str
+    cause: str
 
 
 def fit(name: str, seed: int) -> Outcome:
@@ -176,7 +310,7 @@ def fit(name: str, seed: int) -> Outcome:
     tracks_m = cs.simulate(error.actual, TRUTH | dict(error.more_constants), "newmark").markers_m
     noise_m = np.random.default_rng((seed, 1)).normal(scale=NOISE_M, size=tracks_m.shape)
     problem = cs.Problem(
-        [cs.with_markers(error.described, tracks_m + noise_m)],
+        [cs.with_markers(error.described, error.recorded(tracks_m + noise_m))],
         UNKNOWN,
         uncertainty=cs.UncertaintyOptions(assumptions=error.assumptions),
     )
@@ -186,6 +320,7 @@ def fit(name: str, seed: int) -> Outcome:
         run.estimates["young_pa"].value / TRUTH["young_pa"],
         contains_truth=low_pa <= TRUTH["young_pa"] <= high_pa,
         verdict=run.trust.verdict,
+        cause=run.trust.concerns[0].code if run.trust.concerns else "",
     )
 
 

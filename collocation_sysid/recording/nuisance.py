@@ -138,6 +138,8 @@ class NuisanceRow:
         to two away are interpolated.
     considered : float, optional
         Standard deviation in the uncertainty budget where the parameter is not estimated.
+    largest : float
+        Largest absolute value that is possible in a laboratory, in `unit`.
     """
 
     # Functions of an `Experiment`, which has nuisance parameters itself: the module of its class
@@ -165,6 +167,7 @@ class NuisanceRow:
     reading: Callable[[ca.SX, ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
     clock: Callable[[ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
     considered: float | None = None
+    largest: float = np.inf
 
     def __post_init__(self) -> None:
         """Set the default label, in place: the name, with the component of marker parameters and
@@ -428,6 +431,7 @@ TILT = NuisanceRow(
     by="length",
     label="tilt of gravity, {axis}",
     sentence="tilt of gravity: {size}",
+    largest=3 * DEGREE,
     description="a tilt of the direction of gravity",
     same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
 )
@@ -442,6 +446,7 @@ GRASP_TURN = NuisanceRow(
     by="length",
     label="turn in the grasp, {axis}",
     sentence="rotation of the body in the gripper: {size}",
+    largest=5 * DEGREE,
     description="a constant rotation of the body in its grasps",
     same=_hand_eye_sharing_key,
 )
@@ -456,6 +461,7 @@ GRASP_SHIFT = NuisanceRow(
     by="length",
     label="shift in the grasp, {axis}",
     sentence="translation of the body in the gripper: {size}",
+    largest=5e-3,
     description="a constant translation of the body in its grasps; rotation and "
     "translation are estimated if the start is an equilibrium and there are "
     "markers",

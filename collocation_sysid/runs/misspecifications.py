@@ -32,8 +32,8 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     solution : Solution
         The fit.
     budget : int, optional
-        Largest number of sweeps over the first samples for all refits together; by default three
-        times the work of the fit, at most 150.
+        Largest number of sweeps over the first samples for all refits together; by default five
+        times the work of the fit, at most 200.
 
     Returns
     -------

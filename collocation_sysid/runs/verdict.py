@@ -101,6 +101,8 @@ def solution_concerns(
             low=low,
             high=high,
             is_specimen=part.transcription.experiment.specimen is not None,
+            rows=[entry.row for entry in nuisance.entries],
+            scales=nuisance.scales.tolist(),
         )
         for feature in FEATURES:
             yield from feature.part_concerns(part)

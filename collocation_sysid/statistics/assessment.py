@@ -7,7 +7,7 @@ be "good", however many markers and nuisance parameters there are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
@@ -20,6 +20,7 @@ from ..fem.laws.constants import symbol_of, unit_of
 from ..program.modes.stability import Instability
 from ..recording.experiment import Experiment
 from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
+from ..recording.nuisance import NuisanceRow, in_readable_unit
 from ..recording.specimen_hysteresis import unloading_difference
 from .budget.discretisation_error import Refinement
 from .budget.uncertainty_budget import source_label
@@ -39,6 +40,8 @@ Verdict = Literal["good", "check", "doubtful"]
 
 # Factor of the misfit from which on a hypothesis is as good as certain.
 CERTAIN = 2.0
+# Codes of hypotheses that stand for several, none of which is likely alone.
+OPEN_CAUSES = "several", "insufficient"
 # Probability of a false alarm of each test.
 RARE = 1e-4
 # Residuals over sigma, or sigma over residuals: from here on "check". The noise of
@@ -159,13 +162,14 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     """Return a concern for each likely misspecification, in the same order.
 
     It is "doubtful" if the misfit decreases by more than a factor of two (`CERTAIN`) without the
-    misspecification, else "check"; its message begins with "likely: ". No hypothesis is left out.
+    misspecification, else "check"; its message begins with "likely: " unless it names several. No
+    hypothesis is left out.
     """
     return [
-        replace(cause, subject=f"likely: {cause.subject}").concern(
-            "doubtful" if cause.strength > CERTAIN else "check"
-        )
-        for cause in causes
+        (
+            each if each.code in OPEN_CAUSES else replace(each, subject=f"likely: {each.subject}")
+        ).concern("doubtful" if each.strength > CERTAIN else "check")
+        for each in causes
     ]
 
 
@@ -434,8 +438,11 @@ def nuisance_concerns(
     high: Iterable[float],
     *,
     is_specimen: bool = False,
+    rows: Sequence[NuisanceRow] = (),
+    scales: Sequence[float] = (),
 ) -> list[Concern]:
-    """Return concerns about nuisance parameters far from their priors or at their limits.
+    """Return concerns about nuisance parameters far from their priors or at their limits; of the
+    components of a vector that are far, about the farthest.
 
     Parameters
     ----------
@@ -447,6 +454,10 @@ def nuisance_concerns(
         Limits of the estimates, likewise.
     is_specimen : bool
         Whether they are those of a specimen, whose page explains them.
+    rows : sequence of NuisanceRow
+        Their kinds; empty if these are not known.
+    scales : sequence of float
+        Standard deviations of their priors, in the units of the kinds.
 
     Notes
     -----
@@ -458,19 +469,24 @@ def nuisance_concerns(
     items = [*zip(names, deviations, low, high, strict=True)]
     limit = largest_deviation(len(items))
     concerns: list[Concern] = []
-    for name, phi, lowest, highest in items:
+    far: dict[str, tuple[float, Concern]] = {}
+    for k, (name, phi, lowest, highest) in enumerate(items):
         deviation = abs(float(phi))
         limited = not lowest + 1e-3 < phi < highest - 1e-3
         concerns += concern_if(
             limited, True, code="specimen/limit" if is_specimen else "nuisance/limit", name=name
         )
-        concerns += concern_if(
-            deviation > limit and not limited,
-            deviation > ABSURD,
-            code="specimen/far" if is_specimen else "nuisance/far",
-            name=name,
-            deviations=deviation,
-        )
+        vector = name.rpartition(", ")[0] or name
+        if limited or deviation <= max(limit, far.get(vector, (0.0,))[0]):
+            continue
+        data: dict[str, object] = {"name": name, "deviations": deviation}
+        code = "specimen/far" if is_specimen else "nuisance/far"
+        if rows and not is_specimen:
+            size, unit = in_readable_unit(deviation * scales[k], rows[k].unit)
+            data |= {"size": f"{size:.2g}{unit}"}
+            code = "nuisance/large" if deviation * scales[k] > rows[k].largest else "nuisance/sized"
+        far[vector] = deviation, Concern(code, "doubtful" if deviation > ABSURD else "check", data)
+    concerns += (concern for _, concern in far.values())
     return concerns
 
 

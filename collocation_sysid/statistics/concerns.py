@@ -109,6 +109,30 @@ TOPICS: dict[str, Topic] = {
             "markers.labels or reference_m",
             "markers-exchanged/later": "the names of markers are exchanged {when}: {names}; "
             "correct them there, or remove these samples",
+            "law": "the material deforms by another law than stated, such as {material}: compare laws "
+            "with compare-models --materials",
+            "law/damping": "the material is damped by another law than stated, such as {damping}: "
+            "compare laws with compare-models --damping",
+            "law/both": "material and damping obey other laws than stated, such as {material} with "
+            "{damping}: compare laws with compare-models --materials and --damping",
+            "mesh-width": "the mesh is about {percent:.2g} % too {way} along its {axis} axis: compare "
+            "its extents with those of the real body",
+            "mesh-mirrored": "the mesh is a mirror image of the body, along its {axis} axis: compare "
+            "it with the real body",
+            "rest-shape": "the mesh is the shape of the body under its weight, with gravity along "
+            "({down}) of the mesh, not a stress-free one: state object.rest_shape",
+            "several": "a correction of the description brings the residuals to the noise, but the "
+            "data do not tell which: {causes}",
+            "insufficient": "no single correction of the description brings the residuals to the "
+            "noise; these reduce them most: {causes}",
+            "tracks-filtered": "the tracks have hardly any noise above {frequency_hz:.2g} Hz "
+            "({percent:.2g} % of sigma_m above twice this frequency), as after a low-pass filter, "
+            "which changes the motion too: export the tracks without filtering",
+            "markers-same": "the tracks of markers {first} and {second} are {by_mm:.2g} mm (RMS) apart, "
+            "but these markers are at different places of the body: one track is a copy of the other; "
+            "correct markers.labels, or omit one of them",
+            "markers-same/unplaced": "the tracks of markers {first} and {second} are {by_mm:.2g} mm "
+            "(RMS) apart: one track is a copy of the other; omit one of them",
             "marker-slip": "marker {marker} slips at about t = {t_s:.4g} s: give it "
             "markers.weights = 0, or end window_s before",
             "marker-slip/alone": "marker {marker} slips by {by_mm:.2g} mm at t = {t_s:.4g} s, the "
@@ -251,15 +275,22 @@ TOPICS: dict[str, Topic] = {
     "nuisance": Topic(
         "Nuisance parameters of a recording",
         "motion_capture",
-        remedy="Check whether the value is possible: are gravity, clocks, grasps and positions as "
-        "stated in the problem file? If it is possible, widen its prior in "
-        "[experiment.nuisance].",
+        remedy="An error of the laws, the mesh or a clock can hide in such a value: compare laws with "
+        "compare-models, and check mesh, places, clocks and gravity first. Widen a prior in "
+        "[experiment.nuisance] only if nothing else explains the value and a measurement confirms it.",
         messages={
-            "limit": "{name} ended at the largest value allowed: check whether this value is "
-            "possible, and if it is, widen its prior in [experiment.nuisance]",
+            "limit": "{name} ended at the largest value allowed: compare laws with compare-models, "
+            "and check mesh, places and clocks, whose errors it can hide",
             "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero: "
-            "check whether this value is possible, and if it is, widen its prior in "
-            "[experiment.nuisance]",
+            "compare laws with compare-models, and check mesh, places and clocks, whose errors it "
+            "can hide",
+            "sized": "{name} is {deviations:.1f} standard deviations of its prior away from zero "
+            "({size}): compare laws with compare-models, and check mesh, places and clocks, whose "
+            "errors it can hide; if nothing else explains this value, measure it, and widen its "
+            "prior in [experiment.nuisance] if it is confirmed",
+            "large": "{name} is {deviations:.1f} standard deviations of its prior away from zero "
+            "({size}), more than such an error can be: it hides another error. Compare laws with "
+            "compare-models, and check mesh, places and clocks; do not widen its prior",
             "clock": "the markers of '{experiment}' were measured {shift_ms:.2g} ms {when} than "
             "their times state: the estimates are corrected for this, but find the cause of the "
             "difference",

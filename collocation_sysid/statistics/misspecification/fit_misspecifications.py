@@ -11,8 +11,9 @@ Hypotheses about sensors and obstacles are in modules of their own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,18 +21,23 @@ from ...common.array_types import Array, root_mean
 from ...common.time_dependence import at_times
 from ...errors import InputError, SimulationError
 from ...methods.continuation import first_samples
+from ...methods.initial_trajectories import associated_at_guess
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution, Status
 from ...program.modes.modal_prediction import DeclaredMotion
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
+from ...recording.nuisance import GRASP_SHIFT, GRASP_TURN, TILT, TIME
 from ...recording.poses import PoseSequence
-from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis
+from ..distributions import normal_isf
+from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
 from .modal_misspecifications import (
     ModalComparison,
     find_misspecifications_by_modes,
     gravity_hypotheses,
 )
+from .model_misspecifications import mirror_images, screened_bodies
+from .track_misspecifications import filtered_tracks, same_tracks
 
 # RMS residual in standard deviations up to which there is nothing to explain.
 NOISE = 1.15
@@ -48,15 +54,27 @@ FEWEST_SWEEPS = 15
 # Most sweeps of one refit; within these limits, as many as the fit took iterations.
 MOST_SWEEPS = 40
 # Work of all refits over that of the fit.
-EFFORT = 3
+EFFORT = 5
 # Most sweeps of all refits.
-BUDGET = 150
+BUDGET = 200
 # Length of the last step of a parameter's logarithm.
 TOLERANCE = 1e-2
 # Factor of the misfit from which on no other hypothesis is tested.
 CERTAIN = 4.0
 # Change of the lag that ends the search [s].
 SAME_LAG_S = 5e-4
+# Standard deviations of an estimated time shift up to which the fit follows a lag by itself.
+ESTIMATED_LAGS = 2.0
+# Discrepancy from which on mirror images of the mesh are fitted.
+MIRRORED = 2.0
+# Difference of losses (χ²) below which two corrections explain the data equally well.
+INDISTINGUISHABLE = 10.0
+# Strength over the largest one from which on a correction that does not suffice is mentioned.
+PARTIAL = 0.7
+# Probability of a discrepancy of the pose of a faultless recording, as of every test of the verdict.
+RARE = 1e-4
+# Nuisance parameters of the body in its grasp, which turn and shift it to hide other mistakes.
+BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
 # Fewest samples before and after a slip.
 SHORTEST = 4
 
@@ -75,67 +93,125 @@ def motion_misspecifications(
         Other hypotheses; nothing is fitted again if one of these, or of the natural modes, is
         nearly certain (`CERTAIN`).
     budget : int, optional
-        Largest number of sweeps over the first samples for all refits together; by default three
-        times the work of the fit, at most 150.
+        Largest number of sweeps over the first samples for all refits together; by default five
+        times the work of the fit, at most 200.
     """
-    misfits = _misfits(solution)
-    if max(misfits) <= NOISE:
-        return []
     fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
-    worst = fitted[int(np.argmax(misfits))]
-    hypotheses = list(
-        find_misspecifications_by_modes(
-            worst, solution.parameters, huber=solution.collocation.huber
-        )
+    hypotheses = [each for experiment in fitted for each in same_tracks(experiment)]
+    hypotheses += [each for part in solution.parts for each in filtered_tracks(part)]
+    discrepancies = [_discrepancy(solution, k) for k in range(len(fitted))]
+    if max(discrepancies) <= 1.0 or hypotheses:
+        return hypotheses
+    worst = fitted[number := int(np.argmax(discrepancies))]
+    by_modes = find_misspecifications_by_modes(
+        worst, solution.parameters, huber=solution.collocation.huber
     )
+    rms_m = solution.rms_by_experiment_m.get(worst.name, np.inf)
+    # The fit moved the body, not only its natural modes: what leaves more than the fit is refuted.
+    hypotheses += [h for h in by_modes if h.remaining is None or h.remaining < rms_m]
     certainty = max((each.strength for each in (*known, *hypotheses)), default=0.0)
     if certainty < CERTAIN:
-        hypotheses += _refit_hypotheses(solution, worst, budget=budget)
+        hypotheses += _refit_hypotheses(
+            solution, worst, discrepancy=discrepancies[number], budget=budget
+        )
     return hypotheses
 
 
 def markers_miss(solution: Solution) -> bool:
-    """Return whether the markers of an experiment miss by more than `NOISE` σ."""
-    return max(_misfits(solution)) > NOISE
+    """Return whether the markers of an experiment miss by more than noise, or its body is turned
+    or shifted in its grasp more than such errors are.
+    """
+    return max(_discrepancy(solution, k) for k in range(len(solution.parts))) > 1.0
 
 
-def _misfits(solution: Solution) -> list[float]:
-    fitted = (transcription.experiment for transcription in solution.collocation.transcriptions)
-    return [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
+def _discrepancy(solution: Solution, number: int = 0) -> float:
+    """Return the discrepancy of an experiment (index) of a fit, 1 or less for noise: the RMS
+    residual of its markers over `NOISE` σ, or the largest error of gravity or of the pose in the
+    grasp over the largest one that a faultless recording has, if that is larger.
+    """
+    part = solution.parts[number]
+    if not part.transcription.experiment.markers.count_samples():
+        return 0.0
+    nuisance = part.transcription.nuisance
+    rows = nuisance.indices_of_rows(*BODY_ROWS)
+    limit = float(normal_isf(RARE / 2 / max(1, len(part.phi))))
+    largest = float(np.abs(part.phi[rows]).max(initial=0.0)) / limit
+    misfit = _misfit(part.transcription.experiment, solution.readings_m[number])
+    return max(misfit / NOISE, largest)
 
 
 def _refit_hypotheses(
-    solution: Solution, experiment: Experiment, budget: int | None
+    solution: Solution, experiment: Experiment, discrepancy: float, budget: int | None
 ) -> list[Hypothesis]:
-    """Return the hypotheses whose correction lets the first samples of an experiment fit far
-    better; empty if these cannot be fitted.
+    """Return the hypothesis whose correction lets the first samples of an experiment fit as well as
+    noise allows; several as one hypothesis if the fits do not tell them apart, or if none of
+    them suffices. Empty if nothing decreases the discrepancy clearly, or these samples cannot be
+    fitted.
     """
     first = first_samples(experiment, MOST_SAMPLES)
     alone = _Refitter(solution, first, sweeps=budget)
-    fitted_m = alone.fit(first)
-    if fitted_m is None:
+    stated = alone.fit(first)
+    if stated is None:
         return []
+    fitted_m = stated.readings_m[0]
     trial = HypothesisTest(
-        _misfit(first, fitted_m),
-        alone.misfit_after_refit,
+        _discrepancy(stated),
+        alone.discrepancy_after_refit,
         required_factor=BETTER,
-        smallest_misfit=1.0,
-        noise_level=NOISE,
+        smallest_misfit=1 / NOISE,
+        noise_level=1.0,
     )
     of = f"'{experiment.name}'"
-    lags = [] if first.is_static else _clock_hypotheses(alone, first, fitted_m=fitted_m, of=of)
+    lags = [] if first.is_static else _clock_hypotheses(alone, first, stated=stated, of=of)
     comparison = ModalComparison.from_experiment(first, solution.parameters)
     turned = [] if comparison is None else _gravity_hypotheses(first, comparison)
-    return [
+    mirrored = mirror_images(first) if discrepancy > MIRRORED else ()
+    bodies = [*screened_bodies(solution, first)]
+    alone.near_answer.update(each.corrected for each in bodies)
+    tested = [
         *trial.accepted(
             [
                 *lags,
                 *_slip_hypotheses(first, fitted_m, of=of),
                 *turned,
+                *bodies,
+                *mirrored,
                 *_grasp_layer_hypotheses(first, of),
             ]
         )
     ]
+    return _named_alone_or_together(tested, alone.loss_after_refit)
+
+
+def _named_alone_or_together(
+    tested: Sequence[Hypothesis], loss_of: Callable[[Any], float]
+) -> list[Hypothesis]:
+    """Return the hypothesis that brings the residuals to the noise; as one of several if others do
+    so with a loss that is larger by at most `INDISTINGUISHABLE`; if none does, those that reduce
+    them most, as one hypothesis.
+    """
+    sufficient = [each for each in tested if each.remaining is not None and each.remaining <= 1.0]
+    if not sufficient:
+        partial = sorted(tested, key=lambda each: -each.strength)
+        partial = [each for each in partial if each.strength > PARTIAL * partial[0].strength]
+        return _together("insufficient", partial)
+    losses = [loss_of(each.corrected) for each in sufficient]
+    likely = [
+        each
+        for each, loss in zip(sufficient, losses, strict=True)
+        if loss <= min(losses) + INDISTINGUISHABLE
+    ]
+    return likely if len(likely) == 1 else _together("several", likely)
+
+
+def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return hypotheses as one, whose message contains theirs; nothing if there are none."""
+    if not hypotheses:
+        return []
+    ranked = rank(hypotheses)
+    texts = (replace(each, subject="", corrected=None).message for each in ranked)
+    data = {"causes": "; or ".join(texts)}
+    return [replace(ranked[0], code=code, data=data)]
 
 
 def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
@@ -200,8 +276,8 @@ def _largest_step(residual: Array) -> tuple[float, int]:
 
 
 class _Refitter:
-    """Fits of one experiment at a time from the problem's guess, with a limited number of
-    sweeps.
+    """Fits of one experiment at a time with a limited number of sweeps, from the problem's guess, or
+    from the answer for experiments in `near_answer`.
 
     Parameters
     ----------
@@ -221,28 +297,34 @@ class _Refitter:
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
         work = EFFORT * self.each * rows // len(declared.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
-        self.known: dict[Experiment, Array | None] = {}
+        self.near_answer: set[Experiment] = set()
+        parameters = solution.collocation.parameters
+        values = parameters.values(solution.q)
+        self.answer = {item.name: values[item.name] for item in parameters.free}
+        self.known: dict[Experiment, Solution | None] = {}
         if len(fitted) == 1 and len(declared.t_s) == rows:
-            self.known[declared] = solution.readings_m[0]
+            self.known[declared] = solution
 
-    def fit(self, experiment: Experiment) -> Array | None:
-        """Return the fitted markers (T, M, 3) [m] of an experiment; None if there is no fit, or no
-        sweeps are left. Results are cached.
+    def fit(self, experiment: Experiment) -> Solution | None:
+        """Return the fit of an experiment; None if there is none, or no sweeps are left. Results
+        are cached.
         """
         if experiment not in self.known:
             self.known[experiment] = self._fit(experiment)
         return self.known[experiment]
 
-    def misfit_after_refit(self, experiment: Experiment) -> float | None:
-        """Return the misfit of the markers after a refit, in standard deviations; None if there is
-        no fit.
-        """
-        fitted_m = self.fit(experiment)
-        return None if fitted_m is None else _misfit(experiment, fitted_m)
+    def discrepancy_after_refit(self, experiment: Experiment) -> float | None:
+        """Return the discrepancy after a refit, see `_discrepancy`; None if there is no fit."""
+        fitted = self.fit(experiment)
+        return None if fitted is None else _discrepancy(fitted)
 
-    def _fit(self, experiment: Experiment) -> Array | None:
-        """Return the markers (T, M, 3) [m] of a fit of one experiment, and subtract its sweeps from
-        those allowed.
+    def loss_after_refit(self, experiment: Experiment) -> float:
+        """Return the loss with priors after a refit; infinite if there is no fit."""
+        fitted = self.fit(experiment)
+        return np.inf if fitted is None else fitted.history[-1].loss
+
+    def _fit(self, experiment: Experiment) -> Solution | None:
+        """Return the fit of one experiment, and subtract its sweeps from those allowed.
 
         None if none are left, or the fit fails; a fit that reaches its limit of iterations counts.
         """
@@ -250,40 +332,45 @@ class _Refitter:
             return None
         method = ReducedSpace(max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE)
         try:
-            solution = method(replace(self.collocation, experiments=(experiment,)))
+            changed = replace(self.collocation, experiments=(experiment,))
+            if experiment in self.near_answer:
+                changed = changed.with_parameters(changed.parameters.with_guess(self.answer))
+            solution = method(associated_at_guess(changed))
         except (InputError, SimulationError):
             return None
         self.sweeps -= solution.iterations
         solution.unless_interrupted()
         ended = solution.status.converged or solution.status is Status.ITERATION_LIMIT
-        return solution.readings_m[0] if ended else None
+        return solution if ended else None
 
 
 def _clock_hypotheses(
-    alone: _Refitter, declared: Experiment, fitted_m: Array, of: str
+    alone: _Refitter, declared: Experiment, stated: Solution, of: str
 ) -> Iterator[Hypothesis]:
     """Yield the clock lag for which residuals and velocities agree best, after a few refits, as one
-    hypothesis; nothing if no lag decreases the misfit.
+    hypothesis; nothing if no lag decreases the misfit, or if it is so small that the fit estimates
+    it already.
     """
-    least = _misfit(declared, fitted_m)
+    least = _discrepancy(stated)
     lag_s = 0.0
     shifted = declared
+    fitted = stated
     best = None
     for _ in range(CLOCK_REFITS):
-        more_s = _marker_lag_s(shifted, fitted_m)
+        more_s = _marker_lag_s(shifted, fitted.readings_m[0])
         lag_s += more_s
         if abs(more_s) < SAME_LAG_S:
             break
         later = with_pose_lag(declared, lag_s)
-        fitted = None if later is None else alone.fit(later)
-        if later is None or fitted is None:
+        refitted = None if later is None else alone.fit(later)
+        if later is None or refitted is None:
             break
         shifted = later
-        fitted_m = fitted
-        if (now := _misfit(shifted, fitted_m)) < least:
+        fitted = refitted
+        if (now := _discrepancy(fitted)) < least:
             best = clock_hypothesis(of, lag_s, corrected=shifted)
             least = now
-    if best is not None:
+    if best is not None and abs(lag_s) > ESTIMATED_LAGS * (declared.nuisance.sigma(TIME) or 0.0):
         yield best
 
 

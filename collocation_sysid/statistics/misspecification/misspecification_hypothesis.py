@@ -36,6 +36,9 @@ class Hypothesis:
         Factor by which a hypothesis with fitted numbers must fit better than one without.
     strength : float
         Factor by which the misfit decreases if the hypothesis is true; 0 until it is tested.
+    remaining : float or None
+        Misfit that remains if the hypothesis is true, in the unit of its test; None if it is not
+        known.
     """
 
     code: str
@@ -44,6 +47,7 @@ class Hypothesis:
     corrected: Any = None
     handicap: float = 1.0
     strength: float = 0.0
+    remaining: float | None = None
 
     @property
     def cause(self) -> str:
@@ -112,7 +116,7 @@ class HypothesisTest:
                 continue
             strength = self.misfit / max(self.smallest_misfit, misfit) / each.handicap
             if strength > self.required_factor or misfit < self.noise_level < self.misfit:
-                yield replace(each, strength=strength)
+                yield replace(each, strength=strength, remaining=misfit)
 
 
 def clock_hypothesis(

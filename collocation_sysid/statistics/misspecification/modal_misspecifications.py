@@ -285,7 +285,9 @@ class ModalComparison:
         strength = misfit_m / (LARGEST_MISFIT * size_m)
         if strength > 1:
             data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
-            yield Hypothesis("unlike", self.declared.name, data=data, strength=strength)
+            yield Hypothesis(
+                "unlike", self.declared.name, data=data, strength=strength, remaining=misfit_m
+            )
 
     def _other_axes(self) -> Iterator[Hypothesis]:
         """Yield the hypotheses of other axes of the tracks that fit far better by the modes."""
