@@ -95,15 +95,11 @@ LAWS_ADVICE = (
     "; a wrong damping or material law has similar effects: compare the laws first, with "
     "compare-models --damping and --materials"
 )
-# The same for a branch of memory with a positive, and with a negative share.
+# The same for a branch of memory.
 MEMORY_ADVICE = (
     "; these estimates are of first order in the share, for a given relaxation time. The moduli "
     "without memory are too large for slow loads: add a branch to the material ([[object.prony]], "
     "in Python Body(prony=...)), and estimate it"
-)
-NO_MEMORY_ADVICE = (
-    "; a negative share is not memory: another effect depends on the rate, such as the damping law. "
-    "Compare the laws with compare-models --damping and --materials"
 )
 # Codes of the concern about an estimated, and about a measured discretisation error.
 NUMERICAL = "scheme/step", "mesh/refined"
@@ -388,7 +384,7 @@ def _advice(probe: Probe) -> str:
         return ""
     if assumption_name(probe.name) != MEMORY:
         return LAWS_ADVICE
-    return MEMORY_ADVICE if (probe.size or 0.0) > 0 else NO_MEMORY_ADVICE
+    return MEMORY_ADVICE
 
 
 def _hysteresis_text(experiments: Iterable[Experiment]) -> str:

@@ -201,6 +201,13 @@ def test_a_probe_alarms_if_it_is_significant_and_relevant():
     assert not is_alarming(replace(probe(2.0), kind="window"))
 
 
+def test_a_negative_share_is_no_memory():
+    negative = probe(2.0, name=f"{MEMORY} τ=0.1s")
+    assert negative.size < 0
+    assert not is_alarming(negative)
+    assert is_alarming(replace(negative, size=0.05))
+
+
 def test_the_concern_names_the_assumption_and_every_corrected_estimate():
     both = [probe(1.0, name=CLOCK, fall=12.0), probe(1.0)]
     (concern,) = probe_concerns(both, {"young_pa": 1.01, "poisson": 1.0})

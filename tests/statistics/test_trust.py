@@ -21,6 +21,7 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.problem import Problem
+from collocation_sysid.recording.nuisance import GRASP_TURN
 from collocation_sysid.result.run_sections import remedy_command
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.statistics.assessment import (
@@ -83,7 +84,7 @@ def test_a_concern_keeps_its_code_and_its_numbers_in_files():
     stored = json.loads(as_json(found))
     (reason,) = stored["reasons"]
     assert reason.startswith(
-        "time is 4.0 standard deviations of its prior away from zero: check whether"
+        "time is 4.0 standard deviations of its prior away from zero: compare laws with"
     )
     (concern,) = stored["concerns"]
     assert concern["code"] == "nuisance/far"
@@ -220,6 +221,21 @@ def test_nuisance_parameters_far_from_their_prior():
 
 def off(sigmas: float, count: int = 1000) -> InstrumentMisfit:
     return InstrumentMisfit("stress", "its sigma", sigmas, sigmas, count)
+
+
+def test_a_turn_that_no_grasp_has_is_no_reason_to_widen_its_prior():
+    names = [f"turn in the grasp, {axis} [rad]" for axis in "xyz"]
+    walls = [-np.inf] * 3, [np.inf] * 3
+    given = {"rows": [GRASP_TURN] * 3, "scales": [GRASP_TURN.sigma] * 3}
+    (found,) = nuisance_concerns(names, [8.0, 21.4, 7.0], *walls, **given)
+    assert found.code == "nuisance/large"
+    assert "y [rad]" in found.message
+    assert "(11°)" in found.message
+    assert "compare-models" in found.message
+    assert "do not widen" in found.message
+    (found,) = nuisance_concerns(names, [0.0, 5.0, 0.0], *walls, **given)
+    assert found.code == "nuisance/sized"
+    assert found.message.index("compare laws") < found.message.index("widen")
 
 
 def test_a_roll_out_is_measured_by_the_fit_and_the_noise():

@@ -27,8 +27,8 @@ FEWEST_SAMPLES = 32
 STOPPED = 0.15
 # Amplitude of filtered noise over σ at the cutoff; the largest frequency with more is the cutoff.
 PASSED = 0.5
-# Largest amplitude in the highest quarter of the band over that between the cutoff and there: a
-# filter falls, noise is flat.
+# Largest amplitude in the highest quarter of the band over that in the quarter below: a filter
+# falls, noise is flat.
 FALLING = 0.5
 
 
@@ -112,5 +112,5 @@ def _cutoff(amplitude: Array) -> int | None:
     def level(first: int, last: int) -> float:
         return float(np.sqrt(np.mean(amplitude[first:last] ** 2)))
 
-    falls = level(3 * count // 4, count) < FALLING * level(3 * cutoff // 2, 3 * count // 4)
+    falls = level(3 * count // 4, count) < FALLING * level(count // 2, 3 * count // 4)
     return cutoff if level(2 * cutoff, count) < STOPPED and falls else None

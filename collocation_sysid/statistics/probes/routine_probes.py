@@ -145,10 +145,13 @@ def significance_limit(changes: ResidualChanges, name: str) -> float:
 
 def is_alarming(probe: Probe) -> bool:
     """Whether a probe relaxes an assumption that is significant (it has `sentences`), and relevant
-    to the estimates (`relevance` at least `RELEVANT`); false for parts of the data.
+    to the estimates (`relevance` at least `RELEVANT`); false for parts of the data, and for memory
+    with a negative share, which no material has.
     """
+    is_possible = assumption_name(probe.name) != MEMORY or (probe.size or 0.0) > 0
     return (
-        bool(probe.sentences)
+        is_possible
+        and bool(probe.sentences)
         and probe.kind == "assumption"
         and (probe.relevance or 0.0) >= RELEVANT
     )

@@ -1,0 +1,116 @@
+"""Copies of tracks and filtered tracks are named, and which corrections are named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from kit.problems import hung_cube
+from scipy.signal import butter, filtfilt
+from study_hidden_errors import TRUTH, twin
+
+from collocation_sysid import Unknown
+from collocation_sysid.pipeline import solve
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.runs.misspecifications import find_misspecifications
+from collocation_sysid.statistics.misspecification.fit_misspecifications import (
+    _named_alone_or_together,
+)
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
+from collocation_sysid.statistics.misspecification.model_misspecifications import (
+    mirror_images,
+    with_shape,
+)
+from collocation_sysid.statistics.misspecification.track_misspecifications import (
+    _amplitudes,
+    _cutoff,
+    same_tracks,
+)
+
+STEP_S = 0.01
+
+
+def recorded(copied: bool):
+    """A cube with noisy tracks of its markers at their places; the second may copy the first."""
+    hung = hung_cube(20)
+    places_m = hung.markers.predict_positions(hung.body.nodes_m)
+    sigma_m = hung.markers.sigma_m[0]
+    noise = np.random.default_rng(0).normal(scale=sigma_m, size=(21, *places_m.shape))
+    tracks_m = places_m + noise
+    if copied:
+        tracks_m[:, 1] = tracks_m[:, 0]
+    return with_markers(hung, tracks_m)
+
+
+def test_two_markers_with_one_track_are_named():
+    assert not [*same_tracks(recorded(copied=False))]
+    (cause,) = same_tracks(recorded(copied=True))
+    first, second, *_ = recorded(copied=True).markers.names
+    assert f"markers {first} and {second}" in cause.message
+
+
+def residuals(rng: np.random.Generator, noise: float) -> np.ndarray:
+    """White noise, and the slow error of a wrong model."""
+    t_s = STEP_S * np.arange(120)
+    error = 3 * np.sin(2 * np.pi * 2 * t_s)[:, None] * rng.normal(size=12)
+    return noise * rng.normal(size=(120, 12)) + error
+
+
+@pytest.mark.parametrize("cutoff_hz", [6.0, 10.0, 15.0])
+def test_the_cutoff_of_filtered_tracks_is_found(cutoff_hz: float):
+    rng = np.random.default_rng(1)
+    b, a = butter(2, cutoff_hz, fs=1 / STEP_S)
+    smooth = filtfilt(b, a, residuals(rng, 1.0), axis=0)
+    frequency_hz, amplitude = _amplitudes(smooth, STEP_S)
+    cutoff = _cutoff(amplitude)
+    assert cutoff is not None
+    assert abs(frequency_hz[cutoff] / cutoff_hz - 1) < 0.25
+
+
+@pytest.mark.parametrize("noise", [1.0, 0.2, 0.01])
+def test_white_noise_with_a_wrong_model_is_not_filtered(noise: float):
+    assert _cutoff(_amplitudes(residuals(np.random.default_rng(2), noise), STEP_S)[1]) is None
+
+
+def test_a_cause_is_named_alone_only_if_it_suffices_and_no_other_does():
+    lag = Hypothesis("gripper-frame", "'a'", corrected=1, strength=1.8, remaining=1.4)
+    law = Hypothesis("poses-inverted", "'a'", corrected=2, strength=3.0, remaining=0.9)
+    other = Hypothesis("camera-frame", "'a'", corrected=3, strength=2.9, remaining=0.95)
+    losses = {1: 500.0, 2: 100.0, 3: 105.0}
+    assert _named_alone_or_together([lag, law], losses.__getitem__) == [law]
+    (either,) = _named_alone_or_together([lag, law, other], losses.__getitem__)
+    assert either.code == "several"
+    assert "inverted" in either.message
+    assert "world frames" in either.message
+    (partial,) = _named_alone_or_together([lag], losses.__getitem__)
+    assert partial.code == "insufficient"
+    assert _named_alone_or_together([law, other], {2: 100.0, 3: 150.0}.__getitem__) == [law]
+
+
+def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():
+    hung = hung_cube(5)
+    assert not [*mirror_images(hung)]
+    wider = with_shape(hung, np.array([1.1, 1.0, 1.0]))
+    assert wider is not None
+    assert np.isclose(np.ptp(wider.body.nodes_m[:, 0]), 1.1 * np.ptp(hung.body.nodes_m[:, 0]))
+    assert len(wider.grasps[0].nodes) == len(hung.grasps[0].nodes)
+    assert np.isclose(wider.body.mass_kg, hung.body.mass_kg)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        ("mirrored", "mesh-mirrored"),
+        ("wide", "mesh-width"),
+        ("hanging", "rest-shape"),
+        ("filtered", "tracks-filtered"),
+        ("twice", "markers-same"),
+        ("law", "law"),
+    ],
+)
+def test_hidden_errors_of_a_bent_bar_are_named(error: str, cause: str):
+    near = {name: Unknown(1.3 * value) for name, value in TRUTH.items()}
+    problem = replace(twin(error, 0, near), substeps=2)
+    assert find_misspecifications(solve(problem))[0].cause == cause
