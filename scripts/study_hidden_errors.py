@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.signal import butter, filtfilt
+from scipy.signal import butter, sosfiltfilt
 from script_arguments import make_parser
 from twins import random_poses
 
@@ -223,8 +223,10 @@ def scanned_while_hanging(seed: int) -> HiddenError:
 def filtered(seed: int) -> HiddenError:
     """Return the bent bar, whose tracks were low-passed by the software of the cameras."""
     actual = bar_recording(seed)
-    b, a = butter(2, LOW_PASS_HZ, fs=1 / STEP_S)
-    return HiddenError(actual, without_places(actual), recorded=lambda x: filtfilt(b, a, x, axis=0))
+    sections = butter(2, LOW_PASS_HZ, output="sos", fs=1 / STEP_S)
+    return HiddenError(
+        actual, without_places(actual), recorded=lambda x: sosfiltfilt(sections, x, axis=0)
+    )
 
 
 def twice(seed: int) -> HiddenError:
