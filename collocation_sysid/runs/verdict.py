@@ -9,6 +9,7 @@ import numpy as np
 from ..common.array_types import root_mean
 from ..errors import SimulationError
 from ..features.registry import FEATURES
+from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
 from ..model.schemes import as_scheme
 from ..problem import Problem
@@ -81,6 +82,8 @@ def solution_concerns(
         return
     if status is Status.ACCEPTABLE:
         yield Concern("solve/acceptable")
+    if ENDED_BY_ASSOCIATION in solution.notes:
+        yield Concern("solve/jump")
     if uncertainty is not None:
         yield from as_specimen_concerns(
             [*fit_concerns(uncertainty), *parameter_concerns(uncertainty)],

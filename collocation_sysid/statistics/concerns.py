@@ -471,6 +471,8 @@ TOPICS: dict[str, Topic] = {
         "reports no mistake.",
         messages={
             "lost": "the solve did not converge: {why}",
+            "jump": "the search ended where the loss jumps as measured points change to other "
+            "parts of the surface: other guesses may lead to other minima",
             "no-start": "there is no initial state yet: send a frame with a pose of the grasp",
             "not-simulable": "the body cannot be simulated with these parameters: give stiffer "
             "guesses, and check mass, units and grasps",

@@ -279,7 +279,7 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
     monkeypatch.setattr(run_record, "write_pictures", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     ((out, result),) = shown
-    assert "Verdict: check" in out
+    assert "Verdict: good" in out
     assert "written to run" in out
     assert result == result_in(tiny / "run")
     assert outcome.code == 130
@@ -295,7 +295,7 @@ def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(tiny, monkeypa
     monkeypatch.setattr(run_record, "write_all_frames", fail)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 2
-    assert "Verdict: check" in outcome.out
+    assert "Verdict: good" in outcome.out
     assert "written to" not in outcome.out
     assert "No space left on device" in outcome.err
     assert not (tiny / "run").exists()
@@ -308,7 +308,7 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatc
     monkeypatch.setattr(run_record, "write_pictures", lambda *_, **__: time.sleep(60))
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert "Verdict: check" in outcome.out
+    assert "Verdict: good" in outcome.out
     assert "the result is kept in run" in outcome.err
     assert result_in(tiny / "run")["status"] == "converged"
 

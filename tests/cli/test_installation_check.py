@@ -107,15 +107,15 @@ def test_an_extra_is_complete_or_names_what_is_missing(monkeypatch):
         "requires",
         lambda _: [
             "numpy>=2",
-            "absent-package>=1; extra == 'view'",
-            "numpy>=99; extra == 'view'",
+            "absent-package>=1; extra == 'film'",
+            "numpy>=99; extra == 'film'",
             "numpy>=2; extra == 'logs'",
             "never>=1; sys_platform == 'none' and extra == 'logs'",
         ],
     )
     extras = {each.name: each for each in optional_packages()}
-    assert extras["view"].missing == ("absent-package", "numpy")
-    assert extras["view"].install == 'pip install "collocation-sysid[view]"'
+    assert extras["film"].missing == ("absent-package", "numpy")
+    assert extras["film"].install == 'pip install "collocation-sysid[film]"'
     assert extras["logs"].missing == ()
     assert "test" not in extras
 

@@ -34,7 +34,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.result.element_fields import ElementFields
-from collocation_sysid.result.run_sections import run_summary
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.linearised import linearise_fit

@@ -180,7 +180,7 @@ def test_names_that_are_shown_in_tables_are_shown_as_they_are(tiny: Path):
         text = text.replace("side = [", f"{name} = [").replace("side_", f"{name}_")
         (tiny / file).write_text(text)
     method = settings("solver.method=reduced-space")
-    outcome = run_command("solve", "problem.toml", "-v", *method, "--out", "run")
+    outcome = run_command("solve", "problem.toml", "-v", "--details", *method, "--out", "run")
     assert outcome.code == 0, outcome
     assert_harmless(outcome)
     assert "␛[2J[/b]:smile:" in outcome.out

@@ -290,7 +290,9 @@ def worn(tiny: Path) -> Path:
 def test_readings_in_a_file_are_simulated_and_identified_from(worn: Path):
     head = (worn / "data" / "swing_reading_cell.csv").read_text().splitlines()[0]
     assert head == "t_s,pull_n"
-    done = run_command("solve", *ALLOWED, "--out", "found", "--method", "reduced-space")
+    done = run_command(
+        "solve", *ALLOWED, "--out", "found", "--method", "reduced-space", "--details"
+    )
     assert done.code == 0, done.err
     result = json.loads((worn / "found" / "result.json").read_text())
     for name, value in TINY_TRUTH.items():

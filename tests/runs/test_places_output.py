@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = write_problem(place, {"swing": 24})
     replace_text(REFERENCES, GIVEN)(place)
     command = ("solve", file, "--method", "reduced-space", *OPTIONS)
-    outcome = run_command(*command, "--out", place / "run")
+    outcome = run_command(*command, "--details", "--out", place / "run")
     assert outcome.code == 0, outcome.err
     (place / "printed.txt").write_text(outcome.out)
     return place
