@@ -258,11 +258,14 @@ class CheckCommand(ProblemOptions, OutputOptions):
     ----------
     full : bool
         Simulate the complete recordings and make all comparisons, however long this takes.
+    details : bool
+        Show everything: quality of the elements, modes, all grasps and methods, notes.
     out : DIR
         Folder for pictures of the cameras' images; runs/<problem>_check by default.
     """
 
     full: bool = False
+    details: bool = False
     out: Path | None = None
 
 
@@ -295,7 +298,7 @@ def check(options: CheckCommand) -> None:
             error_console, quiet=options.quiet, activity="checking bodies, recordings and grasps"
         ):
             findings_at_once = quick_check(problem)
-        print_result(quick_check_tables(findings_at_once))
+        print_result(quick_check_tables(findings_at_once, options.details))
         _write_camera_overlays(
             problem,
             options.out or Path("runs") / f"{run_name(options.problem)}_check",
@@ -305,7 +308,7 @@ def check(options: CheckCommand) -> None:
         error_console, quiet=options.quiet, activity="preparing the complete program"
     ) as progress:
         findings = check_problem(problem, progress.say, full=options.full)
-    options.print_result(findings.as_dict(), full_check_tables(findings))
+    options.print_result(findings.as_dict(), full_check_tables(findings, options.details))
     good = findings.derivatives_agree and not findings.causes
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 

@@ -6,7 +6,8 @@ simulations.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ..common.display import Line, Shown, Table, duration, labelled
 from ..fem.laws.constants import symbol_of, unit_of
 from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
 from ..runs.check.body_check import grasp_sentence
+from ..runs.check.cost import MethodCost
 from .run_sections import remedy_command
 
 # Natural modes in the table, lowest first.
@@ -22,40 +24,60 @@ SHOWN_MODES = 3
 SHOWN_RECORDINGS = 4
 
 
-def quick_check_tables(quick_check: QuickCheck) -> list[Shown]:
-    """Return the tables of a quick check, which need no simulation: one for each body, also that of
-    specimens without a mesh, then one of the measurements.
+def quick_check_tables(quick_check: QuickCheck, details: bool = False) -> list[Shown]:
+    """Return what a quick check finds without a simulation: bodies, also those of specimens without
+    a mesh, and measurements.
+
+    Parameters
+    ----------
+    quick_check : QuickCheck
+    details : bool
+        Whether the quality of the elements and the grasps of each recording are shown, too.
     """
-    return [*map(_body_section, quick_check.bodies), _measurements_section(quick_check)]
+    bodies = [_body_section(body, details) for body in quick_check.bodies]
+    tables = [*bodies, _measurements_section(quick_check, details)]
+    return [*tables] if details else [_joined(tables)]
 
 
-def full_check_tables(findings: CheckResult) -> list[Shown]:
+def full_check_tables(findings: CheckResult, details: bool = False) -> list[Shown]:
     """Return the findings of a check that need simulations, for the terminal.
 
-    First come the natural modes (left out if all recordings are static), then a table of costs and
-    derivatives, notes and warnings if there are any, the command that explains remedies if there is
-    a concern, and the conclusion.
+    First come the natural modes (left out if all recordings are static), then guess and cost,
+    warnings, the number of notes, the command that explains remedies if there is a concern, and the
+    conclusion.
 
     Parameters
     ----------
     findings : CheckResult
         Result of the check.
+    details : bool
+        Whether notes, other modes, all methods, and the sizes of the program are shown, too.
     """
-    messages = {"note": (findings.notes, ""), "warning": (findings.warnings, "check")}
+    warnings = _messages("warning", findings.warnings, "check")
+    notes = _messages("note", findings.notes, "") if details else _note_count(findings.notes)
     return [
-        *_motion_section(findings),
-        _solve_section(findings),
-        "",
-        *(
-            Table(
-                "", (), rows=tuple((f"{kind}:", each) for each in sentences), texts=1, style=style
-            )
-            for kind, (sentences, style) in messages.items()
-            if sentences
-        ),
+        *([*_motion_section(findings), _solve_section(findings), ""] if details else []),
+        *([] if details else [_solve_brief(findings)]),
+        *notes,
+        *warnings,
         *remedy_command(findings.concerns),
         _check_verdict(findings),
     ]
+
+
+def _joined(tables: Sequence[Table]) -> Table:
+    """Return tables of the same columns as one without a title."""
+    return replace(tables[0], title="", rows=tuple(row for each in tables for row in each.rows))
+
+
+def _messages(kind: str, sentences: Iterable[str], style: str) -> list[Shown]:
+    rows = tuple((f"{kind}:", each) for each in sentences)
+    return [Table("", (), rows=rows, texts=1, style=style)] if rows else []
+
+
+def _note_count(notes: Sequence[str]) -> list[Shown]:
+    count = "a note" if len(notes) == 1 else f"{len(notes)} notes"
+    return [Line(f"{count}: see check --details", "quiet")] if notes else []
 
 
 def _check_verdict(findings: CheckResult) -> Line:
@@ -93,9 +115,9 @@ def _point_masses(body: BodyCheck) -> str:
     return f", and point masses: {stated}"
 
 
-def _body_section(body: BodyCheck) -> Table:
-    """Return the table "Body": size, volume, mass, mesh, element quality, the rest shape unless the
-    mesh is free of stress, and fields.
+def _body_section(body: BodyCheck, details: bool) -> Table:
+    """Return the table "Body": size, volume, mass, mesh, with `details` element quality, the rest
+    shape unless the mesh is free of stress, and fields.
 
     For specimens, which have no mesh, it is the table "Specimens" with the names of the experiments
     alone.
@@ -113,8 +135,12 @@ def _body_section(body: BodyCheck) -> Table:
             + _point_masses(body),
             "mesh": f"{body.nodes:,} nodes, {body.elements:,} {body.element}; edges "
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
-            "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
         }
+        | (
+            {"quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}"}
+            if details
+            else {}
+        )
         | ({} if body.rest_shape == "stress_free" else {"rest shape": _rest_shape(body)})
         | {
             f"field of {symbol_of(name)}": f"{each.modes} shapes with {each.share:.0%} of the "
@@ -140,6 +166,18 @@ def _rest_shape(body: BodyCheck) -> str:
     return (
         f"the mesh was made under gravity; the stress-free shape differs from it by up to {change}"
     )
+
+
+def _motion_rows(findings: CheckResult) -> dict[str, str]:
+    """Return a table row with the first mode of the first moving recording; empty if none moves."""
+    first = next((m.first_mode for m in findings.motions if m.first_mode), None)
+    if first is None:
+        return {}
+    return {
+        "first mode": f"{first.frequency_hz:.3g} Hz at the guess, damping ratio "
+        f"{first.damping_ratio:.2g}; {first.samples_per_period:.1f} samples and "
+        f"{first.steps_per_period:.1f} time steps per period"
+    }
 
 
 def _motion_section(findings: CheckResult) -> list[Shown]:
@@ -180,9 +218,10 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
     return [Table(title, heads, rows=rows, names=0), *more]
 
 
-def _measurements_section(findings: QuickCheck) -> Table:
+def _measurements_section(findings: QuickCheck, details: bool) -> Table:
     """Return the table of at most `SHOWN_RECORDINGS` recordings with samples, markers and grasps,
-    and of the air densities of all.
+    and of the air densities of all. Without `details`, grasps that are described in the same words
+    appear once.
     """
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
@@ -197,8 +236,16 @@ def _measurements_section(findings: QuickCheck) -> Table:
     densities = {r.air_density_kg_m3 for r in findings.recordings if not r.test}
     if densities:
         rows["air"] = ", ".join(map(_air_description, sorted(densities)))
-    for recording in findings.recordings[:SHOWN_RECORDINGS]:
-        rows |= _grasp_rows(recording.experiment, findings.holds)
+    if details:
+        for recording in findings.recordings[:SHOWN_RECORDINGS]:
+            rows |= _grasp_rows(recording.experiment, findings.holds)
+    else:
+        grasps = [*dict.fromkeys(map(grasp_sentence, findings.holds))]
+        shown = grasps[:SHOWN_RECORDINGS]
+        names = ["grasp"] if len(shown) == 1 else [f"grasp {k + 1}" for k in range(len(shown))]
+        rows |= dict(zip(names, shown, strict=True))
+        if len(grasps) > len(shown):
+            rows["other grasps"] = f"{len(grasps) - len(shown)} (see check --details)"
     return labelled("Measurements", rows)
 
 
@@ -250,10 +297,8 @@ def _marker_summary(recording: RecordingCheck) -> str:
     return f"{len(recording.markers)} markers, {missing}; {place}{besides}"
 
 
-def _solve_section(findings: CheckResult) -> Table:
-    """Return the table of guesses, problem size, expected costs of each method, and derivative
-    errors.
-    """
+def _guess_rows(findings: CheckResult) -> dict[str, str]:
+    """Return table rows with the guess of each body and the deviation from the markers there."""
     rows = {
         "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
             f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
@@ -266,6 +311,30 @@ def _solve_section(findings: CheckResult) -> Table:
             "the simulation deviates from the markers by "
             f"{1e3 * findings.rms_at_guess_m:.3g} mm RMS"
         )
+    return rows
+
+
+def _cost_text(cost: MethodCost) -> str:
+    memory = (
+        f"{cost.memory_mb:.0f} MB" if cost.memory_mb < 1e3 else f"{cost.memory_mb / 1e3:.2g} GB"
+    )
+    return f"about {duration(cost.time_s)} and {memory}"
+
+
+def _solve_brief(findings: CheckResult) -> Table:
+    """Return the table of guesses, the first mode, and the expected cost of the chosen method."""
+    rows = _guess_rows(findings) | _motion_rows(findings)
+    for cost in findings.costs:
+        if cost.method == findings.method:
+            rows["solve"] = f"{_cost_text(cost)} by {cost.method} (rough estimates, without checks)"
+    return labelled("", rows)
+
+
+def _solve_section(findings: CheckResult) -> Table:
+    """Return the table of guesses, problem size, expected costs of each method, and derivative
+    errors.
+    """
+    rows = _guess_rows(findings)
     rows |= {
         "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
         f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
@@ -273,10 +342,7 @@ def _solve_section(findings: CheckResult) -> Table:
     rows |= findings.lifted_texts
     for cost in findings.costs:
         chosen = ", chosen" if cost.method == findings.method else ""
-        memory = (
-            f"{cost.memory_mb:.0f} MB" if cost.memory_mb < 1e3 else f"{cost.memory_mb / 1e3:.2g} GB"
-        )
-        rows[cost.method] = f"about {duration(cost.time_s)} and {memory}{chosen}"
+        rows[cost.method] = f"{_cost_text(cost)}{chosen}"
     if findings.costs:
         rows["times"] = (
             f"rough estimates for {findings.timesteps:,} time steps or equilibria, without checks"

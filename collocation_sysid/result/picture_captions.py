@@ -15,9 +15,8 @@ GENERAL_CAPTIONS = {
     "mesh": "The mesh, its grasped nodes and the estimated positions of the markers.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
-    "confidence": "95 % confidence ellipses of pairs of parameters, for the measurement noise "
-    "only.",
-    "correlation": "Correlation of the estimates.",
+    "confidence": "95 % regions of pairs of parameters, for the combined uncertainty if it is known.",
+    "correlation": "Correlation of the estimates, for the same uncertainty.",
     "budget": "Contributions to the variance of each estimate.",
     "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
     "scan": "Scan of the stiffness for an initial guess: misfit of the first part of the "

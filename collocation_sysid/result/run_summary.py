@@ -11,7 +11,7 @@ from ..common.display import Line, Shown, Table, flattened_parts, number
 from ..common.serialisation import copy_fields
 from ..errors import listed
 from ..features.measurement_results import FittedExperiment, PredictionErrors, SimulatedExperiment
-from ..fem.laws.constants import symbol_of, unit_of
+from ..fem.laws.constants import symbol_of, unit_of, without_region
 from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
@@ -131,7 +131,9 @@ def _details(result: Result) -> list[Shown]:
 def _estimates(result: Result) -> Iterator[Shown]:
     """Yield the table of estimates, a line with the fixed parameters, and one for each field."""
     values = result.collect_estimates()
-    shown = [name for name in values if name in result.parameters or name in SHOWN_MODULI]
+    shown = [
+        name for name in values if name in result.parameters or without_region(name) in SHOWN_MODULI
+    ]
     fixed = [name for name in shown if values[name].fixed and not values[name].tied]
     free = [name for name in shown if name not in fixed]
     if free:
@@ -163,7 +165,9 @@ def _limit(result: Result) -> Iterator[str]:
         return
     stated = stated_as_undetermined(result)
     vague = [name for name in known if name not in stated and not values[name].is_determined]
-    shown = [name for name in vague if name in result.parameters or name in SHOWN_MODULI]
+    shown = [
+        name for name in vague if name in result.parameters or without_region(name) in SHOWN_MODULI
+    ]
     stiffness = next((name for name in STIFFNESS_NAMES if name in known), known[0])
     name = next(iter(shown), stiffness)
     largest = next(iter(result.budget[name]))

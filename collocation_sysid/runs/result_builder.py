@@ -163,6 +163,9 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
     if known is None:
         return None
     reported = [k for k, name in enumerate(known.names) if name in known.estimates]
+    combined = None
+    if answer.systematic_effects is not None:
+        combined = answer.covariance()[np.ix_(reported, reported)]
     return copy_fields(
         UncertaintyResult,
         known,
@@ -170,6 +173,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
         correlation=known.correlation[np.ix_(reported, reported)],
         covariance=known.covariance[np.ix_(reported, reported)],
         quantiles=known.quantiles[reported],
+        combined_covariance=combined,
         noise_factors=known.level.factors,
         autocorrelation=known.dependence.lag1,
         verdicts=tuple(identifiability_sentences(known)),

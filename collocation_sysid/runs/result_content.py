@@ -315,7 +315,10 @@ class UncertaintyResult:
     correlation, covariance : (k, k) arrays
         Statistical correlation and covariance.
     quantiles : (k,) array
-        Half width of a 95 % interval over the standard error.
+        Half width of a statistical 95 % interval over the standard error.
+    combined_covariance : (k, k) array or None
+        Covariance due to noise, discretisation and systematic effects, whose 95 % intervals have
+        half widths of 1.96 standard deviations; None if systematic effects were not evaluated.
     verdicts : tuple of str
         Sentences on what the data determine.
     recordings : mapping of str to RecordingsAgreement, or None
@@ -336,6 +339,7 @@ class UncertaintyResult:
     verdicts: tuple[str, ...]
     recordings: Mapping[str, RecordingsAgreement] | None
     profiles: Mapping[str, ProfileResult]
+    combined_covariance: Array | None = optional()  # noqa: RUF009, it returns a field
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from ..common.array_types import Array
 from ..errors import InputError, hint_at
 from ..fem.laws.constants import unit_of
 from ..methods.solution import Solution
@@ -25,7 +26,7 @@ from ..statistics.budget.combined_intervals import combine
 from ..statistics.budget.discretisation_error import DiscretisationError, Refinement
 from ..statistics.budget.uncertainty_budget import BudgetLine, VarianceSources, budget
 from ..statistics.concerns import Concern
-from ..statistics.estimates import Estimate
+from ..statistics.estimates import Estimate, relative_derivatives
 from ..statistics.field_estimates import FieldEstimate, field_estimates
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.linearised import DerivedModuli
@@ -349,6 +350,61 @@ class SolvedProblem:
             For an unknown name.
         """
         return _or_nan(self._estimate(name).combined_std_error)
+
+    def covariance(
+        self,
+        kind: Literal["combined", "statistical"] = "combined",
+        units: Literal["relative", "si"] = "relative",
+    ) -> Array:
+        """Return the covariance (k, k) of the estimated parameters, in the order of
+        `uncertainty.names`.
+
+        The diagonal of the combined covariance has the squares of the combined standard
+        uncertainties of the table.
+
+        Parameters
+        ----------
+        kind : {"combined", "statistical"}
+            Due to noise, discretisation and systematic effects together, or to noise alone.
+        units : {"relative", "si"}
+            Of the logarithms of the parameters (of a parameter that may be negative, of its value
+            over its size), or of the parameters in their SI units.
+
+        Returns
+        -------
+        (k, k) array
+            NaN in rows and columns of parameters at a bound, and in those that have no combined
+            uncertainty.
+
+        Raises
+        ------
+        InputError
+            For an unknown kind or unit, or without error bars.
+        """
+        for name, found, known in (
+            ("kind", kind, ("combined", "statistical")),
+            ("units", units, ("relative", "si")),
+        ):
+            if found not in known:
+                raise InputError(f"{name}: found {found!r}; expected one of {', '.join(known)}")
+        if self.uncertainty is None or self.systematic_effects is None:
+            raise InputError("the run has no error bars, and therefore no covariance")
+        statistical = self.uncertainty.covariance
+        parameters = self.solution.collocation.parameters
+        sizes = relative_derivatives(parameters, self.solution.q)
+        by_value = sizes.copy()  # derivatives of the relative coordinates by the values
+        deviations = np.full(len(sizes), np.nan)
+        for k, name in enumerate(self.uncertainty.names):
+            each = self.estimates[name]
+            is_linear, _ = parameters.scale_and_bounds(name)
+            by_value[k] /= parameters.free[k].value_derivative(self.solution.parameters[name])
+            if not is_linear and each.value:
+                by_value[k] = 1 / each.value
+            deviations[k] = abs(by_value[k]) * _or_nan(each.combined_std_error)
+        matrix = statistical
+        if kind == "combined":
+            matrix = self.systematic_effects.combine_covariance(statistical, sizes, deviations)
+        return matrix if units == "relative" else matrix / np.outer(by_value, by_value)
 
     def nuisance(self, name: str) -> float:
         """Return the value of a nuisance parameter of a recording in its unit; `name` is as in

@@ -56,12 +56,12 @@ def _single_sentences(uncertainty: Uncertainty) -> list[str]:
         if name in uncertainty.estimates
         and (factor := _interval_factor(uncertainty.estimates[name])) is not None
     }
-    well = [f"{name} to {_precision_text(f)}" for name, f in factors.items() if f <= WELL_FIXED]
-    badly = [
-        f"{name} only to {_precision_text(f)}" for name, f in factors.items() if f > WELL_FIXED
-    ]
+    well = [f"{name} {_precision_text(f)}" for name, f in factors.items() if f <= WELL_FIXED]
+    badly = [f"{name} only {_precision_text(f)}" for name, f in factors.items() if f > WELL_FIXED]
     parts = [listed(part) for part in (well, badly) if part]
-    return [f"the data determine {'; '.join(parts)} (95 %, statistical)"] if parts else []
+    if not parts:
+        return []
+    return [f"noise alone leaves {'; '.join(parts)} (95 %, statistical, no systematic effects)"]
 
 
 def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
@@ -119,7 +119,7 @@ def _combination_sentence(
         return (
             f"of {listed(names)} only the combination "
             f"{_product_text(names, weights / weights[largest])} is determined, to "
-            f"{_precision_text(float(fixed))} (95 %)"
+            f"{_precision_text(float(fixed))} (95 %, statistical)"
         )
     if not has_powers:
         return (
@@ -129,7 +129,7 @@ def _combination_sentence(
     return (
         f"{listed(names)} are confounded{how}: only their combination "
         f"{_product_text(names, weights / weights[largest])} is determined, to "
-        f"{_precision_text(float(fixed))} (95 %)"
+        f"{_precision_text(float(fixed))} (95 %, statistical)"
     )
 
 
@@ -156,10 +156,13 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
         factor = _interval_factor(estimate)
         if factor is not None:
             parts.append(
-                f"{name} {'only ' if factor > WELL_FIXED else ''}to {_precision_text(factor)}"
+                f"{name} {'only ' if factor > WELL_FIXED else ''}{_precision_text(factor)}"
             )
     return (
-        [f"expressed as other elastic constants, the data determine {listed(parts)} (95 %)"]
+        [
+            f"expressed as other elastic constants, noise alone leaves {listed(parts)} "
+            "(95 %, statistical)"
+        ]
         if parts
         else []
     )

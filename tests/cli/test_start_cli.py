@@ -88,7 +88,7 @@ def test_a_run_with_a_guess_has_no_scan(folder):
 
 
 def test_check_finds_a_start(folder):
-    outcome = run_command("check", folder / "problem.toml", *UNGUESSED)
+    outcome = run_command("check", folder / "problem.toml", "--details", *UNGUESSED)
     assert outcome.code == 0
     assert "no guess: started from E = " in outcome.out
 

@@ -12,6 +12,7 @@ from kit.problems import TRUTH, hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text, readable_stress, rounded, two_digits
+from collocation_sysid.result.pictures.confidence import Confidence
 from collocation_sysid.result.run_summary import next_step, run_summary
 from collocation_sysid.runs.misspecifications import NO_CAUSE
 from collocation_sysid.runs.result_content import Result
@@ -32,6 +33,11 @@ def solved(recordings: int = 1) -> Result:
             fit=replace(one.fit, experiments=dict.fromkeys(names, fitted)),
             rollout=replace(one.rollout, experiments=dict.fromkeys(names, simulated)),
         )
+    return finished().result
+
+
+@cache
+def finished() -> cs.Run:
     hung = hung_cube(10)
     exact_m = cs.simulate(hung, TRUTH, "midpoint", substeps=1).markers_m
     noise_m = 1e-4 * np.random.default_rng(0).standard_normal(exact_m.shape)
@@ -39,7 +45,7 @@ def solved(recordings: int = 1) -> Result:
     seen = replace(hung.markers, positions_m=exact_m + noise_m, sigma_m=sigma_m)
     unknown = TRUTH | {"mu_pa": cs.Unknown(250.0), "lambda_pa": cs.Unknown(300.0)}
     problem = cs.Problem([replace(hung, markers=seen)], unknown, substeps=1)
-    return cs.run(problem, seek_causes=False).result
+    return cs.run(problem, seek_causes=False)
 
 
 def lines(result: Result, **options: bool) -> list[str]:
@@ -130,3 +136,31 @@ def test_the_next_command_suits_the_result():
     good = replace(result, provenance=file, trust=replace(result.trust, concerns=()))
     assert good.trust.verdict == "good"
     assert "refine 'runs/a swing' (" in next_step(good, folder, "collocation-sysid solve p.toml")
+
+
+def test_the_combined_covariance_agrees_with_the_table():
+    run = finished()
+    assert run.uncertainty is not None
+    names = run.uncertainty.names
+    combined = [run.estimates[name].combined_std_error for name in names]
+    np.testing.assert_allclose(np.sqrt(np.diag(run.covariance(units="si"))), combined, rtol=1e-9)
+    relative = np.array(combined) / [run.estimates[name].value for name in names]
+    np.testing.assert_allclose(np.sqrt(np.diag(run.covariance())), relative, rtol=1e-9)
+    statistical = run.covariance("statistical")
+    np.testing.assert_allclose(statistical, run.uncertainty.covariance)
+    assert (np.diag(statistical) < np.diag(run.covariance())).all()
+    eigenvalues = np.linalg.eigvalsh(run.covariance())
+    assert eigenvalues.min() > -1e-12 * eigenvalues.max()
+    with pytest.raises(cs.InputError, match="found 'both'; expected one of combined, statistical"):
+        run.covariance("both")  # type: ignore[arg-type]
+
+
+def test_pictures_of_the_confidence_have_the_combined_width():
+    result = solved()
+    found = Confidence.from_result(result)
+    assert found is not None
+    assert found.is_combined
+    for k, name in enumerate(found.names):
+        low, high = result.parameters[name].combined95 or (0.0, 0.0)
+        half = found.quantiles[k] * np.sqrt(found.covariance[k, k])
+        assert half == pytest.approx(np.log(high / low) / 2, rel=0.02)

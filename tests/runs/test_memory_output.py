@@ -132,7 +132,7 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     assert findings.hessian_error > 0
     assert {cost.method for cost in findings.costs} == {"reduced-space", "interior-point"}
     monkeypatch.setattr("collocation_sysid.runs.check.derivatives.MOST_LIFTED_NONZEROS", 0)
-    checked = run_command("check", tiny / "problem.toml", *settings(GUESSED))
+    checked = run_command("check", tiny / "problem.toml", "--details", *settings(GUESSED))
     assert f"{findings.overstresses:,} additional variables and constraints" in checked.out
     assert "τ prony_1" in checked.out
 
@@ -141,6 +141,8 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
 def test_a_problem_with_memory_is_solved_from_the_command_line(tiny):
     MEMORY(tiny)
     path, method = tiny / "problem.toml", "solver.method=interior-point"
-    solved = run_command("solve", path, *settings(GUESSED, method), "--out", tiny / "run")
+    solved = run_command(
+        "solve", path, *settings(GUESSED, method), "--out", tiny / "run", "--details"
+    )
     assert solved.code == 0, solved.err
     assert "instantaneous" in solved.out

@@ -178,12 +178,12 @@ def test_the_terminal_shows_nuisance_verdicts_and_residuals(two, tmp_path, monke
     monkeypatch.setenv("COLUMNS", "400")
     sigma = settings(*(f"experiment.{n}.markers.sigma_m=2e-4" for n in ("swing", "turn")))
     outcome = run_command(
-        "solve", two / "problem.toml", *REDUCED, *sigma, "--out", tmp_path / "run"
+        "solve", two / "problem.toml", *REDUCED, *sigma, "--out", tmp_path / "run", "--details"
     )
     assert outcome.code == 0
     assert "nuisance parameters of 'swing': " in outcome.out
     assert "mm (prior ±3 mm)" in outcome.out
-    assert "the data determine" in outcome.out
+    assert "noise alone leaves" in outcome.out
     assert "residuals: swing/" in outcome.out
     stored = json.loads((tmp_path / "run" / "result.json").read_text())
     assert stored["rollout"]["experiments"]["turn"]["nuisance"]

@@ -425,7 +425,7 @@ def test_check_does_not_call_a_doubtful_problem_valid(tiny: Path):
     flat = " ".join(outcome.out.split())
     assert "The problem is valid" not in flat
     assert "looks wrong: 'swing': the names of markers are exchanged" in flat
-    assert "grasp of 'swing' 9 nodes, 25% of all" in flat
+    assert "grasp 9 nodes, 25% of all" in flat
 
 
 def test_a_refusal_names_the_likeliest_cause(tiny: Path):

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from ...common.array_types import Array
 from ...runs.result_content import Result
+from ...statistics.budget.combined_intervals import NORMAL_95
 from ...statistics.budget.uncertainty_budget import main_sources, source_label
 from ...statistics.distributions import chi2_isf, normal_isf
 from ...statistics.estimates import correlation_from_covariance
@@ -51,30 +52,38 @@ class Confidence:
         Covariance of their logarithms, finite.
     quantiles : (k,)
         Half widths of the 95 % intervals in standard deviations.
+    is_combined : bool
+        Whether the covariance contains systematic effects, not noise alone.
     """
 
     names: Sequence[str]
     values: Array
     covariance: Array
     quantiles: Array
+    is_combined: bool = False
 
     @classmethod
     def from_result(cls, result: Result) -> Confidence | None:
-        """Return the estimates of a result that have an uncertainty; those at a bound have none.
+        """Return the estimates of a result that have an uncertainty, with the combined covariance if
+        it is known, else the statistical one; those at a bound have none.
 
         None if the result has no error bars.
         """
         if (uncertainty := result.uncertainty) is None:
             return None
-        known = np.isfinite(np.diag(uncertainty.covariance)) & np.isfinite(uncertainty.quantiles)
+        covariance, quantiles = uncertainty.covariance, uncertainty.quantiles
+        if (combined := uncertainty.combined_covariance) is not None:
+            covariance, quantiles = combined, np.full(len(combined), NORMAL_95)
+        known = np.isfinite(np.diag(covariance)) & np.isfinite(quantiles)
         indices = np.flatnonzero(known).tolist()
         names = [uncertainty.names[k] for k in indices]
         values = np.array([result.parameters[name].value for name in names])
         return cls(
             names,
             values,
-            covariance=uncertainty.covariance[np.ix_(indices, indices)],
-            quantiles=uncertainty.quantiles[indices],
+            covariance=covariance[np.ix_(indices, indices)],
+            quantiles=quantiles[indices],
+            is_combined=combined is not None,
         )
 
 
@@ -140,8 +149,11 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
         if first:
             axes.set_ylabel(scales[j].axis_label(confidence.names[j]), fontsize=TEXT_PT)
             axes.yaxis.set_label_coords(-0.13 * count, 0.5)
-    note = "deviation from the estimate:\n95 % region of each pair,\n95 % interval of each alone"
-    figure.text(0.98, 0.97, note if count > 1 else "", ha="right", va="top", fontsize=SMALL_PT)
+    what = "combined" if confidence.is_combined else "statistical"
+    note = f"{what} uncertainty"
+    if count > 1:
+        note += ";\ndeviation from the estimate:\n95 % region of each pair,\n95 % interval of each alone"
+    figure.text(0.98, 0.97, note, ha="right", va="top", fontsize=SMALL_PT)
     return figure
 
 

@@ -280,6 +280,25 @@ class VarianceSources:
         freedom = self.freedom * ((others + more) / more) ** 2
         return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
 
+    def combine_covariance(self, statistical: Array, sizes: Array, deviations: Array) -> Array:
+        """Return the covariance (nq, nq) due to noise and systematic effects in the coordinates of
+        a statistical one, scaled to given standard deviations.
+
+        Parameters
+        ----------
+        statistical : (nq, nq) array
+            Statistical covariance; NaN for parameters at a bound.
+        sizes : (nq,) array
+            Derivatives of its coordinates by q.
+        deviations : (nq,) array
+            Combined standard uncertainties in the same coordinates, which also contain the
+            discretisation error; its correlations are those of the other contributions.
+        """
+        ways = sizes[:, None] * np.hstack([self.sensitivities, self.recording_sensitivities])
+        both = statistical + ways @ ways.T
+        factors = deviations / np.sqrt(np.diag(both))
+        return both * np.outer(factors, factors)
+
     def known_effect(self, by_q: Array) -> float:
         """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects,
         to first order; 0 without known effects. Of an assumption with several components each
