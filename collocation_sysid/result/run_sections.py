@@ -326,7 +326,9 @@ def estimate_row(result: Result, name: str) -> tuple[str, ...]:
     each = values[name]
     factor, unit = 1.0, unit_of(name)
     if unit == "Pa":
-        factor, unit = readable_stress(e.value for n, e in values.items() if unit_of(n) == "Pa")
+        factor, unit = readable_stress(
+            e.value for n, e in values.items() if unit_of(n) == "Pa" and (not e.fixed or n == name)
+        )
     deviation, statistical, systematic = (
         None if size is None else factor * size
         for size in (

@@ -128,6 +128,14 @@ def test_the_table_has_the_unit_of_its_values():
     assert row.split()[:7] == ["μ", "kPa", "300", "20", "260", "…", "340"]
 
 
+def test_a_fixed_bulk_modulus_does_not_choose_the_unit():
+    result = solved()
+    fixed = replace(result.parameters["lambda_pa"], value=1e9, fixed=True)
+    shown = lines(replace(result, parameters={**result.parameters, "lambda_pa": fixed}))
+    assert any(line.startswith("μ Pa ") for line in shown)
+    assert any(line.startswith("fixed: λ 1e9 Pa") for line in shown)
+
+
 def test_the_next_command_suits_the_result():
     result = solved()
     folder = Path("runs/a swing")
