@@ -11,7 +11,6 @@ from .common import signal_handling as _starting  # noqa: F401  (before all that
 # isort: split
 import ast as _ast
 from importlib import import_module as _import_module
-from importlib.metadata import version as _version
 from pathlib import Path as _Path
 from typing import TYPE_CHECKING
 from typing import Any as _Any
@@ -187,7 +186,9 @@ if not TYPE_CHECKING:
     def __getattr__(name: str) -> _Any:
         """Return a public name; its module is imported at the first use."""
         if name == "__version__":
-            return _version("collocation-sysid")
+            from .common.installation import package_version
+
+            return package_version()
         if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module = _import_module(_MODULES[name], __name__)

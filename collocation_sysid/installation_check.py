@@ -11,7 +11,6 @@ import os
 import platform
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,10 +18,17 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .common.installation import (
+    PACKAGE,
+    extra_names,
+    package_version,
+    python_command,
+    stated_requirements,
+)
+
 if TYPE_CHECKING:
     from packaging.requirements import Requirement  # which may be missing
 
-PACKAGE = "collocation-sysid"
 # Extras for work on the package itself, and the collection of the others.
 DEVELOPMENT_EXTRAS = ("all", "dev", "docs", "test")
 # Values of the option linear_solver of IPOPT.
@@ -49,6 +55,7 @@ import sys, casadi
 x = casadi.SX.sym("x")
 for name in sys.argv[1:]:
     options = {"ipopt.linear_solver": name, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+    options["ipopt.option_file_name"] = ""
     program = {"x": x, "f": (x - 1) ** 2 + x ** 4, "g": x}
     try:
         solver = casadi.nlpsol("f", "ipopt", program, options | {"print_time": False})
@@ -246,7 +253,7 @@ def check_installation() -> InstallationReport:
     dependencies = tuple(required_packages())
     self_test = _self_test_unless_missing(dependencies)
     return InstallationReport(
-        version=metadata.version(PACKAGE),
+        version=package_version(),
         python=platform.python_version(),
         platform=platform.platform(),
         location=str(Path(__file__).parent),
@@ -279,8 +286,7 @@ def optional_packages() -> Iterator[Extra]:
     """
     if not _is_importable("packaging"):
         return
-    names = metadata.metadata(PACKAGE).get_all("Provides-Extra") or []
-    for name in sorted(set(names) - set(DEVELOPMENT_EXTRAS)):
+    for name in sorted(set(extra_names()) - set(DEVELOPMENT_EXTRAS)):
         packages = map(_dependency, _requirements(name))
         missing = sorted(each.name for each in packages if not each.is_suitable)
         yield Extra(name, tuple(missing), install=f'pip install "{PACKAGE}[{name}]"')
@@ -292,7 +298,7 @@ def _requirements(extra: str) -> Iterator[Requirement]:
     """
     from packaging.requirements import Requirement
 
-    for text in metadata.requires(PACKAGE) or []:
+    for text in stated_requirements():
         requirement = Requirement(text)
         marker = requirement.marker
         if marker is None:
@@ -358,7 +364,7 @@ def _working_linear_solvers(names: Sequence[str]) -> Iterator[str]:
     while remaining:
         try:
             done = subprocess.run(
-                [sys.executable, "-c", SOLVER_PROGRAM, *remaining],
+                python_command(SOLVER_PROGRAM, *remaining),
                 capture_output=True,
                 text=True,
                 errors="replace",

@@ -27,6 +27,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 from typer.main import get_command, get_command_from_info
 
+from ..common.installation import package_version
 from ..common.signal_handling import heed_interrupts, leave
 from ..errors import InputError, SimulationError, hint_at
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
@@ -148,9 +149,7 @@ app = typer.Typer(
 def _print_version(is_requested: bool) -> None:
     """Print the version and exit if the option was given; otherwise do nothing."""
     if is_requested:
-        from importlib.metadata import version
-
-        typer.echo(version("collocation-sysid"))
+        typer.echo(package_version())
         raise typer.Exit
 
 

@@ -7,13 +7,14 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from .installation import python_command
 
 _WRAPPER = """
 import sys, numpy
@@ -132,7 +133,7 @@ def run_isolated(
         np.savez(folder / "given.npz", allow_pickle=False, **arrays)
         try:
             done = subprocess.run(
-                [sys.executable, "-c", _WRAPPER.format(limit=limit, code=code), *words],
+                python_command(_WRAPPER.format(limit=limit, code=code), *words),
                 cwd=folder,
                 capture_output=True,
                 text=True,

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cache, partial
-from importlib.metadata import version
 from typing import Any, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
 from ..common.cluster import connected, distributed
 from ..common.files import reason
+from ..common.installation import package_version
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.kernels import map_experiments, run_single_threaded
@@ -309,9 +309,9 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 
 def _require_package(client: Any) -> set[str]:
     """Return the addresses of the workers of a Dask client, after a check of their versions."""
-    own_version = version("collocation-sysid")
+    own_version = package_version()
     try:
-        versions = client.run(_version, on_error="return")
+        versions = client.run(package_version, on_error="return")
     except (Exception, distributed().client.CancelledError) as error:
         raise _refusal(
             f"the scheduler stopped answering while its workers were asked for their versions "
@@ -351,11 +351,6 @@ def _disconnection(reason: str) -> SearchEnded:
 
 
 # On the workers -----------------------------------------------------------------------------------
-
-
-def _version() -> str:
-    """Return the version of this package; workers run this function."""
-    return version("collocation-sysid")
 
 
 def _run_alone(run: Callable[..., T], *arguments: Any) -> T:

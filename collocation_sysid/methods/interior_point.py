@@ -264,6 +264,7 @@ class InteriorPoint(MethodOptions):
             "ipopt.max_iter": self.max_iterations,
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
+            "ipopt.option_file_name": "",  # IPOPT reads ipopt.opt of the working folder otherwise
             "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
             "ipopt.constr_mult_init_max": 0.0,  # the warm-up needs no multipliers
             "jac_g": functions.function("jac_g", "g", "jac_g"),

@@ -1,12 +1,14 @@
-"""Python files that a problem names: custom materials, forces, sensors and nuisance parameters.
+"""Code that a problem names: Python files with custom materials, forces, sensors and nuisance
+parameters, and options of solvers that load libraries or start programs.
 
-They are run only if the user allows it.
+It is run only if the user allows it.
 """
 
 from __future__ import annotations
 
+import re
 import runpy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -20,6 +22,12 @@ from ..recording.nuisance import NuisanceRow
 from .named_files import existing_file
 from .nuisance_schema import CustomNuisanceSection
 from .schema import CodeSection, NodeForceSection
+
+# Options with which IPOPT loads a library or opens a file, and CasADi starts a compiler.
+_CODE_OPTION = re.compile(r"lib$|file|jit|dump")
+# Texts of CasADi's options: any other one may be a plugin, for which the working folder is searched.
+_CASADI_TEXTS = {"piqp", "qrqp", "osqp", "qpoases", "daqp", "highs", "clp", "proxqp", "hpipm"}
+_CASADI_TEXTS |= {"none", "regularize", "eigen-reflect", "eigen-clip"}
 
 
 @dataclass(frozen=True)
@@ -141,6 +149,28 @@ class CodeLoader:
 
         return self._load(file, name, key=key, kind="function", is_kind=is_function)
 
+    def require_harmless(self, solvers: Mapping[str, Any]) -> None:
+        """Refuse options of IPOPT and of CasADi by which a file could run code, unless running code
+        is allowed; `solvers` are the methods by name.
+
+        Raises
+        ------
+        InputError
+            For the first option of that kind; its location is the table of the options.
+        """
+        if self.is_allowed:
+            return
+        for name, method in solvers.items():
+            for table in ("ipopt", "casadi"):
+                option = next(_code_options(getattr(method, table, {}), table), None)
+                if option is not None:
+                    message = (
+                        f"found {option}, with which a solver may load or write a file, or start a "
+                        "program; allow that with --allow-code (allow_code=True from Python) if "
+                        "you trust the file"
+                    )
+                    raise InputError(message, where=f"solver.{name}.{table}")
+
     def _load(
         self, name: str, value_name: str, key: str, kind: str, is_kind: Callable[[Any], bool]
     ) -> tuple[Path, Any]:
@@ -165,3 +195,16 @@ class CodeLoader:
             known = f"{', '.join(known_names) or 'none'}{hint_at(value_name, known_names)}"
             raise InputError(f"there is no {kind} {value_name!r}; expected one of {known}", file)
         return file, names[value_name]
+
+
+def _code_options(options: Mapping[str, Any], table: str) -> Iterator[str]:
+    """Yield the names of options that may run code, also in tables within the options."""
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            yield from (f"{name}.{inner}" for inner in _code_options(value, table))
+        elif _CODE_OPTION.search(name) or (
+            table == "casadi"
+            and not isinstance(value, int | float)
+            and str(value) not in _CASADI_TEXTS
+        ):
+            yield name

@@ -74,6 +74,8 @@ def problem_arguments(
     folder = path.parent if folder is None else Path(folder)
     unknowns = file.parameters
     code = CodeLoader(folder, allow_code)
+    with located(path):
+        code.require_harmless(file.solver.methods)
     if say is not None:
         announce_reading({*_named_files(file, folder)}, say)
     size = None

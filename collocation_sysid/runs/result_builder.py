@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.metadata import version
 
 import casadi
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.display import short
 from ..common.files import SCHEMA
+from ..common.installation import package_version
 from ..common.serialisation import copy_fields
 from ..features.custom_sensor_feature import units_by_name
 from ..features.measurement_results import (
@@ -121,7 +121,7 @@ def _provenance(problem: Problem) -> Provenance:
     origin = problem.origin
     text = None if origin is None else origin.text.encode()
     return Provenance(
-        version=version("collocation-sysid"),
+        version=package_version(),
         casadi=casadi.CasadiMeta.version(),
         numpy=np.__version__,
         python=platform.python_version(),

@@ -13,7 +13,6 @@ import json
 import os
 import secrets
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -26,6 +25,7 @@ from typing import IO, Any
 
 from ...common.cluster import connected, distributed
 from ...common.files import write_text_file
+from ...common.installation import python_command
 from ...common.isolated_process import killed_by
 from ...common.serialisation import as_json
 from ...common.validated_classes import validated
@@ -34,7 +34,9 @@ from ...errors import InputError
 from ...fem.kernels import available_threads
 from .study_planning import PlannedRun
 
-COMMAND = (sys.executable, "-m", "collocation_sysid.extras.studies.run_worker")
+COMMAND = python_command(
+    "from collocation_sysid.extras.studies.run_worker import main; main()", with_package=True
+)
 # Environment of a run: one thread, since runs share the cores and their times are compared.
 ONE_THREAD = {
     name: "1"

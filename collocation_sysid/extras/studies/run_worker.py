@@ -1,4 +1,4 @@
-"""Worker process of one run: ``python -m collocation_sysid.extras.studies.run_worker OUT``.
+"""Worker process of one run, which `run_execution` starts.
 
 The run is read as one line of JSON from stdin, and its record is written to the file OUT. The
 process ends when its stdin is closed, so that it never outlives the study.
@@ -114,7 +114,3 @@ def _end_with_study() -> None:
     """Wait until stdin is closed, and end the process at once with code 1, without any clean-up."""
     os.read(0, 1)  # returns when the other end is closed
     os._exit(1)
-
-
-if __name__ == "__main__":
-    main()

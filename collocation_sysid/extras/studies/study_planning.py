@@ -13,12 +13,12 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...common.installation import package_version
 from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Count, OneOrMore
 from ...errors import InputError
@@ -344,7 +344,7 @@ def _planned_run(
     content["solver"]["method"] = method
     of_study = start if more.get("test_name") is None else f"without {more['test_name']}"
     hashes = _file_hashes(content, path.parent)
-    decisive = [content, of_study, hashes, version("collocation-sysid")]
+    decisive = [content, of_study, hashes, package_version()]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
     return PlannedRun(
