@@ -23,6 +23,7 @@ from ..program.lifted.lifted_collocation import lifted_count, with_lifted_variab
 from ..recording.experiment import Experiment
 from . import nlpsol
 from .callbacks import NlpFunctions
+from .certificate import certify
 from .complementarity import require_frictionless, solve_complementarity
 from .condensed_program import complete_program, condense
 from .initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
@@ -136,7 +137,8 @@ class InteriorPoint(MethodOptions):
     max_iterations : int
         Largest number of iterations.
     max_time_s : float
-        Largest computing time in seconds.
+        Largest computing time in seconds. A factorisation that lasts longer is abandoned after two
+        further seconds, with the best iterate.
     ipopt : mapping
         Further IPOPT options by name; they override the ones above.
     """
@@ -190,7 +192,7 @@ class InteriorPoint(MethodOptions):
         """Return the solution with the contact law of each obstacle, without the complementarity
         solves.
         """
-        recorder = Recorder(self.name, collocation, watch=watch)
+        recorder = Recorder(self.name, collocation, watch=watch, max_time_s=self.max_time_s)
         if self.initial == "simulation":
             return self._solve_by_ipopt(recorder, start)
         initial = compute_initial_point(recorder, start, max_time_s=self.max_time_s)
@@ -242,6 +244,10 @@ class InteriorPoint(MethodOptions):
             statuses=IPOPT_STATUS,
             initial_multipliers=multipliers,
         )
+        if solution.status.converged and not recorder.is_late():
+            certificate = certify(recorder.collocation, solution.z, solution.multipliers)
+            if certificate is not None:
+                solution = replace(solution, notes=(*solution.notes, certificate.sentence))
         if "Invalid_Option" not in solution.message:
             return solution
         linear_solver = self.ipopt.get("linear_solver", self.linear_solver)

@@ -29,7 +29,7 @@ NAMES = {"ipopt": "IPOPT"}
 
 Settings = Callable[[NlpFunctions], Mapping[str, Any]]
 
-# Time in which a solver may end by itself after Ctrl-C [s].
+# Time in which a solver may end by itself after Ctrl-C or the limit of time [s].
 GRACE_S = 2.0
 # Interval at which that is checked [s].
 LOOK_EVERY_S = 0.05
@@ -56,9 +56,10 @@ def solve(
     its best iterate.
 
     Ctrl-C stops the solver after the iteration, or abandons it after 2 s; the status is then
-    `INTERRUPTED`. If the recorder's time is over before convergence it is `TIME_LIMIT`. This holds
-    on the main thread; on others Ctrl-C is not handled. The recorder gets an entry of its history
-    for each iteration, notes, and the times of its stopwatch.
+    `INTERRUPTED`. If the recorder's time is over before convergence it is `TIME_LIMIT`, also where
+    the solver had to be abandoned. This holds on the main thread; on others Ctrl-C is not handled.
+    The recorder gets an entry of its history for each iteration, notes, and the times of its
+    stopwatch.
 
     Parameters
     ----------
@@ -256,8 +257,8 @@ def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> Non
     """Run a search on a thread and wait for its end, so that the main thread, from which this must
     be called, can handle signals during long factorisations.
 
-    After a request to stop, the search is abandoned if it does not end within `GRACE_S`: the thread
-    goes on, and `monitor.errors` receives an entry.
+    After a request to stop, or the limit of time, the search is abandoned if it does not end within
+    `GRACE_S`: the thread goes on, and `monitor.errors` receives an entry.
     """
     thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
     with _interruptible(monitor):
@@ -266,7 +267,8 @@ def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> Non
             remaining_s = GRACE_S
             while thread.is_alive() and remaining_s > 0:
                 thread.join(LOOK_EVERY_S)
-                remaining_s -= LOOK_EVERY_S if monitor.stop else 0.0
+                is_over = monitor.stop or monitor.recorder.is_late()
+                remaining_s -= LOOK_EVERY_S if is_over else 0.0
         finally:
             if thread.is_alive():
                 thread.name = ABANDONED_THREAD

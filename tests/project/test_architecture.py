@@ -115,6 +115,7 @@ def test_the_core_is_loaded_without_the_packages_that_use_it():
 # The methods that need sparse exact matrices, and what checks or measures their programs.
 LIFTING = (
     "program.lifted",
+    "methods.certificate",
     "methods.interior_point",
     "methods.initial_point",
     "methods.complementarity",

@@ -1,0 +1,120 @@
+"""Optimality of a solution of the complete program: conditions of first and second order.
+
+The first-order conditions (Karush, Kuhn and Tucker) are stationarity of the Lagrangian L = f + yᵀ g,
+feasibility, and complementarity of bounds. The second-order condition is that the reduced Hessian
+Wᵀ ∇²L W is positive definite; the columns of W, a basis of the null space of the constraints,
+are the changes of all variables per change of a parameter, along the linearised constraints. If
+both hold, the solution is a strict local minimum (Nocedal and Wright, Numerical Optimization,
+theorem 12.6).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse.linalg as spla
+
+from ..common.array_types import Array
+from ..program.collocation import BOUND_TOLERANCE, Collocation, convert_variables
+from ..program.lifted.lifted_collocation import with_lifted_variables
+from .initial_point import adjoint_multipliers
+
+# Eigenvalues of the reduced Hessian below this share of the largest are rounding.
+SMALLEST_CURVATURE = 1e-12
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Conditions of optimality at a solution, in the scaling of the program.
+
+    Attributes
+    ----------
+    stationarity, feasibility, complementarity : float
+        Largest violations of the conditions of first order.
+    curvatures : (free parameters,) array
+        Eigenvalues of the reduced Hessian, ascending; parameters at a bound are not varied.
+    """
+
+    stationarity: float
+    feasibility: float
+    complementarity: float
+    curvatures: Array
+
+    @property
+    def is_strict_minimum(self) -> bool:
+        """Whether the reduced Hessian is positive definite."""
+        return bool(np.all(self.curvatures > SMALLEST_CURVATURE * self.curvatures.max(initial=0)))
+
+    @property
+    def sentence(self) -> str:
+        """Sentence for the user."""
+        count = len(self.curvatures)
+        negative = int(
+            np.sum(self.curvatures <= SMALLEST_CURVATURE * self.curvatures.max(initial=0))
+        )
+        meaning = (
+            "is positive definite: a strict local minimum"
+            if self.is_strict_minimum
+            else f"has {negative} of {count} eigenvalues that are not positive: some combination of "
+            "the parameters is not determined, or the point is no minimum"
+        )
+        return (
+            f"optimality of the complete program: stationarity {self.stationarity:.1e}, feasibility "
+            f"{self.feasibility:.1e}, complementarity {self.complementarity:.1e}; the reduced "
+            f"Hessian of {count} free parameter{'s' * (count != 1)} {meaning}"
+        )
+
+
+def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certificate | None:
+    """Return the conditions of optimality at variables z, by one sparse factorisation; None if the
+    constraints do not determine the positions there.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    z : (variables,) array
+        Variables.
+    multipliers : (constraints,) array
+        Multipliers of the constraints, for the first-order conditions. The Hessian has those of the
+        adjoint equations, which include lifted variables.
+    """
+    program = with_lifted_variables(collocation)
+    adjoint = adjoint_multipliers(program, collocation, z=z)
+    if adjoint is None:
+        return None
+    variables = convert_variables(z, collocation, target=program)
+    lower, upper = program.bounds()
+    is_parameter = np.zeros(len(variables), dtype=bool)
+    is_parameter[: program.nq] = True
+    is_parameter[program.phi_columns] = True
+    is_position = ~is_parameter & (lower < upper)
+    jacobian = program.jacobian(variables).tocsc()
+    by_position = jacobian[:, np.flatnonzero(is_position)]
+    if by_position.shape[0] != by_position.shape[1]:
+        return None
+    distance = np.minimum(variables - lower, upper - variables)
+    is_free = is_parameter & (distance > BOUND_TOLERANCE)
+    try:
+        factor = spla.splu(by_position.tocsc())
+    except RuntimeError:  # singular
+        return None
+    basis = np.zeros((len(variables), int(is_free.sum())))
+    basis[np.flatnonzero(is_free), np.arange(basis.shape[1])] = 1.0
+    basis[is_position] = -factor.solve(jacobian[:, np.flatnonzero(is_free)].toarray())
+    hessian = program.hessian(variables, 1.0, multipliers=adjoint.constraints)
+    reduced = basis.T @ (hessian @ basis)
+    curvatures = np.asarray(np.linalg.eigvalsh((reduced + reduced.T) / 2), dtype=float)
+
+    slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
+    of_parameters = np.concatenate([slope[: collocation.nq], slope[collocation.phi_columns]])
+    distances = np.concatenate([distance[: program.nq], distance[program.phi_columns]])
+    at_bound = distances <= BOUND_TOLERANCE
+    complementarity = np.abs(of_parameters * distances)[at_bound]
+    return Certificate(
+        collocation.kkt_residual(z, multipliers),
+        float(np.abs(collocation.constraint_values(z)).max(initial=0.0)),
+        float(complementarity.max(initial=0.0)),
+        curvatures,
+    )
