@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import io
 import re
 import signal
@@ -273,6 +274,8 @@ def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> Non
             if thread.is_alive():
                 thread.name = ABANDONED_THREAD
                 monitor.errors.append(_SolverAbandoned())
+                # Its callbacks must not be freed before the solver calls them once more and ends.
+                atexit.register(thread.join)
 
 
 @contextmanager
