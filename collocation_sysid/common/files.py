@@ -39,7 +39,7 @@ DAMAGE = (
 LONGEST_REASON = 200
 RESULT_FILE = "result.json"
 # Version of the form of result.json and summary.json.
-SCHEMA = 4
+SCHEMA = 5
 # Remedy for a damaged file, at the end of a message.
 AGAIN = "; run the command that wrote it again"
 

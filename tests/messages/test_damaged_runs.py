@@ -198,8 +198,8 @@ def test_damaged_frames_are_refused(run: Path, content: str):
     [
         "",
         "[]",
-        '{"schema": 4, "runs": []}',
-        '{"schema": 4, "runs": [], "tables": [{"heads": ["a"], "rows": [[]]}]}',
+        '{"schema": 5, "runs": []}',
+        '{"schema": 5, "runs": [], "tables": [{"heads": ["a"], "rows": [[]]}]}',
     ],
 )
 def test_a_damaged_study_is_refused(tmp_path: Path, content: str):
@@ -210,7 +210,7 @@ def test_a_damaged_study_is_refused(tmp_path: Path, content: str):
 @pytest.mark.parametrize("command", ["report", "plot", "animate", "refine"])
 def test_a_run_of_another_version_is_refused(run: Path, command: str):
     entry(1, "schema")(run)
-    assert "result.json has schema 1; expected 4, which this version writes" in refused(
+    assert "result.json has schema 1; expected 5, which this version writes" in refused(
         command, run
     )
 
@@ -241,7 +241,7 @@ def test_a_page_shows_nothing_that_links_lead_to_elsewhere(run: Path, elsewhere:
 def test_nor_does_that_of_a_study(tmp_path: Path, elsewhere: Path):
     study = tmp_path / "study"
     study.mkdir()
-    summary = {"schema": 4, "kind": "sweep", "title": "a", "problem": "p", "headline": "",
+    summary = {"schema": 5, "kind": "sweep", "title": "a", "problem": "p", "headline": "",
                "runs": [], "notes": [], "tables": [], "failures": []}  # fmt: skip
     (study / "summary.json").write_text(json.dumps(summary))
     (study / "sweep.png").symlink_to(elsewhere)

@@ -214,7 +214,7 @@ def test_a_comparison_has_a_page_too(comparison: Path):
 
 
 def test_a_damaged_comparison_is_refused(comparison: Path, tmp_path: Path):
-    (tmp_path / "summary.json").write_text('{"schema": 4, "kind": "compare-methods"}')
+    (tmp_path / "summary.json").write_text('{"schema": 5, "kind": "compare-methods"}')
     outcome = run_command("report", tmp_path)
     assert outcome.code == 2
     assert "summary.json is damaged" in outcome.err
