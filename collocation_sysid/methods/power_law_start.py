@@ -41,7 +41,7 @@ SEPARATION = 0.5
 MOST_IMPROVED = 4
 DISTINCT = 0.4
 # Most evaluations of an improvement.
-MOST_EVALUATIONS = 100
+MOST_EVALUATIONS = 1000
 # Difference of χ², over χ² of one measurement, up to which fits count as equal: smaller exponents
 # are then preferred.
 EQUAL_LOSS = 4.0
@@ -219,7 +219,8 @@ class _PowerLawFits:
     @classmethod
     def of(cls, collocation: Collocation) -> _PowerLawFits | None:
         """Return the fits of a problem; None if it has none, see `power_law_start`."""
-        parts = [part for each in collocation.experiments for part in each.body.parts]
+        experiments = [each.experiment for each in collocation.transcriptions]  # fitted ones
+        parts = [part for each in experiments for part in each.body.parts]
         laws = {part.material.name for part in parts}
         parameters = collocation.parameters
         estimated = {item.name for item in parameters.free if item.prior is None}
@@ -227,14 +228,14 @@ class _PowerLawFits:
         if (
             len(laws) != 1
             or not is_power_law(law := laws.pop())
-            or any(each.specimen is None for each in collocation.experiments)
+            or any(each.specimen is None for each in experiments)
             or any(part.prony for part in parts)
             or not set(own) <= estimated
             or any(item.tied is not None for item in parameters.components)
         ):
             return None
         is_foam = law.startswith("hyperfoam-")
-        tests = [test for each in collocation.experiments if (test := _test(each, is_foam))]
+        tests = [test for each in experiments if (test := _test(each, is_foam))]
         fits = cls(parameters, tests, is_foam)
         return fits if own and fits.measurements > len(own) else None
 

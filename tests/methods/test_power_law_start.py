@@ -168,3 +168,13 @@ def test_a_law_with_too_many_terms_converges_without_a_guess():
     assert solution.parameters["alpha_1"] == pytest.approx(2.0, abs=0.1)
     assert solution.parameters["mu_3_pa"] == 0.0
     assert any("2 of 3 terms" in note for note in solution.notes)
+
+
+def test_a_recording_for_validation_does_not_change_the_start():
+    rubber = measured("ogden-2", RUBBER, RUBBER_TESTS[:2], 2e3)
+    alone, _ = start_of(without_guess("ogden-1", rubber[:1]))
+    problem = without_guess("ogden-1", rubber)
+    tested = replace(problem.experiments[1], validation=True)
+    beside, _ = start_of(replace(problem, experiments=[problem.experiments[0], tested]))
+    assert beside.loss == alone.loss
+    assert beside.parameters.guesses == alone.parameters.guesses
