@@ -34,6 +34,7 @@ from ..statistics.assessment import (
 from ..statistics.concerns import Concern
 from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.misspecification.plausibility import (
+    making_concerns,
     material_hypothesis,
     size_and_density_hypotheses,
 )
@@ -146,7 +147,7 @@ def solution_concerns(
 def body_concerns(solution: Solution) -> Iterator[Concern]:
     """Yield concerns about implausible sizes and densities, or else about an implausible stiffness
     at the estimates, of each fitted body, and about an unknown scale of the moduli; all are
-    doubtful.
+    doubtful, except densities that are unusual for the way in which a body was made.
     """
     for body in dict.fromkeys(
         transcription.body for transcription in solution.collocation.transcriptions
@@ -155,6 +156,7 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
             material_hypothesis(body, body.theta_from_values(solution.parameters))
         ]
         yield from (each.concern("doubtful") for each in odd if each is not None)
+        yield from making_concerns(body)
     experiments = [
         transcription.experiment for transcription in solution.collocation.transcriptions
     ]

@@ -78,6 +78,9 @@ TOPICS: dict[str, Topic] = {
             "density": "the body's density is {density_kg_m3:.4g} kg/m³; expected {least:g} to "
             "{most:g}: correct object.density_kg_m3 or mass_kg ({likely}), and check "
             "object.length_unit",
+            "density-of-making": "the stated density of {density_kg_m3:.4g} kg/m³ is not one of bodies "
+            'with made = "{made}", which have {least:g} to {most:g} kg/m³: check object.mass_kg (does '
+            "it contain the gripper?), length_unit and made",
             "density/metal": "the body is as dense as metal ({density_kg_m3:.4g} kg/m³) and as "
             "soft as rubber (E = {young_pa:.3g} Pa): both are 1000 times too large if the mass "
             "was stated in g instead of kg; check object.density_kg_m3 or mass_kg",

@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from ...common.array_types import Array
+from ...errors import listed
 from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.mesh import TetMesh
@@ -17,6 +18,7 @@ from ...fem.spatial_field import FieldResolution
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...statistics.concerns import Concern, concern_if
+from ...statistics.misspecification.plausibility import making_concerns
 from ...statistics.stability_concerns import rest_stability_concerns
 
 # Mean-ratio quality below which an element's shape functions are poor.
@@ -242,11 +244,13 @@ class BodyCheck:
     rest_shape_change_m : float
         Largest distance of the mesh from the stress-free shape at the guess; NaN where there is no
         such shape.
+    made, mesh_from : str or None
+        How the body was made, and where its mesh comes from, as stated.
     is_homogeneous : bool
         Whether it is the cell of specimens without a mesh, whose deformation is homogeneous.
     """
 
-    SERIALISED_PROPERTIES: ClassVar = ("warnings",)
+    SERIALISED_PROPERTIES: ClassVar = ("warnings", "open_question")
 
     experiments: tuple[str, ...]
     nodes: int
@@ -266,7 +270,23 @@ class BodyCheck:
     fields: dict[str, FieldResolution]
     rest_shape: str | None = None
     rest_shape_change_m: float = 0.0
+    made: str | None = None
+    mesh_from: str | None = None
     is_homogeneous: bool = False
+
+    @property
+    def open_question(self) -> str | None:
+        """What should be stated about the origin of the body, in one sentence; None if nothing is
+        missing.
+        """
+        questions = []
+        if self.made is None:
+            questions.append("how was the body made (made = cast, foam, printed or tissue)")
+        if self.rest_shape is None and self.mesh_from is None and not self.is_homogeneous:
+            questions.append("where does the mesh come from (mesh_from = cad or scan)")
+        if not questions:
+            return None
+        return f"state in [object]: {listed(questions)}? The answers set the default deviations"
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -322,11 +342,14 @@ def check_body(
         concerns=(
             *(() if is_homogeneous else element_concerns(body, theta, shape=shape, worst=worst[0])),
             *rest_stability_concerns(body, theta),
+            *(() if is_homogeneous else making_concerns(body)),
             *(() if is_homogeneous else _field_concerns(fields)),
         ),
         fields=fields,
         rest_shape=_rest_shape(body),
         rest_shape_change_m=_rest_shape_change_m(body, theta),
+        made=body.made,
+        mesh_from=body.mesh_from,
         is_homogeneous=is_homogeneous,
     )
 

@@ -28,6 +28,7 @@ from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.obstacle import Obstacle
 from ...recording.poses import Frame
+from ..concerns import Concern
 from .misspecification_hypothesis import Hypothesis
 
 # Densities of soft objects [kg/m³].
@@ -85,6 +86,29 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
         if each.strength > IMPOSSIBLE:
             raise InputError(each.message, None, where="object")
     return tuple(each for each in tried if each.strength > 1)
+
+
+# Densities of soft materials [kg/m³] by how a body was made: silicone, gels and polyurethane are cast;
+# printed bodies may be hollow; tissue from fat to tendon, without lungs and bones.
+DENSITIES_BY_MAKING_KG_M3 = {
+    "cast": (900.0, 1250.0),
+    "foam": (10.0, 700.0),
+    "printed": (100.0, 1300.0),
+    "tissue": (900.0, 1150.0),
+}
+
+
+def making_concerns(body: Body) -> list[Concern]:
+    """Return one concern, as a list, if the stated density of a body is not one of bodies that were
+    made like it (`Body.made`); else empty.
+    """
+    if body.made is None or any(part.has_free_density for part in body.parts):
+        return []
+    least, most = DENSITIES_BY_MAKING_KG_M3[body.made]
+    density_kg_m3 = float(body.mass_kg / body.mesh.volume_m3)
+    data = {"made": body.made, "density_kg_m3": density_kg_m3, "least": least, "most": most}
+    is_usual = least <= density_kg_m3 <= most
+    return [] if is_usual else [Concern("description/density-of-making", data=data)]
 
 
 def _likely_length(body: Body, *, too_large: bool) -> str:
