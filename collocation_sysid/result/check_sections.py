@@ -117,7 +117,7 @@ def _point_masses(body: BodyCheck) -> str:
 
 def _body_section(body: BodyCheck, details: bool) -> Table:
     """Return the table "Body": size, volume, mass, mesh, with `details` element quality, the rest
-    shape unless the mesh is free of stress, and fields.
+    shape if the mesh was made under gravity, and fields; what is not known of its origin is asked.
 
     For specimens, which have no mesh, it is the table "Specimens" with the names of the experiments
     alone.
@@ -141,7 +141,8 @@ def _body_section(body: BodyCheck, details: bool) -> Table:
             if details
             else {}
         )
-        | ({} if body.rest_shape == "stress_free" else {"rest shape": _rest_shape(body)})
+        | ({"origin": body.open_question} if body.open_question else {})
+        | ({"rest shape": _rest_shape(body)} if body.rest_shape == "under_gravity" else {})
         | {
             f"field of {symbol_of(name)}": f"{each.modes} shapes with {each.share:.0%} of the "
             f"prior variance, correlation length {1e3 * each.length_m:.3g} mm; resolved details: "
@@ -152,11 +153,9 @@ def _body_section(body: BodyCheck, details: bool) -> Table:
 
 
 def _rest_shape(body: BodyCheck) -> str:
-    """Return a text on the rest shape of a body whose mesh is not stated to be stress-free: that
-    nothing is stated, how far the stress-free shape differs from the mesh, or that none was found.
+    """Return how far the stress-free shape differs from a mesh that was made under gravity, or that
+    none was found.
     """
-    if body.rest_shape is None:
-        return "not stated; set object.rest_shape"
     if np.isnan(body.rest_shape_change_m):
         return (
             "the mesh was made under gravity; no stress-free shape was found at the guess: give "

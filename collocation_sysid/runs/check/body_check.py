@@ -281,12 +281,12 @@ class BodyCheck:
         """
         questions = []
         if self.made is None:
-            questions.append("how was the body made (made = cast, foam, printed or tissue)")
+            questions.append("made (cast, foam, printed, tissue)")
         if self.rest_shape is None and self.mesh_from is None and not self.is_homogeneous:
-            questions.append("where does the mesh come from (mesh_from = cad or scan)")
+            questions.append("mesh_from (cad, scan)")
         if not questions:
             return None
-        return f"state in [object]: {listed(questions)}? The answers set the default deviations"
+        return f"object.{listed(questions)} not stated"
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -1,0 +1,100 @@
+"""How a body was made and where its mesh comes from: defaults of the budget, densities, questions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from kit.problem_files import run_command, write_problem
+from kit.problems import GUESS, hung_cube, measured
+
+import collocation_sysid as cs
+from collocation_sysid.errors import InputError
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.runs.check.body_check import check_body
+from collocation_sysid.statistics.budget.systematic_effects import usual_deviations
+from collocation_sysid.statistics.misspecification.plausibility import making_concerns
+
+BOX = cs.box_mesh((0.04, 0.04, 0.08), (1, 1, 2))
+
+
+def body(density_kg_m3: float = 1070.0, **origin: str) -> cs.Body:
+    mesh = TetMesh(BOX.points_m, BOX.tetrahedra)  # not generated from stated lengths
+    return cs.Body(mesh, density_kg_m3=density_kg_m3, **origin)
+
+
+def test_the_origin_selects_default_deviations():
+    unknown, cast, foam = (
+        usual_deviations([body(**o)]) for o in ({}, {"made": "cast"}, {"made": "foam"})
+    )
+    assert cast["anisotropy"] < unknown["anisotropy"] < foam["anisotropy"]
+    assert unknown["mass"] == cast["mass"] == foam["mass"]
+    # Of several bodies the largest counts.
+    assert usual_deviations([body(made="cast"), body(made="foam")]) == foam
+    options = cs.UncertaintyOptions(assumptions=cs.Assumptions(anisotropy=0.07))
+    assert options.collect_considered([body(made="foam")])["anisotropy"] == 0.07
+
+
+@pytest.mark.parametrize(
+    ("origin", "words"),
+    [({"made": "steel"}, "expected one of cast"), ({"mesh_from": "photo"}, "expected one of cad")],
+)
+def test_unknown_words_are_refused(origin, words):
+    with pytest.raises(InputError, match=words):
+        body(**origin)
+
+
+def test_a_drawing_cannot_hang():
+    hung = cs.UnderGravity(cs.Indices([0, 1, 2, 3]), (0, 0, -9.81))
+    with pytest.raises(InputError, match="a drawing is free of stress"):
+        body(mesh_from="cad", rest_shape=hung)
+
+
+def test_a_density_that_such_bodies_do_not_have_is_a_concern():
+    assert not making_concerns(body(1070.0, made="cast"))
+    (concern,) = making_concerns(body(1.2 * 1070.0, made="cast"))
+    assert concern.grade == "check"
+    assert "1284 kg/m³" in concern.message
+    assert not making_concerns(body(1.2 * 1070.0))
+
+
+def test_check_asks_what_is_not_stated():
+    theta = body().theta_from_values(
+        {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.1}
+    )
+
+    def asked(**origin: str) -> str | None:
+        return check_body(body(**origin), theta, ("swing",)).open_question
+
+    assert (
+        asked() == "object.made (cast, foam, printed, tissue) and mesh_from (cad, scan) not stated"
+    )
+    assert asked(made="cast") == "object.mesh_from (cad, scan) not stated"
+    assert asked(made="cast", mesh_from="cad") is None
+
+
+def test_the_answer_states_what_the_origin_would_change():
+    experiment = measured(hung_cube(12))
+    found = cs.run(cs.Problem([experiment], GUESS, substeps=1), seek_causes=False)
+    widths = {each.answer: each.half_widths["mu_pa"] for each in found.origin_answers}
+    assert set(widths) == {"cast", "foam", "printed", "tissue"}
+    assert widths["cast"] < widths["printed"] < widths["foam"]
+    # The promised width is that of the solve in which it is stated.
+    of_foam = replace(experiment, body=_made(experiment.body, "foam"))
+    stated = cs.run(cs.Problem([of_foam], GUESS, substeps=1), seek_causes=False)
+    assert not stated.origin_answers
+    deviation = stated.budget["mu_pa"].combined_std_error / stated.estimates["mu_pa"].value
+    assert widths["foam"] == pytest.approx(1.96 * deviation, rel=0.01)
+
+
+def _made(of: cs.Body, made: str) -> cs.Body:
+    return cs.Body(of.mesh, density_kg_m3=float(of.mass_kg / of.mesh.volume_m3), made=made)
+
+
+def test_a_problem_file_states_the_origin(tmp_path):
+    file = write_problem(tmp_path, {"swing": 5})
+    read = cs.Problem.read(file, ['object.made="foam"', 'object.mesh_from="scan"'])
+    (own,) = read.bodies
+    assert (own.made, own.mesh_from) == ("foam", "scan")
+    assert read.assumed_deviations["anisotropy"] == 0.2
+    assert run_command("check", file, "object.made=steel").code == 2
