@@ -484,8 +484,8 @@ def test_the_findings_fit_a_screen_with_the_warnings_last(tiny: Path, monkeypatc
     monkeypatch.setattr(common, "PlainConsole", lambda: console)
     nearly = ("parameters.mu_pa.guess=200", "parameters.lambda_pa.guess=9800")
     euler = "transcription.scheme=backward-euler"
-    meshed = "object.rest_shape=stress_free"
-    outcome = run_command("check", "problem.toml", *settings(*nearly, euler, meshed))
+    origin = "object.rest_shape=stress_free", "object.made=foam"
+    outcome = run_command("check", "problem.toml", *settings(*nearly, euler, *origin))
     lines = [line.rstrip() for line in screen.getvalue().rstrip("\n").split("\n")]
     assert len(lines) <= 28  # of 80 characters
     assert max(map(len, lines)) <= 80
