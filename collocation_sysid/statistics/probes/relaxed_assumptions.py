@@ -82,7 +82,7 @@ class Probe:
     routine : bool
         Whether this is one of the probes of every solve, with one linear step.
     relevance : float or None
-        For an assumption the largest change of an estimate, in half widths of the statistical
+        For an assumption the largest change of an estimate, in half widths of the combined
         interval, see `relevance`; None for parts of the data.
     """
 
@@ -326,19 +326,21 @@ def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> P
 
 
 def relevance(fit: SolvedFit, probe: Probe) -> float:
-    """Return the largest absolute change of an estimate by a probe, in half widths of its
-    statistical interval; 0 if there are no such changes.
+    """Return the largest absolute change of an estimate by a probe, in half widths of its combined
+    interval, or of its statistical one without a budget; 0 if there are no such changes.
 
     For a drift, half of it counts as a change of the moduli too: by so much the stiffness at either
     end of a recording differs from the one that is reported.
     """
     shares = [0.0]
     for name, move in probe.moves.items():
-        if move.of_statistical95 is None:
+        budget = fit.budget.get(name)
+        interval = budget.combined95 if budget else None
+        interval = interval or fit.statistical[name].statistical95
+        if interval is None:
             continue
-        shares.append(abs(move.of_statistical95))
-        interval = fit.statistical[name].statistical95
-        if probe.name == DRIFT and is_modulus(name) and interval is not None:
+        shares.append(abs(_share_of_interval(move.change, interval) or 0.0))
+        if probe.name == DRIFT and is_modulus(name):
             half_width = max((interval[1] - interval[0]) / 2, 1e-300)
             shares.append(abs(0.5 * (probe.size or 0.0) * move.value) / half_width)
     return max(shares)
