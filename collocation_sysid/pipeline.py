@@ -26,6 +26,7 @@ from .problem import Problem
 from .program.collocation import Collocation
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import simulate_experiments, step_error
+from .runs.mesh_resolution import estimate_mesh_error
 from .runs.misspecifications import cause_notes, find_misspecifications
 from .runs.numerical_error import refine
 from .runs.result_builder import build_result
@@ -210,9 +211,12 @@ def run(
             )
         answer = _with_problem_notes(answer)
         if answer.uncertainty is not None and fit is not None:
+            known = answer.uncertainty
+            if not problem.uncertainty.numerical:
+                answer = _with_mesh_error(answer, fit, say=say)
             profiles = profile_likelihoods(answer, fit, say=say)
             changes = _changes(answer, say)
-            sources = _sources(answer, fit, known=answer.uncertainty, changes=changes)
+            sources = _sources(answer, fit, known=known, changes=changes)
             answer = replace(answer, profiles=profiles, systematic_effects=sources)
             answer = replace(
                 answer, probes=_probes(answer, fit, changes=changes, say=say, deep=probe)
@@ -266,6 +270,19 @@ def _with_problem_notes(answer: Run) -> Run:
     )
     tests = one_kind_notes(problem.experiments, problem.parameters)
     return replace(answer, notes=(*rotations, *tests, *answer.notes))
+
+
+def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:
+    """Return the run with the effect of the mesh on the estimates, to first order, or with a note
+    why it is unknown.
+    """
+    say("estimating the error of the mesh")
+    with counted_phase(StepUnit.TIME_STEP, _row_count(answer.solution)):
+        refinement, note = estimate_mesh_error(
+            answer.problem, answer.solution, fit, answer.optimum, known=answer.refinement
+        )
+    notes = (*answer.notes, note) if note else answer.notes
+    return replace(answer, refinement=refinement, notes=notes)
 
 
 def _with_offset_notes(answer: Run, fit: LinearisedFit) -> Run:

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..methods.solution import Watch
 from ..model.parameters import Parameters
 from ..problem import Problem
+from ..runs.mesh_resolution import MESH_ERROR
 from ..runs.numerical_error import solve_refined
 from ..runs.result_content import ReportedEstimate, Result
 from ..runs.warm_start import WarmStart
@@ -27,6 +28,7 @@ from ..statistics.budget.discretisation_error import (
     Refinement,
     RefinementLevel,
 )
+from ..statistics.budget.uncertainty_budget import MESH
 from ..statistics.budget.uncertainty_budget import NUMERICAL as DISCRETISATION
 from ..statistics.estimates import Estimate
 from .replay import damaged_run_refused
@@ -162,7 +164,7 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
     uncertainties = {
         name: each.combined_std_error for name, each in after.collect_estimates().items()
     }
-    others = [each for each in before.trust.concerns if each.code not in NUMERICAL]
+    others = [each for each in before.trust.concerns if each.code not in (*NUMERICAL, MESH_ERROR)]
     concerns = (*others, *numerical_concerns(optimum, uncertainties, refinement=refinement))
     return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
 
@@ -213,7 +215,9 @@ def _updated_shares(
     ratio = (before.combined_std_error / after.combined_std_error) ** 2
     # Standard errors are relative to their values, see `IntervalCoordinate`.
     ratio *= (after.value / before.value) ** 2 if before.value else 1.0
-    others = {name: share * ratio for name, share in shares.items() if name != DISCRETISATION}
+    others = {
+        name: share * ratio for name, share in shares.items() if name not in (DISCRETISATION, MESH)
+    }
     total = max(1.0, sum(others.values()))
     corrected = {name: share / total for name, share in others.items()}
     corrected[DISCRETISATION] = 1.0 - sum(corrected.values())

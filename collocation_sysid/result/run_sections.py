@@ -199,9 +199,20 @@ def parameter_section(result: Result) -> TitledParts:
     elif corrected := [
         f"{symbol_of(name)} {100 * (error.extrapolated / optimum - 1):+.2g} %"
         for name, error in result.collect_numerical_errors().items()
-        if (optimum := values[name].optimum) and values[name].statistical95 is not None
+        if (optimum := values[name].optimum)
+        and values[name].statistical95 is not None
+        and error.step is not None
     ]:
         parts.append(f"corrected for the estimated time-step error: {', '.join(corrected)}")
+    if estimated := [
+        f"{symbol_of(name)} {-100 * error.estimated_mesh / abs(optimum):+.2g} %"
+        for name, error in result.collect_numerical_errors().items()
+        if error.estimated_mesh is not None and (optimum := values[name].optimum)
+    ]:
+        parts.append(
+            "estimated difference from a mesh with half the edge lengths, which the intervals "
+            f"contain: {', '.join(estimated)}"
+        )
     if known := [
         f"{symbol_of(name)} {100 * each.known_correction / each.value:+.2g} %"
         for name, each in values.items()
@@ -256,10 +267,11 @@ def _coverage_sentence(result: Result) -> str:
     moving = any(not each.static for each in result.fit.experiments.values())
     meshed = any(each.test is None for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",) if meshed else ()
-    covered = [f"the {kind} error" for kind in kinds if kind in result.list_discretisation_kinds()]
-    missing = [
-        f"the {kind} error" for kind in kinds if kind not in result.list_discretisation_kinds()
-    ]
+    known = set(result.list_discretisation_kinds())
+    if any(e.estimated_mesh is not None for e in result.collect_numerical_errors().values()):
+        known.add("mesh")
+    covered = [f"the {kind} error" for kind in kinds if kind in known]
+    missing = [f"the {kind} error" for kind in kinds if kind not in known]
     parts = listed(["noise", *covered, "systematic effects"])
     sentence = f"± (standard uncertainty) and intervals combine {parts}"
     return sentence + (f", but not {listed(missing)} (measured by refine)" if missing else "")

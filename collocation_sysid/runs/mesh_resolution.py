@@ -1,24 +1,94 @@
-"""Whether the meshes of a solved problem are fine enough for bodies that bend.
+"""Error of the estimates by the meshes of a solved problem, and whether the meshes are fine enough.
 
-`check` warns of a mesh that is too coarse before the solve; these functions give the verdict and
-the notes of an answer the same warning.
+Every solve estimates the change of the estimates on a finer mesh to first order, see `mesh_error`.
+`check` warns of a mesh that is too coarse before the solve; the verdict and the notes of an answer
+contain the same warning.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
+import numpy as np
+
+from ..errors import InputError, SimulationError
 from ..fem.body import Body
 from ..fem.laws.constants import without_region
 from ..fem.laws.moduli import ELASTIC
+from ..methods.solution import Solution
 from ..problem import Problem
-from ..statistics.budget.discretisation_error import Refinement
+from ..statistics.budget.discretisation_error import Refinement, with_estimated_mesh
+from ..statistics.budget.mesh_error import mesh_change
 from ..statistics.concerns import Concern
+from ..statistics.estimates import Estimate
+from ..statistics.linearised import LinearisedFit, parameter_values
 from .check.body_check import LINEAR, bending_concerns, slenderness
 from .check.declared_simulation import is_declared_simulated
 
 # Value of `RefinementLevel.refined` of a solve on a finer mesh.
 MESH = "mesh"
+# Code of the concern about a large estimated error of the mesh.
+MESH_ERROR = "mesh/error"
+# Relative change of an elastic constant on a finer mesh that is too large for an estimate.
+LARGEST_CHANGE = 0.5
+# Largest number of nodes of a body whose error of the mesh is estimated in every solve: with more,
+# the search starts on a coarser mesh, and a note compares both meshes.
+LARGEST_NODE_COUNT = 1500
+# Largest change of a logarithm: a larger one is no estimate.
+LARGEST_STEP = 2.0
+# Lowest order of convergence of the elements.
+LEAST_ORDERS = {LINEAR: 0.5}
+
+
+def estimate_mesh_error(
+    problem: Problem,
+    solution: Solution,
+    fit: LinearisedFit,
+    estimates: Mapping[str, Estimate],
+    known: Refinement | None,
+) -> tuple[Refinement | None, str]:
+    """Return the discretisation errors with the effect of the mesh on every estimate, to first
+    order, and a note why it is unknown, or "".
+
+    The errors are those that are known already for recordings that are declared to be simulated,
+    for specimens without a mesh, and where the effect cannot be computed.
+
+    Parameters
+    ----------
+    problem : Problem
+    solution : Solution
+        Converged solution.
+    fit : LinearisedFit
+        The measurements linearised at the solution.
+    estimates : mapping of str to Estimate
+        Estimates at the solution, with their statistical intervals.
+    known : Refinement or None
+        Errors of the step.
+    """
+    collocation = solution.collocation
+    fitted = [each.experiment for each in collocation.transcriptions]
+    bodies = list(dict.fromkeys(each.body for each in fitted if each.specimen is None))
+    if not bodies or is_declared_simulated(problem):
+        return known, ""
+    nodes = max(len(body.nodes.points_m) for body in bodies)
+    if nodes > LARGEST_NODE_COUNT:
+        reason = f"a body has {nodes:,} nodes, more than {LARGEST_NODE_COUNT:,}"
+        return known, f"the error of the mesh was not estimated: {reason}; `refine` measures it"
+    try:
+        change = mesh_change(collocation, solution.z, fit)
+    except (InputError, SimulationError, np.linalg.LinAlgError) as error:
+        return known, f"the error of the mesh was not estimated: {error}"
+    linear = collocation.parameters.list_linear_names()
+    is_linear = np.array([item.name in linear for item in collocation.parameters.free], dtype=bool)
+    change = np.where(is_linear, change, np.clip(change, -LARGEST_STEP, LARGEST_STEP))
+    q = np.clip(solution.q + change, *collocation.parameters.compute_bounds_q())
+    return with_estimated_mesh(
+        known,
+        estimates,
+        parameter_values(collocation, q),
+        least_order=min(LEAST_ORDERS.get(body.element.name, 1.0) for body in bodies),
+        linear=linear,
+    ), ""
 
 
 def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) -> list[Concern]:
@@ -37,9 +107,33 @@ def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) ->
     levels = () if refinement is None else refinement.levels
     if is_declared_simulated(problem) or any(level.refined == MESH for level in levels):
         return []
+    return [*_large_error_concerns(problem, refinement), *_few_cells_concerns(problem)]
+
+
+def _few_cells_concerns(problem: Problem) -> list[Concern]:
+    """Return a concern for each body of too few linear tetrahedra."""
     return [
         concern for concern in _coarse_mesh_concerns(problem) if concern.data["element"] == LINEAR
     ]
+
+
+def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> Iterator[Concern]:
+    """Yield a concern about the elastic constant whose estimated change on a finer mesh is largest,
+    if that is more than `LARGEST_CHANGE` of its value.
+    """
+    if refinement is None:
+        return
+    bodies = dict.fromkeys(e.body for e in problem.experiments if e.specimen is None)
+    elastic = set().union(*map(_elastic_names, bodies))
+    changes = {
+        name: error.estimated_mesh / abs(error.extrapolated)
+        for name, error in refinement.errors.items()
+        if error.estimated_mesh is not None and error.extrapolated
+        if without_region(name) in elastic
+    }
+    name = max(changes, key=lambda each: abs(changes[each]), default="")
+    if name and abs(changes[name]) > LARGEST_CHANGE:
+        yield Concern(MESH_ERROR, "check", data={"name": name, "percent": 100 * changes[name]})
 
 
 def mesh_resolution_notes(problem: Problem) -> list[str]:

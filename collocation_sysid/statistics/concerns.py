@@ -383,6 +383,8 @@ TOPICS: dict[str, Topic] = {
             "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
             "{percent:+.2g} %, {errors:.2g} standard uncertainties; use smaller steps "
             "(transcription.substeps) or a finer mesh",
+            "error": "the mesh is too coarse: on one with half the edge lengths {name} would change "
+            "by about {percent:+.2g} %, too much for an estimate to first order; refine the mesh",
             "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
             "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
             "improve the mesh there",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from .budget.systematic_effects import ASSUMPTIONS
-from .budget.uncertainty_budget import BETWEEN, NOISE, NUISANCES, NUMERICAL
+from .budget.uncertainty_budget import BETWEEN, MESH, NOISE, NUISANCES, NUMERICAL
 
 LAW = "law"
 
@@ -16,6 +16,7 @@ REMEDIES: Mapping[str, str] = {
     NUISANCES: "measure clocks, marker positions and the grip, or the area and unloaded length of "
     "a specimen, and state tighter priors",
     NUMERICAL: "raise transcription.substeps, or run refine",
+    MESH: "solve on a finer mesh, or run refine",
     BETWEEN: "find out what differs between the recordings, such as temperature or clamping",
     LAW: "record larger strains, which distinguish the material laws",
     "calibration_scale": "film a ruler where the body moves",

@@ -32,6 +32,7 @@ from .systematic_effects import ASSUMPTIONS
 NOISE = "noise"
 NUISANCES = "nuisance parameters"
 NUMERICAL = "step and mesh"
+MESH = "mesh"
 BETWEEN = "between recordings"
 # Rows of assumptions whose alternative is reported, by name.
 ALTERNATIVES = {row.name: row for row in ASSUMPTIONS if row.alternative}
@@ -379,7 +380,9 @@ def _line(
     own, agreed = sources.noise_shares(by_q)
     excess = noise * (1 - agreed)
     parts = {NOISE: noise * agreed * own, NUISANCES: noise * agreed * (1 - own)}
-    parts[NUMERICAL] = max(0.0, _variance(at, middle, ends=ends) - noise)
+    of_mesh = 0.0 if error is None else abs(error.estimated_mesh or 0.0)
+    is_mesh = error is not None and of_mesh > abs(error.step or 0.0)
+    parts[MESH if is_mesh else NUMERICAL] = max(0.0, _variance(at, middle, ends=ends) - noise)
     by_coordinate = by_q * at.derivative(estimate.value)
     by_assumption = sources.variances_of_assumptions(name, by_coordinate)
     others = sum(parts.values()) + sum(by_assumption.values())

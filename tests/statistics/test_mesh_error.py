@@ -1,0 +1,133 @@
+"""The estimated effect of the mesh agrees with solves on a finer mesh, and intervals contain it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.program.simulation import with_wrenches
+from collocation_sysid.runs.mesh_resolution import estimate_mesh_error, mesh_resolution_concerns
+from collocation_sysid.runs.numerical_error import finer_mesh
+from collocation_sysid.runs.solving import solve
+from collocation_sysid.statistics.budget.discretisation_error import Refinement, with_estimated_mesh
+from collocation_sysid.statistics.budget.mesh_error import mesh_change
+from collocation_sysid.statistics.estimates import Estimate
+from collocation_sysid.statistics.linearised import linearise_fit, parameter_values
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
+
+TRUTH = {"young_pa": 15e3, "poisson": 0.33, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+GUESS = TRUTH | {"young_pa": cs.Unknown(14e3), "poisson": cs.Unknown(0.3)}
+LENGTH_M = 0.06
+NO_TURN = [0, 0, 0, 1.0]
+
+
+def deformed_block(element: str) -> cs.Experiment:
+    """A block with two elements across, bent, compressed and twisted between its ends."""
+    body = cs.Body(
+        cs.box_mesh((0.03, 0.03, LENGTH_M), (2, 2, 3)), density_kg_m3=1000.0, element=element
+    )
+    t_s = np.arange(4.0)
+    moved_m = np.array([[0, 0, 0], [6e-3, 0, 0], [0, 0, 4e-3], [0, 0, 0]])
+    turns = np.array([NO_TURN, NO_TURN, NO_TURN, [0, 0, np.sin(0.1), np.cos(0.1)]])
+    still = cs.PoseSequence(t_s, np.zeros((4, 3)), np.tile(NO_TURN, (4, 1)))
+    top = cs.Grasp(cs.Box((-1, -1, LENGTH_M - 1e-9), (1, 1, 1)), still)
+    wrench = cs.Wrench(t_s, np.zeros((4, 6)), 1e-3, 1e-5)
+    bottom = cs.Grasp(
+        cs.Box((-1, -1, -1), (1, 1, 1e-9)), cs.PoseSequence(t_s, moved_m, turns), wrench=wrench
+    )
+    places_m = [[0, 0, 0.02], [0.03, 0, 0.02], [0, 0.03, 0.04], [0.03, 0.03, 0.04]]
+    markers = cs.Markers(t_s, np.zeros((4, 4, 3)), 1e-4, places_m=places_m)
+    return cs.Experiment(
+        body,
+        t_s,
+        [top, bottom],
+        markers,
+        kind="static",
+        nuisance=cs.Nuisance.none(),
+        air_density_kg_m3="none",
+    )
+
+
+@cache
+def coarse_problem(element: str) -> cs.Problem:
+    """The block with the measurements of a mesh with half the edge lengths."""
+    problem = cs.Problem([deformed_block(element)], GUESS)
+    (fine,) = finer_mesh(problem).experiments
+    truth = cs.simulate(fine, TRUTH)
+    (coarse,) = problem.experiments
+    measured = with_wrenches(cs.with_markers(coarse, truth.markers_m), truth.wrenches)
+    return replace(problem, experiments=[measured])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("element", "least", "most"), [("tet4", 0.5, 1.0), ("tet10", 0.7, 1.4)])
+def test_estimated_change_is_nearly_that_of_a_solve_on_the_finer_mesh(element, least, most):
+    solution = solve(coarse_problem(element))
+    fit = linearise_fit(solution.collocation, solution.z)
+    change = mesh_change(solution.collocation, solution.z, fit)
+    before = solution.parameters["young_pa"]
+    after = parameter_values(solution.collocation, solution.q + change)["young_pa"]
+    assert abs(before / TRUTH["young_pa"] - 1) > 0.04
+    assert least < np.log(after / before) / np.log(TRUTH["young_pa"] / before) < most
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("element", ["tet10", "tet10-p0"])
+def test_intervals_contain_the_error_of_the_mesh(element):
+    problem = coarse_problem(element)
+    solution = solve(problem)
+    independent = ErrorModel(errors="independent")
+    known = uncertainty_at(solution.collocation, solution.z, independent).estimates
+    fit = linearise_fit(solution.collocation, solution.z)
+    refinement, note = estimate_mesh_error(problem, solution, fit, known, None)
+    assert not note
+    assert refinement is not None
+    for name in ("young_pa", "poisson"):
+        error = refinement.errors[name]
+        assert error.extrapolated == known[name].value  # not corrected
+        low, high = error.interval95
+        assert low < TRUTH[name] < high
+    if element == "tet10":
+        low, high = known["poisson"].statistical95
+        assert not low < TRUTH["poisson"] < high
+
+
+@pytest.mark.long
+def test_recordings_that_are_declared_to_be_simulated_have_no_mesh_error():
+    exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
+    problem = replace(coarse_problem("tet10"), uncertainty=exact)
+    solution = solve(problem)
+    fit = linearise_fit(solution.collocation, solution.z)
+    assert estimate_mesh_error(problem, solution, fit, {}, None) == (None, "")
+
+
+def estimated(halved: float, least_order: float = 1.0) -> Refinement:
+    """The error of a modulus of 100 Pa that is `halved` with half the edge lengths."""
+    answer = {"mu_pa": Estimate(100.0, 0.5, (99.0, 101.0))}
+    return with_estimated_mesh(
+        None, answer, {"mu_pa": halved}, least_order=least_order, linear=frozenset()
+    )
+
+
+def test_interval_is_widened_towards_the_finest_mesh():
+    low, high = estimated(110.0).errors["mu_pa"].interval95
+    assert low == pytest.approx(99.0, rel=1e-3)
+    assert high == pytest.approx(121.0, rel=1e-2)  # twice the change
+    assert estimated(110.0, least_order=0.5).errors["mu_pa"].interval95[1] > 135.0
+    low, high = estimated(100.0 / 1.1).errors["mu_pa"].interval95
+    assert (low, high) == (pytest.approx(100.0 / 1.21, rel=1e-2), pytest.approx(101.0, rel=1e-3))
+
+
+def test_change_too_large_for_first_order_widens_both_sides_and_is_a_concern():
+    refinement = estimated(300.0)
+    low, high = refinement.errors["mu_pa"].interval95
+    assert low * high == pytest.approx(1e4)
+    problem = cs.Problem(coarse_problem("tet10").experiments, {**GUESS})
+    assert mesh_resolution_concerns(problem, estimated(110.0)) == []
+    (concern,) = mesh_resolution_concerns(problem, refinement)
+    assert (concern.code, concern.grade) == ("mesh/error", "check")
+    assert "+2e+02 %" in concern.message
