@@ -93,7 +93,7 @@ def test_an_obstacle_far_from_where_it_is_stated_is_told(
     off_m: float, prior_m: float, verdict: str
 ):
     run = answer(poked(off_m, prior_m))
-    assert "nuisance/far" in told(run)
+    assert "nuisance/sized" in told(run)
     assert run.trust is not None
     assert run.trust.verdict == verdict
 

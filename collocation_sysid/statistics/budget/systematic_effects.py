@@ -966,6 +966,7 @@ ASSUMPTIONS = (
         remedy="add a branch of memory to the material, and estimate its share",
         effect=_memory,
         component_names=" ".join(f"{RELAXATION_TIME}{tau_s:g}s" for tau_s in RELAXATION_TIMES_S),
+        redefines=(GAMMA_R.name, GAMMA_M.name),
     ),
     Assumption(
         "time_scale",

@@ -36,14 +36,14 @@ MESH = "mesh"
 BETWEEN = "between recordings"
 # Rows of assumptions whose alternative is reported, by name.
 ALTERNATIVES = {row.name: row for row in ASSUMPTIONS if row.alternative}
+REDEFINED = {row.name: row.redefines for row in ASSUMPTIONS}
 
 
 def is_definition(row: str, estimate: str) -> bool:
     """Return whether an assumption, by its name, defines an estimate: under the alternative the
     constant would be another quantity, see `Assumption.redefines`.
     """
-    known = ALTERNATIVES.get(row)
-    return known is not None and without_region(estimate) in known.redefines
+    return without_region(estimate) in REDEFINED.get(row, ())
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ...fem.laws.constants import is_modulus
 from ...program.collocation import Collocation, ExperimentIterate
 from ..budget.consider_analysis import ResidualChanges, changes_of_assumptions
 from ..budget.systematic_effects import ExperimentAtAnswer
-from ..budget.uncertainty_budget import BudgetLine
+from ..budget.uncertainty_budget import BudgetLine, is_definition
 from ..estimates import Estimate
 from ..linearised import DerivedModuli, LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..residuals.recording_scatter import TELLING
@@ -329,7 +329,8 @@ def relevance(fit: SolvedFit, probe: Probe) -> float:
     """Return the largest absolute change of an estimate by a probe, in half widths of its combined
     interval, or of its statistical one without a budget; 0 if there are no such changes.
 
-    For a drift, half of it counts as a change of the moduli too: by so much the stiffness at either
+    Constants that the assumption defines, such as γ_r without memory, do not count. For a drift,
+    half of it counts as a change of the moduli too: by so much the stiffness at either
     end of a recording differs from the one that is reported.
     """
     shares = [0.0]
@@ -337,7 +338,7 @@ def relevance(fit: SolvedFit, probe: Probe) -> float:
         budget = fit.budget.get(name)
         interval = budget.combined95 if budget else None
         interval = interval or fit.statistical[name].statistical95
-        if interval is None:
+        if interval is None or is_definition(assumption_name(probe.name), name):
             continue
         shares.append(abs(_share_of_interval(move.change, interval) or 0.0))
         if probe.name == DRIFT and is_modulus(name):
