@@ -91,8 +91,11 @@ def next_step(result: Result, folder: Path, solve_command: str) -> str:
         and refinable
         and "mesh" not in (result.list_discretisation_kinds())
     ):
+        errors = result.collect_numerical_errors().values()
+        is_estimated = any(error.estimated_mesh is not None for error in errors)
+        in_intervals = "contain as an estimate" if is_estimated else "do not contain"
         return (
-            f"{program} refine {run} (measures the mesh error, which the intervals do not contain)"
+            f"{program} refine {run} (measures the mesh error, which the intervals {in_intervals})"
         )
     return f"{program} report {run} (everything on one page, with the pictures)"
 

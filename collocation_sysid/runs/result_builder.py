@@ -140,10 +140,10 @@ def _scale(problem: Problem) -> ScaleReference | None:
 
 
 def _reference_sentences(problem: Problem) -> Iterator[str]:
-    """Yield up to two sentences on what the values refer to: the damping law of γ_r if a body has
-    it, and how moduli are scaled if no force is measured.
+    """Yield up to two sentences on what the values refer to: the damping law of γ_r if a body that
+    moves has it, and how moduli are scaled if no force is measured.
     """
-    parts = [part for body in problem.bodies for part in body.parts]
+    parts = [part for each in problem.experiments if not each.is_static for part in each.body.parts]
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
     law_names = [
         law + (", which also damps rigid rotation" if law == "rayleigh" else "") for law in laws
