@@ -118,18 +118,20 @@ def _few_cells_concerns(problem: Problem) -> list[Concern]:
 
 
 def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> Iterator[Concern]:
-    """Yield a concern about the elastic constant whose estimated change on a finer mesh is largest,
-    if that is more than `LARGEST_CHANGE` of its value.
+    """Yield a concern about the estimated elastic constant whose change on a finer mesh is largest,
+    if that is more than `LARGEST_CHANGE` of its value. Derived moduli do not count: λ changes
+    without limit near ν = ½.
     """
     if refinement is None:
         return
     bodies = dict.fromkeys(e.body for e in problem.experiments if e.specimen is None)
     elastic = set().union(*map(_elastic_names, bodies))
+    estimated = {item.name for item in problem.parameters.free}
     changes = {
         name: error.estimated_mesh / abs(error.extrapolated)
         for name, error in refinement.errors.items()
         if error.estimated_mesh is not None and error.extrapolated
-        if without_region(name) in elastic
+        if name in estimated and without_region(name) in elastic
     }
     name = max(changes, key=lambda each: abs(changes[each]), default="")
     if name and abs(changes[name]) > LARGEST_CHANGE:
