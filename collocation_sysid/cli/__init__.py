@@ -17,6 +17,7 @@ import ast
 import logging
 import sys
 from collections.abc import Callable
+from contextlib import chdir
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -187,6 +188,10 @@ def main() -> None:
 def _run_command() -> None:
     """Run the command of the arguments; the function ends with an exception in any case."""
     restore = heed_interrupts()
+    if Path("matplotlibrc").is_file():
+        # matplotlib obeys the one in the working folder when it is imported.
+        with chdir(Path(__file__).parent):
+            import_module("matplotlib")
     # That it builds its cache of fonts, or where, is no news to who solves a problem.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:

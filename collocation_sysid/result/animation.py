@@ -25,7 +25,16 @@ from ..common.array_types import Array
 from ..common.files import replaced_file, safe_name
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, require_among
-from .figure_style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, add_legend_above, style_axes
+from .figure_style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    LINE_PT,
+    TEXT_PT,
+    add_legend_above,
+    own_settings,
+    style_axes,
+)
 from .pictures.camera_pictures import LEGEND_ENTRY
 from .pictures.over_time import rms_over_markers
 from .pictures.projection import ParallelCamera
@@ -116,6 +125,7 @@ def animate(
     return film(replay, file, fps=fps, slowdown=slowdown, headline=text)
 
 
+@own_settings()
 def film(
     replay: MotionRecord,
     file: Path,

@@ -24,6 +24,7 @@ from ..program.depth.visible_surface import VisibleSurface
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
 from ..runs.solved_problem import SolvedProblem
+from .figure_style import own_settings
 from .pictures.album import save_pictures, with_unique_names
 from .pictures.camera_pictures import KIND, depth_picture
 from .pictures.projection import ParallelCamera
@@ -260,6 +261,7 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
     return by_camera
 
 
+@own_settings()
 def save_overlays(experiments: Iterable[Experiment], folder: Path) -> list[Path]:
     """Draw the first image of each depth camera with the outlines of the undeformed body, see
     `undeformed_rows`, and return the files; empty without depth cameras.

@@ -6,10 +6,13 @@ Figures are `matplotlib.figure.Figure` objects without pyplot: no display, no gl
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from math import inf
 from typing import Any
 
+from matplotlib import rc_context, rcdefaults
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backend_bases import RendererBase
@@ -45,8 +48,25 @@ RESOLUTION_DPI = 200
 _GREY = "#606060"
 
 
+@contextmanager
+def own_settings() -> Iterator[None]:
+    """Draw with matplotlib's defaults; no settings of the user or the working folder have an effect.
+
+    It is a decorator, too: of functions that make figures. The figures are written with the same
+    settings.
+    """
+    with rc_context():
+        rcdefaults()
+        yield
+
+
 class NotebookFigure(Figure):
     """Figure that a notebook shows, with or without pyplot."""
+
+    def savefig(self, *arguments: Any, **options: Any) -> None:
+        """Write the figure with `own_settings`; see `Figure.savefig`."""
+        with own_settings():
+            super().savefig(*arguments, **options)
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
         """Return the figure as PNG bytes, with its width in pixels for a notebook, at 96 pixels per

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -20,6 +21,7 @@ from collocation_sysid.cli import study_commands
 from collocation_sysid.common.serialisation import as_json
 from collocation_sysid.extras.studies import run_execution
 from collocation_sysid.extras.studies import study_progress as display
+from collocation_sysid.extras.studies.study_plots import sweep_plots
 from collocation_sysid.methods.solution import Iteration
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
@@ -292,6 +294,22 @@ def test_a_sweep_tabulates_estimates_against_the_swept_values(tiny, stand_in):
     content = json.loads((tiny / "out" / "summary.json").read_text())
     assert content["varied_values"] == ["parameters.mu_pa.guess", "transcription.substeps"]
     assert "| mu_pa.guess | substeps |" in (tiny / "out" / "summary.md").read_text()
+
+
+@pytest.mark.parametrize("half_width", [math.nan, math.inf, 10.0])
+def test_a_sweep_is_drawn_also_without_finite_intervals(half_width: float):
+    rows = [
+        {
+            "guess_mu_pa": 100.0,
+            "substeps": m,
+            "rms_m": 1e-3,
+            "converged": True,
+            "value_mu_pa": 200.0,
+        }
+        | {"low_mu_pa": 200.0 - half_width, "high_mu_pa": 200.0 + half_width}
+        for m in (1, 2)
+    ]
+    assert [*sweep_plots(rows, ["substeps"])] == ["sweep"]
 
 
 def test_words_and_lists_can_be_swept(tiny, stand_in):

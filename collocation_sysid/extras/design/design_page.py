@@ -19,6 +19,7 @@ from ...result.figure_style import (
     add_legend_above,
     format_plain_numbers,
     new_figure,
+    own_settings,
     style_axes,
     symbol_as_mathtext,
 )
@@ -93,6 +94,7 @@ def _column_note(design: Design) -> str:
     return f"before: the motion of {shipped} in the problem; {after} alone"
 
 
+@own_settings()
 def design_figures(design: Design) -> dict[str, Figure]:
     """Return the figures of a design by file name without suffix: "motion" and "error_bars"."""
     return {"motion": motion_picture(design), "error_bars": error_bars_picture(design)}

@@ -15,7 +15,14 @@ from ...common.files import replaced_file
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...errors import InputError
 from ...fem.laws.constants import unit_of
-from ...result.figure_style import BLUE, ORANGE, new_figure, style_axes, symbol_as_mathtext
+from ...result.figure_style import (
+    BLUE,
+    ORANGE,
+    new_figure,
+    own_settings,
+    style_axes,
+    symbol_as_mathtext,
+)
 from ...result.run_sections import verdict_section
 from .estimator import LiveUpdate
 
@@ -114,6 +121,7 @@ def require_gif(file: Path) -> None:
         raise InputError(f"found '{file.suffix}'; expected .gif", file, where="--film")
 
 
+@own_settings()
 def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     """Write the estimates with their statistical intervals as a growing plot in a GIF.
 

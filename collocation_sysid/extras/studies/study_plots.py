@@ -28,6 +28,7 @@ from ...result.figure_style import (
     format_plain_numbers,
     make_log_axis,
     new_figure,
+    own_settings,
     style_axes,
     symbol_as_mathtext,
 )
@@ -56,6 +57,7 @@ MOST_TICKS = 9
 PANEL_MM = 32.0
 
 
+@own_settings()
 def comparison_plots(
     rows: Sequence[Row], records: Mapping[str, Record], yardstick: SuccessCriterion
 ) -> dict[str, Figure]:
@@ -300,6 +302,7 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     return figure
 
 
+@own_settings()
 def sweep_plots(rows: Sequence[Row], varied_keys: Sequence[str]) -> dict[str, Figure]:
     """Return the figures of a sweep by file name without suffix: one, "sweep"; empty if no run has
     a result.
@@ -364,7 +367,11 @@ def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure
         if len(varied_keys) > 1:
             add_legend_above(panels[0, column], 2)
     for line in panels:
-        drawn = np.concatenate([c.get_segments() for c in line[0].collections])[..., 1].ravel()
+        bars = [bar for c in line[0].collections for bar in c.get_segments()]
+        # Bars without a finite end have no points.
+        drawn = np.concatenate([np.empty((0, 2)), *(np.reshape(bar, (-1, 2)) for bar in bars)])[
+            :, 1
+        ]
         if drawn.size and drawn.min() > 0 and drawn.max() > WIDE * drawn.min():
             make_log_axis(line[0])
     return figure

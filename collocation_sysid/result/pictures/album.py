@@ -13,7 +13,7 @@ from ...common.array_types import Array
 from ...common.files import replaced_file, safe_name
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...runs.result_content import Result
-from ..figure_style import RESOLUTION_DPI
+from ..figure_style import RESOLUTION_DPI, own_settings
 from ..replay import MotionRecord, damaged_run_refused, read_run
 from .camera_pictures import camera_pictures
 from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
@@ -26,6 +26,7 @@ from .spectrum import spectrum_picture
 from .stress_strain import strain_picture
 
 
+@own_settings()
 def all_pictures(
     replays: Sequence[MotionRecord], result: Result, truth: Mapping[str, float] | None = None
 ) -> dict[str, Figure]:
@@ -145,6 +146,7 @@ def _infinities_as_nan(markers_m: Array | None) -> Array | None:
     return None if markers_m is None else np.where(np.isfinite(markers_m), markers_m, np.nan)
 
 
+@own_settings()
 def save_pictures(
     folder: str | Path, pictures: Mapping[str, Figure], say: Callable[[str], None] | None = None
 ) -> list[Path]:

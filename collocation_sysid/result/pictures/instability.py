@@ -8,7 +8,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from ...program.forward.loss_of_stability import StabilityLoss
-from ..figure_style import PAGE_MM, SMALL_PT
+from ..figure_style import PAGE_MM, SMALL_PT, own_settings
 from .projection import ParallelCamera
 from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
 from .shapes import FIELD_COLOURS
@@ -25,6 +25,7 @@ MAX_BODY_HEIGHT_MM = 90.0
 RELATIVE_AMPLITUDE = 0.08
 
 
+@own_settings()
 def instability_picture(instability: StabilityLoss) -> Figure:
     """Return a figure of the body displaced along its unstable mode, coloured by the mode's
     amplitude, with its stretches and wavelength as the title.

@@ -15,7 +15,14 @@ from matplotlib.image import AxesImage
 from ...common.array_types import Array
 from ...program.collocation import Collocation
 from ...recording.measurement_selection import shortened_experiment
-from ..figure_style import PAGE_MM, SMALL_PT, framed_figure, style_axes, symbol_as_mathtext
+from ..figure_style import (
+    PAGE_MM,
+    SMALL_PT,
+    framed_figure,
+    own_settings,
+    style_axes,
+    symbol_as_mathtext,
+)
 
 # Timesteps shown: enough to see the band, few enough to see its blocks.
 SHOWN_STEPS = 6
@@ -27,6 +34,7 @@ RASTER_SIZE = 400
 DECADES = 6
 
 
+@own_settings()
 def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     """Return a figure of the constraint Jacobian of the first timesteps, and of one of its blocks,
     coloured by magnitude.

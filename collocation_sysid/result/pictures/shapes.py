@@ -19,7 +19,7 @@ from ...common.array_types import Array, Index
 from ...errors import InputError, hint_at
 from ...fem.body import Body
 from ..element_fields import ElementFields
-from ..figure_style import PAGE_MM, SMALL_PT
+from ..figure_style import PAGE_MM, SMALL_PT, own_settings
 from ..replay import MotionRecord
 from .projection import ELEVATION_DEG, ParallelCamera
 from .scene import (
@@ -224,6 +224,7 @@ FIELD_TITLES = {
 MAX_SHAPES = 20
 
 
+@own_settings()
 def field_shapes(
     replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str | None, count: int
 ) -> Figure:
