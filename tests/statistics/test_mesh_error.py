@@ -126,8 +126,10 @@ def test_change_too_large_for_first_order_widens_both_sides_and_is_a_concern():
     refinement = estimated(300.0)
     low, high = refinement.errors["mu_pa"].interval95
     assert low * high == pytest.approx(1e4)
-    problem = cs.Problem(coarse_problem("tet10").experiments, {**GUESS})
+    experiments = coarse_problem("tet10").experiments
+    problem = cs.Problem(experiments, {**GUESS, "mu_pa": cs.Unknown(100.0)})
     assert mesh_resolution_concerns(problem, estimated(110.0)) == []
+    assert mesh_resolution_concerns(cs.Problem(experiments, {**GUESS}), refinement) == []
     (concern,) = mesh_resolution_concerns(problem, refinement)
     assert (concern.code, concern.grade) == ("mesh/error", "check")
     assert "+2e+02 %" in concern.message
