@@ -127,7 +127,8 @@ def test_change_too_large_for_first_order_widens_both_sides_and_is_a_concern():
     low, high = refinement.errors["mu_pa"].interval95
     assert low * high == pytest.approx(1e4)
     experiments = coarse_problem("tet10").experiments
-    problem = cs.Problem(experiments, {**GUESS, "mu_pa": cs.Unknown(100.0)})
+    damping = {name: value for name, value in TRUTH.items() if name.startswith("gamma")}
+    problem = cs.Problem(experiments, damping | {"mu_pa": cs.Unknown(100.0), "lambda_pa": 200.0})
     assert mesh_resolution_concerns(problem, estimated(110.0)) == []
     assert mesh_resolution_concerns(cs.Problem(experiments, {**GUESS}), refinement) == []
     (concern,) = mesh_resolution_concerns(problem, refinement)
