@@ -109,7 +109,7 @@ def solve(options: SolveCommand) -> None:
     problem = options.read_problem()
     require_possible(folder)
     require_replaceable(folder)
-    with ExitStack() as until_shown:
+    with ExitStack() as until_saved:
         with SolveProgress(
             error_console, problem, verbose=options.verbose, quiet=options.quiet
         ) as progress:
@@ -127,7 +127,7 @@ def solve(options: SolveCommand) -> None:
                 raise interruption_exit(
                     f"no result could be kept; nothing was written to {folder}", continues=False
                 ) from None
-            until_shown.enter_context(INTERRUPTS.deferred())
+            until_saved.enter_context(INTERRUPTS.deferred())
         if not options.as_json:
             print_result(
                 run_summary(finished.result, details=options.details, budget=options.budget)
@@ -143,9 +143,8 @@ def solve(options: SolveCommand) -> None:
             finished.save(folder, pictures=False)
         if not options.as_json:
             print_result(f"written to {folder}")
-    result = (
-        _draw_pictures(finished, folder, options=options) if options.pictures else finished.result
-    )
+        drawn = _draw_pictures(finished, folder, options=options, until_saved=until_saved)
+    result = drawn or finished.result
     if options.as_json:
         typer.echo(as_json(result))
     else:
@@ -154,32 +153,35 @@ def solve(options: SolveCommand) -> None:
         again = shlex.join(["collocation-sysid", *sys.argv[1:]])
         print_result(f"next: {next_step(result, folder, again)}")
     status = finished.solution.status
-    if options.pictures and result.elapsed_s.pictures is None:
-        raise typer.Exit(EXIT_INTERRUPTED)
-    if status is Status.INTERRUPTED or finished.omitted_checks:
+    if drawn is None or status is Status.INTERRUPTED or finished.omitted_checks:
         raise typer.Exit(EXIT_INTERRUPTED)
     if options.strict and finished.trust.verdict == "doubtful":
         raise typer.Exit(EXIT_DOUBTFUL)
     raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
 
 
-def _draw_pictures(finished: Run, folder: Path, options: SolveCommand) -> Result:
-    """Draw the pictures of a finished run into its folder, and return its result with the time that
-    they took.
+def _draw_pictures(
+    finished: Run, folder: Path, options: SolveCommand, until_saved: ExitStack
+) -> Result | None:
+    """Draw the pictures of a finished run into its folder if `options` ask for them, and return its
+    result with the time that they took; None after an interrupt, of which a message on stderr says
+    how to go on.
 
-    After an interrupt the result without that time is returned, and a message on stderr says how to
-    go on. Progress is shown as `options` states.
+    `until_saved`, which defers interrupts, is closed before.
     """
     from ..result.solve_progress import SolveProgress
 
     try:
+        until_saved.close()
+        if not options.pictures:
+            return finished.result
         with SolveProgress(error_console, verbose=options.verbose, quiet=options.quiet) as progress:
             return draw_run(finished, folder, report=progress.say)
     except KeyboardInterrupt:
         again = shlex.join(["collocation-sysid", "plot", str(folder)])
         message = f"interrupted: the result is kept in {folder}, but some pictures are missing"
         error_console.print(Text(f"{message}; draw them with: {again}"), soft_wrap=True)
-        return finished.result
+        return None
 
 
 @validated(kw_only=True)

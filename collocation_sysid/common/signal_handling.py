@@ -29,14 +29,16 @@ class Interrupts:
     """Handler of signals that raises `KeyboardInterrupt`, but not within imports and `deferred`.
 
     Libraries convert an exception within their imports into an error of their own. There the first
-    signal is deferred until the import (or the block) has ended: it is sent again every `RETRY_S`.
-    A second signal in this time raises at once.
+    signal is deferred until the import has ended: it is sent again every `RETRY_S`. A second signal
+    in this time raises at once. At the end of a `deferred` block `KeyboardInterrupt` is raised if a
+    signal came meanwhile.
     """
 
     def __init__(self) -> None:
         self._deferring = 0
         self._timer: threading.Timer | None = None
         self._tries_again = False
+        self._number = int(signal.SIGINT)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise `KeyboardInterrupt`, or defer the signal if `frame`, which it interrupted, is
@@ -45,27 +47,49 @@ class Interrupts:
         is_second = self._timer is not None and not self._tries_again
         self._tries_again = False
         if not is_second and (self._deferring or _is_importing(frame)):
-            self._timer = threading.Timer(RETRY_S, self._try_again, (number,))
-            self._timer.daemon = True
-            self._timer.start()
+            self._repeat(number)
             return
         self.forget()
+        self._number = number
         raise KeyboardInterrupt
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Defer the first signal beyond the end of the block; blocks may be nested."""
+        """Defer the first signal to the end of the block; blocks may be nested."""
         self._deferring += 1
         try:
             yield
         finally:
             self._deferring -= 1
+        if not self._deferring:
+            self.raise_deferred()
+
+    def raise_deferred(self) -> None:
+        """Raise `KeyboardInterrupt` if a signal is deferred."""
+        if self._timer is not None:
+            self.forget()
+            raise KeyboardInterrupt
+
+    def note_unraisable(self, failure: sys.UnraisableHookArgs) -> None:
+        """Repeat a signal whose `KeyboardInterrupt` was raised where Python can only report it, as in
+        a callback of the garbage collector; report other errors.
+        """
+        if failure.exc_type is KeyboardInterrupt:
+            self._repeat(self._number)
+        else:
+            sys.__unraisablehook__(failure)
 
     def forget(self) -> None:
         """Drop a signal that is deferred; no effect without one."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None
+
+    def _repeat(self, number: int) -> None:
+        """Send the signal `number` once more after `RETRY_S`."""
+        self._timer = threading.Timer(RETRY_S, self._try_again, (number,))
+        self._timer.daemon = True
+        self._timer.start()
 
     def _try_again(self, number: int) -> None:
         """Send the signal `number` to the main thread once more, marked as a repetition."""
@@ -98,11 +122,14 @@ def heed_interrupts() -> Callable[[], None]:
     Returns
     -------
     callable
-        Function without arguments that restores the previous handlers and drops a deferred signal.
+        Function without arguments that restores the previous handlers, and raises
+        `KeyboardInterrupt` if a signal is deferred.
     """
     default_handlers = (signal.SIG_DFL, signal.default_int_handler)
     previous = {}
+    previous_hook = sys.unraisablehook
     if _in_main_thread():
+        sys.unraisablehook = INTERRUPTS.note_unraisable
         for number in (signal.SIGINT, signal.SIGTERM):
             handler = signal.getsignal(number)
             if handler in default_handlers:
@@ -110,9 +137,10 @@ def heed_interrupts() -> Callable[[], None]:
                 signal.signal(number, INTERRUPTS)
 
     def restore() -> None:
-        INTERRUPTS.forget()
+        sys.unraisablehook = previous_hook
         for number, handler in previous.items():
             signal.signal(number, handler)
+        INTERRUPTS.raise_deferred()
 
     return restore
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
+import weakref
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from kit.problem_files import REFERENCES, replace_cell, replace_text, run_comman
 
 from collocation_sysid.common import machine
 from collocation_sysid.common.isolated_process import Failed, ProcessLimits, run_isolated
-from collocation_sysid.common.signal_handling import INTERRUPTS, heed_interrupts
+from collocation_sysid.common.signal_handling import IMPORTING, INTERRUPTS, heed_interrupts
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import (
@@ -511,19 +512,45 @@ def test_a_second_signal_ends_an_import(tiny: Path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_deferred_signal_interrupts_what_follows():
+def test_a_deferred_signal_interrupts_at_the_end_of_the_block():
     restore = heed_interrupts()
+    kept = ""
     try:
-        with INTERRUPTS.deferred():
+        with pytest.raises(KeyboardInterrupt), INTERRUPTS.deferred():  # noqa: PT012
             signal.raise_signal(signal.SIGTERM)
             time.sleep(0.2)
             kept = "whole"
-        with pytest.raises(KeyboardInterrupt):
-            time.sleep(30)
     finally:
         restore()
     assert kept == "whole"
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_signal_within_a_weak_reference_callback_is_not_lost(capsys: pytest.CaptureFixture[str]):
+    class Thing:
+        pass
+
+    restore = heed_interrupts()
+    try:
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+            thing = Thing()
+            callback = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGTERM))
+            del thing
+            assert callback() is None  # Python has ignored the exception
+            time.sleep(30)
+    finally:
+        restore()
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_signal_that_is_still_deferred_at_the_end_is_not_lost():
+    restore = heed_interrupts()
+    code = compile("import signal; signal.raise_signal(signal.SIGINT)", IMPORTING, "exec")
+    exec(code)
+    with pytest.raises(KeyboardInterrupt):
+        restore()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

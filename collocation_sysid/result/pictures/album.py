@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from ...common.array_types import Array
 from ...common.files import replaced_file, safe_name
+from ...common.signal_handling import INTERRUPTS
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI, own_settings
@@ -172,8 +173,9 @@ def save_pictures(
             file = Path(folder) / f"{safe_name(name)}.png"
             if say is not None:
                 say(f"drawing picture {k} of {len(pictures)}: {file.name}")
-            # Harder compression takes longer than drawing, for a tenth of the size.
-            with replaced_file(file) as draft:
+            # Harder compression takes longer than drawing, for a tenth of the size. Libraries may
+            # lose an exception that a signal raises within them.
+            with INTERRUPTS.deferred(), replaced_file(file) as draft:
                 figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
             complete_steps(StepUnit.PICTURE)
             files.append(file)
