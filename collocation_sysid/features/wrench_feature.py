@@ -306,7 +306,13 @@ WRENCH = Feature(
             "Wrench of a grasp: measured, fitted and simulated.",
             before="error",
             is_leading=True,
-        )
+        ),
+        PictureKind(
+            "force_displacement",
+            "Force over displacement: measured, fitted and simulated.",
+            before="shapes",
+            is_leading=True,
+        ),
     ],
     series_kind=SERIES_KIND,
     instruments=instruments,

@@ -400,12 +400,9 @@ class FilmFigure:
         """Draw the axis directions, the scale bar and the legend below the body into `axes`."""
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))
-        named = ["grasped", "measured", "behind the body"]
-        camera_points = ""
-        if self.replay.visible_points:
-            markers = named[1:] if len(self.replay.marker_names) else []
-            named = ["grasped", *markers]
-            camera_points = LEGEND_ENTRY
+        markers = ["measured", "behind the body"] if len(self.replay.marker_names) else []
+        named = ["grasped", *markers]
+        camera_points = LEGEND_ENTRY if self.replay.visible_points else ""
         handles = legend_handles(*named, camera_points=camera_points)
         draw_legend(
             axes, handles, corner_mm=(FILM_WIDTH_MM * (0.42 if len(handles) < 4 else 0.35), 5.5)
@@ -429,9 +426,8 @@ class FilmFigure:
             distances = np.linalg.norm(drawn.markers_m[sample] - measured, axis=1)
             present = distances[np.isfinite(distances)]
             off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
-            drawn.title.set_text(
-                drawn.name if drawn.markers_m is replay.measured_m else f"{drawn.name}: {off}"
-            )
+            is_compared = measured.size and drawn.markers_m is not replay.measured_m
+            drawn.title.set_text(f"{drawn.name}: {off}" if is_compared else drawn.name)
         if self.cursor is not None:
             now_s = replay.t_s[sample] - replay.t_s[0]
             self.cursor.set_xdata([now_s, now_s])

@@ -9,6 +9,7 @@ from ..features.registry import FEATURES
 
 # Captions of the pictures of every run in the order of a report, by the beginning of their names.
 GENERAL_CAPTIONS = {
+    "stress": "Stress over strain: measured, fitted and simulated.",
     "shapes": "The fitted body at several times of the recording; orange: measured markers.",
     "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
     "through the body. Pale colours: the data add little to the prior.",
@@ -40,8 +41,9 @@ def _all_captions() -> dict[str, str]:
 
 PICTURE_CAPTIONS = _all_captions()
 # Pictures that show measurement and fit, one of which leads the page.
-LEADING_PICTURES = tuple(
-    kind.name for feature in FEATURES for kind in feature.picture_kinds if kind.is_leading
+LEADING_PICTURES = (
+    "stress",
+    *(kind.name for feature in FEATURES for kind in feature.picture_kinds if kind.is_leading),
 )
 
 

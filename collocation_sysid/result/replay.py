@@ -71,6 +71,7 @@ ARRAY_LAYOUT = {
     "gaps_m": ("f", "TF"),
     "pressures_pa": ("f", "TF"),
     "strain": ("f", "T"),
+    "travel_m": ("f", "T3"),
 }
 # Words for the kinds of numbers in `ARRAY_LAYOUT`.
 KINDS_TEXT = {"f": "floats", "iu": "whole numbers", "b": "booleans"}
@@ -146,6 +147,8 @@ class MotionRecord:
         Units of the custom sensors that state one.
     strain : (T,), or None
         Strain of a specimen without a mesh; None for other experiments.
+    travel_m : (T, 3), or None
+        Displacement along a line of a test bench whose force is measured; None for other motions.
     """
 
     name: str
@@ -178,6 +181,7 @@ class MotionRecord:
     visible_points: Mapping[str, Array] = field(default_factory=dict)
     reading_units: Mapping[str, str] = field(default_factory=dict)
     strain: Array | None = None
+    travel_m: Array | None = None
 
     @classmethod
     def from_experiment(
@@ -238,6 +242,7 @@ class MotionRecord:
             obstacles_m=_obstacle_outlines(experiment),
             reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit},
             strain=specimen_strains(experiment)[0] if experiment.specimen else None,
+            travel_m=_bench_travel(experiment),
             **recorded,
         )
 
@@ -360,6 +365,30 @@ class MotionRecord:
                 f"{len(stored['part_names']) - 1}, the indices of part_names"
             )
         return cls(name=name, **stored)
+
+
+# Part of its way by which a bench may leave the line along which it moves.
+LINE_TOLERANCE = 1e-3
+
+
+def _bench_travel(experiment: Experiment) -> Array | None:
+    """Return the displacement (T, 3) [m] of the grasp or obstacle that moves farthest, of the whole
+    specimen; None if no force is measured, anything turns, or the displacement is on no line.
+    """
+    if experiment.specimen or not experiment.wrenches:
+        return None
+    travels = [np.zeros((len(experiment.t_s), 3))]
+    for grasp in experiment.grasps:
+        rotations, shifts = grasp.poses.at(experiment.t_s)
+        if not np.allclose(rotations, np.eye(3), atol=1e-6):
+            return None
+        travels.append(shifts / grasp.displacement_scale)
+    farthest = max(travels, key=lambda travel: float(np.ptp(travel, axis=0).max()))
+    for travel in (farthest, farthest - farthest[0]):
+        sizes = np.linalg.svd(travel, compute_uv=False)
+        if len(sizes) == 1 or sizes[1] <= LINE_TOLERANCE * sizes[0]:
+            return travel if np.ptp(travel, axis=0).max() > 0 else None
+    return None
 
 
 def _obstacle_outlines(experiment: Experiment) -> Array | None:

@@ -538,8 +538,8 @@ def notes_section(result: Result) -> TitledParts:
 
 
 def _cards(result: Result) -> Cards:
-    """Return the three main numbers: the most important stiffness (or else the first estimate), the
-    misfit of the markers, and that of the forward simulation. The result must have an estimate.
+    """Return the main numbers: the most important stiffness (or else the first estimate), and the
+    misfits of what was measured. The result must have an estimate.
     """
     values = result.collect_estimates()
     fit = result.fit
@@ -548,15 +548,18 @@ def _cards(result: Result) -> Cards:
     interval = values[name].combined95
     value = f"{number(values[name].value, 4)} {unit_of(name)}"
     known = "{:.4g} to {:.4g} (95 %)".format(*interval) if interval else "no error bar"
-    alone = f"RMS; expected from noise alone: {millimetres(fit.noise_rms_m)}"
-    most = f"RMS; {millimetres(simulated.max_m)} at most"
-    return Cards(
-        (
-            (symbol_of(name), value.strip(), known),
-            ("markers, fitted", millimetres(fit.rms_m), alone),
-            ("markers, forward simulation", millimetres(simulated.rms_m), most),
-        )
-    )
+    cards = [(symbol_of(name), value.strip(), known)]
+    if any(each.samples for each in fit.experiments.values()):
+        alone = f"RMS; expected from noise alone: {millimetres(fit.noise_rms_m)}"
+        cards.append(("markers, fitted", millimetres(fit.rms_m), alone))
+        most = f"RMS; {millimetres(simulated.max_m)} at most"
+        cards.append(("markers, forward simulation", millimetres(simulated.rms_m), most))
+    elif (uncertainty := result.uncertainty) is not None:
+        ratio = number(uncertainty.reduced_chi_squared, 3)
+        cards.append(("reduced χ²", ratio, "1 expected from the stated noise"))
+    if fit.wrench_rms_n is not None:
+        cards.append(("force, fitted", f"{number(fit.wrench_rms_n, 3)} N", "RMS"))
+    return Cards(tuple(cards))
 
 
 def remedy_lines(concerns: Iterable[Concern]) -> Iterator[Line]:

@@ -63,6 +63,7 @@ from collocation_sysid.result.pictures.projection import ParallelCamera
 from collocation_sysid.result.pictures.scene import BodyDrawing, SheetView, sheet
 from collocation_sysid.result.pictures.shapes import FIELD_COLOURS, SurfaceField
 from collocation_sysid.result.pictures.spectrum import spectral_density
+from collocation_sysid.result.pictures.stress_strain import is_unloading
 from collocation_sysid.result.replay import MotionRecord
 from collocation_sysid.runs.result_content import Result
 
@@ -521,6 +522,56 @@ def test_modes_are_numbered_and_near_ones_together():
 
 
 @pytest.mark.long
+def bench(measured_axes: tuple[int, ...] = (2,)) -> MotionRecord:
+    """A record of a bench that presses down by 4 mm and back, with a stiffness of 1000 N/m."""
+    seen = replay()
+    way_m = 0.004 * (1 - np.abs(np.linspace(-1, 1, len(seen.t_s))))
+    columns = np.full((len(seen.t_s), 19), np.nan)
+    columns[:, 0] = seen.t_s
+    for axis in measured_axes:
+        columns[:, 1 + axis] = -1000.0 * way_m
+    columns[:, 7:10] = np.outer(-1100.0 * way_m, [0.3, 0.3, 1.0])
+    travel_m = np.outer(way_m, [0.0, 0.0, -1.0])
+    return replace(seen, sensor_columns={"wrench": [columns]}, travel_m=travel_m)
+
+
+def test_a_bench_is_drawn_as_force_over_displacement():
+    pictures = dict(experiment_pictures(bench()))
+    (axes,) = pictures["force_displacement_hung_cube"].axes
+    lines = {line.get_label(): line.get_xydata() for line in axes.lines}
+    assert lines.keys() == {"measured", "measured, unloading", "fitted"}
+    for label, stiffness in (("measured", 1.0), ("measured, unloading", 1.0), ("fitted", 1.1)):
+        np.testing.assert_allclose(lines[label][:, 1], stiffness * lines[label][:, 0], atol=1e-12)
+    assert lines["measured"][:, 0].max() > 0
+    assert axes.get_xlabel() == "displacement [mm]"
+    assert axes.get_ylabel() == "force [N]"
+
+
+def test_a_bench_without_the_force_along_its_way_has_no_curve():
+    names = [name for name, _ in experiment_pictures(bench(measured_axes=(0,)))]
+    assert "wrench_hung_cube" in names
+    assert "force_displacement_hung_cube" not in names
+
+
+def test_forces_that_were_not_measured_have_no_panel():
+    figure = dict(experiment_pictures(bench()))["wrench_hung_cube"]
+    assert [axes.get_title() for axes in figure.axes] == ["fz"]
+
+
+@pytest.mark.parametrize(
+    ("at", "expected"),
+    [
+        ([0, 1, 2, 3], [0, 0, 0, 0]),
+        ([0, 2, 4, 2, 0], [0, 0, 0, 1, 1]),
+        ([0, -2, -4, -2, -3, -5], [0, 0, 0, 1, 0, 0]),
+        ([0, 100, 99.9, 200], [0, 0, 0, 0]),
+        ([], []),
+    ],
+)
+def test_unloading_is_a_decrease_of_the_magnitude(at: list[float], expected: list[int]):
+    np.testing.assert_array_equal(is_unloading(np.array(at, dtype=float)), expected)
+
+
 def test_a_run_has_all_its_pictures(tmp_path):
     seen = replay()
     pictures = all_pictures([seen], told())

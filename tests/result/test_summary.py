@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.problems import TRUTH, hung_cube
+from kit.results import FIT, a_result, value
 
 import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text, readable_stress, rounded, two_digits
 from collocation_sysid.result.pictures.confidence import Confidence
+from collocation_sysid.result.run_sections import _cards
 from collocation_sysid.result.run_summary import next_step, run_summary
 from collocation_sysid.runs.misspecifications import NO_CAUSE
 from collocation_sysid.runs.result_content import Result
@@ -172,3 +174,10 @@ def test_pictures_of_the_confidence_have_the_combined_width():
         low, high = result.parameters[name].combined95 or (0.0, 0.0)
         half = found.quantiles[k] * np.sqrt(found.covariance[k, k])
         assert half == pytest.approx(np.log(high / low) / 2, rel=0.02)
+
+
+def test_a_run_without_markers_has_no_cards_of_markers():
+    result = replace(a_result({"young_pa": value()}), fit=replace(FIT, wrench_rms_n=0.25))
+    cards = dict((name, shown) for name, shown, _ in _cards(result).items)
+    assert cards["force, fitted"] == "0.25 N"
+    assert not any("markers" in name for name in cards)

@@ -24,7 +24,7 @@ from .over_time import marker_errors, marker_tracks, sensor_picture
 from .search_pictures import convergence, scan_picture
 from .shapes import obstacle_pictures, shapes_picture
 from .spectrum import spectrum_picture
-from .stress_strain import strain_picture
+from .stress_strain import force_picture, strain_picture
 
 
 @own_settings()
@@ -123,6 +123,10 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     for series in replay.sensor_series:
         count = len(replay.sensor_columns[series.kind])
         which = "" if count == 1 else f"_{series.number}"
+        if replay.travel_m is not None and series.kind == "wrench":
+            curve = force_picture(replay.travel_m, t_s, series.columns)
+            if curve is not None:
+                yield f"force_displacement_{replay.name}{which}", curve
         yield (
             f"{series.kind}_{replay.name}{which}",
             sensor_picture(series.columns, series.names, units=series.units),

@@ -85,12 +85,8 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     middle.tick_params(labelleft=False, left=False)
     name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
     free = "" if transcription.has_constraints_of_grasps else ", free dofs only"
-    style_axes(
-        right,
-        f"{name}: connectivity of the mesh",
-        xlabel="column, 3 node + axis",
-        ylabel=f"row{free}",
-    )
+    meaning = "" if transcription.experiment.specimen else ": connectivity of the mesh"
+    style_axes(right, f"{name}{meaning}", xlabel="column, 3 node + axis", ylabel=f"row{free}")
     for axes in (full_axes, middle, right):
         axes.grid(False)
         axes.spines[:].set_visible(True)

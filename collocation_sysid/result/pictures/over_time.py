@@ -276,7 +276,7 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
     """Return a figure of the numbers of a sensor over time, three in a row, as the force above the
     torque.
 
-    A row of three numbers without any measurement is left out; at least one must be measured.
+    Numbers without any measurement are left out; at least one must be measured.
 
     Parameters
     ----------
@@ -291,7 +291,7 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
         samples, [1, *np.cumsum([len(names)] * 2) + 1], axis=1
     )
     there = np.asarray(np.isfinite(measured).any(axis=0))
-    shown = [k for k in range(len(names)) if there[k - k % 3 : k - k % 3 + 3].any()]
+    shown = [k for k in range(len(names)) if there[k]]
     columns = min(3, len(shown))
     size = PAGE_MM / 25.4, HEIGHT_MM * -(-len(shown) // columns) / 25.4
     figure = NotebookFigure(figsize=size, layout="constrained")

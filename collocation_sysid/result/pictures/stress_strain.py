@@ -1,10 +1,13 @@
-"""Pictures of specimens: stress or lateral stretch over strain, measured, fitted and simulated."""
+"""Pictures of specimens and test benches: stress over strain and force over displacement, measured,
+fitted and simulated.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ..figure_style import BLACK, COLUMN_MM, add_legend_above, framed_figure, style_axes
@@ -14,7 +17,11 @@ from .over_time import drawn_models
 STRESS_UNITS = (("MPa", 1e-6), ("kPa", 1e-3), ("Pa", 1.0))
 # Largest measured value, in a readable unit, from which on that unit is used.
 READABLE = 1.0
-HEIGHT_MM = 58
+HEIGHT_MM = 62
+# Component of a unit vector below which a direction does not count as having it.
+DIRECTION_TOLERANCE = 1e-3
+# Share of the largest strain or displacement by which it must reverse to count as unloading.
+REVERSAL = 0.02
 
 
 def strain_picture(strain: Array, t_s: Array, samples: Array, name: str, unit: str) -> Figure:
@@ -37,19 +44,74 @@ def strain_picture(strain: Array, t_s: Array, samples: Array, name: str, unit: s
     """
     at = np.interp(samples[:, 0], t_s, strain)
     shown_unit, factor = _readable_unit(samples[:, 1], unit)
-    measured, fitted, simulated = factor * samples[:, 1:].T
-    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=9)
+    label = f"{name} [{shown_unit}]" if shown_unit else name
+    return _curve(at, factor * samples[:, 1:], xlabel="strain", ylabel=label)
+
+
+def force_picture(travel_m: Array, t_s: Array, samples: Array) -> Figure | None:
+    """Return a figure of the force of a test bench over its displacement, both along the direction
+    in which it moves farthest; None if that force is not measured.
+
+    Parameters
+    ----------
+    travel_m : (T, 3) array
+        Displacement along a line at the times of the experiment [m], not all zero.
+    t_s : (T,) array
+        Times of the experiment [s].
+    samples : (S, 19) array
+        Time [s], and the wrench as measured, fitted and simulated [N, N m]; NaN where there is
+        none.
+    """
+    farthest = travel_m[np.linalg.norm(travel_m, axis=1).argmax()]
+    direction = farthest / np.linalg.norm(farthest)
+    axes = np.flatnonzero(np.abs(direction) > DIRECTION_TOLERANCE)
+    forces_n = samples[:, 1:].reshape(-1, 3, 6)[:, :, axes] @ direction[axes]
+    if not np.isfinite(forces_n[:, 0]).any():
+        return None
+    at_mm = 1e3 * np.interp(samples[:, 0], t_s, travel_m @ direction)
+    return _curve(at_mm, forces_n, xlabel="displacement [mm]", ylabel="force [N]")
+
+
+def _curve(at: Array, columns: Array, xlabel: str, ylabel: str) -> Figure:
+    """Draw measured, fitted and simulated values (S, 3); measurements while unloading are open."""
+    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=13)
     axes = figure.subplots()
-    dots = {"ls": "", "marker": ".", "ms": 4.0, "color": BLACK, "mec": "none", "alpha": 0.6}
-    axes.plot(at, measured, label="measured", zorder=3, **dots)
+    measured, fitted, simulated = columns.T
+    unloads = is_unloading(at)
+    dots = {"ls": "", "marker": "o", "ms": 2.4, "mec": BLACK, "mew": 0.5, "zorder": 3}
+    for label, there, fill in (
+        ("measured", ~unloads, BLACK),
+        ("measured, unloading", unloads, "white"),
+    ):
+        if np.isfinite(measured[there]).any():
+            axes.plot(at[there], measured[there], label=label, mfc=fill, **dots)
     models = (each if np.isfinite(each).any() else None for each in (fitted, simulated))
     for label, values, style in drawn_models(*models):
         axes.plot(at, values, label=label, **style)
-    label = f"{name} [{shown_unit}]" if shown_unit else name
-    style_axes(axes, "", xlabel="strain", ylabel=label)
+    style_axes(axes, "", xlabel=xlabel, ylabel=ylabel)
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    add_legend_above(axes, columns=3)
+    add_legend_above(axes, columns=2)
     return figure
+
+
+def is_unloading(at: Array) -> NDArray[np.bool_]:
+    """Return of each of the values (S,), in the order of time, whether their magnitude decreases
+    there; reversals by less than `REVERSAL` of the largest magnitude do not count.
+    """
+    size = np.abs(at)
+    turn = REVERSAL * size.max(initial=0.0)
+    unloads = np.zeros(len(at), dtype=bool)
+    last, falls = 0, False  # the last extreme value, and what comes after it
+    for k in range(1, len(at)):
+        change = size[k] - size[last]
+        unloads[k] = falls
+        if (change <= 0) if falls else (change >= 0):
+            last = k
+        elif abs(change) > turn:
+            falls = not falls
+            unloads[last + 1 : k + 1] = falls
+            last = k
+    return unloads
 
 
 def _readable_unit(values: Array, unit: str) -> tuple[str, float]:
