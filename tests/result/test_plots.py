@@ -56,6 +56,7 @@ from collocation_sysid.result.pictures import (
     shapes_picture,
     spectrum_picture,
 )
+from collocation_sysid.result.pictures.album import experiment_pictures
 from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse_outline
 from collocation_sysid.result.pictures.jacobian import RASTER_SIZE, SHOWN_STEPS
 from collocation_sysid.result.pictures.mesh_pictures import spread_levels
