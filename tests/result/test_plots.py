@@ -56,7 +56,7 @@ from collocation_sysid.result.pictures import (
     shapes_picture,
     spectrum_picture,
 )
-from collocation_sysid.result.pictures.album import experiment_pictures
+from collocation_sysid.result.pictures.album import experiment_pictures, with_unique_names
 from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse_outline
 from collocation_sysid.result.pictures.jacobian import RASTER_SIZE, SHOWN_STEPS
 from collocation_sysid.result.pictures.mesh_pictures import spread_levels
@@ -537,7 +537,7 @@ def bench(measured_axes: tuple[int, ...] = (2,)) -> MotionRecord:
 
 
 def test_a_bench_is_drawn_as_force_over_displacement():
-    pictures = dict(experiment_pictures(bench()))
+    pictures = with_unique_names(experiment_pictures(bench()))
     (axes,) = pictures["force_displacement_hung_cube"].axes
     lines = {line.get_label(): line.get_xydata() for line in axes.lines}
     assert lines.keys() == {"measured", "measured, unloading", "fitted"}
@@ -549,13 +549,13 @@ def test_a_bench_is_drawn_as_force_over_displacement():
 
 
 def test_a_bench_without_the_force_along_its_way_has_no_curve():
-    names = [name for name, _ in experiment_pictures(bench(measured_axes=(0,)))]
+    names = with_unique_names(experiment_pictures(bench(measured_axes=(0,))))
     assert "wrench_hung_cube" in names
     assert "force_displacement_hung_cube" not in names
 
 
 def test_forces_that_were_not_measured_have_no_panel():
-    figure = dict(experiment_pictures(bench()))["wrench_hung_cube"]
+    figure = with_unique_names(experiment_pictures(bench()))["wrench_hung_cube"]
     assert [axes.get_title() for axes in figure.axes] == ["fz"]
 
 
