@@ -556,7 +556,7 @@ def test_a_bench_without_the_force_along_its_way_has_no_curve():
 
 def test_forces_that_were_not_measured_have_no_panel():
     figure = with_unique_names(experiment_pictures(bench()))["wrench_hung_cube"]
-    assert [axes.get_title() for axes in figure.axes] == ["fz"]
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["fz"]
 
 
 @pytest.mark.parametrize(
