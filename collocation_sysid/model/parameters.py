@@ -208,6 +208,24 @@ class Parameter:
         return value if self.scale == "log" else self.unit
 
 
+def is_default_bound(item: Parameter, value: float) -> bool:
+    """Return whether the bound nearest to a value of a free parameter is the default one of a
+    constant with `widest` bounds, or one of these, and no physical limit.
+
+    A stated bound that equals the default one counts as the default.
+    """
+    constant = constant_named(item.name)
+    if constant.widest is None:
+        return False
+    is_lower = abs(item.to_coordinate(value) - item.to_coordinate(item.lower)) < abs(
+        item.to_coordinate(value) - item.to_coordinate(item.upper)
+    )
+    side = 0 if is_lower else 1
+    return (item.lower, item.upper)[side] == constant.bounds[side] and constant.bounds[
+        side
+    ] != constant.widest[side]
+
+
 def _lower_limit_text(least: float) -> str:
     """Return the start of an inequality with the smallest admissible value; "" if there is none."""
     return "" if least == -np.inf else f"{least:g} <= "

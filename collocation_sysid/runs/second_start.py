@@ -5,18 +5,22 @@
 - *Laws in powers of the stretches*: with every order and every sign of the exponents there is
   another optimum, and no search crosses an exponent of zero, at which a term vanishes. The closed
   forms of specimens tell whether there is a better one, see `methods.power_law_start`.
+- *Default bounds*: they are those of foams and rubbers. A search that ends at one of them is
+  continued within what is physically possible, for metals, liquids and auxetic bodies.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Mapping
+from dataclasses import dataclass, replace
 
-from ..fem.laws.constants import usual_value, without_region
+import numpy as np
+
+from ..fem.laws.constants import SHARE, constant_named, usual_value, without_region
 from ..methods.power_law_start import power_law_start
 from ..methods.solution import Solution
-from ..model.parameters import Parameters
-from ..statistics.linearised import parameter_values
+from ..model.parameters import Parameter, Parameters, is_default_bound
+from ..statistics.linearised import AT_BOUND, parameter_values
 
 # Poisson's ratio above which a second search starts from the usual one at the same Young's modulus.
 # Smaller ratios do not lock.
@@ -29,6 +33,8 @@ LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
 # share of χ² by which that is better.
 OTHER_EXPONENT = 0.05
 LEAST_SHARE = 0.01
+# Least share of a branch of memory, whose logarithm is estimated beyond the default bound.
+LITTLE_MEMORY = 1e-3
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,52 @@ class SecondStart:
 def second_start(solution: Solution) -> SecondStart | None:
     """Return the start of a second search after a solution; None if a worse optimum is unlikely."""
     return _usual_poisson_start(solution) or _power_law_start(solution)
+
+
+def start_beyond_bounds(solution: Solution) -> SecondStart | None:
+    """Return the estimates of a solution as a start within the `widest` bounds of its constants;
+    None if no parameter ended at a default bound that can be widened.
+
+    Bounds that equal the default ones count as not stated. Beyond its bound a share of memory is
+    estimated by its logarithm: the long-term modulus falls as it grows.
+    """
+    parameters = solution.collocation.parameters
+    lower, upper = parameters.compute_bounds_q()
+    known = parameter_values(solution.collocation, solution.q)
+    ended = {
+        item.name: known[item.name]
+        for item, distance in zip(
+            parameters.free, np.minimum(solution.q - lower, upper - solution.q), strict=True
+        )
+        if distance < AT_BOUND and is_default_bound(item, known[item.name])
+    }
+    if not ended:
+        return None
+    listed = " and ".join(f"{name} = {bound:.4g}" for name, bound in ended.items())
+    values = {item.name: known[item.name] for item in parameters.free}
+    return SecondStart(
+        parameters.map_components(lambda item: _widened(item, ended)).with_estimates(values),
+        f"the search ended at the default bound{'s' * (len(ended) > 1)} {listed}; a second one, "
+        "with wider bounds,",
+    )
+
+
+def _widened(item: Parameter, ended: Container[str]) -> Parameter:
+    """Return a parameter with the widest bounds in place of its default ones, of shares those that
+    ended at one.
+    """
+    widest = constant_named(item.name).widest
+    if item.is_fixed or item.tied is not None or widest is None:
+        return item
+    is_share = without_region(item.name) == SHARE.name
+    if is_share and item.name not in ended:
+        return item
+    lower, upper = constant_named(item.name).bounds
+    lower = widest[0] if item.lower == lower else item.lower
+    upper = widest[1] if item.upper == upper else item.upper
+    if is_share:
+        return replace(item, lower=max(lower, LITTLE_MEMORY), upper=upper, scale="log", unit=1.0)
+    return replace(item, lower=lower, upper=upper)
 
 
 def _usual_poisson_start(solution: Solution) -> SecondStart | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from .coarse_start import (
     start_note,
     undetermined_names,
 )
-from .second_start import second_start
+from .second_start import SecondStart, second_start, start_beyond_bounds
 from .several_starts import follow_starts
 from .thinned_start import (
     NoThinnedStartError,
@@ -454,16 +454,16 @@ def _solve_from_scan(
 
 
 def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -> Solution:
-    """Return the better of a solution and of the solution from its `second_start`, with a note if
-    that is the second one.
+    """Return the best of a solution, of the solution from its `second_start`, and of the one that
+    continues at default bounds, see `start_beyond_bounds`; with a note on each that is better.
 
-    The second is better if it converges, and the first did not or has a χ² that is higher by more
-    than `LEAST_GAIN`, an absolute difference. There is no second search after a first one that was
-    interrupted, refused, or ended at the limit of time.
+    Another solution is better if it converges, and the one before did not or has a χ² that is
+    higher by more than `LEAST_GAIN`, an absolute difference. There is no other search after one
+    that was interrupted, refused, or ended at the limit of time.
 
-    Otherwise `first` itself is returned; after an interrupt of the second search a copy of it with
-    the status and message of the interrupt. The history, counts and times of the result are those
-    of its own search alone. Exceptions of the method are not caught.
+    Otherwise `first` itself is returned; after an interrupt of another search a copy of the best
+    one with the status and message of the interrupt. The history, counts and times of the result
+    are those of its own search alone. Exceptions of the method are not caught.
 
     Parameters
     ----------
@@ -472,12 +472,25 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
     first : Solution
         Solution of the first search.
     watch : callable or None
-        Called with every iteration of the second search.
+        Called with every iteration of the other searches.
+    """
+    best = _better_of(solver, first, watch, choose=second_start)
+    return _better_of(solver, best, watch, choose=start_beyond_bounds)
+
+
+def _better_of(
+    solver: Method,
+    first: Solution,
+    watch: Watch | None,
+    choose: Callable[[Solution], SecondStart | None],
+) -> Solution:
+    """Return the better of a solution and of that from the start chosen for it, see
+    `best_of_second_start`.
     """
     if first.status in FINAL_STATUSES or not first.history:
         return first
     try:
-        other = second_start(first)
+        other = choose(first)
         if other is None:
             return first
         again = associated_at_guess(first.collocation.with_parameters(other.parameters))

@@ -87,7 +87,10 @@ def solution_concerns(
         yield Concern("solve/jump")
     if uncertainty is not None:
         yield from as_specimen_concerns(
-            [*fit_concerns(uncertainty), *parameter_concerns(uncertainty)],
+            [
+                *fit_concerns(uncertainty),
+                *parameter_concerns(uncertainty, solution.collocation.parameters),
+            ],
             [each.experiment for each in solution.collocation.transcriptions],
         )
     elif solution.collocation.nq:

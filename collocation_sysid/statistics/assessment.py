@@ -17,6 +17,7 @@ from ..common.array_types import Array
 from ..common.display import short
 from ..errors import listed
 from ..fem.laws.constants import symbol_of, unit_of
+from ..model.parameters import Parameters, is_default_bound
 from ..program.modes.stability import Instability
 from ..recording.experiment import Experiment
 from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
@@ -126,11 +127,20 @@ class Assessment:
     def from_concerns(cls, concerns: Iterable[Concern]) -> Assessment:
         """Build from concerns: "doubtful" ones come first, in their given order, then "check" ones.
 
-        Of several concerns with the same message the first is kept, whatever its grade and code.
+        A default bound at which a parameter ended comes before all others, with their gravest
+        grade: they may follow from it. Of several concerns with the same message the first is kept,
+        whatever its grade and code.
         """
         by_message = {concern.message: concern for concern in reversed([*concerns])}
         gravest = sorted(reversed(by_message.values()), key=lambda each: each.grade == "check")
-        return cls(tuple(gravest))
+        first = [
+            replace(each, grade=gravest[0].grade)
+            for each in gravest
+            if each.code == "information/default-bound"
+        ]
+        return cls(
+            (*first, *(each for each in gravest if each.code != "information/default-bound"))
+        )
 
     @property
     def verdict(self) -> Verdict:
@@ -262,17 +272,29 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
     return [Concern(code, data=data)]
 
 
-def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
+def parameter_concerns(
+    uncertainty: Uncertainty, parameters: Parameters | None = None
+) -> list[Concern]:
     """Return concerns about estimated parameters at their bounds, and one, "doubtful", if no
     parameter has a standard error, so that there is no answer.
 
-    Several parameters at bounds are one concern, "doubtful"; a single one is "check". Mode
-    coefficients of fields do not count. That some parameters are not determined contradicts nothing
-    and is no concern: the table of the estimates shows it.
+    Several parameters at stated bounds are one concern, "doubtful"; a single one is "check". Those
+    at default bounds of `parameters`, if given, are another one, "check". Mode coefficients of
+    fields do not count. That some parameters are not determined contradicts nothing and is no
+    concern: the table of the estimates shows it.
     """
     known = uncertainty.estimates
     estimates = {name: known[name] for name in uncertainty.names if name in known}
-    bounded = [name for name, estimate in estimates.items() if estimate.at_bound]
+    at_default = [
+        item.name
+        for item in (() if parameters is None else parameters.free)
+        if item.name in estimates
+        and estimates[item.name].at_bound
+        and is_default_bound(item, estimates[item.name].value)
+    ]
+    bounded = [
+        name for name, estimate in estimates.items() if estimate.at_bound and name not in at_default
+    ]
     undetermined = [
         name
         for name, estimate in estimates.items()
@@ -281,6 +303,7 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     several = len(bounded) > 1
     code = "information/bounds" if several else "information/bound"
     return [
+        *concern_if(bool(at_default), False, code="information/default-bound", names=at_default),
         *concern_if(bool(bounded), several, code=code, names=bounded),
         *concern_if(
             bool(undetermined) and len(undetermined) == len(estimates),

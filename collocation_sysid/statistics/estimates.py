@@ -428,6 +428,13 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
                 f"the data do not determine whether there is memory: the share of {branch} "
                 f"may be 0, and is at most {share.statistical95[1]:.2g} (95 %)"
             )
+        elif share.value > SHARE.bounds[1]:
+            left = 100 / (1 + share.value)
+            notes.append(
+                f"{branch} relaxes to {left:.2g} % of the stress at once, as that of a liquid: "
+                "the data determine the instantaneous modulus and the relaxation time, and no "
+                "long-term modulus; record for longer if there is one"
+            )
         elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
             notes.append(
                 f"{branch} relaxes within {tau.value:.2g} s, slower than the longest "

@@ -55,6 +55,9 @@ class Constant:
         Smallest admissible value of a linear constant; not used for a logarithmic one.
     prior : (mean, deviation) or None
         Normal prior of an estimate if the problem states none; None for no prior.
+    widest : (lower, upper) or None
+        Bounds of a second search if the first ended at one of `bounds` that the problem does not
+        state: what is physically possible. None for constants without one.
 
     Raises
     ------
@@ -73,6 +76,7 @@ class Constant:
     below: float = float("inf")
     at_least: float = -float("inf")
     prior: tuple[float, float] | None = None
+    widest: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.scale not in get_args(Scale):
@@ -94,10 +98,14 @@ class Constant:
 
 # Default bounds of a stiffness [Pa]: softer than any gel, stiffer than any rubber.
 STIFFNESS = (1.0, 1e9)
-LAMBDA = Constant("lambda_pa", "λ", meaning="first Lamé parameter", bounds=STIFFNESS)
-MU = Constant("mu_pa", "μ", meaning="shear modulus", bounds=STIFFNESS)
+# Stiffness of anything solid [Pa]; diamond has 1.2e12.
+ANY_STIFFNESS = (1e-3, 1e13)
+LAMBDA = Constant(
+    "lambda_pa", "λ", meaning="first Lamé parameter", bounds=STIFFNESS, widest=ANY_STIFFNESS
+)
+MU = Constant("mu_pa", "μ", meaning="shear modulus", bounds=STIFFNESS, widest=ANY_STIFFNESS)
 KAPPA = Constant("kappa_pa", "κ", meaning="bulk modulus", bounds=(1.0, 1e10))
-YOUNG = Constant("young_pa", "E", meaning="Young's modulus", bounds=STIFFNESS)
+YOUNG = Constant("young_pa", "E", meaning="Young's modulus", bounds=STIFFNESS, widest=ANY_STIFFNESS)
 POISSON = Constant(
     "poisson",
     "ν",
@@ -107,6 +115,7 @@ POISSON = Constant(
     typical=0.1,
     usual=0.3,
     below=0.5,
+    widest=(-0.9, 0.4999),
 )
 GAMMA_R = Constant(
     "gamma_r_s", "γ_r", meaning="stiffness-proportional damping", bounds=(1e-7, 10.0), usual=3e-3
@@ -114,7 +123,13 @@ GAMMA_R = Constant(
 GAMMA_M = Constant(
     "gamma_m_1_s", "γ_m", meaning="mass-proportional damping", bounds=(1e-4, 1e4), usual=0.3
 )
-C10 = Constant("c10_pa", "C₁₀", meaning="half the shear modulus, or a part of it", bounds=STIFFNESS)
+C10 = Constant(
+    "c10_pa",
+    "C₁₀",
+    meaning="half the shear modulus, or a part of it",
+    bounds=STIFFNESS,
+    widest=ANY_STIFFNESS,
+)
 C01 = Constant("c01_pa", "C₀₁", meaning="factor of the second invariant", bounds=STIFFNESS)
 C20 = Constant("c20_pa", "C₂₀", meaning="factor of (Ī₁ − 3)²", bounds=(-1e9, 1e9), scale="linear")
 C30 = Constant("c30_pa", "C₃₀", meaning="factor of (Ī₁ − 3)³", bounds=(-1e9, 1e9), scale="linear")
@@ -185,7 +200,7 @@ USUAL_SHARES = (1.0, 0.1, -0.1, -0.05)
 # Constants of a branch of the memory, preceded by the name of the branch: ``prony_1.share``.
 SHARE = Constant(
     "share", "g", meaning="stiffness that relaxes, relative to the long-term one",
-    bounds=(0.0, 20.0), scale="linear", typical=0.1, usual=0.1, at_least=0.0,
+    bounds=(0.0, 20.0), scale="linear", typical=0.1, usual=0.1, at_least=0.0, widest=(0.0, 1e6),
 )  # fmt: skip
 TAU = Constant("tau_s", "τ", meaning="relaxation time", bounds=(1e-4, 1e3), usual=0.3)
 DENSITY = Constant("density_kg_m3", "ρ", meaning="density", bounds=(1.0, 1e5))

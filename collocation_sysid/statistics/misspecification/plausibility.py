@@ -37,8 +37,8 @@ DENSITIES_KG_M3 = (10.0, 25_000.0)
 SIZES_M = (1e-4, 10.0)
 # Densities from which on a body contains metal [kg/m³].
 METAL_KG_M3 = 5e3
-# Smallest Young's modulus of a metal [Pa].
-SOFTEST_METAL_PA = 1e9
+# Young's modulus [Pa] that a metal exceeds; below the default bound, which tells nothing about it.
+SOFTEST_METAL_PA = 9e8
 # Factor outside these ranges from which on a value is rejected.
 IMPOSSIBLE = 100.0
 
