@@ -497,9 +497,15 @@ def _better_of(
         second = solve_with_renewed_correspondences(solver, again, watch=watch)
     except KeyboardInterrupt:
         return _as_interrupted(first)
-    gain = first.history[-1].loss - second.history[-1].loss
     if second.status is Status.INTERRUPTED:
         return replace(first, status=second.status, message=second.message)
+    gain = first.history[-1].loss - second.history[-1].loss if second.history else 0.0
+    if first.status.converged and not second.status.converged and gain > LEAST_GAIN:
+        note = (
+            f"{other.reason} fitted better (χ² lower by {gain:.3g}), but did not converge: "
+            f"{second.message}"
+        )
+        return replace(first, notes=(*first.notes, note))
     if not second.status.converged or (first.status.converged and gain <= LEAST_GAIN):
         return first
     note = f"{other.reason} found a better fit (χ² lower by {gain:.3g})"

@@ -27,7 +27,7 @@ from .budget.discretisation_error import Refinement
 from .budget.uncertainty_budget import source_label
 from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
-from .estimates import Estimate, display_name
+from .estimates import Estimate, display_name, is_liquid
 from .instrument_misfit import InstrumentMisfit
 from .misspecification.misspecification_hypothesis import Hypothesis
 from .probes.relaxed_assumptions import DRIFT, MEMORY, Probe, assumption_name
@@ -41,6 +41,8 @@ Verdict = Literal["good", "check", "doubtful"]
 
 # Factor of the misfit from which on a hypothesis is as good as certain.
 CERTAIN = 2.0
+# Codes of concerns about bounds from which others may follow.
+FIRST = "information/default-bound", "information/liquid"
 # Codes of hypotheses that stand for several, none of which is likely alone.
 OPEN_CAUSES = "several", "insufficient"
 # Probability of a false alarm of each test.
@@ -127,20 +129,14 @@ class Assessment:
     def from_concerns(cls, concerns: Iterable[Concern]) -> Assessment:
         """Build from concerns: "doubtful" ones come first, in their given order, then "check" ones.
 
-        A default bound at which a parameter ended comes before all others, with their gravest
-        grade: they may follow from it. Of several concerns with the same message the first is kept,
-        whatever its grade and code.
+        Those of `FIRST` come before all others, with their gravest grade, because the others may
+        follow from them. Of several concerns with the same message the first is kept, whatever its
+        grade and code.
         """
         by_message = {concern.message: concern for concern in reversed([*concerns])}
         gravest = sorted(reversed(by_message.values()), key=lambda each: each.grade == "check")
-        first = [
-            replace(each, grade=gravest[0].grade)
-            for each in gravest
-            if each.code == "information/default-bound"
-        ]
-        return cls(
-            (*first, *(each for each in gravest if each.code != "information/default-bound"))
-        )
+        first = [replace(e, grade=gravest[0].grade) for e in gravest if e.code in FIRST]
+        return cls((*first, *(each for each in gravest if each.code not in FIRST)))
 
     @property
     def verdict(self) -> Verdict:
@@ -279,9 +275,10 @@ def parameter_concerns(
     parameter has a standard error, so that there is no answer.
 
     Several parameters at stated bounds are one concern, "doubtful"; a single one is "check". Those
-    at default bounds of `parameters`, if given, are another one, "check". Mode coefficients of
-    fields do not count. That some parameters are not determined contradicts nothing and is no
-    concern: the table of the estimates shows it.
+    at default bounds of `parameters`, if given, are another one, "check", and so are shares of
+    memory that grew to the largest one. Mode coefficients of fields do not count. That some
+    parameters are not determined contradicts nothing and is no concern: the table of the estimates
+    shows it.
     """
     known = uncertainty.estimates
     estimates = {name: known[name] for name in uncertainty.names if name in known}
@@ -292,9 +289,9 @@ def parameter_concerns(
         and estimates[item.name].at_bound
         and is_default_bound(item, estimates[item.name].value)
     ]
-    bounded = [
-        name for name, estimate in estimates.items() if estimate.at_bound and name not in at_default
-    ]
+    at_bound = [name for name, estimate in estimates.items() if estimate.at_bound]
+    liquid = [name for name in at_bound if is_liquid(name, estimates[name])]
+    bounded = [name for name in at_bound if name not in (*at_default, *liquid)]
     undetermined = [
         name
         for name, estimate in estimates.items()
@@ -304,6 +301,7 @@ def parameter_concerns(
     code = "information/bounds" if several else "information/bound"
     return [
         *concern_if(bool(at_default), False, code="information/default-bound", names=at_default),
+        *concern_if(bool(liquid), False, code="information/liquid", names=liquid),
         *concern_if(bool(bounded), several, code=code, names=bounded),
         *concern_if(
             bool(undetermined) and len(undetermined) == len(estimates),

@@ -246,9 +246,12 @@ TOPICS: dict[str, Topic] = {
         messages={
             "bound": "{names} ended at its bound: widen the bound, or fix the parameter",
             "bounds": "{names} ended at their bounds: widen the bounds, or fix the parameters",
-            "default-bound": "{names} ended at a bound that the problem does not state, and no "
-            "better solution was found beyond it: the other reasons may follow from this; state "
-            "guess, lower and upper where the value may lie elsewhere, or fix the parameter",
+            "default-bound": "{names} ended at a bound that the problem does not state: the best "
+            "value may lie beyond it, and the other reasons may follow from this; state guess, "
+            "lower and upper, or fix the parameter",
+            "liquid": "the stress relaxes to zero, as that of a liquid: {names} grew without limit, "
+            "so that the data determine the instantaneous modulus and the relaxation times, and no "
+            "long-term modulus; record for longer if there is one",
             "none": "the data do not determine {names}: state known values or priors, or record a "
             "motion on which these parameters have a larger influence",
             "at-bound": "{name} is at a bound: widen the bound, or fix the parameter",

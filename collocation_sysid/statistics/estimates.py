@@ -354,6 +354,8 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
     for item in (each for each in parameters.free if each.name in estimates):
         name = item.name
         estimate = estimates[item.name]
+        if is_liquid(name, estimate):
+            continue  # the verdict tells it
         if estimate.at_bound:
             nearest = min(
                 ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
@@ -373,6 +375,15 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
         elif estimate.statistical_std_error is None:
             reasons[name] = str(estimate.reason)
     return [*notes, *_unidentifiable_notes(reasons)]
+
+
+def is_liquid(name: str, estimate: Estimate) -> bool:
+    """Return whether a share of memory ended at the largest one, so that no long-term modulus is
+    left.
+    """
+    if without_region(name) != SHARE.name or SHARE.widest is None:
+        return False
+    return estimate.at_bound and estimate.value > 0.99 * SHARE.widest[1]
 
 
 def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
@@ -427,13 +438,6 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
             notes.append(
                 f"the data do not determine whether there is memory: the share of {branch} "
                 f"may be 0, and is at most {share.statistical95[1]:.2g} (95 %)"
-            )
-        elif share.value > SHARE.bounds[1]:
-            left = 100 / (1 + share.value)
-            notes.append(
-                f"{branch} relaxes to {left:.2g} % of the stress at once, as that of a liquid: "
-                "the data determine the instantaneous modulus and the relaxation time, and no "
-                "long-term modulus; record for longer if there is one"
             )
         elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
             notes.append(
