@@ -40,6 +40,7 @@ from .formats.columns import (
     column_statement,
     fitting_column_names,
     name_and_unit,
+    other_columns_text,
     read_columns,
     similar_column_names,
 )
@@ -325,7 +326,8 @@ def _one_of(
         raise table.grid.error_at(
             f"the columns are {', '.join(table.grid.columns)}; found "
             f"{present or 'no column'} of the {what}, "
-            f"expected exactly one of {expected}, in these or other units. State "
+            f"expected exactly one of {expected}, in these or other units"
+            f"{other_columns_text(table.grid)}. State "
             f"{column_advice(table.grid, layout)}"
         )
     return there[0]

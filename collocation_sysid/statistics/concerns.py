@@ -394,7 +394,7 @@ TOPICS: dict[str, Topic] = {
             "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
             "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
             "improve the mesh there",
-            "locks": "Poisson's ratio is {poisson:.3g} at the guess and {element} elements lock "
+            "locks": "Poisson's ratio is {poisson:.6g} at the guess and {element} elements lock "
             "from {limit:g} on, so that the estimated stiffness will be too low: {remedy}",
             "few": "only about {cells:.1f} {element} elements lie across the body's thickness of "
             "{thickness_mm:.3g} mm, which makes it too {off} in bending, so that the "

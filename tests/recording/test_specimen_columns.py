@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
+from collocation_sysid.recording.formats.columns import name_and_unit
 from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
 
@@ -151,3 +152,40 @@ def test_the_volume_ratio_is_read_under_its_documented_name(tmp_path, header):
     path.write_text(f"{header},pressure (kPa)\n0.975,1.5\n0.95,2.9\n")
     table = read_specimen(path, SpecimenLayout(test="volumetric", columns={}))
     assert (1 + table.strain) ** 3 == pytest.approx([0.975, 0.95])
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "stretch,stress difference (MPa)",
+        "stretch,von Mises stress (MPa)",
+        "stretch,stress std (kPa)",
+        "strain rate (1),stress (MPa)",
+    ],
+)
+def test_a_word_that_makes_another_quantity_is_no_stress_or_strain(tmp_path, header):
+    path = tmp_path / "pull.csv"
+    path.write_text(f"{header}\n1,0\n1.1,2\n1.2,3\n")
+    with pytest.raises(cs.InputError) as raised:
+        read_specimen(path, SpecimenLayout(**of_test({})))
+    text = str(raised.value)
+    assert "makes it another quantity" in text
+    named = [name for statement in statements(text) for name in statement.values()]
+    assert not [name for name in named if "difference" in name or "Mises" in name or "std" in name]
+
+
+def test_a_column_of_errors_beside_the_stress_is_not_read(tmp_path):
+    path = tmp_path / "pull.csv"
+    path.write_text("stretch,stress (kPa),stress error (kPa)\n1,0,9\n1.1,2,9\n1.2,3,9\n")
+    table = read_specimen(path, SpecimenLayout(**of_test({})))
+    np.testing.assert_allclose(table.stress_pa, [0, 2e3, 3e3])
+
+
+@pytest.mark.parametrize(
+    ("column", "factor"),
+    [("stress_kgf_cm2", 98066.5), ("stress_n_mm2", 1e6), ("true_stress_kn_m2", 1e3)],
+)
+def test_units_per_area_are_read_with_underscores(column, factor):
+    name, unit = name_and_unit(column)
+    assert name == column.split("stress")[0] + "stress"
+    assert si_factor(unit, "pressure") == factor

@@ -109,6 +109,8 @@ _NAMED = re.compile(
     r"(?P<name>.*?)\s*(?:[(\[](?P<bracketed>[^()\[\]]*)[)\]]"
     r"|(?:_|\s/\s*|\sin\s)(?P<behind>[^\s_]+))"
 )
+# A unit with underscores, as in stress_kgf_cm2.
+_PER_AREA = re.compile(r"(?P<name>.+)_(?P<unit>[^\W_]+)_(?P<area>[^\W_]+)")
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
 _DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
 # Words in the name of a column that distinguish quantities with the same other words, by key.
@@ -116,6 +118,12 @@ QUALIFIERS = {
     "deformed": _DEFORMED,
     "second": {"second", "zweite"},
     "lateral": {"lateral", "transverse", "quer", "querdehnung"},
+    # Of no quantity: values that are computed from others, of something else, or not measured.
+    "other": {
+        *("difference", "differenz", "différence", "deviatoric", "hydrostatic", "mises", "tresca"),
+        *("volumetric", "rate", "energy", "error", "fehler", "deviation", "abweichung", "std"),
+        *("uncertainty", "residual", "target", "setpoint", "command", "commanded", "sollwert"),
+    },
 }
 
 
@@ -339,7 +347,11 @@ def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
                 and si_factor(unit, quantity.dimension) is not None
             )
             others = KNOWN_QUANTITIES
-        if is_similar and not any(_name_fits(column, each) for each in others):
+        if (
+            is_similar
+            and not _other_word(column)
+            and not any(_name_fits(column, each) for each in others)
+        ):
             names.append(column)
     return names
 
@@ -363,10 +375,33 @@ def _name_fits(column: str, quantity: Quantity) -> bool:
     return _key_of(name) == quantity.key or bool(called and qualifiers == own)
 
 
+def other_columns_text(grid: TextTable) -> str:
+    """Return the addition to a message on missing columns that names those of other quantities,
+    such as a stress difference; "" without any.
+    """
+    others = {column: word for column in grid.columns if (word := _other_word(column))}
+    return "".join(
+        f"; {column} is not read, because the word {word!r} makes it another quantity"
+        for column, word in others.items()
+    )
+
+
+def _other_word(column: str) -> str:
+    """Return the word of a column's name that makes it another quantity than any that is read; ""
+    without one.
+    """
+    return next(iter(sorted(_words(name_and_unit(column)[0]) & QUALIFIERS["other"])), "")
+
+
 def name_and_unit(column: str) -> tuple[str, str | None]:
     """Return the parts of a column's name: ("Load", "kN") of "Load (kN)"; the unit is None without
     one, or if the brackets are empty.
     """
+    parts = _PER_AREA.fullmatch(column)
+    if parts is not None:
+        unit = f"{parts['unit']}/{parts['area']}"
+        if si_factor(unit, STRESS.dimension) is not None:
+            return parts["name"], unit
     parts = _NAMED.fullmatch(column)
     if parts is None or _key_of(column) in {quantity.key for quantity in KNOWN_QUANTITIES}:
         return column, None
@@ -412,7 +447,7 @@ def _columns_error(
     return grid.error_at(
         f"the columns are {', '.join(grid.columns)}; expected {TIME.column} and "
         f"{'all' if all_of else 'any'} of {expected}, each once, in these or other units"
-        f"{why}{''.join(needed)}"
+        f"{why}{''.join(needed)}{other_columns_text(grid)}"
     )
 
 
