@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..recording.experiment import Experiment
+from ..recording.specimen import LATERAL_NAME
 from ..recording.specimen_files import specimen_strains
 from .concerns import Concern
 
@@ -25,6 +26,10 @@ SPECIMEN_CODES: Mapping[str, str] = {
 }
 # Laws of rubber to compare, in the order of their number of constants.
 COMPARED_LAWS = ("neo-hookean", "mooney-rivlin", "yeoh", "ogden-2")
+# Laws to compare for foams, whose volume changes.
+FOAM_LAWS = ("neo-hookean", "hyperfoam-1", "hyperfoam-2")
+# Largest change of the logarithm of a volume, relative to that of the stretch, in rubber.
+LITTLE_DILATATION = 0.1
 
 
 def as_specimen_concerns(
@@ -64,8 +69,30 @@ def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
     laws = list(
         dict.fromkeys(part.material.name for each in experiments for part in each.body.parts)
     )
-    others = [*laws, *(law for law in COMPARED_LAWS if law not in laws)]
+    is_foam = any(law.startswith("hyperfoam-") for law in laws)
+    is_foam |= any(_changes_volume(each) for each in experiments)
+    compared = FOAM_LAWS if is_foam else COMPARED_LAWS
+    others = [*laws, *(law for law in compared if law not in laws)]
     return {"laws": laws, "range": " and ".join(_ranges(experiments)), "others": ",".join(others)}
+
+
+def _changes_volume(experiment: Experiment) -> bool:
+    """Return whether the measured lateral stretches of a uniaxial test show a change of volume:
+    by the median over the larger half of the strains.
+    """
+    if experiment.specimen is None or experiment.specimen.test != "uniaxial":
+        return False
+    for gauge in experiment.readings:
+        if gauge.name != LATERAL_NAME or gauge.values is None:
+            continue
+        logarithm = np.log1p(specimen_strains(experiment)[0])
+        lateral = np.asarray(gauge.values, dtype=float)[:, 0]
+        is_large = np.abs(logarithm) >= np.median(np.abs(logarithm))
+        is_large &= np.isfinite(lateral) & (logarithm != 0) & (lateral > 0)
+        if is_large.any():
+            dilatation = 1 + 2 * np.log(lateral[is_large]) / logarithm[is_large]
+            return bool(np.abs(np.median(dilatation)) > LITTLE_DILATATION)
+    return False
 
 
 def _ranges(experiments: Sequence[Experiment]) -> Iterator[str]:

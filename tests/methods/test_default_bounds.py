@@ -14,7 +14,7 @@ from collocation_sysid.statistics.concerns import Concern
 UNDAMPED = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 
 
-def metal_wire(**statement: float) -> cs.Solution:
+def metal_wire(upper: float | None = None) -> cs.Solution:
     """Solution of a tensile test of a wire of 70 GPa."""
     strain = np.linspace(1e-4, 2e-3, 12)
     noise = np.random.default_rng(1).standard_normal(len(strain))
@@ -22,7 +22,7 @@ def metal_wire(**statement: float) -> cs.Solution:
     return cs.solve(
         cs.Problem(
             [specimen.experiment("neo-hookean", "wire")],
-            {"young_pa": cs.Unknown(**statement), "poisson": 0.33, **UNDAMPED},
+            {"young_pa": cs.Unknown(upper=upper), "poisson": 0.33, **UNDAMPED},
         )
     )
 

@@ -187,5 +187,6 @@ def test_a_column_of_errors_beside_the_stress_is_not_read(tmp_path):
 )
 def test_units_per_area_are_read_with_underscores(column, factor):
     name, unit = name_and_unit(column)
+    assert unit is not None
     assert name == column.split("stress")[0] + "stress"
     assert si_factor(unit, "pressure") == factor

@@ -1,0 +1,37 @@
+"""Laws that a misfit of a specimen advises to compare are those of its kind of material."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.statistics.concerns import Concern
+from collocation_sysid.statistics.specimen_concerns import as_specimen_concerns
+
+STRAIN = np.linspace(-0.4, 0.3, 15)
+
+
+def advised(material: str, lateral_power: float | None = None) -> str:
+    """Message on the misfit of a uniaxial test, with lateral stretches λ^power."""
+    specimen = cs.Specimen("uniaxial", STRAIN, 1e4 * STRAIN, 10.0)
+    if lateral_power is not None:
+        specimen = replace(specimen, lateral_stretch=(1 + STRAIN) ** lateral_power)
+    concerns = [Concern("noise/larger", data={"factor": 3.0, "stated": "sigma_m"})]
+    return as_specimen_concerns(concerns, [specimen.experiment(material)])[0].message
+
+
+@pytest.mark.parametrize(("material", "power"), [("hyperfoam-1", None), ("neo-hookean", -0.1)])
+def test_foams_are_compared_with_laws_of_foams(material, power):
+    message = advised(material, power)
+    assert "hyperfoam-2" in message
+    assert "yeoh" not in message
+    assert "ogden" not in message
+
+
+@pytest.mark.parametrize("power", [None, -0.48])
+def test_rubbers_are_compared_with_laws_of_rubbers(power):
+    message = advised("neo-hookean", power)
+    assert "--materials neo-hookean,mooney-rivlin,yeoh,ogden-2" in message
