@@ -16,7 +16,7 @@ from ..common.files import replaced_file, require_possible, run_name
 from ..common.serialisation import as_json
 from ..common.signal_handling import INTERRUPTS
 from ..common.validated_classes import validated
-from ..errors import SimulationError
+from ..errors import InputError, SimulationError
 from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import Run, run
@@ -109,6 +109,7 @@ def solve(options: SolveCommand) -> None:
     problem = options.read_problem()
     require_possible(folder)
     require_replaceable(folder)
+    no_output = None
     with ExitStack() as until_saved:
         with SolveProgress(
             error_console, problem, verbose=options.verbose, quiet=options.quiet
@@ -129,9 +130,12 @@ def solve(options: SolveCommand) -> None:
                 ) from None
             until_saved.enter_context(INTERRUPTS.deferred())
         if not options.as_json:
-            print_result(
-                run_summary(finished.result, details=options.details, budget=options.budget)
-            )
+            try:
+                print_result(
+                    run_summary(finished.result, details=options.details, budget=options.budget)
+                )
+            except OSError as error:  # a standard output that is closed or full loses no run
+                no_output = error
         # Notes of the problem were shown before.
         with SolveProgress(
             error_console,
@@ -140,7 +144,14 @@ def solve(options: SolveCommand) -> None:
             quiet=options.quiet,
             activity="writing the run folder",
         ):
-            finished.save(folder, pictures=False)
+            try:
+                finished.save(folder, pictures=False)
+            except InputError:
+                if options.as_json:
+                    typer.echo(as_json(finished.result))
+                raise
+        if no_output is not None:
+            raise no_output
         if not options.as_json:
             print_result(f"written to {folder}")
         drawn = _draw_pictures(finished, folder, options=options, until_saved=until_saved)

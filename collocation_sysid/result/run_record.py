@@ -6,10 +6,14 @@ gives the arrays of each experiment to pictures and films without a folder.
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -45,6 +49,9 @@ def write_run(
     the pictures after the folder is in its place, so that an error while drawing does not lose the
     result.
 
+    If the disk is full or fails, the run is kept in a folder for temporary files, or as much of it
+    as that has room for; the message names it.
+
     Parameters
     ----------
     solved : SolvedProblem
@@ -60,12 +67,50 @@ def write_run(
         If the folder holds anything but an earlier run, see `replaced_folder`, or a file or
         picture cannot be written.
     """
-    result = build_result(solved)
+    try:
+        _write_folder(solved, Path(folder), frames=frames)
+    except OSError as error:
+        full = InputError(f"this cannot be written: {error.strerror or error}", folder)
+        raise _kept_elsewhere(solved, full, frames=frames) from error
+    except InputError as error:
+        if isinstance(error.__cause__, OSError):
+            raise _kept_elsewhere(solved, error, frames=frames) from error
+        raise
+    if pictures:
+        draw_run(solved, Path(folder))
+    return Path(folder)
+
+
+def _kept_elsewhere(solved: SolvedProblem, error: InputError, frames: bool) -> InputError:
+    """Write a run that could not be written (`error`) into a folder for temporary files, and return
+    the error whose message names it; if that fails, too, the error unchanged.
+    """
+    for content in (partial(_write_folder, frames=frames), _write_answer):
+        with suppress(InputError, OSError):
+            folder = Path(mkdtemp(prefix="collocation-sysid-run-"))
+            try:
+                content(solved, folder)
+            except (InputError, OSError):
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            what = "the run" if content is not _write_answer else f"its {RESULT_FILE} alone"
+            message = f"{error.message}; {what} is kept in {folder}: move it to another disk"
+            return InputError(message, error.source, where=error.where)
+    return error
+
+
+def _write_answer(solved: SolvedProblem, place: Path) -> None:
+    """Write ``result.json``, and ``problem.toml`` if the problem has a file, into a folder."""
+    (place / RESULT_FILE).write_text(_result_text(build_result(solved)), encoding="utf-8")
+    origin = solved.problem.origin
+    if origin is not None:
+        (place / "problem.toml").write_text(origin.text, encoding="utf-8")
+
+
+def _write_folder(solved: SolvedProblem, folder: Path, frames: bool) -> None:
+    """Write the folder of a run, see `write_run`, without pictures."""
     with replaced_folder(folder) as place:
-        origin = solved.problem.origin
-        if origin is not None:
-            (place / "problem.toml").write_text(origin.text, encoding="utf-8")
-        (place / RESULT_FILE).write_text(_result_text(result), encoding="utf-8")
+        _write_answer(solved, place)
         if solved.refinement is not None and solved.refinement.levels:
             text = as_json(solved.refinement)
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
@@ -73,9 +118,6 @@ def write_run(
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **arrays)
         if frames:
             write_all_frames(solved, place)
-    if pictures:
-        draw_run(solved, Path(folder))
-    return Path(folder)
 
 
 def draw_run(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,8 +16,12 @@ from pathlib import Path
 import pytest
 from kit.problem_files import Outcome, contents, run_command, settings, write_problem
 
+from collocation_sysid.cli import problem_commands
 from collocation_sysid.common.files import replaced_file, write_text_file
+from collocation_sysid.result import run_record
+from collocation_sysid.result.replay import read_run
 from collocation_sysid.result.run_writers import replaced_folder
+from collocation_sysid.runs.result_content import Result
 
 resource = pytest.importorskip("resource", reason="limits of POSIX")
 
@@ -150,3 +156,56 @@ def test_an_output_that_is_full_is_told():
     assert done.returncode == 2
     assert done.stderr.startswith("error: standard output, or a temporary file: No space left")
     assert done.stderr.count("\n") == 1
+
+
+def full_disk(*_: object, **__: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def solved_on_a_full_disk(tiny: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> Outcome:
+    """Solve where temporary files go to the folder "spare"."""
+    (tiny / "spare").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tiny / "spare"))
+    method = settings("solver.method=reduced-space")
+    return run_command("solve", "problem.toml", *method, "--out", "run", *words)
+
+
+def test_a_run_that_finds_no_room_is_kept_whole_elsewhere(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch
+):
+    write = run_record.write_all_frames
+    monkeypatch.setattr(
+        run_record,
+        "write_all_frames",
+        lambda solved, place: (write if "spare" in str(place) else full_disk)(solved, place),
+    )
+    outcome = solved_on_a_full_disk(tiny, monkeypatch, "-q")
+    (kept,) = (tiny / "spare").iterdir()
+    assert outcome.code == 2
+    assert f"No space left on device; the run is kept in {kept}: move it" in outcome.err
+    assert not (tiny / "run").exists()
+    assert (kept / "trajectory.npz").is_file()
+    result, _ = read_run(kept)
+    assert result.status == "converged"
+
+
+def test_the_result_alone_is_kept_if_there_is_room_for_no_more(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(run_record, "write_all_frames", full_disk)
+    outcome = solved_on_a_full_disk(tiny, monkeypatch, "--json", "-q")
+    (kept,) = (tiny / "spare").iterdir()
+    assert outcome.code == 2
+    assert f"its result.json alone is kept in {kept}: move it" in outcome.err
+    assert {each.name for each in kept.iterdir()} == {"result.json", "problem.toml"}
+    assert Result.read(kept).status == "converged"
+    assert json.loads(outcome.out)["status"] == "converged"
+
+
+def test_output_that_cannot_be_written_loses_no_run(tiny: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(problem_commands, "print_result", full_disk)
+    method = settings("solver.method=reduced-space")
+    outcome = run_command("solve", "problem.toml", *method, "--out", "run", "-q")
+    assert outcome.code == 2
+    assert "No space left on device" in outcome.err
+    assert Result.read(tiny / "run").status == "converged"
