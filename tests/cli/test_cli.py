@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import xml.etree.ElementTree as ElementTree
@@ -741,11 +742,16 @@ def test_an_output_that_cannot_be_written_is_explained(tiny, monkeypatch):
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device", "run/trajectory.npz")
 
+    spare = tiny / "spare"
+    spare.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(spare))
     monkeypatch.setattr(np, "savez_compressed", full)
     outcome = run_command("solve", "problem.toml", "--out", "run")
+    (kept,) = spare.iterdir()
     assert outcome.code == 2
-    assert (
-        outcome.err == f"error: {tiny / 'run'}: this cannot be written: No space left on device\n"
+    assert outcome.err == (
+        f"error: {tiny / 'run'}: this cannot be written: No space left on device; its result.json "
+        f"alone is kept in {kept}: move it to another disk\n"
     )
     assert not (tiny / "run").exists()
     assert not list(tiny.glob(".run*"))
