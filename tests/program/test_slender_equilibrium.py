@@ -47,8 +47,13 @@ def theta_of(body: Body, poisson: float) -> NDArray[np.float64]:
     return body.theta_from_values(values)
 
 
-@pytest.mark.parametrize(("element", "poisson"), [("tet4", 0.45), ("tet10-p0", 0.49)])
-def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(element, poisson, monkeypatch):
+@pytest.mark.parametrize(
+    ("element", "poisson", "most"),
+    [("tet4", 0.45, 12), ("tet4", 0.49, 12), ("tet10-p0", 0.49, 12), ("tet10-p0", 0.499, 40)],
+)
+def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(
+    element, poisson, most, monkeypatch
+):
     bar = notched_bar(element)
     factorised = []
     factorise = Factoriser.factorise
@@ -61,7 +66,7 @@ def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(element, pois
     x = equilibrium(bar, theta_of(bar.body, poisson)).reshape(-1, 3)
     sag_m = -(x - bar.body.nodes_m)[:, 2].min()
     assert sag_m > 0.5 * SIZE_M[0]
-    assert len(factorised) <= 40
+    assert len(factorised) <= most
 
 
 def test_a_limit_on_the_iterations_ends_the_search_with_an_explanation():
@@ -85,6 +90,14 @@ def test_a_rotation_of_the_whole_body_is_applied_without_strain(element):
     lengths = np.linalg.norm(turned - turned[0], axis=1)
     np.testing.assert_allclose(lengths, np.linalg.norm(x - x[0], axis=1), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(body.volume_ratios(turned.ravel()), 1.0, rtol=1e-6)
+
+
+def test_a_strain_without_trace_keeps_the_volume():
+    body = notched_bar("tet10-p0").body
+    x = body.nodes_m
+    free = np.zeros(x.shape, dtype=bool)
+    stretched = Retraction(body, free)(x.ravel(), (x * [0.3, -0.2, -0.1]).ravel())
+    np.testing.assert_allclose(body.volume_ratios(stretched), 1.0, rtol=1e-6)
 
 
 def test_small_increments_are_added():

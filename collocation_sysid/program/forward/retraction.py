@@ -7,10 +7,12 @@ next steps. The retraction applies the same increment as rotation and strain (ro
 coordinates: Huang, Tong, Zhou, Bao and Desbrun, IEEE TVCG 17, 2011): with the deformation
 gradient F and the gradient of the increment H = ∇δ F⁻¹ = ε + ω, its symmetric and skew part,
 
-    F_new = exp(ω) (I + ε) F
+    F_new = exp(ω) exp(ε) F
 
 at each quadrature point, and the new positions y minimise Σ V ‖∇y − F_new‖². To first order in δ
-they are x + δ, so that Newton's method keeps its order.
+they are x + δ, so that Newton's method keeps its order. The exponential of ε keeps volumes where its
+trace is zero: I + ε would change them in second order, which in a nearly incompressible body makes
+pressures with which the stiffness is indefinite.
 """
 
 from __future__ import annotations
@@ -101,13 +103,19 @@ class Retraction:
         spin = (relative - relative.transpose(0, 2, 1)) / 2
         vectors = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
         rotation = Rotation.from_rotvec(vectors).as_matrix()
-        target = rotation @ (np.eye(3) + strain) @ deformation
+        target = rotation @ _exponential(strain) @ deformation
         return target.transpose(2, 0, 1).reshape(-1, 3)
 
     def _deformation(self, field: Array) -> Array:
         """Return the gradient (points, 3, 3) of a nodal field (3n,) by the undeformed positions."""
         by_axis = (self._gradient @ field.reshape(-1, 3)).reshape(3, -1, 3)
         return by_axis.transpose(1, 2, 0)
+
+
+def _exponential(strain: Array) -> Array:
+    """Return the exponentials of symmetric matrices (points, 3, 3)."""
+    values, vectors = np.linalg.eigh(strain)
+    return (vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
 
 
 def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
