@@ -98,7 +98,8 @@ class ExplainCommand:
     "explain theory | less",
 )
 def explain(options: ExplainCommand) -> None:
-    """Show pages of the documentation, or list their topics; describe keys of the problem file.
+    """Show pages of the documentation, or list their topics; describe keys of the problem file,
+    constants and rows of the uncertainty budget.
 
     Pages are part of the installation; no network is needed. If the output is not a terminal, they
     are printed as Markdown.
@@ -118,7 +119,9 @@ def explain(options: ExplainCommand) -> None:
     console = PlainConsole()
     for topic in options.topics:
         if topic not in page_files():
-            print_result(_key_table(topic))
+            for table in (_key_table(topic), _word_table(topic)):
+                if table.rows:
+                    print_result(table)
         elif console.is_terminal:
             from .markdown import TerminalPage
 
@@ -128,10 +131,12 @@ def explain(options: ExplainCommand) -> None:
 
 
 def _require_topic(topic: str) -> None:
-    """Raise an `InputError` unless a page or a key of the problem file has this name."""
+    """Raise an `InputError` unless a page, a key of the problem file, a constant or a row of the
+    uncertainty budget has this name.
+    """
     from ..problem.key_descriptions import all_keys, find_keys
 
-    if topic in page_files() or find_keys(topic):
+    if topic in page_files() or find_keys(topic) or _word_table(topic).rows:
         return
     names = [each.path.rpartition(".")[2] for each in all_keys()]
     known = [*page_files(), *dict.fromkeys(names)]
@@ -151,6 +156,35 @@ def _key_table(name: str) -> Table:
     rows = tuple((each.path, each.form, each.default, each.description) for each in find_keys(name))
     heads = ("key", "values", "default", "meaning")
     return Table("", heads, rows=rows, names=3, texts=1)
+
+
+def _word_table(word: str) -> Table:
+    """Return the table of the constants with a name or symbol, and of the rows of the uncertainty
+    budget with a label: name, symbol and meaning.
+    """
+    from ..fem.laws.constants import KNOWN, constants_with_symbol, unit_of
+    from ..statistics.budget.systematic_effects import ASSUMPTIONS
+    from ..statistics.budget.uncertainty_budget import source_label
+    from ..statistics.remedies import REMEDIES
+
+    constants = [word] if word in KNOWN else constants_with_symbol(word)
+    rows = [
+        (name, f"{KNOWN[name].symbol} {unit_of(name)}".strip(), KNOWN[name].meaning)
+        for name in constants
+    ]
+    sources = {
+        component: (each.name, each.description)
+        for each in ASSUMPTIONS
+        for component in (each.name, *each.list_components())
+    }
+    sources |= {
+        name: (name, "contribution to the uncertainty") for name in REMEDIES if name not in sources
+    }
+    labels = {source_label(source): about for source, about in sources.items()}
+    if about := sources.get(word) or labels.get(word):
+        name, meaning = about
+        rows.append((name, "uncertainty", f"{meaning}; to reduce it, {REMEDIES[name]}"))
+    return Table("", ("name", "", "meaning"), rows=tuple(rows), names=2, texts=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,6 +29,7 @@ from ..fem.laws.constants import (
     Constant,
     Scale,
     constant_named,
+    constants_with_symbol,
     is_density,
     is_known_constant,
     is_modulus,
@@ -280,9 +281,11 @@ def complete_parameter(
         low = 1e-9 * high
     prior = user_statement.prior or constant.prior
     if user_statement.guess is None and prior is None and usual_value(name, 1.0) is None:
+        meant = constants_with_symbol(without_region(name))
+        hint = f"; did you mean {' or '.join(map(repr, meant))}?" if meant else ""
         raise InputError(
             "this parameter has no guess, and no usual value of it is known; expected guess = a "
-            "value",
+            f"value{hint}",
             None,
             where=name,
         )
@@ -782,8 +785,11 @@ class Parameters:
                 # Names with and without a region are one entry: those without come first.
                 plain = [n for n in known if "." not in n] or known
                 expected = ", ".join(dict.fromkeys(plain))
+                meant = [n for n in constants_with_symbol(key) if n in known]
+                hint = f"; did you mean {' or '.join(map(repr, meant))}?" if meant else ""
                 raise InputError(
-                    f"the model has no such parameter; expected one of {expected}{hint_at(name, known)}",
+                    f"the model has no such parameter; expected one of {expected}"
+                    f"{hint or hint_at(name, known)}",
                     None,
                     where=name,
                 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from email.message import Message
 from importlib import metadata
 from pathlib import Path
@@ -11,12 +12,17 @@ import pytest
 from kit.problem_files import run_command
 
 from collocation_sysid.cli.markdown import TerminalPage
+from collocation_sysid.cli.texts import _key_table, _word_table
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.pages import page_files, page_text, page_url
+from collocation_sysid.fem.laws.constants import KNOWN, constants_with_symbol
 from collocation_sysid.problem.key_descriptions import all_keys, find_keys
 from collocation_sysid.result.run_sections import remedy_command, remedy_lines
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
+from collocation_sysid.statistics.budget.uncertainty_budget import source_label
 from collocation_sysid.statistics.concerns import TOPICS, Concern
+from collocation_sysid.statistics.remedies import REMEDIES
 
 ROOT = Path(__file__).parents[2]
 CONCERNS = (Concern("residuals/persist"), Concern("scheme/step"), Concern("solve/no-start"))
@@ -114,3 +120,57 @@ def test_reports_link_to_the_documentation_that_the_project_states(
         assert page_url("theory") == f"{base}theory.html"
         assert links[0] == f"{base}howto/trust.html"
         assert len(links) == len(CONCERNS)
+
+
+def test_every_key_has_a_table():
+    for each in all_keys():
+        assert _key_table(each.path).rows, each.path
+
+
+def test_every_printed_constant_has_a_meaning():
+    for name, constant in KNOWN.items():
+        for word in (name, constant.symbol):
+            assert any(row[0] == name and row[2] for row in _word_table(word).rows), word
+
+
+def test_every_row_of_the_budget_is_explained():
+    sources = [*REMEDIES, *(part for each in ASSUMPTIONS for part in each.list_components())]
+    for source in sources:
+        (row,) = _word_table(source_label(source)).rows[-1:]
+        assert row[1] == "uncertainty", source
+
+
+@pytest.mark.parametrize(
+    ("word", "names"),
+    [
+        ("E", ["young_pa"]),
+        ("nu", ["poisson"]),
+        ("ν", ["poisson"]),
+        ("lambda", ["lambda_pa"]),
+        ("mu", ["mu_pa"]),
+        ("gamma", ["gamma_r_s", "gamma_m_1_s"]),
+        ("x", []),
+    ],
+)
+def test_symbols_name_constants(word: str, names: list[str]):
+    assert constants_with_symbol(word) == names
+
+
+def test_labels_are_explained_by_the_command():
+    shown = " ".join(run_command("explain", "grip layer", "E").out.split())
+    assert "grip_layer_m" in shown
+    assert "glue the body to a stiff plate" in shown
+    assert "young_pa" in shown
+
+
+@pytest.mark.parametrize(
+    ("symbol", "name"), [("E", "young_pa"), ("nu", "poisson"), ("ν", "poisson")]
+)
+def test_a_symbol_among_the_parameters_names_the_key(tmp_path: Path, symbol: str, name: str):
+    assert run_command("new", tmp_path / "bench", "--kind", "compression").code == 0
+    file = tmp_path / "bench" / "problem.toml"
+    text = file.read_text()
+    file.write_text(re.sub(rf"^{name} +=", f'"{symbol}" =', text, flags=re.MULTILINE))
+    outcome = run_command("check", file)
+    assert outcome.code == 2
+    assert f"did you mean {name!r}?" in outcome.err

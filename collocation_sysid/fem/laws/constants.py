@@ -7,6 +7,7 @@ region is preceded by the region: ``core.mu_pa``.
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -290,6 +291,34 @@ def symbol_of(name: str) -> str:
         KNOWN[name_in_region].symbol if name_in_region in KNOWN else without_unit(name_in_region)
     )
     return f"{symbol} {region}".strip()
+
+
+_LETTERS = {
+    "α": "alpha",
+    "β": "beta",
+    "γ": "gamma",
+    "κ": "kappa",
+    "λ": "lambda",
+    "μ": "mu",
+    "ν": "nu",
+    "ρ": "rho",
+    "τ": "tau",
+}
+
+
+def constants_with_symbol(word: str) -> list[str]:
+    """Return the names of the constants whose symbol is a word, such as "E", "ν" or "nu", or begins
+    with it and an underscore, such as "gamma"; empty for none.
+    """
+
+    def spelled(symbol: str) -> str:
+        plain = unicodedata.normalize("NFKC", symbol)
+        return "".join(_LETTERS.get(unicodedata.normalize("NFKC", a), a) for a in plain).lower()
+
+    symbols = {name: spelled(each.symbol) for name, each in KNOWN.items() if each.symbol}
+    sought = spelled(word)
+    exact = [name for name, symbol in symbols.items() if symbol == sought]
+    return exact or [name for name, symbol in symbols.items() if symbol.startswith(f"{sought}_")]
 
 
 def symbol_with_unit(name: str) -> str:
