@@ -98,8 +98,9 @@ _SENTENCES = {
     Status.INTERRUPTED: "Interrupted; this is the best iterate so far.",
     Status.CLUSTER_DISCONNECTED: "The cluster was lost; this is the best iterate so far, "
     "simulated on this machine. Continue from it with --start.",
-    Status.NOT_SIMULABLE: "The body cannot be simulated at the guess; start from stiffer or less "
-    "damped parameters or without a guess, or use interior-point, which needs no simulation.",
+    Status.NOT_SIMULABLE: "The body cannot be simulated at the values where the search began; "
+    "give stiffer or less damped ones, omit the guess, if one is given, or use interior-point, "
+    "which needs no simulation.",
     Status.REFUSED: "The solver refused the problem or one of its options.",
 }
 
