@@ -63,30 +63,41 @@ def start_beyond_bounds(solution: Solution) -> SecondStart | None:
     None if no parameter ended at a default bound that can be widened.
 
     Bounds that equal the default ones count as not stated. Beyond its bound a share of memory is
-    estimated by its logarithm: the long-term modulus falls as it grows.
+    estimated by its logarithm: the long-term modulus falls as it grows. The upper bound of
+    Poisson's ratio remains for elements that lock near one half.
     """
     parameters = solution.collocation.parameters
     lower, upper = parameters.compute_bounds_q()
     known = parameter_values(solution.collocation, solution.q)
+    locks = any(
+        each.experiment.specimen is None and not each.body.element.mean_dilatation
+        for each in solution.collocation.transcriptions
+    )
     ended = {
         item.name: known[item.name]
         for item, distance in zip(
             parameters.free, np.minimum(solution.q - lower, upper - solution.q), strict=True
         )
-        if distance < AT_BOUND and is_default_bound(item, known[item.name])
+        if distance < AT_BOUND
+        and is_default_bound(item, known[item.name])
+        and not (locks and _is_nearly_half(item.name, known[item.name]))
     }
     if not ended:
         return None
     listed = " and ".join(f"{name} = {bound:.4g}" for name, bound in ended.items())
     values = {item.name: known[item.name] for item in parameters.free}
     return SecondStart(
-        parameters.map_components(lambda item: _widened(item, ended)).with_estimates(values),
+        parameters.map_components(lambda item: _widened(item, ended, locks)).with_estimates(values),
         f"the search ended at the default bound{'s' * (len(ended) > 1)} {listed}; a second one, "
         "with wider bounds,",
     )
 
 
-def _widened(item: Parameter, ended: Container[str]) -> Parameter:
+def _is_nearly_half(name: str, value: float) -> bool:
+    return without_region(name) == "poisson" and value > NEARLY_INCOMPRESSIBLE
+
+
+def _widened(item: Parameter, ended: Container[str], locks: bool) -> Parameter:
     """Return a parameter with the widest bounds in place of its default ones, of shares those that
     ended at one.
     """
@@ -98,7 +109,8 @@ def _widened(item: Parameter, ended: Container[str]) -> Parameter:
         return item
     lower, upper = constant_named(item.name).bounds
     lower = widest[0] if item.lower == lower else item.lower
-    upper = widest[1] if item.upper == upper else item.upper
+    keeps_upper = item.upper != upper or (locks and _is_nearly_half(item.name, upper))
+    upper = item.upper if keeps_upper else widest[1]
     if is_share:
         return replace(item, lower=max(lower, LITTLE_MEMORY), upper=upper, scale="log", unit=1.0)
     return replace(item, lower=lower, upper=upper)

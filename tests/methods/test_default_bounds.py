@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from kit.problems import hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.model.parameters import Parameter, is_default_bound
@@ -65,6 +66,16 @@ def test_a_physical_limit_is_no_default_bound():
     share = Parameter("b.share", 0.1, 0.0, 20.0, scale="linear", unit=0.1)
     assert is_default_bound(share, 20.0)
     assert not is_default_bound(share, 0.0)
+
+
+def test_elements_that_lock_keep_the_upper_bound_of_the_ratio():
+    cube = hung_cube()
+    truth = {"young_pa": 600.0, "poisson": 0.495, "gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
+    tracks_m = cs.simulate(cube, truth, "midpoint", substeps=1).markers_m
+    statements = {**truth, "poisson": cs.Unknown(0.49499)}
+    solution = cs.solve(cs.Problem([cs.with_markers(cube, tracks_m)], statements))
+    assert solution.parameters["poisson"] == pytest.approx(0.495, abs=1e-4)
+    assert start_beyond_bounds(solution) is None
 
 
 def test_a_default_bound_is_the_first_reason_with_the_gravest_grade():

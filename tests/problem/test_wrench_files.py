@@ -50,7 +50,7 @@ def test_components_that_are_not_measured_are_left_out(tmp_path: Path):
 
 
 BAD = {
-    "no unit": (lines("t_s,fx,fy_n,fz_n,tx_nm,ty_nm,tz_nm"), ["fx names no unit", "fx_n"]),
+    "no unit": (lines("t_s,fx,fy_n,fz_n,tx_nm,ty_nm,tz_nm"), ["fx names no unit", "for example fx (n)"]),
     "a mass": (
         lines("t_s,fx_kg,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),
         ["fx_kg has the unit kg", "a unit of force", "kgf", "fx_n"],
