@@ -50,7 +50,10 @@ def test_components_that_are_not_measured_are_left_out(tmp_path: Path):
 
 
 BAD = {
-    "no unit": (lines("t_s,fx,fy_n,fz_n,tx_nm,ty_nm,tz_nm"), ["fx names no unit", "for example fx (n)"]),
+    "no unit": (
+        lines("t_s,fx,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),
+        ["fx names no unit", "for example fx (n)"],
+    ),
     "a mass": (
         lines("t_s,fx_kg,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),
         ["fx_kg has the unit kg", "a unit of force", "kgf", "fx_n"],
@@ -66,7 +69,7 @@ BAD = {
     ),
     "no time": (
         lines("time,fx_n,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),
-        ["column time names no unit", "t_s"],
+        ["column time names no unit", "for example time (s)"],
     ),
     "only times": ("t_s\n0\n1\n", ["the columns are t_s; expected t_s and any of"]),
     "text": (lines(rows=[*ROWS[:3], "0.03,0,0,much,0,0,0"]), ["line 5", "fz_n holds 'much'"]),
