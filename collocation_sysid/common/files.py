@@ -17,6 +17,7 @@ from typing import Any
 from zipfile import BadZipFile
 
 from ..errors import InputError
+from .machine import machine_memory_mb
 from .written_files import add_to_list
 
 # What reading and drawing raise where files do not hold what they should. Errors of the disk tell
@@ -35,6 +36,10 @@ DAMAGE = (
     ValueError,
     zlib.error,
 )
+# Memory that is needed while text is read, in sizes of its file: cells are objects of their own.
+TEXT_FACTOR = 25
+# Files below this are read in any case [bytes].
+SMALL_BYTES = 50_000_000
 # Longest reason of an error of another library in a message [characters]: about two lines.
 LONGEST_REASON = 200
 RESULT_FILE = "result.json"
@@ -68,6 +73,38 @@ def require_regular(path: str | Path, where: str | None = None) -> None:
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         kind = "a pipe" if stat.S_ISFIFO(mode) else "a device or socket"
         raise InputError(f"this is {kind}; expected a regular file", path, where=where)
+
+
+def require_size(path: str | Path, most: int | None = None) -> None:
+    """Refuse a file of text that is too large for the memory, before it is read.
+
+    A path that does not exist is accepted: it is left to the reader.
+
+    Parameters
+    ----------
+    path : str or Path
+        The path; links are followed.
+    most : int, optional
+        Largest size [bytes]; by default that of which this machine holds `TEXT_FACTOR` copies.
+
+    Raises
+    ------
+    InputError
+        Naming the path.
+    """
+    try:
+        size = os.stat(path).st_size
+    except (OSError, ValueError):
+        return
+    if most is None:
+        memory_mb = machine_memory_mb()
+        most = size if memory_mb is None else max(SMALL_BYTES, int(1e6 * memory_mb / TEXT_FACTOR))
+    if size > most:
+        raise InputError(
+            f"this file has {size / 1e6:,.0f} MB; expected at most {most / 1e6:,.0f} MB of text: "
+            "it is no such file, or has more than this machine's memory can take",
+            path,
+        )
 
 
 def is_own(folder: Path, file: Path) -> bool:
@@ -137,6 +174,7 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
         "schema" is not `SCHEMA`.
     """
     require_own(file)
+    require_size(file)
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except NotADirectoryError:

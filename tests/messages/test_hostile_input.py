@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 from kit.problem_files import REFERENCES, replace_cell, replace_text, run_command, settings
 
-from collocation_sysid.common import machine
+from collocation_sysid.common import files, machine
+from collocation_sysid.common.files import read_json
 from collocation_sysid.common.isolated_process import Failed, ProcessLimits, run_isolated
 from collocation_sysid.common.signal_handling import IMPORTING, INTERRUPTS, heed_interrupts
 from collocation_sysid.errors import InputError
@@ -33,6 +34,7 @@ from collocation_sysid.fem.meshes.structured import (
 from collocation_sysid.problem import Problem, loading, problem_size
 from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
 from collocation_sysid.recording.formats.depth_files import read_depth
+from collocation_sysid.recording.formats.text import read_bytes
 from collocation_sysid.result import run_writers
 from collocation_sysid.runs.check import cost as memory
 
@@ -605,3 +607,25 @@ def test_what_a_killed_run_left_is_removed_by_the_next(
     assert not stale.exists()
     assert others.exists()
     assert going_on.exists()
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (4,), (2, 2, 2, 2)])
+def test_depth_archives_of_the_wrong_shape_are_refused(tmp_path: Path, shape: tuple[int, ...]):
+    np.savez(tmp_path / "depth.npz", depth_m=np.ones(shape))
+    with pytest.raises(InputError, match=r"depth_m has the shape .*; expected \(any, any\) or"):
+        read_depth(tmp_path / "depth.npz", count_m=None, length_m=None)
+
+
+def test_text_that_no_memory_can_hold_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(files, "machine_memory_mb", lambda: 6000.0)
+    for name, read in (("a.csv", read_bytes), ("result.json", lambda f: read_json(f, "a result"))):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(3_000_000_000)
+        tracemalloc.start()
+        with pytest.raises(InputError, match=r"has 3,000 MB; expected at most 240 MB of text"):
+            read(tmp_path / name)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 1e6

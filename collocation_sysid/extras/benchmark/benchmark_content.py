@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...common.files import damage_refused, read_json
+from ...common.files import damage_refused, read_json, require_size
+from ...common.plain_arrays import require_shape
 from ...common.written_files import is_written_here
 from ...errors import InputError
 from .signals import RecordingSignals, Signal
@@ -111,12 +112,16 @@ def _read_signals(folder: Path, body: str, recording: Mapping[str, Any]) -> Reco
     tables = {}
     for role in ("measured", "simulated", "undeformed"):
         file = _unchanged(folder, f"{body}/{recording['files'][role]}")
+        require_size(file)
         try:
             tables[role] = np.atleast_2d(np.genfromtxt(file, delimiter=",", skip_header=1))
         except OSError as error:
             raise InputError(
                 f"this file cannot be read ({error.strerror}); {REMEDY}", file
             ) from error
+    shape = (len(tables["measured"]), 1 + len(recording["columns"]))
+    for role, table in tables.items():
+        require_shape(table.shape, shape, f"the table {recording['files'][role]}")
     measured = Signal(
         recording["quantity"],
         recording["key"],

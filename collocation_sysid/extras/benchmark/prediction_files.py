@@ -10,7 +10,7 @@ import numpy as np
 
 from ...common.array_files import load_arrays
 from ...common.array_types import Array, Index
-from ...common.files import reason, require_regular
+from ...common.files import reason, require_regular, require_size
 from ...errors import InputError, excerpt, hint_at, listed
 from .signals import Signal
 
@@ -75,6 +75,7 @@ def read_prediction(file: Path, measured: Signal) -> Signal:
         If the file cannot be read, a column, sample or number is missing, or a value is not finite.
     """
     require_regular(file)
+    require_size(file)
     keys, values = (
         _read_archive(file, measured) if file.suffix == ".npz" else _read_table(file, measured)
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.files import require_regular
+from ...common.files import require_regular, require_size
 from ...errors import InputError, require_among
 from ...methods import METHODS, require_method
 from ...problem.problem_reading import parse_toml
@@ -96,6 +96,7 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
         return None, {name.strip(): value.strip() for name, _, value in pairs}
     path = Path(item)
     require_regular(path, "--truth")
+    require_size(path)
     try:
         content = parse_toml(path.read_text(encoding="utf-8-sig"), path)
     except FileNotFoundError:

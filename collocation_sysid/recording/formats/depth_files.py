@@ -17,7 +17,8 @@ import numpy as np
 
 from ...common.array_files import load_array, load_arrays
 from ...common.array_types import Array
-from ...common.files import reason, require_regular
+from ...common.files import reason, require_regular, require_size
+from ...common.plain_arrays import float_array
 from ...errors import InputError, located
 from . import ply
 from .camera_messages import (
@@ -135,6 +136,8 @@ def read_depth(
     if path.is_dir():
         return _read_folder(path, count_m, length_m=length_m)
     require_regular(path)
+    if path.suffix.lower() in (".xyz", ".ply", ".pcd"):
+        require_size(path)
     kind = path.suffix.lower()
     if kind not in _READERS:
         expected = ", ".join(_READERS)
@@ -295,14 +298,20 @@ def _read_npz(path: Path) -> DepthFileContent:
             "depth_m, depth_counts (with count_m) and points_m, and optionally t_s, "
             "camera_matrix, camera_pose"
         )
-    values = arrays[names[0]]
-    if names[0] == "depth_counts":
-        values = values * float(arrays.get("count_m", USUAL_COUNT_M))
-    samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
     clouded = names[0] == "points_m"
+    columns = (3, 6) if clouded else (None,)
+    shapes = [(*first, None, last) for first in ((), (None,)) for last in columns]
+    values = float_array(arrays[names[0]], names[0], shapes, finite=False)
+    if names[0] == "depth_counts":
+        values *= float(float_array(arrays.get("count_m", USUAL_COUNT_M), "count_m", ()))
+    samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
     for sample in samples:
         _require_possible_lengths(sample)
-    camera = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
+    camera_shapes = {"t_s": ((), (None,)), "camera_matrix": (3, 3), "camera_pose": (4, 4)}
+    camera = (
+        float_array(arrays[name], name, shapes) if name in arrays else None
+        for name, shapes in camera_shapes.items()
+    )
     return DepthFileContent([] if clouded else samples, samples if clouded else [], *camera)
 
 

@@ -19,7 +19,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.files import require_regular
+from ...common.files import require_regular, require_size
 from ...errors import InputError, excerpt, located
 from ..sample_times import first_unordered_time
 from .logs import TopicAddress
@@ -92,6 +92,7 @@ def read_bytes(path: str | Path) -> bytes:
     if (address := TopicAddress.from_path(path)) is not None:
         return address_as_csv(address)
     require_regular(path)
+    require_size(path)
     try:
         return Path(path).read_bytes()
     except OSError as error:
@@ -158,10 +159,12 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
         separator = next((mark for mark, share in shares.items() if share > 0.5), ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     try:
-        rows = [Row(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        rows = []
+        for given in reader:  # blank lines are skipped at once: there may be millions
+            if given and any(cells := [cell.strip() for cell in given]):
+                rows.append(Row(reader.line_num, cells))
     except csv.Error as error:
         raise InputError(f"this is not a CSV text file: {error}") from error
-    rows = [row for row in rows if any(row.cells)]
     if not rows:
         raise InputError(_EMPTY)
     if separator != "," and not any(_POINTED.fullmatch(cell) for row in rows for cell in row.cells):
