@@ -49,9 +49,10 @@ def main() -> None:
             number = (signal.SIGINT, signal.SIGTERM)[k % 2]
             moment_s = draw.uniform(0.0, duration_s)
             time.sleep(moment_s)
+            ended = os.waitid(os.P_PID, process, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
             os.kill(process, number)
             code = wait_for(process)
-            outcome = describe(code, folder)
+            outcome = describe(code, folder, ended=ended)
             counts[outcome] += 1
             if not outcome.endswith(", right"):
                 print(f"{k}: {number.name} after {moment_s:.2f} s: {outcome}")
@@ -96,8 +97,10 @@ def wait_for(process: int) -> int:
     return 128 + os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
 
 
-def describe(code: int, folder: Path) -> str:
-    """Return what a command has left: its exit code, folder and whether this is right."""
+def describe(code: int, folder: Path, ended: bool) -> str:
+    """Return what a command has left: its exit code, folder and whether this is right, if it had
+    `ended` before the signal or not.
+    """
     output = (folder / "output.txt").read_text()
     names = {each.name for each in folder.iterdir()} - {"output.txt"}
     kept = "no run"
@@ -112,7 +115,7 @@ def describe(code: int, folder: Path) -> str:
     words = [f"exit code {code}", kept]
     if "Traceback" in output or "Exception ignored" in output:
         words.append("traceback")
-    is_right = code in (130, 143) or (code == 0 and "next: " in output)
+    is_right = code == 0 if ended else code in (130, 143)
     if is_right and kept in ("no run", "complete run") and len(words) == 2:
         words.append("right")
     return ", ".join(words)
