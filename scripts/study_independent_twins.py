@@ -1,0 +1,354 @@
+"""Verdicts and combined intervals for recordings that an independent program simulated.
+
+The simulator in `hexahedral_bar.py` shares no code with the package. Every twin is a tapered bar of
+120 mm with constants, density, cross-section, motion and six to ten marker places of its own. Size,
+mass, clock, gravity, grip, gradients and stiffness deviate from the description by random numbers
+with the default standard deviations of the package (`DEVIATIONS`). A twin is saved as a problem folder
+and solved with tet10 elements, two across the thickness (275 nodes), without guesses and without
+marker places.
+
+Answers are appended to a file with one line of JSON per twin; twins that the file has are not solved
+again. To solve the same twins with another version of the package, run this script with the Python
+of that version's environment and another `--answers`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hexahedral_bar
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+import collocation_sysid as cs
+
+LENGTH_M = 0.12
+SAMPLE_S = 0.01
+DURATION_S = 1.2
+POSE_STEP_S = 0.005
+CONSTANTS = {"young_pa": "E", "poisson": "ν", "gamma_r_s": "γ_r", "gamma_m_1_s": "γ_m"}
+DEGREE = np.pi / 180
+# Standard deviations of the errors of the description: the defaults of the package.
+DEVIATIONS = {
+    "size": 0.01,
+    "mass": 0.01,
+    "time_shift_s": 5e-3,
+    "clock_rate": 1e-4,
+    "gravity_rad": DEGREE,
+    "hand_eye_rad": 0.5 * DEGREE,
+    "hand_eye_m": 1e-3,
+    "grip_layer_m": 2e-4,
+    "grasp_edge_m": 5e-4,
+    "density_gradient": 0.05,
+    "stiffness_gradient": 0.05,
+    "stiffness_drift": 0.02,
+}
+COMPONENTS = {
+    "gravity_rad": 2,
+    "hand_eye_rad": 3,
+    "hand_eye_m": 3,
+    "density_gradient": 3,
+    "stiffness_gradient": 3,
+}
+# Mistakes of the description that are far larger than a deviation.
+MISTAKES = ("none", "mass +20 %")
+
+
+@dataclass(frozen=True)
+class Twin:
+    """True bar, motion and errors of a twin."""
+
+    truth: dict[str, float]
+    width_m: tuple[float, float]
+    taper: tuple[float, float]
+    errors: dict[str, Any]
+    swing: dict[str, Any]
+    marker_places: list[list[float]]
+    noise_m: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--twins", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--folder", type=Path, default=Path("independent_twins"))
+    parser.add_argument(
+        "--answers", type=Path, help="file of the answers, in the folder by default"
+    )
+    parser.add_argument("--exact", action="store_true", help="no errors of the description")
+    parser.add_argument("--across", type=int, default=2, help="tet10 elements across the thickness")
+    parser.add_argument("--poisson", type=float, help="true Poisson's ratio of all twins")
+    parser.add_argument("--mistake", choices=MISTAKES, default="none")
+    parser.add_argument("--unstated-rest", action="store_true", help="without object.rest_shape")
+    parser.add_argument("--only-simulate", action="store_true")
+    parser.add_argument("--only-table", action="store_true", help="table of the existing answers")
+    arguments = parser.parse_args()
+    answers = arguments.answers or arguments.folder / "answers.jsonl"
+    known = read_answers(answers)
+    for seed in range(arguments.first, arguments.first + arguments.twins):
+        if seed in known or arguments.only_table:
+            continue
+        folder = arguments.folder / f"{seed:03d}"
+        if not (folder / "problem.toml").exists():
+            twin = draw(seed, arguments.exact, arguments.poisson)
+            write_problem(
+                twin, folder, seed, arguments.across, arguments.mistake, arguments.unstated_rest
+            )
+        if arguments.only_simulate:
+            continue
+        known[seed] = solve(folder, seed)
+        answers.parent.mkdir(parents=True, exist_ok=True)
+        with answers.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(known[seed]) + "\n")
+        print(line(known[seed]), flush=True)
+    if known:
+        seeds = range(arguments.first, arguments.first + arguments.twins)
+        print(table([known[seed] for seed in seeds if seed in known]))
+
+
+def read_answers(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the answers of a file, by seed; empty without a file."""
+    if not path.exists():
+        return {}
+    answers = map(json.loads, path.read_text(encoding="utf-8").splitlines())
+    return {answer["seed"]: answer for answer in answers}
+
+
+# One twin -----------------------------------------------------------------------------------------
+
+
+def draw(seed: int, exact: bool = False, poisson: float | None = None) -> Twin:
+    """Draw a twin; `exact` makes all errors of the description zero."""
+    rng = np.random.default_rng(seed)
+    truth = {
+        "young_pa": _log_uniform(rng, 5e3, 31e3),
+        "poisson": float(rng.uniform(0.2, 0.45)),
+        "gamma_r_s": _log_uniform(rng, 3e-3, 15e-3),
+        "gamma_m_1_s": _log_uniform(rng, 0.3, 3.0),
+        "density_kg_m3": _log_uniform(rng, 80.0, 400.0),
+    }
+    if poisson is not None:
+        truth["poisson"] = poisson
+    width_m = tuple(map(float, rng.uniform(0.024, 0.036, 2)))
+    taper = tuple(map(float, rng.uniform(0.0, 0.35, 2)))
+    errors = {
+        name: (rng.standard_normal(COMPONENTS.get(name, 1)) * sigma * (not exact)).tolist()
+        for name, sigma in DEVIATIONS.items()
+    }
+    swing = {
+        "amplitude_m": rng.uniform(0.02, 0.05, 3).tolist(),
+        "amplitude_rad": rng.uniform(0.15, 0.4, 3).tolist(),
+        "frequency_hz": rng.uniform(1.0, 2.5, 6).tolist(),
+        "phase": rng.uniform(0, 2 * np.pi, 6).tolist(),
+        "tilt_rad": rng.uniform(-0.6, 0.6, 3).tolist(),
+    }
+    places = []
+    for _ in range(rng.integers(6, 11)):
+        place = [*rng.uniform(-1, 1, 2), rng.uniform(0.3, 1.0)]
+        place[rng.integers(2)] = float(rng.choice([-1.0, 1.0]))
+        places.append([float(value) for value in place])
+    return Twin(truth, width_m, taper, errors, swing, places, 3e-4)
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def hand(twin: Twin, t_s: np.ndarray) -> tuple[Rotation, np.ndarray]:
+    """Return rotations and positions (T, 3) [m] of the held end: a swing that begins smoothly."""
+    t = np.maximum(t_s, 0.0)[:, None]
+    rise = 1 - np.exp(-((t / 0.25) ** 3))
+    swing = twin.swing
+    waves = rise * np.sin(2 * np.pi * t * swing["frequency_hz"] + np.array(swing["phase"]))
+    start = Rotation.from_rotvec(swing["tilt_rad"]) * Rotation.from_rotvec([np.pi, 0, 0])
+    rotations = Rotation.from_rotvec(waves[:, 3:] * swing["amplitude_rad"]) * start
+    return rotations, waves[:, :3] * swing["amplitude_m"]
+
+
+def simulate(twin: Twin, divisions: tuple[int, int, int] = (2, 2, 8), step_s: float = 0.0025):
+    """Return the times and the exact marker positions (T, M, 3) of the true motion [m]."""
+    errors = {name: np.array(values) for name, values in twin.errors.items()}
+    edge_m = errors["grasp_edge_m"][0] - abs(errors["grip_layer_m"][0])
+    bar = hexahedral_bar.Bar(
+        length_m=LENGTH_M,
+        start_m=edge_m,
+        width_m=twin.width_m,
+        taper=twin.taper,
+        scale=1 + errors["size"][0],
+        divisions=divisions,
+        truth=twin.truth,
+        density_gradient=errors["density_gradient"],
+        stiffness_gradient=errors["stiffness_gradient"],
+        drift=errors["stiffness_drift"][0],
+        drift_s=DURATION_S,
+    )
+    grip = Rotation.from_rotvec(errors["hand_eye_rad"])
+
+    def motion(t_s):
+        rotations, positions = hand(twin, t_s)
+        return rotations * grip, positions + rotations.apply(errors["hand_eye_m"])
+
+    tilt = Rotation.from_rotvec([*errors["gravity_rad"], 0.0])
+    gravity = tilt.apply([0.0, 0.0, -9.81])
+    places = bar.interpolation(twin.marker_places)
+    end_s = DURATION_S + 0.03
+    t_s = step_s * np.arange(round(end_s / step_s) + 1)
+    return t_s, bar.simulate(t_s, motion, gravity, places)
+
+
+def write_problem(
+    twin: Twin,
+    folder: Path,
+    seed: int,
+    across: int = 2,
+    mistake: str = "none",
+    unstated_rest: bool = False,
+) -> None:
+    """Simulate a twin, and write its problem folder and its truth."""
+    began = time.process_time()
+    fine_s, exact_m = simulate(twin)
+    folder.mkdir(parents=True, exist_ok=True)
+    t_s = SAMPLE_S * np.arange(round(DURATION_S / SAMPLE_S) + 1)
+    shift = twin.errors["time_shift_s"][0]
+    rate = twin.errors["clock_rate"][0]
+    seen_s = np.clip(t_s * (1 + rate) - shift, 0.0, fine_s[-1])
+    tracks = CubicSpline(fine_s, exact_m)(seen_s)
+    rng = np.random.default_rng((seed, 1))
+    tracks = tracks + twin.noise_m * rng.standard_normal(tracks.shape)
+    names = [f"m{k + 1}" for k in range(len(twin.marker_places))]
+    heads = ["t_s", *(f"{name}_{axis}" for name in names for axis in "xyz")]
+    _write_csv(folder / "markers.csv", heads, np.column_stack([t_s, tracks.reshape(len(t_s), -1)]))
+    pose_s = POSE_STEP_S * np.arange(round(DURATION_S / POSE_STEP_S) + 1)
+    rotations, positions_m = hand(twin, pose_s)
+    heads = ["t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+    _write_csv(
+        folder / "poses.csv", heads, np.column_stack([pose_s, positions_m, rotations.as_quat()])
+    )
+    box = cs.box_mesh((1.0, 1.0, LENGTH_M), (across, across, 5), (-0.5, -0.5, 0.0))
+    points_m = np.array(box.points_m)
+    shrink = 1 - np.outer(points_m[:, 2] / LENGTH_M, twin.taper)
+    points_m[:, :2] *= shrink * twin.width_m
+    mesh = cs.TetMesh(points_m, box.tetrahedra)
+    mesh.write(folder / "bar.vtu")
+    true_kg = twin.truth["density_kg_m3"] * mesh.volume_m3 * (1 + twin.errors["size"][0]) ** 3
+    stated_kg = true_kg / (1 + twin.errors["mass"][0]) * (1.2 if mistake == "mass +20 %" else 1.0)
+    rest = "" if unstated_rest else 'rest_shape = "stress_free"\n'
+    (folder / "problem.toml").write_text(
+        f"""title = "Independent twin {seed}"
+
+[object]
+mesh = "bar.vtu"
+element = "tet10"
+mass_kg = {stated_kg:.6g}
+{rest}
+[parameters]
+young_pa = {{}}
+poisson = {{}}
+gamma_r_s = {{}}
+gamma_m_1_s = {{}}
+
+[environment]
+air_density_kg_m3 = "none"
+
+[[experiment]]
+name = "swing"
+grasp = {{ nodes = {{ box_m = [[-1, -1, -1e-6], [1, 1, 1e-6]] }}, poses = "poses.csv" }}
+start = "equilibrium"
+
+[experiment.markers]
+file = "markers.csv"
+sigma_m = {twin.noise_m:g}
+""",
+        encoding="utf-8",
+    )
+    record = {**vars(twin), "simulation_cpu_s": time.process_time() - began}
+    (folder / "truth.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+
+
+def _write_csv(path: Path, heads: Sequence[str], rows: np.ndarray) -> None:
+    np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=",".join(heads), comments="")
+
+
+def solve(folder: Path, seed: int) -> dict[str, Any]:
+    """Solve a saved twin, and compare the answer with the truth."""
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["truth"]
+    began = time.process_time()
+    answer: dict[str, Any] = {"seed": seed}
+    try:
+        run = cs.run(cs.Problem.read(folder / "problem.toml"))
+    except Exception as error:  # a failure is an answer of the study too
+        return answer | {"verdict": "failed", "reasons": [repr(error)], "constants": {}}
+    answer |= {"verdict": run.trust.verdict, "reasons": list(run.trust.reasons)}
+    answer["constants"] = {name: _constant(run, name, truth[name]) for name in CONSTANTS}
+    return answer | {"solve_cpu_s": time.process_time() - began}
+
+
+def _constant(run: Any, name: str, true: float) -> dict[str, Any]:
+    estimate = run.estimates[name]
+    low, high = run.interval(name)
+    shares = {} if name not in run.budget else dict(run.budget[name].shares)
+    largest = sorted(shares.items(), key=lambda pair: -pair[1])[:4]
+    return {
+        "true": true,
+        "value": float(estimate.value),
+        "interval": [float(low), float(high)],
+        "statistical": list(estimate.statistical95 or ()),
+        "inside": bool(low <= true <= high),
+        "half_width": float((high - low) / 2 / true),
+        "shares": {key: float(value) for key, value in largest},
+    }
+
+
+# Table --------------------------------------------------------------------------------------------
+
+
+def line(answer: Mapping[str, Any]) -> str:
+    """Return one twin as a line."""
+    parts = [f"{answer['seed']:3d} {answer['verdict']:8s} {answer.get('solve_cpu_s', 0):.0f} s"]
+    for name, symbol in CONSTANTS.items():
+        if name in answer["constants"]:
+            c = answer["constants"][name]
+            parts.append(
+                f"{symbol} {100 * (c['value'] / c['true'] - 1):+.1f} ± {100 * c['half_width']:.0f} %"
+                + "" * c["inside"]
+                + " OUTSIDE" * (not c["inside"])
+            )
+    return " | ".join(parts) + " | " + " // ".join(reason[:90] for reason in answer["reasons"])
+
+
+def table(answers: Sequence[Mapping[str, Any]]) -> str:
+    """Return verdicts, and coverage, error and half width of each constant, as Markdown."""
+    verdicts = Counter(answer["verdict"] for answer in answers)
+    rows = [
+        f"{len(answers)} twins: " + ", ".join(f"{n} {v}" for v, n in verdicts.most_common()),
+        "",
+        "| constant | inside | RMS error % | median half width % | 10 to 90 % of half widths |",
+        "|---|---|---|---|---|",
+    ]
+    for name, symbol in CONSTANTS.items():
+        found = [a["constants"][name] for a in answers if name in a["constants"]]
+        if not found:
+            continue
+        inside = sum(c["inside"] for c in found)
+        errors = np.array([c["value"] / c["true"] - 1 for c in found])
+        widths = 100 * np.array([c["half_width"] for c in found])
+        low, high = np.quantile(widths, [0.1, 0.9])
+        rows.append(
+            f"| {symbol} | {inside} of {len(found)} | {100 * np.sqrt(np.mean(errors**2)):.1f} | "
+            f"{np.median(widths):.0f} | {low:.0f} to {high:.0f} |"
+        )
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    main()
