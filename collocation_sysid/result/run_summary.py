@@ -97,7 +97,7 @@ def next_step(result: Result, folder: Path, solve_command: str) -> str:
         return (
             f"{program} refine {run} (measures the mesh error, which the intervals {in_intervals})"
         )
-    return f"{program} report {run} (everything on one page, with the pictures)"
+    return f"{program} report {run} (everything on one page)"
 
 
 def _brief(result: Result) -> list[Shown]:

@@ -121,7 +121,7 @@ ESTIMATE_KEYS = {
 
 
 def test_the_result_has_every_promised_key(solved):
-    assert solved.result["schema"] == 4
+    assert solved.result["schema"] == 5
     assert solved.result["status"] == "converged"
     for key, inner in RESULT_KEYS.items():
         assert key in solved.result
@@ -252,7 +252,7 @@ def test_pictures_may_be_left_out(tiny):
     with pictures_drawn():
         outcome = run_command("solve", "problem.toml", "--out", "run", "--no-pictures")
     assert outcome.code == 0
-    assert "pictures" not in outcome.out
+    assert "pictures drawn" not in outcome.out
     assert not [*(tiny / "run").glob("*.png")]
     assert result_in(tiny / "run")["elapsed_s"]["pictures"] is None
     assert len(frames_in(tiny / "run" / "trajectory.pvd")) == 9
@@ -280,7 +280,7 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
     monkeypatch.setattr(run_record, "write_pictures", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     ((out, result),) = shown
-    assert "Verdict: good" in out
+    assert "Verdict: check" in out
     assert "written to run" in out
     assert result == result_in(tiny / "run")
     assert outcome.code == 130
@@ -296,7 +296,7 @@ def test_the_answer_is_shown_even_if_its_folder_cannot_be_written(tiny, monkeypa
     monkeypatch.setattr(run_record, "write_all_frames", fail)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 2
-    assert "Verdict: good" in outcome.out
+    assert "Verdict: check" in outcome.out
     assert "written to" not in outcome.out
     assert "No space left on device" in outcome.err
     assert not (tiny / "run").exists()
@@ -309,7 +309,7 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatc
     monkeypatch.setattr(run_record, "write_pictures", lambda *_, **__: time.sleep(60))
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
-    assert "Verdict: good" in outcome.out
+    assert "Verdict: check" in outcome.out
     assert "the result is kept in run" in outcome.err
     assert result_in(tiny / "run")["status"] == "converged"
 

@@ -282,7 +282,7 @@ def test_killed_processes_cost_no_answer(apart, monkeypatch, ended, status, said
 
 
 def test_workers_of_another_version_are_refused():
-    answers = {"tcp://a:1": experiment_executors.version("collocation-sysid"), "tcp://b:1": "0.0.1"}
+    answers = {"tcp://a:1": experiment_executors.package_version(), "tcp://b:1": "0.0.1"}
     client = SimpleNamespace(run=lambda *_, **__: answers)
     with pytest.raises(
         InputError, match=r"found collocation-sysid 0\.0\.1 on the worker tcp://b:1; expected"
