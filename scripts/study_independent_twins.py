@@ -31,9 +31,9 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 
 LENGTH_M = 0.12
-SAMPLE_S = 0.01
-DURATION_S = 1.2
-POSE_STEP_S = 0.005
+SAMPLE_S = 0.0125
+DURATION_S = 0.75
+POSE_STEP_S = 0.00625
 CONSTANTS = {"young_pa": "E", "poisson": "ν", "gamma_r_s": "γ_r", "gamma_m_1_s": "γ_m"}
 DEGREE = np.pi / 180
 # Standard deviations of the errors of the description: the defaults of the package.
@@ -67,8 +67,8 @@ class Twin:
     """True bar, motion and errors of a twin."""
 
     truth: dict[str, float]
-    width_m: tuple[float, float]
-    taper: tuple[float, float]
+    width_m: list[float]
+    taper: list[float]
     errors: dict[str, Any]
     swing: dict[str, Any]
     marker_places: list[list[float]]
@@ -139,8 +139,8 @@ def draw(seed: int, exact: bool = False, poisson: float | None = None) -> Twin:
     }
     if poisson is not None:
         truth["poisson"] = poisson
-    width_m = tuple(map(float, rng.uniform(0.024, 0.036, 2)))
-    taper = tuple(map(float, rng.uniform(0.0, 0.35, 2)))
+    width_m = rng.uniform(0.024, 0.036, 2).tolist()
+    taper = rng.uniform(0.0, 0.35, 2).tolist()
     errors = {
         name: (rng.standard_normal(COMPONENTS.get(name, 1)) * sigma * (not exact)).tolist()
         for name, sigma in DEVIATIONS.items()
@@ -167,7 +167,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 def hand(twin: Twin, t_s: np.ndarray) -> tuple[Rotation, np.ndarray]:
     """Return rotations and positions (T, 3) [m] of the held end: a swing that begins smoothly."""
     t = np.maximum(t_s, 0.0)[:, None]
-    rise = 1 - np.exp(-((t / 0.25) ** 3))
+    rise = 1 - np.exp(-((t / 0.15) ** 3))
     swing = twin.swing
     waves = rise * np.sin(2 * np.pi * t * swing["frequency_hz"] + np.array(swing["phase"]))
     start = Rotation.from_rotvec(swing["tilt_rad"]) * Rotation.from_rotvec([np.pi, 0, 0])
@@ -175,7 +175,7 @@ def hand(twin: Twin, t_s: np.ndarray) -> tuple[Rotation, np.ndarray]:
     return rotations, waves[:, :3] * swing["amplitude_m"]
 
 
-def simulate(twin: Twin, divisions: tuple[int, int, int] = (2, 2, 8), step_s: float = 0.0025):
+def simulate(twin: Twin, divisions: tuple[int, int, int] = (2, 2, 8), step_s: float = 0.003125):
     """Return the times and the exact marker positions (T, M, 3) of the true motion [m]."""
     errors = {name: np.array(values) for name, values in twin.errors.items()}
     edge_m = errors["grasp_edge_m"][0] - abs(errors["grip_layer_m"][0])
@@ -187,8 +187,8 @@ def simulate(twin: Twin, divisions: tuple[int, int, int] = (2, 2, 8), step_s: fl
         scale=1 + errors["size"][0],
         divisions=divisions,
         truth=twin.truth,
-        density_gradient=errors["density_gradient"],
-        stiffness_gradient=errors["stiffness_gradient"],
+        density_gradient=twin.errors["density_gradient"],
+        stiffness_gradient=twin.errors["stiffness_gradient"],
         drift=errors["stiffness_drift"][0],
         drift_s=DURATION_S,
     )
