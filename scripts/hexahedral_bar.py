@@ -9,6 +9,7 @@ Run as a script it compares sag, frequency and decay of a slender cantilever wit
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -370,4 +371,5 @@ def _beam_check() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     _beam_check()
