@@ -42,22 +42,24 @@ class Certificate:
     curvatures: Array
 
     @property
+    def flat_count(self) -> int:
+        """Number of eigenvalues that are not positive."""
+        return int(np.sum(self.curvatures <= SMALLEST_CURVATURE * self.curvatures.max(initial=0)))
+
+    @property
     def is_strict_minimum(self) -> bool:
         """Whether the reduced Hessian is positive definite."""
-        return bool(np.all(self.curvatures > SMALLEST_CURVATURE * self.curvatures.max(initial=0)))
+        return self.flat_count == 0
 
     @property
     def sentence(self) -> str:
         """Sentence for the user."""
         count = len(self.curvatures)
-        negative = int(
-            np.sum(self.curvatures <= SMALLEST_CURVATURE * self.curvatures.max(initial=0))
-        )
         meaning = (
             "is positive definite: a strict local minimum"
             if self.is_strict_minimum
-            else f"has {negative} of {count} eigenvalues that are not positive: some combination of "
-            "the parameters is not determined, or the point is no minimum"
+            else f"has {self.flat_count} of {count} eigenvalues that are not positive: some "
+            "combination of the parameters is not determined, or the point is no minimum"
         )
         return (
             f"optimality of the complete program: stationarity {self.stationarity:.1e}, feasibility "

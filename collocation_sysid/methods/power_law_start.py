@@ -514,7 +514,7 @@ _KEYS = (("mu", "_pa"), ("alpha", ""), ("beta", ""))
 
 def _has_default_bounds(item: Parameter) -> bool:
     is_free = not item.is_fixed and item.tied is None
-    return is_free and (item.lower, item.upper) == constant_named(item.name).bounds
+    return is_free and item.has_default_bound(0) and item.has_default_bound(1)
 
 
 def _widened(item: Parameter) -> Parameter:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import casadi as ca
@@ -112,6 +112,8 @@ class Parameter:
         Change of a linear parameter per unit of q; NaN until the scan of the stiffness sets it.
     tied : Tied or None
         Relation to another parameter; guess and bounds are then not used.
+    stated_bounds : (bool, bool)
+        Whether the user stated the lower and the upper bound.
 
     Raises
     ------
@@ -129,6 +131,7 @@ class Parameter:
     scale: Scale = "log"
     unit: float = 1.0
     tied: Tied | None = None
+    stated_bounds: tuple[bool, bool] = field(default=(False, False), compare=False)
 
     def __post_init__(self) -> None:
         if self.tied is not None:
@@ -194,6 +197,13 @@ class Parameter:
                 f"{what} = {value:g}, expected less than {limit:g}{why}", None, where=self.name
             )
 
+    def has_default_bound(self, side: int) -> bool:
+        """Return whether a bound, 0 the lower and 1 the upper, is that of the constant and was not
+        stated.
+        """
+        bound = (self.lower, self.upper)[side]
+        return not self.stated_bounds[side] and bound == constant_named(self.name).bounds[side]
+
     def to_coordinate(self, value: float) -> float:
         """Return the solver's coordinate q of a value: its logarithm, −∞ for 0, or the value
         divided by `unit`, NaN while `unit` is.
@@ -211,9 +221,7 @@ class Parameter:
 
 def is_default_bound(item: Parameter, value: float) -> bool:
     """Return whether the bound nearest to a value of a free parameter is the default one of a
-    constant with `widest` bounds, or one of these, and no physical limit.
-
-    A stated bound that equals the default one counts as the default.
+    constant with `widest` bounds, and no physical limit.
     """
     constant = constant_named(item.name)
     if constant.widest is None:
@@ -222,9 +230,7 @@ def is_default_bound(item: Parameter, value: float) -> bool:
         item.to_coordinate(value) - item.to_coordinate(item.upper)
     )
     side = 0 if is_lower else 1
-    return (item.lower, item.upper)[side] == constant.bounds[side] and constant.bounds[
-        side
-    ] != constant.widest[side]
+    return item.has_default_bound(side) and constant.bounds[side] != constant.widest[side]
 
 
 def _lower_limit_text(least: float) -> str:
@@ -313,6 +319,7 @@ def complete_parameter(
             prior=prior,
             scale=scale,
             unit=float(typical) if scale == "linear" else 1.0,
+            stated_bounds=(user_statement.lower is not None, user_statement.upper is not None),
         )
     except InputError as error:
         if user_statement.lower is not None and user_statement.upper is not None:

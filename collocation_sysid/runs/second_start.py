@@ -62,9 +62,9 @@ def start_beyond_bounds(solution: Solution) -> SecondStart | None:
     """Return the estimates of a solution as a start within the `widest` bounds of its constants;
     None if no parameter ended at a default bound that can be widened.
 
-    Bounds that equal the default ones count as not stated. Beyond its bound a share of memory is
-    estimated by its logarithm: the long-term modulus falls as it grows. The upper bound of
-    Poisson's ratio remains for elements that lock near one half.
+    Stated bounds are kept. Beyond its bound a share of memory is estimated by its logarithm: the
+    long-term modulus falls as it grows. The upper bound of Poisson's ratio remains for elements
+    that lock near one half.
     """
     parameters = solution.collocation.parameters
     lower, upper = parameters.compute_bounds_q()
@@ -107,9 +107,10 @@ def _widened(item: Parameter, ended: Container[str], locks: bool) -> Parameter:
     is_share = without_region(item.name) == SHARE.name
     if is_share and item.name not in ended:
         return item
-    lower, upper = constant_named(item.name).bounds
-    lower = widest[0] if item.lower == lower else item.lower
-    keeps_upper = item.upper != upper or (locks and _is_nearly_half(item.name, upper))
+    lower = widest[0] if item.has_default_bound(0) else item.lower
+    keeps_upper = not item.has_default_bound(1) or (
+        locks and _is_nearly_half(item.name, item.upper)
+    )
     upper = item.upper if keeps_upper else widest[1]
     if is_share:
         return replace(item, lower=max(lower, LITTLE_MEMORY), upper=upper, scale="log", unit=1.0)

@@ -7,7 +7,8 @@ import pytest
 from kit.problems import hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.model.parameters import Parameter, is_default_bound
+from collocation_sysid.fem.laws.constants import constant_named
+from collocation_sysid.model.parameters import Parameter, Parameters, is_default_bound
 from collocation_sysid.runs.second_start import start_beyond_bounds
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import Concern
@@ -66,6 +67,14 @@ def test_a_physical_limit_is_no_default_bound():
     share = Parameter("b.share", 0.1, 0.0, 20.0, scale="linear", unit=0.1)
     assert is_default_bound(share, 20.0)
     assert not is_default_bound(share, 0.0)
+
+
+def test_a_stated_bound_that_equals_the_default_is_no_default_bound():
+    (least, most) = constant_named("poisson").bounds
+    for lower, upper, expected in ((None, None, True), (least, None, False), (None, most, True)):
+        stated = cs.Unknown(0.2, lower, upper)
+        (item,) = Parameters.from_mapping({"poisson": stated}).scalars
+        assert is_default_bound(item, least) is expected
 
 
 def test_elements_that_lock_keep_the_upper_bound_of_the_ratio():

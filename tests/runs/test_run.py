@@ -217,7 +217,7 @@ def test_what_the_data_do_not_tell_has_no_error_bar(tmp_path):
         text.replace(
             elastic,
             "young_pa = { guess = 700.0, lower = 10.0, upper = 1e5 }\n"
-            "poisson = { guess = 0.2, lower = 0.002, upper = 0.49 }\n",
+            "poisson = { guess = 0.2, lower = 0.001, upper = 0.49 }\n",
         )
     )
     sigma = settings("experiment.swing.markers.sigma_m=3e-3")
