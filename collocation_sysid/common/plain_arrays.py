@@ -1,5 +1,5 @@
-"""Conversion of what users pass as arrays: every array of the Python interface and of files enters
-here.
+"""Conversion of arrays from files and callers into checked float arrays: used for depth archives and
+the tables of benchmarks; `recording.checked_arrays` checks the arrays of recordings.
 """
 
 from __future__ import annotations
