@@ -354,7 +354,7 @@ def test_an_interruption_before_the_first_iterate_writes_nothing(tiny, monkeypat
     assert contents(tiny) == before
 
 
-def test_an_interruption_of_the_scan_is_told(tiny, monkeypatch):
+def test_an_interruption_of_the_scan_is_reported(tiny, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGTERM)
 
@@ -494,7 +494,7 @@ def test_notes_on_the_data_go_to_stderr(tiny, options, shown):
 # Simulate -----------------------------------------------------------------------------------------
 
 
-def test_simulation_writes_what_a_laboratory_would(tiny):
+def test_simulation_writes_the_files_of_a_laboratory(tiny):
     remove("swing_markers.csv")(tiny)
     expected = cs.simulate(
         cs.Problem.read("problem.toml", AT_TRUTH, simulation=True).experiments[0], TRUTH
@@ -546,7 +546,7 @@ def test_a_simulation_replaces_an_earlier_one(tiny: Path):
     assert "notes.txt" in refusal.err
 
 
-def test_a_simulation_beside_the_problem_keeps_what_others_wrote(tiny: Path):
+def test_a_simulation_beside_the_problem_keeps_other_files(tiny: Path):
     recording = tiny / "swing_markers.csv"
     recording.rename("recorded.csv")
     replace_text('"swing_markers.csv"', '"recorded.csv"')(tiny)
@@ -686,7 +686,7 @@ def test_a_new_problem_leaves_the_data_that_are_there(tmp_path, monkeypatch):
     assert own.read_text() == "measured"
 
 
-def test_the_template_names_only_what_there_is(tmp_path, monkeypatch):
+def test_the_template_names_only_existing_keys(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_command("new", "mine")
     text = (tmp_path / "mine" / "problem.toml").read_text()
@@ -821,7 +821,7 @@ def test_a_run_from_python_is_written_like_any_other(tiny):
     assert not (folder / "frames").exists()
 
 
-def test_a_terminal_is_told_what_is_waited_for_before_anything_heavy(monkeypatch, tiny):
+def test_a_terminal_shows_the_current_phase_before_heavy_imports(monkeypatch, tiny):
     screen = io.StringIO()
     terminal = PlainConsole(file=screen, force_terminal=True, width=100)
     for module in (cli, command_options):
@@ -844,6 +844,6 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
         assert {word for line in found for word in line.split()} == {"misfit"}
 
 
-def test_what_reads_runs_needs_no_solver_to_show_its_help():
+def test_commands_on_runs_show_their_help_without_a_solver():
     code = "import sys, collocation_sysid.cli.run_commands; sys.exit('casadi' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

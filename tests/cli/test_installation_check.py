@@ -101,7 +101,7 @@ def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
     assert "The installation does not work. Install scipy." in outcome.out
 
 
-def test_an_extra_is_complete_or_names_what_is_missing(monkeypatch):
+def test_an_extra_is_complete_or_names_missing_packages(monkeypatch):
     monkeypatch.setattr(
         metadata,
         "requires",
@@ -156,7 +156,7 @@ def test_a_wrong_answer_fails_the_self_test(monkeypatch):
     assert not SelfTest(is_passed, message, 0.1).is_passed
 
 
-def test_a_cache_that_cannot_be_used_says_why(monkeypatch, tmp_path):
+def test_a_cache_that_cannot_be_used_gives_the_reason(monkeypatch, tmp_path):
     file = tmp_path / "file"
     file.write_text("")
     monkeypatch.setenv("COLLOCATION_SYSID_CACHE", str(file / "kernels"))

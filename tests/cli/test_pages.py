@@ -89,7 +89,7 @@ def test_code_of_a_page_can_be_copied_from_a_narrow_terminal():
     assert all(len(each.rstrip()) <= 40 for each in prose)
 
 
-def test_what_to_do_is_a_command_that_works():
+def test_the_advised_command_works():
     (line,) = remedy_command(CONCERNS)
     said = plain_text(line)
     assert said == "what to do: collocation-sysid explain trust scheme"

@@ -180,7 +180,7 @@ def test_nuisance_parameters_are_taken_over(folder):
     ],
     ids=["no-run", "damaged", "other-parameters"],
 )
-def test_what_is_no_start_is_refused_before_anything_is_solved(folder, tmp_path, content, said):
+def test_an_invalid_start_is_refused_before_the_solve(folder, tmp_path, content, said):
     if content == "other-parameters":
         result = result_of(folder / "run")
         result["parameters"] = {"x_pa": result["parameters"]["mu_pa"]}

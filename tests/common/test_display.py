@@ -172,7 +172,7 @@ def test_a_page_has_no_control_characters():
     assert as_html(f"a{HOSTILE[-1]}") == "<p>a␛[2J␀\ufffd</p>\n"
 
 
-def test_json_has_what_was_described():
+def test_json_contains_the_described_problem():
     assert read(Table, json.loads(as_json(NUMBERS))) == NUMBERS
     assert content(labelled("Body", {"mesh": "8 nodes"}))["rows"] == [["  mesh ", "8 nodes"]]
     with pytest.raises(ValueError, match="rows of another length"):

@@ -47,7 +47,7 @@ def test_a_phase_within_another_belongs_to_it():
     assert shares == [0.0, 0.5, 1.0, None]
 
 
-def test_nobody_is_told_outside_of_a_phase_and_without_a_listener():
+def test_no_progress_is_reported_outside_a_phase():
     shares = []
     with listen_to_shares(shares.append):
         complete_steps(StepUnit.TIME_STEP)

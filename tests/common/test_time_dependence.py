@@ -73,7 +73,7 @@ def test_arrays_are_interpolated_and_all_else_is_that_of_the_later_one():
     assert between.tides[1].name == "b"
 
 
-def test_what_does_not_depend_on_time_is_returned_itself():
+def test_constants_are_returned_unchanged():
     @dataclass(frozen=True)
     class Coast:
         length_m: float

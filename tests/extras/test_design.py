@@ -286,7 +286,7 @@ def test_error_bars_are_those_that_a_run_reports():
         )
 
 
-def test_criteria_are_what_they_say_of_the_covariance():
+def test_criteria_agree_with_the_covariance():
     found = errors_at(*at_answer([hung_cube(8)]))
     variances = np.diag(found.covariance)
     size = {kind: np.exp(DesignCriterion(kind).log_size(found)) for kind in ("worst", "A", "D")}
@@ -299,7 +299,7 @@ def test_criteria_are_what_they_say_of_the_covariance():
     assert DesignCriterion(over="worst").combine_draws([1.0, 4.0]) == 4.0
 
 
-def test_what_is_not_told_at_all_has_a_size_that_compares():
+def test_designs_without_information_still_compare():
     found = PredictedErrors.from_information(
         np.zeros((4, 4)), AT, ThetaMap(AT, hung_cube(3).body), AT.guess_q
     )
@@ -334,7 +334,7 @@ def test_draws_follow_priors_and_lie_on_both_sides_within_bounds():
 # Recordings ---------------------------------------------------------------------------------------
 
 
-def test_what_is_not_to_be_designed_is_refused():
+def test_unsupported_designs_are_refused():
     cases = (
         (bar_in_two_hands(4), "has 2 grasps; expected one"),
         (replace(hung_cube(4), grasps=[replace(hung_cube(4).grasps[0], until_s=0.02)],
@@ -363,7 +363,7 @@ def test_the_poses_turn_the_body_about_its_hand():
     )
 
 
-def test_a_small_motion_tells_what_it_does_to_first_order():
+def test_a_small_motion_reports_its_first_order_effect():
     recording = FutureRecording(problem(), hung_cube(8), 0.25)
     motion = replace(drawn_motions(1)[0], duration_s=0.25, active_s=0.22, rise_s=0.08)
     small = motion.scaled(0.1, 0.1)
@@ -399,7 +399,7 @@ def still_poses(recording: FutureRecording) -> PoseSequence:
 FEW = DesignOptions(evaluations=10, pairs=0)
 
 
-def test_a_designed_motion_tells_more_than_a_poor_one():
+def test_a_designed_motion_is_more_informative_than_a_poor_one():
     slow = PoseSequence(
         np.linspace(0, 0.08, 9),
         np.outer(np.linspace(0, 1e-3, 9), [1, 0, 0]),
@@ -481,7 +481,7 @@ def test_ctrl_c_keeps_the_best_motion():
     assert found.best.value == min(tried)
 
 
-def test_no_motion_in_view_and_none_that_can_be_simulated_are_told():
+def test_no_motion_in_view_and_none_that_can_be_simulated_are_reported():
     nowhere = Limits.model_validate(
         LIMITS.model_dump() | {"markers_box_m": ((1.0, 1.0, 1.0), (2.0, 2.0, 2.0))}
     )

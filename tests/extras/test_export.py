@@ -130,7 +130,7 @@ def test_a_run_without_a_problem_file_is_exported_from_python(run_folder, tmp_pa
 # What files hold
 
 
-def test_the_json_holds_what_was_identified(run_folder, tmp_path):
+def test_the_json_contains_the_estimates(run_folder, tmp_path):
     assert run_command("export", run_folder, "--to", "json", "--out", tmp_path / "out").code == 0
     found = json.loads((tmp_path / "out" / "identified.json").read_text())
     result = json.loads((run_folder / "result.json").read_text())
@@ -255,7 +255,7 @@ def test_usd_gets_mesh_material_masses_and_weight(tmp_path):
     assert {tuple(sorted(f)) for f in outside} == {tuple(sorted(f)) for f in body.body.mesh.surface}
 
 
-def test_usd_gets_the_motion_of_the_gripper_and_what_it_holds(tmp_path):
+def test_usd_has_the_motion_of_the_gripper_and_the_held_nodes(tmp_path):
     body = held_bar(moving=True)
     stage = stage_of(exported(body, "usd", tmp_path))
     gripper, grasp = map(stage.GetPrimAtPath, ("/World/Gripper_1", "/World/Gripper_1/Grasp"))
@@ -294,7 +294,7 @@ def test_usd_plays_the_motion_of_the_body_at_the_rate_of_the_recording(tmp_path)
     np.testing.assert_allclose(np.array(points.Get()), placed_m, atol=1e-7)
 
 
-def test_usd_says_that_gravity_is_tilted_and_that_nothing_moves(tmp_path):
+def test_usd_reports_tilted_gravity_and_missing_motion(tmp_path):
     body = held_bar()
     limits = write_export(body, "usd", tmp_path / "level").limitations
     assert not any("gravity" in limit for limit in limits)
@@ -308,7 +308,7 @@ def test_usd_says_that_gravity_is_tilted_and_that_nothing_moves(tmp_path):
     assert "0.5°" in (tmp_path / "tilted" / "body.usda").read_text()
 
 
-def test_usd_gets_a_material_for_each_region_and_says_what_simulators_make_of_them(tmp_path):
+def test_usd_has_a_material_for_each_region_and_names_limits_of_simulators(tmp_path):
     bar = box_mesh(BAR_M, DIVISIONS)
     regions = [Region("soft-end", np.arange(6)), Region("grip", np.arange(6, 30))]
     body = Body(bar, "neo-hookean", 900.0, regions=regions)
@@ -394,7 +394,9 @@ def test_calculix_gets_the_terms_of_the_foam(count, tmp_path):
         ("ogden-1", OGDEN_TERMS[1], "mujoco"),
     ],
 )
-def test_what_has_no_such_material_says_what_becomes_of_it(material, values, target, tmp_path):
+def test_an_exporter_without_the_material_states_the_replacement(
+    material, values, target, tmp_path
+):
     exported_files = write_export(held_bar(material, values), target, tmp_path / target)
     assert any(
         material in limit and ("neo-Hookean" in limit or "same E and ν" in limit)
@@ -518,7 +520,7 @@ def test_a_point_mass_that_ends_has_one_sentence_by_target(to, expected, tmp_pat
 
 
 @pytest.mark.parametrize("to", ["mujoco", "newton", "calculix", "sofa", "febio"])
-def test_air_that_is_not_exported_is_said_and_is_not_in_our_equilibrium(to, tmp_path):
+def test_unexported_air_is_reported_and_left_out_of_the_equilibrium(to, tmp_path):
     bar = held_bar()
     in_air = replace(bar, experiment=replace(bar.experiment, air_density_kg_m3=1.2))
     said = [write_export(each, to, tmp_path / to).limitations for each in (bar, in_air)]
@@ -529,7 +531,7 @@ def test_air_that_is_not_exported_is_said_and_is_not_in_our_equilibrium(to, tmp_
 
 
 @pytest.mark.parametrize("to", ["mujoco", "newton", "calculix"])
-def test_memory_that_is_lost_is_said(to, tmp_path):
+def test_memory_that_is_lost_is_reported(to, tmp_path):
     values = {**MODULI, "prony_1.share": 0.5, "prony_1.tau_s": 0.2}
     limits = write_export(
         held_bar(values=values, prony=("prony_1",)), to, tmp_path / to
@@ -740,7 +742,7 @@ def test_an_experiment_that_is_not_there_is_refused(run_folder, tmp_path):
     assert "expected one of swing" in ended.err
 
 
-def test_what_a_target_cannot_hold_is_refused(tmp_path):
+def test_models_that_a_target_cannot_represent_are_refused(tmp_path):
     with pytest.raises(InputError, match="grasp 2 holds only z"):
         write_export(held_bar(axes="z"), "mujoco", tmp_path / "out")
     with pytest.raises(InputError, match="one region of linear tetrahedra"):
@@ -798,7 +800,7 @@ def test_quadratic_elements_sag_alike_in_calculix(tmp_path):
 
 
 @needs_ccx
-def test_an_error_of_calculix_is_told(tmp_path):
+def test_an_error_of_calculix_is_reported(tmp_path):
     body = held_bar()
     folder = exported(body, "calculix", tmp_path)
     deck = folder / "body.inp"
@@ -900,7 +902,7 @@ LAID_ON = {
 
 @needs_mujoco
 @pytest.mark.parametrize("name", LAID_ON)
-def test_a_block_rests_as_high_on_what_mujoco_gets(name, tmp_path):
+def test_an_exported_block_rests_as_high_in_mujoco(name, tmp_path):
     import mujoco
 
     body = laid_block(LAID_ON[name])
@@ -916,7 +918,7 @@ def test_a_block_rests_as_high_on_what_mujoco_gets(name, tmp_path):
     assert height_m == pytest.approx(body.simulated_m[-1, :, 2].mean(), abs=0.05 * fallen_m)
 
 
-def test_all_solids_are_geoms_and_what_a_geom_lacks_is_said(tmp_path):
+def test_all_solids_are_geoms_and_losses_are_reported(tmp_path):
     ends = np.array([(0.0, 0.0, -0.01), (0.0, 0.04, -0.01)])
     body = laid_block(LAID_ON["plane"])
     solids = [
@@ -1020,7 +1022,7 @@ def test_a_body_of_which_only_a_force_was_measured_is_exported(tmp_path):
     assert decks[0] == decks[1]
 
 
-def test_febio_gets_what_is_touched_as_rigid_facets(tmp_path):
+def test_obstacles_are_rigid_facets_in_febio(tmp_path):
     body = pressed_block(SOLIDS["sphere"], SOLIDS["plane"], friction=0.2)
     model = in_febio(body, tmp_path)
     ids = [node.get("id") for node in model.iterfind("Mesh/Nodes/node")]
@@ -1052,7 +1054,7 @@ def test_febio_gets_what_is_touched_as_rigid_facets(tmp_path):
     assert [float(each.text or "") for each in down] == pytest.approx([-0.0014] * 2, abs=5e-5)
 
 
-def test_sofa_gets_planes_and_balls_and_says_what_else_there_is(tmp_path):
+def test_sofa_gets_planes_and_balls_and_other_solids_are_reported(tmp_path):
     body = pressed_block(*SOLIDS.values(), friction=0.2)
     scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn")
     plane, ball = (scene.find(".//PlaneForceField"), scene.find(".//SphereForceField"))
@@ -1106,7 +1108,7 @@ def test_mujoco_has_the_frequency_of_other_energies(tmp_path):
     assert abs(frequency.compute_relative_difference()) < 0.03
 
 
-def test_newton_says_where_obstacles_touch_differently(tmp_path):
+def test_newton_reports_different_contact(tmp_path):
     alike = pressed_block(SOLIDS["plane"], SOLIDS["sphere"], friction=0.2)
     assert alike.experiment_with_obstacles is not None
     first, second = alike.obstacles

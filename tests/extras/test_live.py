@@ -79,7 +79,7 @@ OF_THE_USER = Nuisance.none(
     [(IDEAL, 0.0), (IDEAL, 10.0), (Nuisance(), 0.0), (OF_THE_USER, 0.0)],
     ids=["ideal", "in dense air", "as in a laboratory", "a user's own"],
 )
-def test_frames_one_by_one_say_what_the_batch_says(nuisance, air_density_kg_m3, monkeypatch):
+def test_single_frames_give_the_answer_of_the_batch(nuisance, air_density_kg_m3, monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem, count = (swing(nuisance=nuisance, air_density_kg_m3=air_density_kg_m3), 30)
     live = streamed(problem, count)
@@ -137,7 +137,7 @@ def test_when_frames_end_the_estimate_settles_where_the_batch_ends(problem):
 
 
 @pytest.mark.long
-def test_it_settles_at_the_batch_of_what_was_not_left_out():
+def test_live_estimates_converge_to_the_batch_of_the_used_samples():
     problem = replace(swing(), substeps=1)
     live = LiveEstimator(problem, NO_TIME)
     (seen,) = problem.experiments
@@ -172,7 +172,7 @@ def test_without_all_it_settles_within_some_passes(hidden, monkeypatch):
     assert 0 < live.finish().relinearised <= len(live.log) + streaming_sweep.ROWS_PER_CHUNK
 
 
-def test_a_pass_that_turns_goes_on_to_first_order_and_says_so(monkeypatch):
+def test_a_pass_with_divided_loads_continues_to_first_order_with_a_note(monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
@@ -218,7 +218,7 @@ def test_rows_are_begun_that_end_in_time():
     assert TimeBudget().affordable_steps(1e-3) == 1
 
 
-def test_rows_leave_time_for_what_follows_them():
+def test_rows_leave_time_for_the_rest_of_the_study():
     budget = TimeBudget.from_times(one_s=2.0, many_s=9.0, many=8)
     budget.record_remainder(1.0)
     budget.record_remainder(0.2)
@@ -242,7 +242,7 @@ def test_a_stream_looks_through_nothing_old_for_garbage(tiny, monkeypatch):
     assert gc.get_freeze_count() == 0
 
 
-def test_what_leaves_the_window_stays_known_as_a_prior(monkeypatch):
+def test_information_that_leaves_the_window_stays_as_a_prior(monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
@@ -296,7 +296,7 @@ def test_residuals_follow_damping_by_mass_that_is_wrong_by_three():
     assert np.linalg.norm(off) < 0.03 * np.linalg.norm(change)
 
 
-def test_rows_solved_together_miss_by_the_square_of_the_step_and_say_so(monkeypatch):
+def test_rows_solved_together_have_a_second_order_error_that_is_reported(monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = swing(nuisance=Nuisance())
     live = streamed(problem)
@@ -364,7 +364,7 @@ def test_parameters_without_a_guess_are_sought():
 # What frames may lack -------------------------------------------------------------------------
 
 
-def test_doubled_late_unordered_and_dropped_frames_are_told_and_change_little():
+def test_doubled_late_unordered_and_dropped_frames_are_reported_and_change_little():
     problem = swing()
     whole, live = (LiveEstimator(problem, NO_TIME), LiveEstimator(problem, NO_TIME))
     frames = frames_of(problem, live)
@@ -397,7 +397,7 @@ def test_a_frame_that_is_too_late_is_left_out():
     assert live.first_pass.sweep.information.row_count == rows
 
 
-def test_missing_markers_say_nothing():
+def test_missing_markers_carry_no_information():
     problem = swing()
     live = LiveEstimator(problem, NO_TIME)
     stated = live.model.prior_information(live.p).row_count
@@ -411,7 +411,7 @@ def test_missing_markers_say_nothing():
         assert found == np.isfinite(tracks).sum()
 
 
-def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_told():
+def test_a_grasp_that_is_lost_for_a_moment_is_bridged_and_for_long_it_is_reported():
     problem = swing()
     live = LiveEstimator(problem, NO_TIME)
     frames = frames_of(problem, live)
@@ -458,7 +458,7 @@ def test_markers_without_poses_are_not_kept():
     assert len(live.intake._waiting) <= 10
 
 
-def test_frames_at_rest_tell_nothing_of_damping_and_the_verdict_says_so():
+def test_frames_at_rest_do_not_determine_damping_and_the_verdict_states_it():
     problem = swing()
     live = LiveEstimator(problem)
     first = frames_of(problem, live)[0]
@@ -493,7 +493,7 @@ def test_a_track_that_jumps_is_left_out():
 
 
 @pytest.mark.parametrize("number", [0, 4])
-def test_what_is_nowhere_near_the_body_or_the_last_grasp_is_left_out(number):
+def test_outliers_far_from_body_or_last_grasp_are_omitted(number):
     problem = swing()
     live, without = (LiveEstimator(problem, NO_TIME), LiveEstimator(problem, NO_TIME))
     for k, frame in enumerate(frames_of(problem, live)[:12]):
@@ -589,7 +589,7 @@ def felt(bias_m_s2: float = 0.3) -> cs.Problem:
     return cs.Problem([cs.with_readings(made, [accelerations, strains])], GUESS, substeps=1)
 
 
-def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
+def test_custom_sensors_count_live_as_in_the_batch(monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = felt()
     live = streamed(problem)
@@ -616,7 +616,7 @@ def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):
 
 
 @pytest.mark.long
-def test_truth_and_what_a_chip_does_not_know_of_itself_are_found_from_frames():
+def test_constants_and_sensor_errors_are_found_from_frames():
     problem = felt()
     live = LiveEstimator(problem, replace(NO_TIME, rows=8))
     for frame in frames_of(problem, live):
@@ -679,7 +679,7 @@ def test_tables_of_frames_have_readings_in_their_columns():
         ("[1]", r"readings are \[1\]; expected samples by name"),
     ],
 )
-def test_readings_that_are_none_are_told_with_their_line(given, said):
+def test_invalid_sensor_values_are_reported_with_their_line(given, said):
     reader = FrameReader([1], ["a"], gauges=felt().experiments[0].readings)
     with pytest.raises(InputError, match=f"input, line 1: {said}"):
         reader.read(f'{{"t_s": 1.0, "readings": {given}}}')
@@ -710,7 +710,7 @@ def test_problems_that_cannot_be_live_are_refused_in_words():
         (dict(t_s=0.0, pose=None, markers=np.zeros((1, 3))), "expected 9 × 3 numbers"),
     ],
 )
-def test_what_is_no_frame_is_refused_and_changes_nothing(given, said):
+def test_an_invalid_frame_is_refused_without_changing_the_state(given, said):
     live = LiveEstimator(swing(), NO_TIME)
     with pytest.raises(InputError, match=said):
         live.update(**given)
@@ -847,7 +847,7 @@ def test_a_recording_is_replayed_and_filmed(tiny):
     assert json.loads(ended.out.splitlines()[-1])["t_s"] == pytest.approx(0.08)
 
 
-def test_poses_of_frames_are_of_the_gripper_if_the_problem_says_so(tiny: Path):
+def test_poses_of_frames_are_of_the_gripper_if_stated(tiny: Path):
     """As the poses of a file: both lead to the poses of the body in the recording."""
     file = tiny / "problem.toml"
     transform = "position_m = [0.01, 0.0, 0.02], quaternion_xyzw = [0, 0.6, 0, 0.8]"

@@ -71,7 +71,7 @@ def solved(name: str) -> tuple[cs.Problem, cs.Run]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
-def test_what_touches_the_body_is_followed_to_where_the_batch_ends(name: str):
+def test_live_contact_ends_where_the_batch_ends(name: str):
     problem, batch = solved(name)
     live = LiveEstimator(problem, NO_TIME)
     live.budget_s = np.inf

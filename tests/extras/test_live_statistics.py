@@ -27,7 +27,7 @@ def test_the_autocorrelation_of_a_wave_is_the_cosine_of_its_step():
 
 
 @pytest.mark.parametrize("size", [0.1, 10.0])
-def test_it_does_not_depend_on_their_size(size):
+def test_the_statistic_does_not_depend_on_the_size_of_the_residuals(size):
     one, other = (
         ResidualScatter.from_residuals(samples(WAVE)),
         ResidualScatter.from_residuals(samples(size * WAVE)),
@@ -36,7 +36,7 @@ def test_it_does_not_depend_on_their_size(size):
     assert other.rms == pytest.approx(size * one.rms)
 
 
-def test_what_is_missing_says_nothing_of_either():
+def test_missing_samples_carry_no_information():
     seen = samples(WAVE)
     gaps = [each if k % 7 else NONE for k, each in enumerate(seen)]
     here = np.array([value if k % 7 else np.nan for k, value in enumerate(WAVE)])
@@ -60,18 +60,18 @@ def test_too_little_shows_no_autocorrelation(values):
     assert ResidualScatter.from_residuals(values).lag1 == 0.0
 
 
-def test_ten_samples_are_enough_and_what_never_forgets_is_limited():
+def test_ten_samples_suffice_and_persistent_errors_are_limited():
     assert ResidualScatter.from_residuals(samples(np.ones(10))) == ResidualScatter(1.0, 0.98)
 
 
 @pytest.mark.parametrize(("count", "matters"), [(30, False), (60, True)])
-def test_what_matters_is_larger_than_its_deviation_by_3(count, matters):
+def test_relevant_changes_exceed_three_standard_deviations(count, matters):
     wave = np.cos(np.arccos(0.3) * np.arange(count))
     found = ResidualScatter.from_residuals(samples(wave, markers=1)).lag1
     assert found == pytest.approx(0.3 if matters else 0.0, abs=0.03)
 
 
-def test_only_what_is_more_than_chance_counts(rng):
+def test_only_significant_deviations_count(rng):
     white = rng.normal(size=(400, 2, 3))
     assert ResidualScatter.from_residuals([*white]).lag1 == 0.0
     weak = white.copy()
@@ -96,7 +96,7 @@ def known(size: float) -> tuple[SquareRootInformation, np.ndarray]:
 
 
 @pytest.mark.parametrize("size", [0.5, 1.0, 1.1])
-def test_residuals_as_sigma_says_or_smaller_widen_nothing(size):
+def test_residuals_within_sigma_widen_nothing(size):
     assert variance_factor(*known(size), FITTED, ResidualScatter(size)) == (1.0, 1.96)
 
 

@@ -70,7 +70,7 @@ def without(experiment: cs.Experiment, waiting: list[tuple[int, float]]) -> cs.E
         ("bdf2", "grasp", UNKNOWN),
     ],
 )
-def test_load_cells_say_what_they_say_to_the_batch(scheme, frame, unknown, monkeypatch):
+def test_load_cells_count_live_as_in_the_batch(scheme, frame, unknown, monkeypatch):
     monkeypatch.setattr(streaming_sweep, "LARGEST_CORRECTION", 1e-12)
     problem = weighed(scheme, frame, **unknown)
     live = streamed(problem)
@@ -120,7 +120,7 @@ def unweighed(problem: cs.Problem) -> cs.Problem:
 
 
 @pytest.mark.long
-def test_a_load_cell_tells_the_scale_that_markers_do_not():
+def test_a_load_cell_determines_the_scale_that_markers_do_not():
     problem = unweighed(weighed(tare=0.1))
     live = LiveEstimator(problem, replace(NO_TIME, rows=8))
     for frame in frames_of(problem, live):
@@ -249,12 +249,12 @@ def test_tables_of_frames_have_wrenches_in_their_columns():
         (2, SIX, "found one wrench; expected those of the grasps 1 and 2, by number"),
     ],
 )
-def test_wrenches_that_are_none_are_told_with_their_line(sensors, given, said):
+def test_invalid_wrenches_are_reported_with_their_line(sensors, given, said):
     with pytest.raises(InputError, match=f"input, line 1: {said}"):
         reader_of(sensors).read(json.dumps({"t_s": 1.0, "wrench": given}))
 
 
-def test_what_live_does_not_take_of_sensors_is_said():
+def test_live_estimation_names_unsupported_sensors():
     with pytest.raises(InputError, match=r"a sensor with a low-pass \(sensor_lag\)"):
         LiveEstimator(weighed(sensor_lag_s=3e-3))
     live = LiveEstimator(swing(nuisance=IDEAL), NO_TIME)

@@ -451,7 +451,7 @@ def test_branches_may_be_a_regions(bar, tiny):
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.6, 0.9])
-def test_measurements_are_worth_as_many_independent_as_the_mean_of_their_errors_tells(phi: float):
+def test_the_effective_number_of_measurements_follows_from_the_mean_of_their_errors(phi: float):
     of = problem((400,), markers=4, offsets=False)
     found = []
     for seed in range(6):
@@ -531,7 +531,7 @@ def test_of_models_that_predict_alike_the_one_with_fewer_parameters_is_taken():
     assert "hardly distinguish the models" in advice(rows)
 
 
-def test_a_clear_difference_of_predictions_is_not_said_to_be_hardly_one():
+def test_a_clear_difference_of_predictions_is_not_called_small():
     better = row_of("better", 4, {"a": WAVY.tolist()}, 900)
     worse = row_of("worse", 4, {"a": (15.0 * WAVY).tolist()}, 900)
     text = advice(rows_of(better, worse))
@@ -550,7 +550,7 @@ def test_a_ratio_of_predictions_that_may_be_one_has_its_interval():
     assert "hardly distinguish the models" in text
 
 
-def test_models_that_predict_alike_tell_what_they_disagree_about():
+def test_models_with_equal_predictions_are_reported_with_their_differences():
     def model(name: str, times: float, young_pa: float) -> dict:
         found = row_of(name, 4, {"a": (times * WAVY).tolist()}, 900)
         found["found"][""]["parameters"] = {"young_pa": young_pa}
@@ -725,7 +725,7 @@ def test_a_comparison_of_laws_of_damping_from_the_command_line(tiny: Path, monke
         assert all("damping_law" not in line["shares"] for line in row["budget"].values())
 
 
-def test_there_must_be_something_to_compare(tiny: Path):
+def test_a_comparison_needs_two_models(tiny: Path):
     nothing = run_command("compare-models", "problem.toml")
     assert (nothing.code, "--materials, --damping, --prony or --with" in nothing.err) == (2, True)
     words = ("compare-models", "problem.toml", "--materials", "gent,yeoh", "--method")

@@ -142,7 +142,7 @@ def test_missing_markers_are_left_out(run_folder, tmp_path):
     assert len(curve["scalars"]) == len(counts) - 1
 
 
-def test_it_cannot_be_verified(run_folder):
+def test_a_recording_without_checksum_cannot_be_verified(run_folder):
     outcome = run_command("export", run_folder, "--to", "rerun", "--verify")
     assert outcome.code == 2
     assert "has no predictions to verify" in outcome.err

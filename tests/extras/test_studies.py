@@ -111,7 +111,7 @@ def test_the_midpoint_rule_biases_stiffness_by_the_square_of_the_step(fits):
     assert study_mismatch.orders(fits["midpoint"])[1] == pytest.approx(2, abs=0.4)
 
 
-def test_steps_with_an_estimate_at_its_bound_say_nothing_of_the_order():
+def test_steps_with_an_estimate_at_its_bound_give_no_order():
     fits = [
         study_mismatch.SchemeFit(
             "midpoint", h, True, np.full(4, -3 * h), np.arange(4) == bounded, 0.0, 0.0

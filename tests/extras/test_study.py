@@ -351,7 +351,7 @@ def test_a_stopped_study_ends_its_runs(stand_in):
     assert record["outcome"] == "stopped"
 
 
-def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
+def test_errors_of_a_run_are_stored_in_its_record(tiny, monkeypatch):
     def __call__(self, *_):
         raise ZeroDivisionError("nothing to divide by")
 
@@ -403,7 +403,7 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("clustered", [True, False])
-def test_an_interrupted_study_keeps_what_is_finished(stand_in, tmp_path, request, clustered):
+def test_an_interrupted_study_keeps_finished_runs(stand_in, tmp_path, request, clustered):
     address = request.getfixturevalue("a_scheduler") if clustered else None
     stand_in("answers")
     store, runs = RunStore(tmp_path / "runs"), planned_runs(20)

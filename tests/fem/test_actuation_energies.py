@@ -89,7 +89,7 @@ def test_a_cavity_encloses_its_volume_and_its_forces_balance(element, rng):
     np.testing.assert_allclose(np.cross(bent, force).sum(axis=0), 0, atol=1e-18)
 
 
-def test_curved_faces_enclose_what_a_finer_flat_surface_does():
+def test_curved_faces_enclose_the_volume_of_a_finer_flat_surface():
     body = Body(box_with_cavity(), density_kg_m3=1e3, element="tet10")
     volume = Pressure(Named("wall"), 1e3).on_body(body).require_measure()
     assert volume is not None
@@ -202,7 +202,7 @@ def test_faces_of_a_box_and_a_ball_are_those_with_all_their_corners_in_it():
         (lambda: Pressure(Named("wall"), np.nan), "pressure_pa of pressure"),
     ],
 )
-def test_what_no_actuator_can_be_is_refused(make, message):
+def test_invalid_actuators_are_refused(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
@@ -217,6 +217,6 @@ def test_what_no_actuator_can_be_is_refused(make, message):
         (lambda: Pressure(Ball((9, 9, 9), 1.0), 1.0), "holds no face of the boundary"),
     ],
 )
-def test_what_does_not_fit_the_body_is_refused(make, message):
+def test_actuators_that_do_not_fit_the_body_are_refused(make, message):
     with pytest.raises(InputError, match=message):
         make().on_body(Body(box_with_cavity(), density_kg_m3=1e3))

@@ -117,7 +117,7 @@ def test_point_masses_displace_no_air_and_no_air_is_damped_as_the_body_is():
     assert mass.inertia_kg.sum() == pytest.approx(body_kg + 1.5 * air_kg)
 
 
-def test_drag_is_the_slope_of_what_it_dissipates_and_acts_at_the_surface_alone(rng):
+def test_drag_is_the_gradient_of_its_dissipation_and_acts_at_the_surface_alone(rng):
     forces = Forces.from_experiment(
         hung_cube(3, (3, 3, 3), air_density_kg_m3=AIR_KG_M3), [0.0, 0.1]
     )
@@ -205,7 +205,7 @@ def holds(interval: tuple[float, float]) -> bool:
     return interval[0] <= TRUTH[GAMMA_M] <= interval[1]
 
 
-def test_the_combined_interval_is_half_of_what_it_is_where_all_air_may_be_missing():
+def test_the_combined_interval_is_halved_where_air_is_known():
     """The drag of the twin is 30 % above that of the model."""
     described = recorded(1.3, AIR_KG_M3)
     found = estimated(described)
@@ -222,7 +222,7 @@ def test_air_that_is_left_out_makes_damping_too_large_and_the_budget_has_no_air(
 
 
 @pytest.mark.long
-def test_air_that_was_not_there_makes_damping_too_small_and_the_budget_says_by_what():
+def test_air_that_was_not_there_makes_damping_too_small_and_the_budget_contains_it():
     found = estimated(recorded(0.0, AIR_KG_M3))
     assert found.statistical95[1] < TRUTH[GAMMA_M]
     assert next(iter(found.line.shares)) == "air_drag"
@@ -235,7 +235,7 @@ def test_air_that_was_not_there_makes_damping_too_small_and_the_budget_says_by_w
 
 
 @pytest.mark.long
-def test_air_is_part_of_the_model_unless_it_is_said_otherwise():
+def test_air_is_part_of_the_model_unless_stated_otherwise():
     """In a process of its own: the tests of this one are in a vacuum by default."""
     script = (
         "import collocation_sysid as cs, numpy as np\n"
@@ -290,7 +290,7 @@ def test_air_that_cannot_be_is_refused_in_python(value):
         hung_cube(3, air_density_kg_m3=value)
 
 
-def test_check_and_result_tell_what_air_is_in_the_model(tiny):
+def test_check_and_result_report_the_air_of_the_model(tiny):
     with_air(tiny, "1.1")
     assert "1.1 kg/m³ (buoyancy, added mass and drag)" in run_command("check", "problem.toml").out
     ended = run_command("solve", "problem.toml", "--json", *settings(*AT_TRUTH))

@@ -274,7 +274,7 @@ def test_functions_called_from_vector_code_are_resolved():
         lambda x, y: x**0.5 + x ** (1 / 3),
     ],
 )
-def test_what_the_compiler_makes_other_calls_of_is_resolved(function):
+def test_calls_that_the_compiler_renames_are_resolved(function):
     x = np.linspace(0, 4, 11)
     np.testing.assert_allclose(*both_values(function, x, x), rtol=1e-13)
 
@@ -287,7 +287,7 @@ def test_branch_that_is_not_taken_is_not_felt():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
-def test_what_is_infinite_in_the_last_element_stays_so(count):
+def test_an_infinite_energy_of_the_last_element_stays_infinite(count):
     x = np.zeros(count)
     found, expected = both_values(lambda x, y: 1 / x, x, x)
     np.testing.assert_array_equal(found, expected)
@@ -345,7 +345,7 @@ def test_material_that_vector_code_lacks_yields_to_casadi_with_a_note(small_mesh
     assert body.energy(x, **ELASTIC) == make_body("neo-hookean", "casadi").energy(x, **ELASTIC)
 
 
-def test_forced_vector_code_refuses_what_it_lacks_with_the_remedy(small_mesh, monkeypatch):
+def test_forced_vector_code_refuses_unsupported_functions_with_the_remedy(small_mesh, monkeypatch):
     refusal = r"operation OP_PRINTME; choose evaluator = 'casadi'"
     with pytest.raises(InputError, match=refusal):
         new_body(small_mesh, printing, "simd")
@@ -354,7 +354,7 @@ def test_forced_vector_code_refuses_what_it_lacks_with_the_remedy(small_mesh, mo
         new_body(small_mesh, printing)
 
 
-def test_kernel_refuses_what_vector_code_lacks():
+def test_kernel_refuses_functions_without_vector_code():
     x = np.ones(3)
     with pytest.raises(InputError, match="no CasADi operation OP_PRINTME"):
         values(kernel_of(ca.SX.printme), "simd", x, x)

@@ -94,7 +94,7 @@ def test_a_linear_body_stays_linear(rng):
     assert relative_error(damping_force(kelvin, x, v), damping_force(rayleigh, x, v)) < 1e-12
 
 
-def test_only_kelvin_voigt_pays_for_what_is_not_symmetric():
+def test_only_kelvin_voigt_has_unsymmetric_matrices():
     at = small_body(damping="rayleigh").linearise(*np.zeros((2, 1, 24)), [1.0, 1.0, 1.0, 1.0])
     assert at.by_position_skew.shape == (1, 0)
 

@@ -71,7 +71,7 @@ def test_the_callers_arrays_stay_their_own():
     np.testing.assert_array_equal(mesh.points_m, CORNERS)
 
 
-def test_hash_tells_meshes_apart(box):
+def test_hash_distinguishes_meshes(box):
     same = TetMesh(box.points_m, box.tetrahedra)
     moved = TetMesh(np.nextafter(box.points_m, 1.0), box.tetrahedra)
     assert box.sha256 == same.sha256
@@ -208,7 +208,7 @@ def test_an_unknown_length_unit_lists_the_known_ones(tmp_path):
         TetMesh.read(tmp_path / "tet.vtu", length_unit="ft")
 
 
-def test_mixed_cells_keep_the_tetrahedra_and_say_so(tmp_path):
+def test_mixed_cells_keep_the_tetrahedra_with_a_note(tmp_path):
     cells = [("triangle", np.array([[0, 1, 2]])), ("tetra", TWO_TETS[:1]), ("tetra", TWO_TETS[1:])]
     write_file(tmp_path / "mixed.vtu", TWO_POINTS, cells)
     mesh = TetMesh.read(tmp_path / "mixed.vtu")
@@ -387,7 +387,7 @@ def test_a_group_of_faces_can_be_clamped(tmp_path, file_format):
 
 
 @pytest.mark.parametrize("file_format", ["gmsh22", "gmsh"])
-def test_groups_of_two_dimensions_with_one_tag_and_no_name_are_told_apart(tmp_path, file_format):
+def test_unnamed_groups_of_one_tag_and_two_dimensions_are_distinguished(tmp_path, file_format):
     write_clamped(tmp_path / "bar.msh", file_format, {})
     mesh = TetMesh.read(tmp_path / "bar.msh")
     assert len(mesh.select(Named("physical_7_surface"))) == 9
@@ -407,7 +407,7 @@ def test_a_cell_of_several_groups_is_in_all_of_them(tmp_path):
     np.testing.assert_array_equal(mesh.select(Named("skin")), np.arange(5))
 
 
-def test_a_file_without_tetrahedra_tells_what_it_holds(tmp_path):
+def test_a_file_without_tetrahedra_is_refused_with_its_content(tmp_path):
     write_file(tmp_path / "shell.vtu", CORNERS, [("triangle", [[0, 1, 2]])])
     with pytest.raises(InputError, match=r"found 1 triangle, but no tetrahedra; .*; a closed"):
         TetMesh.read(tmp_path / "shell.vtu")

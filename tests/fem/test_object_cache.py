@@ -26,7 +26,7 @@ def entry(folder: Path) -> Path:
     return found
 
 
-def test_what_is_stored_is_loaded_by_its_key_alone():
+def test_cached_objects_are_loaded_by_key():
     jit.store_object("key", CODE)
     assert jit.load_object("key") == CODE
     assert jit.load_object("other") is None
@@ -97,7 +97,7 @@ def test_folder_of_another_user_is_refused(folder, monkeypatch):
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give files away")
 @pytest.mark.parametrize("given", ["file", "folder", "parent"])
-def test_what_is_really_another_users_is_not_loaded(folder, given):
+def test_objects_of_another_user_are_not_loaded(folder, given):
     file = entry(folder)
     os.chown({"file": file, "folder": folder, "parent": folder.parent}[given], 65534, 65534)
     if given == "file":

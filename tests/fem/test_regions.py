@@ -95,7 +95,7 @@ def test_constants_are_those_of_the_parts_one_after_another(make_two):
     assert "body: neo-hookean, core: gent" in repr(body)
 
 
-def test_what_no_region_claims_is_the_first_part_and_may_be_nothing(small_mesh):
+def test_elements_of_no_region_are_the_first_part_which_may_be_empty(small_mesh):
     cells = np.arange(len(small_mesh.tetrahedra))
     regions = [Region("a", cells < 10), Region("b", cells >= 10)]
     whole = Body(small_mesh, density_kg_m3=DENSITY_KG_M3, regions=regions)
@@ -113,7 +113,7 @@ def test_a_name_without_a_region_is_for_all_regions_that_have_none_of_their_own(
     np.testing.assert_array_equal(own, [*SOFT.values(), *[*SOFT.values()][:3], 7.0])
 
 
-def test_small_strain_moduli_are_told_for_each_part(make_two):
+def test_small_strain_moduli_are_reported_for_each_part(make_two):
     body = make_two("gent")
     found = body.lame(theta_of_two(body))
     assert found[""] == pytest.approx((200.0, 300.0))
@@ -274,7 +274,7 @@ def test_a_weighed_mass_is_that_of_all_regions(small_mesh):
     assert body.parts[0].density_kg_m3 == pytest.approx((0.1 - 80.0 * core_m3) / rest_m3)
 
 
-def test_regions_without_a_density_share_what_is_left(small_mesh):
+def test_regions_without_a_density_share_the_remaining_mass(small_mesh):
     lower, upper = np.array_split(np.arange(len(small_mesh.tetrahedra)), 2)
     regions = [Region("a", lower, density_kg_m3=80.0), Region("b", upper)]
     body = Body(small_mesh, mass_kg=0.1, regions=regions)
@@ -325,7 +325,7 @@ SECOND = {
 
 
 @pytest.mark.parametrize("how", SECOND)
-def test_cells_are_told_in_any_of_these_ways(slab, how):
+def test_cells_of_a_region_are_selected_in_any_of_these_ways(slab, how):
     second = slab.centres_m[:, 0] > 0.1
     body = Body(slab, density_kg_m3=1.0, regions=[Region("second", SECOND[how](second))])
     np.testing.assert_array_equal(body.parts[1].cells, np.flatnonzero(second))
@@ -359,7 +359,7 @@ def test_regions_that_overlap_are_refused_with_a_cell(slab):
         Body(slab, density_kg_m3=1.0, regions=regions)
 
 
-def test_names_that_cannot_be_told_apart_are_refused(slab):
+def test_names_that_cannot_be_distinguished_are_refused(slab):
     with pytest.raises(InputError, match="two regions are named 'core'"):
         Body(slab, density_kg_m3=1.0, regions=[Region("core", [0]), Region("core", [1])])
     for name in ("", "a.b", "a b"):
@@ -384,7 +384,7 @@ def test_regions_that_leave_no_mass_are_refused(slab, given, message):
         Body(slab, regions=[core], **given)
 
 
-def test_a_mass_that_says_nothing_is_refused(slab):
+def test_a_mass_without_information_is_refused(slab):
     both = [Region(n, c, density_kg_m3=50.0) for n, c in (("a", range(6)), ("b", range(6, 12)))]
     with pytest.raises(InputError, match="every cell is in a region with a density of its own"):
         Body(slab, mass_kg=0.1, regions=both)

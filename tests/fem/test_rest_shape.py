@@ -318,7 +318,7 @@ def test_the_row_of_the_rest_shape_is_the_deflection_in_each_pose():
     assert relative_error(-found["rest_shape z"], expected) < 0.05
 
 
-def test_a_generated_mesh_and_one_that_is_said_to_be_free_of_stress_have_no_such_row():
+def test_generated_and_stress_free_meshes_have_no_rest_shape_row():
     bar = straight_bar()
     assert bar.rest_shape == "stress_free"
     copy = TetMesh(bar.mesh.points_m, bar.mesh.tetrahedra)
@@ -364,7 +364,7 @@ def test_modes_of_the_surface_have_the_deviation_and_the_length_that_are_stated(
 # Refusals ----------------------------------------------------------------------------------------
 
 
-def test_what_has_no_stress_free_shape_is_refused_once():
+def test_a_body_without_a_stress_free_shape_is_refused_once():
     soft = measured(as_scanned(hung_mesh()))
     with pytest.raises(InputError, match=r"no stress-free shape.*expected.*stiffer guesses"):
         replace_guess(soft, 30.0)
@@ -410,7 +410,7 @@ def test_a_scan_goes_from_the_file_to_the_body(tmp_path):
     assert cs.Problem.read(file).bodies[0].rest_shape == "stress_free"
 
 
-def test_a_finer_mesh_keeps_what_is_stated():
+def test_a_finer_mesh_keeps_stated_values():
     from collocation_sysid.fem.meshes.refinement import refine_body
 
     body = scanned_body()

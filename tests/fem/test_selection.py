@@ -72,7 +72,7 @@ def test_a_named_array_must_be_a_mask():
 
 
 @pytest.mark.parametrize("selection", [Box([5, 5, 5], [6, 6, 6]), Ball([5, 5, 5], 1), Indices([])])
-def test_an_empty_selection_tells_where_the_body_is(box, selection):
+def test_an_empty_selection_is_refused_with_the_extent_of_the_body(box, selection):
     with pytest.raises(InputError, match=r"selects none of the 54 nodes.*x from 0 to 0\.1 m"):
         box.select(selection)
 

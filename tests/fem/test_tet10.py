@@ -228,7 +228,7 @@ def sag_m(element: str, divisions, length_m: float, poisson: float) -> float:
 @pytest.mark.parametrize(
     ("poisson", "divisions", "tolerance"), [(0.3, (10, 1, 1), 0.04), (0.49, (20, 2, 2), 0.07)]
 )
-def test_a_slender_beam_sags_as_beam_theory_says(poisson, divisions, tolerance):
+def test_a_slender_beam_sags_as_beam_theory_predicts(poisson, divisions, tolerance):
     length = 0.2
     weight_n_m = DENSITY_KG_M3 * GRAVITY_M_S2 * THICKNESS_M**2
     bending = weight_n_m * length**4 / (8 * YOUNG_PA * THICKNESS_M**4 / 12)

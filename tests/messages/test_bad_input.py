@@ -748,7 +748,7 @@ def keys_in(content: object, above: str = "") -> list[str]:
 
 
 @pytest.mark.parametrize("value", ["1979-05-27", "true", "{ a = 1 }", '[["x"]]'])
-def test_every_key_refuses_what_it_cannot_be(tiny_problem, value):
+def test_every_key_refuses_invalid_values(tiny_problem, value):
     file = tiny_problem / "problem.toml"
     keys = keys_in(tomllib.loads(file.read_text()))
     assert len(keys) > 40

@@ -149,7 +149,7 @@ def test_the_message_names_the_folder_and_not_the_passing_one(tmp_path: Path):
 
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
-def test_an_output_that_is_full_is_told():
+def test_an_output_that_is_full_is_reported():
     program = [sys.executable, "-c", "from collocation_sysid.cli import main; main()", "schema"]
     with open("/dev/full", "w") as full:
         done = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120)

@@ -461,7 +461,7 @@ def ended(program: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("name", ["importlib.metadata", "casadi"])
-def test_an_interrupt_while_modules_are_imported_says_nothing(name: str):
+def test_an_interrupt_during_imports_prints_nothing(name: str):
     done = ended(STARTED.format(name=name))
     assert done.returncode == -signal.SIGINT
     assert done.stderr == ""
@@ -589,7 +589,7 @@ def test_an_interrupt_and_sigterm_leave_the_best_result(
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("host", ["bench", "bench.lab.example.org"])
-def test_what_a_killed_run_left_is_removed_by_the_next(
+def test_leftovers_of_a_killed_run_are_removed_by_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, host: str
 ):
     monkeypatch.setattr(run_writers.platform, "node", lambda: host)

@@ -50,7 +50,7 @@ def test_explicit_grasps_have_multipliers_too():
 
 
 @pytest.mark.long
-def test_it_leaves_far_less_slack_than_a_penalty_of_the_same_weight():
+def test_the_augmented_lagrangian_leaves_less_slack_than_a_penalty_of_the_same_weight():
     collocation = collocation_of("hung-cube", noise_m=1e-3, steps=6)
     paid = Penalty("levenberg-marquardt", schedule="constant", rho=1e6, violation=1.0)(collocation)
     multiplied = AugmentedLagrangian(rho_max=1e6)(collocation)
@@ -66,7 +66,7 @@ def test_gradients_alone_get_near_with_multipliers():
 
 
 @pytest.mark.long
-def test_a_rho_max_too_small_is_told():
+def test_a_rho_max_too_small_is_reported():
     collocation = collocation_of("hung-cube", noise_m=1e-3, steps=6)
     options = AugmentedLagrangian(rho=1e1, rho_max=1e1, max_iterations=40)
     solution = options(collocation)

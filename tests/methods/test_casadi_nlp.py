@@ -189,7 +189,7 @@ def test_an_error_in_a_function_reaches_the_caller(plugin: str, monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("plugin", PLUGINS)
-def test_the_history_is_what_was_watched(plugin: str):
+def test_the_history_contains_the_observed_iterations(plugin: str):
     seen: list[Iteration] = []
     solution = answer(plugin, cube(), seen.append)
     assert list(solution.history) == seen[-len(solution.history) :]
@@ -268,7 +268,7 @@ def test_a_solver_is_chosen_in_a_problem_file(tmp_path):
         ("casadi:sleq", "solver.method: found 'casadi:sleq', which CasADi does not have; did you"),
     ],
 )
-def test_a_problem_file_is_told_why_a_solver_is_not_offered(tmp_path, name: str, message: str):
+def test_a_solver_that_is_not_offered_is_refused_with_the_reason(tmp_path, name: str, message: str):
     file = write_problem(tmp_path, {"swing": 4})
     with pytest.raises(InputError, match=message):
         Problem.read(file, [f"solver.method={name}"])

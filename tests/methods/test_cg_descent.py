@@ -102,7 +102,7 @@ def test_gradients_of_the_functions_are_right(name: str, rng):
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_it_finds_the_minimum_that_scipy_finds(name: str):
+def test_cg_descent_finds_the_minimum_of_scipy(name: str):
     function, start = FUNCTIONS[name]
     result, _ = followed(name)
     settings = {"gtol": 1e-6, "maxiter": 20_000}
@@ -160,7 +160,7 @@ def test_the_value_alone_is_asked_where_that_is_enough():
     assert alone.evaluations < minimise_cg_descent(rosenbrock, start, OPTIONS).evaluations
 
 
-def test_it_says_why_it_ended():
+def test_cg_descent_states_why_it_ended():
     _, start = FUNCTIONS["rosenbrock in 2"]
     few = replace(OPTIONS, max_iterations=3)
     assert minimise_cg_descent(rosenbrock, start, few).ending == "iteration-limit"

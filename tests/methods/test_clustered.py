@@ -100,7 +100,7 @@ def test_markers_without_places_are_read_in_the_same_elements(there):
 
 
 @pytest.mark.long
-def test_what_comes_back_does_not_grow_with_the_recording(there, monkeypatch):
+def test_the_size_of_a_returned_result_is_independent_of_the_recording(there, monkeypatch):
     sizes: list[int] = []
 
     def weighed(self: DaskExecutor, kept: Any) -> list[Any]:
@@ -123,7 +123,7 @@ def test_what_comes_back_does_not_grow_with_the_recording(there, monkeypatch):
 
 
 @pytest.mark.long
-def test_what_a_lost_worker_had_is_done_again(there):
+def test_work_of_a_lost_worker_is_repeated(there):
     collocation = Collocation(several(), GUESS)
 
     def watch(line: Iteration) -> None:

@@ -98,7 +98,7 @@ def answered(name: str) -> tuple[Experiment, Solution]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", MADE)
-def test_it_is_what_an_ever_stiffer_energy_tends_to(name: str):
+def test_complementarity_is_the_limit_of_ever_stiffer_energies(name: str):
     experiment, answer = answered(name)
     assert answer.status.converged
     (hard,) = answer.positions_m

@@ -123,7 +123,7 @@ def test_a_parameter_at_its_bound_stays_there_from_stage_to_stage():
     assert solution.parameters["mu_pa"] == pytest.approx(250.0, rel=1e-9)
 
 
-def test_the_history_goes_on_over_the_stages_and_the_notes_tell_of_them():
+def test_the_history_continues_over_stages_that_the_notes_list():
     seen: list[Iteration] = []
     solution = continued(cube(), seen.append, (0.4, 0.7, 1.0), method="reduced-space")
     assert list(solution.history) == seen
@@ -140,7 +140,7 @@ def test_the_history_goes_on_over_the_stages_and_the_notes_tell_of_them():
     assert timing.evaluations + timing.linear_algebra + timing.build <= timing.total
 
 
-def test_it_starts_from_given_variables():
+def test_reduced_space_starts_from_given_variables():
     collocation = cube()
     answer = ReducedSpace()(collocation)
     solution = Continuation(SHARES, {"method": "shooting"})(collocation, start=answer.z)
@@ -164,7 +164,7 @@ def test_an_interruption_of_a_short_stage_is_an_answer_of_the_whole():
     assert solution.parameters == solution.history[-1].parameters
 
 
-def test_what_a_stage_does_not_reach_the_last_one_reports():
+def test_an_unreached_stage_is_reported_by_the_last_one():
     solution = continued(cube(), method="reduced-space", max_iterations=2)
     assert solution.status is Status.ITERATION_LIMIT
 
@@ -184,7 +184,7 @@ def test_what_a_stage_does_not_reach_the_last_one_reports():
         ),
     ],
 )
-def test_what_does_not_make_sense_is_refused(shares, stage, message):
+def test_invalid_stages_are_refused(shares, stage, message):
     with pytest.raises(InputError, match=message):
         continued(cube(9), shares=shares, **stage)
 

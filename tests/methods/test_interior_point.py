@@ -209,7 +209,7 @@ def note_of(solution: Solution) -> str:
     return note
 
 
-def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
+def test_ipopt_starts_near_the_optimum_with_a_note():
     seen: list[Iteration] = []
     solution = PRECISE(cube(), watch=seen.append)
     assert re.fullmatch(
@@ -415,7 +415,7 @@ ITERATION = r"^ +\d+r?(?: +\S+){5} +(-|-?\d\S+) +\S+ +\S+ +\d+"
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", UNKNOWN)
-def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(name: str, capfd):
+def test_default_unknowns_are_found_without_shifting_the_hessian(name: str, capfd):
     make, truth, known = UNKNOWN[name]
     factors = dict(zip(truth, (2.0, 0.5, 2.0, 0.5, 1.5, 1.5), strict=False))
     given = {k: v if k == known else Unknown(factors[k] * v) for k, v in truth.items()}
@@ -555,7 +555,7 @@ def test_every_status_has_a_sentence(status: Status):
     assert status.sentence.endswith(".")
 
 
-def test_the_message_holds_the_sentence_and_what_ipopt_said():
+def test_the_message_contains_the_status_of_ipopt():
     expected = f"{Status.CONVERGED.sentence} (IPOPT: Solve_Succeeded)"
     assert solved_cube().message == expected
 

@@ -63,7 +63,7 @@ def test_a_method_is_built_from_a_table():
         ("continuation", {"stage": {"tolerance": 0}}, "solver.stage.tolerance: found 0; expected"),
     ],
 )
-def test_what_an_option_cannot_be_is_refused_by_its_key(kind: str, options: dict, message: str):
+def test_invalid_options_are_refused_by_key(kind: str, options: dict, message: str):
     with pytest.raises(InputError, match=message):
         method_from_options(METHODS[kind], options, "solver")
 

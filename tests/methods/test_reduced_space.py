@@ -165,7 +165,7 @@ def test_memory_grows_no_faster_than_the_number_of_timesteps():
 
 
 @pytest.mark.long
-def test_a_guess_that_cannot_be_simulated_is_a_status_that_tells_what_to_change():
+def test_a_guess_that_cannot_be_simulated_is_a_status_with_a_remedy():
     soft = [
         replace(item, guess=guess, lower=1e-4, upper=guess * 1.001)
         for item, guess in zip(GUESS.items[:2], (0.4, 0.15), strict=True)
@@ -179,7 +179,7 @@ def test_a_guess_that_cannot_be_simulated_is_a_status_that_tells_what_to_change(
     assert solution.rms_m > 0
 
 
-def test_it_starts_from_given_variables():
+def test_reduced_space_starts_from_given_variables():
     seen: list[Iteration] = []
     again = ReducedSpace()(cube(), seen.append, solved_cube().z)
     assert again.status is Status.CONVERGED
@@ -382,7 +382,7 @@ def test_curvature_that_rounding_makes_indefinite_is_left_out():
 # History and timing
 
 
-def test_the_history_is_what_was_watched_and_ends_at_the_answer():
+def test_the_history_contains_the_observed_iterations_and_ends_at_the_answer():
     seen: list[Iteration] = []
     solution = ReducedSpace()(cube(), watch=seen.append)
     assert list(solution.history) == seen

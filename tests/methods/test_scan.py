@@ -105,7 +105,7 @@ def test_bounds_clip_the_scan_and_are_tried_once():
     assert found.young_pa[-1] < 2e4
 
 
-def test_a_prior_tells_where_to_start():
+def test_a_prior_is_the_start():
     given = {**NOTHING, "gamma_r_s": Unknown(prior=(0.02, 0.5))}
     assert typical_parameters(Parameters.from_mapping(given), 1e3).guesses["gamma_r_s"] == 0.02
 
@@ -225,7 +225,7 @@ def test_a_test_bench_without_markers_starts_near_its_stiffness():
     assert misfit[-1] > 1e3 * misfit.min()
 
 
-def test_forces_on_a_hand_tell_the_stiffness_as_markers_do():
+def test_forces_on_a_hand_determine_the_stiffness_as_markers_do():
     young_pa, _ = misfits(unseen(wristed_cube(30)))
     assert YOUNG_PA / 3 < young_pa < 3 * YOUNG_PA
 
@@ -273,7 +273,7 @@ def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["reduced-space", "shooting", "interior-point"])
-def test_it_is_solved_without_a_guess(method):
+def test_a_problem_is_solved_without_a_guess(method):
     solution = solve(cube(), method)
     assert solution.status.converged
     assert np.abs(relative_errors(solution)).max() < 1e-5

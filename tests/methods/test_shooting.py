@@ -127,7 +127,7 @@ def test_with_all_parameters_fixed_it_simulates(gradient):
     assert solution.iterations == 1
 
 
-def test_it_starts_from_given_parameters():
+def test_shooting_starts_from_given_parameters():
     seen: list[Iteration] = []
     start = cube().pack(np.log(list(TRUTH.values())), [np.zeros((11, 81))])
     solution = Shooting()(cube(), watch=seen.append, start=start)
@@ -224,7 +224,7 @@ def test_an_error_in_the_callers_function_reaches_the_caller(gradient):
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
-def test_the_history_is_what_was_watched_and_its_loss_falls(gradient):
+def test_the_history_contains_the_observed_iterations_and_its_loss_falls(gradient):
     seen: list[Iteration] = []
     solution = Shooting(gradient)(cube(), seen.append)
     assert list(solution.history) == seen

@@ -122,7 +122,7 @@ def forces_at(transcription: Transcription, u: np.ndarray) -> Forces:
     return at_times(transcription.dynamics.with_inputs(whole).forces, ROWS)
 
 
-def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(rng):
+def test_tendon_and_pressure_energies_are_length_and_volume_times_input(rng):
     xi = states(Collocation([BAR], GUESS).transcriptions[0], rng)[0][:2]
     tendon, pressure = BAR.actuators
     expected = -tension_n(FROM_S)[:, None] * tendon.require_measure().gradient(xi)
@@ -134,7 +134,7 @@ def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(rn
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def test_what_is_lost_and_a_factor_count_and_a_tendon_only_pulls():
+def test_tendon_loss_and_factor_count_and_a_tendon_only_pulls():
     tendon, pressure = BAR.actuators
     stated = tension_n(FROM_S)
     np.testing.assert_allclose(
@@ -184,7 +184,7 @@ def matrix_times(forces: Forces, lower: np.ndarray, skew: np.ndarray, ways: np.n
 
 
 @pytest.mark.parametrize("transcription", BUILT_IN, indirect=True)
-def test_slopes_of_forces_are_those_of_what_they_are(transcription, rng):
+def test_derivatives_of_forces_agree_with_differences(transcription, rng):
     (xi, nu), u = states(transcription, rng), some_inputs(transcription, rng)
     forces = forces_at(transcription, u)
     at = forces.linearise(xi, nu)
@@ -285,7 +285,7 @@ def test_without_any_nothing_is_added():
 
 
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
-def test_a_pressure_on_all_faces_is_what_grows_the_volume_inside(element, rng):
+def test_the_force_of_a_pressure_is_the_gradient_of_the_volume(element, rng):
     """It has no resultant, and its work is what it grows; a tetrahedron of flat faces is exact."""
     mesh = hung_cube(2).body.mesh
     force = NodeForce.from_law(

@@ -83,7 +83,7 @@ def test_a_motion_in_the_grasp_is_a_body_held_elsewhere():
     np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-9)
 
 
-def test_the_start_given_says_where_the_body_is_in_its_grasp():
+def test_a_given_start_contains_the_place_in_the_grasp():
     cube = replace(released_cube(), nuisance=Nuisance.none(hand_eye_m=0.003, hand_eye_rad=0.05))
     assert NuisanceMap.from_experiment(cube).size == 0
 
@@ -176,7 +176,7 @@ def test_nuisance_is_found_beside_the_material(kind: str, method: str, rng):
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 
 
-def test_a_prior_keeps_what_the_data_do_not_tell():
+def test_a_prior_keeps_undetermined_parameters():
     """With one marker the offset and the pose's shift are the same: the priors share it."""
     cube = hung_cube()
     one = replace(cube, markers=_only_first(cube))
@@ -212,7 +212,7 @@ def test_a_shift_of_several_samples_is_found(samples: int):
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=0.02)
 
 
-def test_a_clock_at_its_limit_says_so():
+def test_a_clock_at_its_limit_is_reported():
     cube = replace(hung_cube(32), nuisance=Nuisance.none(time_shift_s=0.2))
     tracks = measured(cube).markers.positions_m
     late = 12  # samples, of which the quarter of the recording allows 8

@@ -93,6 +93,6 @@ def test_few_substeps_suffice_for_slow_modes_and_none_are_enough_for_absurd_ones
     assert substeps_needed(EULER, 1e6, STEP_S, 0.005) is None
 
 
-def test_what_does_not_oscillate_is_refused():
+def test_overdamped_modes_are_refused():
     with pytest.raises(InputError, match=r"damping_ratio = 1, expected"):
         numerical_mode(EULER, 1.0, STEP_S, 1.0)

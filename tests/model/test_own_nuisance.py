@@ -34,7 +34,7 @@ def known_to(experiment: cs.Experiment, sigma_m: float) -> cs.Experiment:
     return replace(experiment, markers=replace(experiment.markers, sigma_m=sigmas))
 
 
-def test_readings_are_changed_as_said():
+def test_a_nuisance_parameter_changes_sensor_values_as_declared():
     cube = replace(hung_cube(), nuisance=only(SCALE, SAG))
     phi = np.zeros(NuisanceMap.from_experiment(cube).size)
     plain = seen_with(cube, phi).markers.positions_m
@@ -55,7 +55,7 @@ FOUND_BY = [
 
 
 @pytest.mark.parametrize(("name", "method"), FOUND_BY)
-def test_what_a_user_adds_is_found_beside_the_material(name: str, method: str, rng):
+def test_a_nuisance_parameter_of_a_user_is_found_beside_the_material(name: str, method: str, rng):
     steps, sigma_m = (14, 1e-7) if method == "reduced-space" else (9, 1e-5)
     cube = known_to(replace(cube_with_gaps(steps), nuisance=only(ROWS[name])), sigma_m)
     phi = rng.uniform(-1, 1, NuisanceMap.from_experiment(cube).size)
@@ -66,7 +66,7 @@ def test_what_a_user_adds_is_found_beside_the_material(name: str, method: str, r
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 
 
-def test_a_run_tells_of_it_and_the_verdict_judges_it():
+def test_a_run_reports_the_numerical_damping_and_the_verdict_judges_it():
     cube = known_to(replace(hung_cube(14), nuisance=only(SCALE)), 1e-4)
     far = 5.0  # deviations of its prior
     seen = seen_with(cube, np.array([far]))

@@ -188,7 +188,7 @@ def test_poisson_is_estimated_on_a_linear_scale_by_tenths():
     assert (poisson.lower, poisson.upper) == (0.05, 0.45)
 
 
-def test_the_scale_may_be_told():
+def test_the_scale_may_be_stated():
     given = {"young_pa": Unknown(700.0), "poisson": Unknown(0.2, scale="log"), **DAMPED}
     logarithm = Parameters.from_mapping(given)
     assert logarithm.guess_q[1] == pytest.approx(np.log(0.2))
@@ -274,7 +274,7 @@ def test_a_parameter_that_only_another_is_tied_to_counts_as_used():
     ],
     ids=["nothing", "itself", "one that is tied"],
 )
-def test_ties_to_what_has_no_value_are_refused(tied, message):
+def test_ties_to_parameters_without_a_value_are_refused(tied, message):
     given = {"lambda_pa": tied, "mu_pa": 1.0, "gamma_r_s": Tied("mu_pa"), "gamma_m_1_s": 0.0}
     with pytest.raises(InputError, match=message):
         Parameters.from_mapping(given)
@@ -304,7 +304,7 @@ def test_regions_share_names_without_a_region_and_have_their_own(rng):
     assert_derivatives(parameters, body, rng)
 
 
-def test_a_region_takes_of_shared_moduli_what_its_material_needs():
+def test_a_region_takes_the_shared_moduli_that_its_material_needs():
     given = {"young_pa": 1.0, "poisson": 0.2, **GIVEN, "core.c10_pa": 1.0, "core.c01_pa": 2.0}
     body = two_regions("mooney-rivlin")
     Parameters.from_mapping(given).require_constants_of([body])
@@ -398,7 +398,7 @@ def test_as_many_numbers_as_constants_are_taken():
         resolve_theta(box(), [400.0, 400.0, 0.01])
 
 
-def test_with_guess_changes_only_what_it_names():
+def test_with_guess_changes_only_the_named_parameters():
     other = MIXED.with_guess({"poisson": 0.3, "young_pa": 800.0})
     assert other.guesses == pytest.approx(
         {"young_pa": 800.0, "poisson": 0.3, "gamma_r_s": 0.02, "gamma_m_1_s": 0.0}
@@ -421,7 +421,7 @@ def test_estimates_beyond_the_bounds_start_at_the_bounds():
         MIXED.with_estimates({"lambda_pa": 3.0})
 
 
-def test_with_fixed_fixes_what_it_names():
+def test_with_fixed_fixes_the_named_parameters():
     other = IN_LAME.with_fixed({"mu_pa": 200.0})
     assert [item.name for item in other.free] == ["lambda_pa", "gamma_r_s", "gamma_m_1_s"]
     assert other.guesses == pytest.approx({**IN_LAME.guesses, "mu_pa": 200.0})
@@ -555,7 +555,7 @@ def test_a_name_given_twice_is_refused():
         Parameters((IN_LAME.items[1], *IN_LAME.items))
 
 
-def test_what_was_found_below_zero_can_be_fixed_there():
+def test_a_negative_estimate_can_be_fixed():
     """So are the constants of a recording that is predicted only."""
     free = Parameters.from_mapping({"c10_pa": 1e4, "c01_pa": Unknown(-1e3, scale="linear")})
     fixed = free.only_fixed({"c01_pa": -1.4e3})

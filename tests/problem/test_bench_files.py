@@ -104,7 +104,7 @@ def test_a_machines_columns_are_recognised_with_their_units(written, text, encod
     assert np.isnan(quarter[:, 1:]).all()
 
 
-def test_strain_and_stress_become_what_a_specimen_of_that_size_does(written):
+def test_strain_and_stress_become_displacement_and_force(written):
     file = written("Strain (%),Stress [MPa]\n0,0\n1,0.02\n2,0.05\n")
     moved = read_displacement(file, length_m=0.03, timed=False)
     np.testing.assert_allclose(moved.positions_m[:, 2], [0, 3e-4, 6e-4])
@@ -177,7 +177,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("text", "how", "words"), BAD.values(), ids=BAD)
-def test_what_cannot_be_the_force_says_why_and_what_to_write(written, text, how, words):
+def test_an_unusable_force_column_is_refused_with_reason_and_remedy(written, text, how, words):
     with pytest.raises(InputError, match=re.escape(words)):
         read_wrench(written(text), **how)
 
@@ -223,7 +223,7 @@ def block_problem(folder: Path, text: str = SHARED) -> Path:
     return folder / "problem.toml"
 
 
-def test_experiments_share_what_they_do_not_say_themselves(tmp_path):
+def test_experiments_share_keys_that_they_do_not_state(tmp_path):
     problem = Problem.read(block_problem(tmp_path))
     first, second = problem.experiments
     np.testing.assert_allclose(first.t_s, [0, 0.2])
@@ -354,7 +354,7 @@ def test_a_part_of_a_default_is_overridden_for_one_experiment(tmp_path):
         ("[experiment_defaults]", "[[experiment_defaults]]", "experiment_defaults: found ["),
     ],
 )
-def test_a_slip_in_what_is_shared_is_named_where_it_stands(tmp_path, old, new, words):
+def test_a_mistake_in_shared_keys_is_named_at_its_place(tmp_path, old, new, words):
     assert old in SHARED
     file = block_problem(tmp_path, SHARED.replace(old, new))
     with pytest.raises(InputError) as caught:
@@ -378,7 +378,7 @@ def test_a_slip_in_what_is_shared_is_named_where_it_stands(tmp_path, old, new, w
         ("%", "ratio", 1e-2),
     ],
 )
-def test_units_are_what_they_are_defined_as(unit: str, dimension: str, si: float):
+def test_units_have_their_defined_factors(unit: str, dimension: str, si: float):
     assert si_factor(unit, dimension) == pytest.approx(si, rel=1e-7)
 
 
@@ -422,7 +422,7 @@ def test_a_new_problem_of_each_kind_runs_as_it_is(tmp_path, monkeypatch, kind, d
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_recordings_of_templates_are_what_a_simulation_gives(tmp_path, kind):
+def test_the_recordings_of_templates_equal_a_simulation(tmp_path, kind):
     shutil.copytree(TEMPLATES / kind, tmp_path / kind)
     shipped = sorted((TEMPLATES / kind).glob("*.csv"))
     for file in shipped:
@@ -502,7 +502,7 @@ def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
     ],
     ids=["signs", "names", "strain and stress", "a name for one", "a time for one", "half"],
 )
-def test_a_simulated_table_reads_back_as_what_was_simulated(
+def test_a_simulated_table_reads_back_unchanged(
     tmp_path, displacement, wrench, measured, simulated
 ):
     text = SHARED.replace("displacement = { sign = -1 }", f"displacement = {{ {displacement} }}")

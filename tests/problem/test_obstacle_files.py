@@ -74,7 +74,7 @@ def written(folder: Path, ball: str = BALL, friction: str = '"ball_friction"') -
     return folder / "problem.toml"
 
 
-def test_what_a_file_says_of_obstacles(tmp_path: Path):
+def test_a_file_describes_obstacles(tmp_path: Path):
     problem = cs.Problem.read(written(tmp_path), simulation=True)
     (experiment,) = problem.experiments
     ball, wall = experiment.obstacles
@@ -109,7 +109,7 @@ def test_what_a_file_says_of_obstacles(tmp_path: Path):
         (BALL, '"table_friction"', "did you mean 'table_friction'"),
     ],
 )
-def test_what_cannot_be_is_refused(tmp_path: Path, ball: str, friction: str, message: str):
+def test_invalid_obstacles_are_refused(tmp_path: Path, ball: str, friction: str, message: str):
     with pytest.raises(InputError, match=message):
         cs.Problem.read(written(tmp_path, ball, friction), simulation=True)
 

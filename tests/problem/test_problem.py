@@ -105,7 +105,7 @@ def test_a_file_from_a_windows_editor_is_read(tiny):
 # Body and parameters ------------------------------------------------------------------------------
 
 
-def test_the_body_weighs_what_was_weighed(tiny):
+def test_the_body_has_the_stated_mass(tiny):
     replace_text("density_kg_m3 = 30.0", "mass_kg = 0.02")(tiny)
     assert load(tiny).bodies[0].node_mass.sum() == pytest.approx(0.02)
 
@@ -172,7 +172,7 @@ def test_parameters_may_be_numbers_ties_and_on_a_linear_scale(tiny):
     assert parameters.guesses["gamma_m_1_s"] == 0.7
 
 
-def test_what_was_cleaned_is_noted(tiny):
+def test_cleaned_samples_are_noted(tiny):
     mesh = meshio.read(tiny / "body.vtu")
     mesh.points = np.vstack([mesh.points, [9.0, 9.0, 9.0]])
     mesh.cells[0].data[0] = mesh.cells[0].data[0][[0, 1, 3, 2]]
@@ -353,7 +353,7 @@ def test_the_window_that_a_message_gives_cuts_a_recording_to_its_poses(tiny):
     assert problem.notes == ()
 
 
-def test_poses_that_lack_one_sample_at_the_end_are_told(tiny):
+def test_poses_that_lack_one_sample_at_the_end_are_reported(tiny):
     keep_lines(POSES, 9)(tiny)
     (note,) = load(tiny).notes
     assert "the markers were cut to the time of the poses by 0.01 s at the end" in note
@@ -368,7 +368,7 @@ def test_a_grasp_that_stands_still_needs_two_poses(tiny):
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
-def test_sparse_poses_are_taken_where_it_is_said_how_the_grasp_moves(tiny, interpolation):
+def test_sparse_poses_are_accepted_where_the_interpolation_is_stated(tiny, interpolation):
     slower(tiny, 300.0)
     keep = (tiny / POSES).read_text().splitlines()
     (tiny / POSES).write_text("\n".join([keep[0], keep[1], keep[-1]]))

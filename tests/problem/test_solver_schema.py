@@ -25,7 +25,7 @@ def solver_of(tables: str) -> SolverSection:
 
 
 @each_method
-def test_the_schema_tells_what_the_method_does_by_default(method: str):
+def test_the_schema_states_the_defaults_of_methods(method: str):
     schema = json.loads(run_command("schema").out)
     table = schema["$defs"]["SolverSection"]["properties"][method]
     defaults = {name: option["default"] for name, option in table["properties"].items()}
@@ -101,7 +101,7 @@ def test_tables_of_several_methods_stand_side_by_side():
         ("solver.penalty.rho_factor=1", "solver.penalty.rho_factor: found 1; expected a number ab"),
     ],
 )
-def test_what_does_not_belong_in_a_table_is_refused(tiny, override: str, message: str):
+def test_unknown_keys_of_a_table_are_refused(tiny, override: str, message: str):
     with pytest.raises(InputError) as refused:
         read_problem_file("problem.toml", [override])
     assert message in str(refused.value)
@@ -123,7 +123,7 @@ def test_the_methods_are_listed_with_a_line_on_each():
 
 
 @each_method
-def test_a_method_tells_its_options(method: str):
+def test_a_method_lists_its_options(method: str):
     text = run_command("methods", method).out
     told = json.loads(run_command("methods", method, "--json").out)["properties"]
     assert list(told) == [field.name for field in fields(METHODS[method])]
@@ -131,7 +131,7 @@ def test_a_method_tells_its_options(method: str):
         assert f"\n{name} " in text
 
 
-def test_an_option_is_told_with_its_default_and_what_it_can_be():
+def test_an_option_is_described_with_default_and_choices():
     told = " ".join(run_command("methods", "reduced-space").out.split())
     assert "ladder [0.25, 0.5, 1] list, each a number above 0; Shares of the recording" in told
     assert (
@@ -145,7 +145,7 @@ def test_an_option_is_told_with_its_default_and_what_it_can_be():
     assert "under [solver.reduced-space]" in told
 
 
-def test_a_method_that_there_is_not_cannot_tell():
+def test_an_unknown_method_is_refused():
     outcome = run_command("methods", "interior")
     assert outcome.code == 2
     assert "NAME: found 'interior'" in outcome.err

@@ -90,7 +90,7 @@ def test_a_marker_of_the_gripper_is_fitted_if_it_is_named(tracked):
     assert experiment.markers.names == ("low", "base1")
 
 
-def test_a_marker_that_moves_on_the_gripper_is_told_with_its_frame(tracked):
+def test_a_marker_that_moves_on_the_gripper_is_reported_with_its_frame(tracked):
     expected = load(tracked).experiments[0].t_s
 
     def loosen(tracks):

@@ -31,7 +31,7 @@ def with_sensor(folder: Path, text: str | None = None, sensor: str = SENSOR) -> 
     return file
 
 
-def test_what_is_written_is_read_again(tmp_path: Path, rng: np.random.Generator):
+def test_written_wrenches_are_read_again(tmp_path: Path, rng: np.random.Generator):
     t_s, values = np.arange(5) / 3, rng.normal(size=(5, 6))
     values[2, 1] = np.nan
     write_wrench_csv(tmp_path / "w.csv", t_s, values)
@@ -84,7 +84,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("text", "words"), BAD.values(), ids=BAD)
-def test_a_file_that_cannot_be_read_says_why(tmp_path: Path, text: str, words: list[str]):
+def test_a_file_that_cannot_be_read_gives_the_reason(tmp_path: Path, text: str, words: list[str]):
     file = tmp_path / "force.csv"
     file.write_text(text)
     with pytest.raises(InputError) as caught:

@@ -93,7 +93,7 @@ REST = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 
 
 @pytest.mark.long
-def test_a_thick_sphere_that_keeps_its_volume_inflates_as_rivlin_says():
+def test_a_thick_sphere_that_keeps_its_volume_inflates_as_rivlin_predicts():
     """p / μ = [−2/λ − 1/(2λ⁴)] between the stretches outside and inside, upside down."""
     inner, outer, mu = 0.01, 0.02, 3e4
 

@@ -134,7 +134,7 @@ def test_a_contact_force_is_the_slope_of_its_energy(which):
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4])
-def test_what_a_body_is_given_its_obstacle_loses(friction):
+def test_body_and_obstacle_exchange_equal_impulses(friction):
     experiment, states = pushed(friction)
     places = states.xi.reshape(-1, 3)
     for term in contact_terms(experiment):
@@ -156,7 +156,7 @@ def test_friction_dissipates_and_stays_within_its_cone():
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4])
-def test_a_step_sees_of_contact_what_all_points_of_the_surface_do(friction):
+def test_a_step_with_near_points_has_the_contact_force_of_all_points(friction):
     experiment, states = pushed(friction)
     forces = Forces.from_experiment(experiment, experiment.t_s[-1:], states.theta)
     rest = forces.without_local_forces()
@@ -286,7 +286,7 @@ def test_platens_that_rub_enough_stick():
 # An independent answer -----------------------------------------------------------------------
 
 
-def test_stiffer_contact_tends_to_what_may_not_enter_at_all():
+def test_stiffer_contact_converges_to_complementarity():
     """The least elastic energy of all shapes of which no point of contact is in the ball."""
     body, t_s = box(divisions=(2, 2, 1)), np.zeros(1)
     held = Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed())

@@ -76,7 +76,7 @@ def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(axis
 
 
 @pytest.mark.long
-def test_what_is_beside_the_body_is_left_out_and_counted(rng):
+def test_pixels_beside_the_body_are_omitted_and_counted(rng):
     image = noisy(rng)
     image[:20] = 0.34  # a wall above the bar, nearer than it
     solution = fitted(image, POSE)
@@ -198,7 +198,7 @@ def test_an_exr_image_is_read(tmp_path):
     np.testing.assert_allclose(read.images_m[0], image_m(), rtol=1e-6)
 
 
-def test_of_a_damaged_exr_image_only_the_refusal_is_said(tmp_path, capfd):
+def test_a_damaged_exr_image_gives_one_message(tmp_path, capfd):
     library, file = pytest.importorskip("OpenEXR"), tmp_path / "image.exr"
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
     with library.File(header, {"Z": image_m().astype(np.float32)}) as image:
@@ -257,7 +257,7 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_truth_as_often_as_they_say():
+def test_intervals_contain_the_truth_at_their_nominal_rate():
     """Of twins with noise alike over three pixels and a bias; see scripts/study_depth.py."""
     from study_depth import holds
 
@@ -273,7 +273,7 @@ def test_a_dropout_is_a_cloud_without_points():
 
 
 @pytest.mark.parametrize(("guess_pa", "is_best"), [(1e5, False), (1.5e5, True)])
-def test_a_search_that_ended_at_a_jump_of_the_loss_says_so(guess_pa, is_best):
+def test_a_search_that_ended_at_a_jump_of_the_loss_is_reported(guess_pa, is_best):
     """Few points from a camera whose stated pose is far off have several minima."""
     pose = moved(np.array([0.15, -0.09, 0.06]), np.array([0.012, 0.006, -0.009]))
     image = image_m() + NOISE_M * np.random.default_rng(2).normal(size=SHAPE)

@@ -64,7 +64,7 @@ def test_of_a_folded_body_where_it_is_nothing_counts_as_hidden():
     assert np.linalg.norm(seen - feet, axis=1)[used].max() < 1e-6
 
 
-def test_points_nearest_to_what_another_part_hides_are_left_out_and_counted():
+def test_points_nearest_to_hidden_parts_are_omitted_and_counted():
     sighting, triangles = seen_in(np.array([0.0, -0.7 * APART_M, 0.0]))
     used, camera = sighting.is_compared[0], sighting.camera.depth.camera
     feet = np.einsum("ea,eai->ei", sighting.weights[0], sighting.shapes_m[0][sighting.nodes[0]])
@@ -84,7 +84,7 @@ def test_points_nearest_to_what_another_part_hides_are_left_out_and_counted():
     assert used.sum() > 50
 
 
-def test_what_a_body_hides_counts_once_its_shape_has_settled():
+def test_hidden_points_count_once_the_shape_has_settled():
     sought, _ = seen_in(np.array([0.0, -0.7 * APART_M, 0.0]), settled=False)
     nothing = np.zeros(sought.camera.nuisance.size)
     far = sought.updated(sought.shapes_m + 0.004, nothing)

@@ -53,7 +53,7 @@ def run() -> cs.Run:
 
 
 @pytest.mark.long
-def test_the_interval_holds_the_truth_beside_what_the_step_does(run):
+def test_the_interval_contains_the_truth_with_a_step_error(run):
     low, high = run.interval("young_pa")
     assert low < MADE["young_pa"] < high
     # Steps of a whole sample make it stiffer, and the run says by how much.

@@ -112,7 +112,7 @@ def test_noise_along_the_rays_does_not_choose_the_points_beside_a_crease():
     assert np.count_nonzero(turned) <= 2
 
 
-def test_a_body_that_is_too_soft_extends_beyond_what_the_image_shows():
+def test_a_body_that_is_too_soft_extends_beyond_the_image():
     apart_px = outside_px(sighting(image_m(), 0.5 * TRUTH["young_pa"]))
     assert apart_px.max() > 5
     stiff_px = outside_px(sighting(image_m(), 2.0 * TRUTH["young_pa"]))

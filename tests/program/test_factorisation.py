@@ -138,7 +138,7 @@ def test_in_wide_bands_the_skew_part_is_solved_for_whether_or_not_it_is_small(
 
 @pytest.mark.parametrize("choice", ["band", "sparse"])
 @pytest.mark.parametrize("stiffness", [1.0, -1.0])
-def test_in_wide_bands_pivots_tell_whether_what_slides_is_stable(choice, stiffness: float):
+def test_pivots_of_wide_bands_decide_the_stability_of_sliding(choice, stiffness: float):
     """A pressure that grows along z, and pushes along x by friction: half of that is symmetric."""
     values, skew = np.zeros(WIDE.entry_count), np.zeros(WIDE.entry_count)
     values[WIDE.diagonal] = stiffness
@@ -168,7 +168,7 @@ def test_factors_that_live_together_do_not_share_their_memory():
             np.testing.assert_allclose(kept(FULL, values, free) @ solved, right, atol=1e-10)
 
 
-def test_what_is_asked_for_and_not_installed_is_told(monkeypatch):
+def test_a_solver_that_is_not_installed_is_reported(monkeypatch):
     monkeypatch.setattr(
         "collocation_sysid.program.linear_algebra.supernodal.load_mkl", lambda: None
     )
@@ -271,7 +271,7 @@ def test_factors_in_single_precision_solve_as_accurately(
 
 @pytest.mark.parametrize("choice", WIDE_CHOICES)
 @pytest.mark.parametrize("is_single", [False, True])
-def test_a_small_skew_part_tells_nothing_about_that_of_the_next_matrix(choice, is_single: bool):
+def test_symmetry_is_examined_for_each_matrix(choice, is_single: bool):
     """As under friction, where points stick in one time step and slip in the next."""
     free = without_first_nodes(WIDE)
     values = random_values(WIDE, 100.0)

@@ -140,7 +140,7 @@ def test_error_bars_and_verdict_know_them():
         ),
     ],
 )
-def test_what_a_reading_lacks_is_said(changes: dict, words: str):
+def test_missing_keys_of_a_custom_sensor_are_named(changes: dict, words: str):
     good = accelerometer(0.01 * np.arange(9))
     with pytest.raises(InputError, match=words):
         replace(good, **changes)
@@ -209,7 +209,7 @@ def clamped(steps: int = 16) -> Experiment:
     return with_readings(made, [1.05 * felt, 1.04 * strains])
 
 
-def test_a_load_cell_in_the_clamp_reads_what_a_sensor_there_does():
+def test_a_load_cell_in_the_clamp_equals_a_sensor_there():
     cube = replace(hung_cube(20), nuisance=IDEAL)
     for frame in ("grasp", "world"):
         wrench = Wrench(cube.t_s, np.zeros((len(cube.t_s), 6)), 1.0, 1.0, frame)
@@ -344,7 +344,7 @@ def blank_cell(folder: Path) -> None:
         (blank_cell, "swing_reading_cell.csv: line 2: column pull_n holds"),
     ],
 )
-def test_what_is_no_reading_in_a_file_is_one_message(worn: Path, edit, words: str):
+def test_an_invalid_custom_sensor_in_a_file_is_one_message(worn: Path, edit, words: str):
     edit(worn)
     done = run_command("check", *ALLOWED)
     assert done.code == 2

@@ -77,7 +77,7 @@ def test_errors_of_another_size_scale_the_covariance(rng):
     np.testing.assert_allclose(found.standard_errors**2, np.diag(found.covariance()))
 
 
-def test_what_is_left_of_the_first_parameters_is_the_inverse_of_their_covariance(rng):
+def test_the_reduced_information_is_the_inverse_of_the_marginal_covariance(rng):
     found = SquareRootInformation.empty(5).with_rows(rng.normal(size=9), rng.normal(size=(9, 5)))
     share = found.marginal(2)
     np.testing.assert_allclose(share.covariance(), found.covariance()[:2, :2], atol=1e-10)

@@ -82,14 +82,14 @@ def test_rigid_motions_of_a_free_body_are_left_out(divisions):
     np.testing.assert_allclose(modes.frequencies_hz, expected[6:12], rtol=1e-7)
 
 
-def test_a_clamped_bar_bends_as_beam_theory_says():
+def test_a_clamped_bar_bends_as_beam_theory_predicts():
     modes = clamped(bar("tet10"))
     # Cantilever: (1.8751 / L)² √(E I / ρ A), I / A = a² / 12; in both directions across.
     expected = 1.8751**2 / LENGTH_M**2 * np.sqrt(YOUNG_PA * SIDE_M**2 / 12 / DENSITY)
     np.testing.assert_allclose(modes.frequencies_hz[:2], expected / (2 * np.pi), rtol=0.03)
 
 
-def test_a_clamped_bar_stretches_as_rod_theory_says():
+def test_a_clamped_bar_stretches_as_rod_theory_predicts():
     body = bar(divisions=(16, 1, 1))
     modes = clamped(body, count=10)
     along = np.einsum("kn,n->k", modes.shapes[:, :, 0] ** 2, body.node_mass)

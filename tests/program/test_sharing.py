@@ -39,7 +39,7 @@ ELASTIC = Parameters(
 )
 
 
-def test_what_is_shared_is_saved():
+def test_shared_parameters_are_saved():
     cube = cube_with_nuisance(4)
     shared = ("marker_offset_m", "camera_offset_m", "time_shift_s", "pose_turn_rad", "gravity_rad")
     first, second = sharing(cube, "hand_eye_m"), swung_again(cube, "second")
@@ -144,7 +144,7 @@ def test_markers_glued_once_are_found_once(on_surface: bool):
     np.testing.assert_array_equal(one.axes, two.axes)
 
 
-def test_places_found_once_leave_the_data_to_tell_of_the_material():
+def test_places_found_once_leave_the_data_to_the_material():
     whole = equilibria(8)
     shear = Parameters(tuple(replace(p, is_fixed=p.name != "mu_pa") for p in ELASTIC.items))
     shear, spreads = shear.with_guess({"lambda_pa": TRUTH["lambda_pa"]}), []
@@ -224,7 +224,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("case", OTHERS)
-def test_what_belongs_to_things_that_differ_is_not_shared(case: str):
+def test_parameters_of_different_objects_are_not_shared(case: str):
     scope, change, message = OTHERS[case]
     cube = replace(hung_cube(4), nuisance=Nuisance(marker_offset_m=0.002, scope=scope))
     other = replace(change(cube), name="other")
@@ -246,7 +246,7 @@ def test_what_belongs_to_things_that_differ_is_not_shared(case: str):
         ),
     ],
 )
-def test_a_scope_that_says_nothing_is_refused(scope, message: str):
+def test_an_empty_scope_is_refused(scope, message: str):
     with pytest.raises(InputError, match=message):
         Nuisance(scope=scope)
 
@@ -278,7 +278,7 @@ def two(made, tmp_path) -> Path:
 
 
 @pytest.mark.long
-def test_a_file_shares_them_and_its_run_says_so_of_both(two: Path):
+def test_a_file_shares_parameters_and_its_run_names_both(two: Path):
     done = run_command("solve", two / "problem.toml", "--out", two / "run")
     assert done.code == 0, done.err
     result = json.loads((two / "run" / "result.json").read_text())
@@ -316,7 +316,7 @@ def test_a_file_shares_them_and_its_run_says_so_of_both(two: Path):
     ],
 )
 @pytest.mark.parametrize("command", ["check", "solve"])
-def test_a_file_that_shares_what_it_cannot_is_refused(two: Path, command, old, new, message: str):
+def test_a_file_that_shares_unshareable_keys_is_refused(two: Path, command, old, new, message: str):
     head, _, tail = (two / "problem.toml").read_text().rpartition(old)
     (two / "problem.toml").write_text(head + new + tail)
     done = run_command(command, two / "problem.toml")

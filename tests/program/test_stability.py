@@ -186,7 +186,7 @@ def test_a_body_that_nobody_holds_is_stable():
 
 
 @pytest.mark.parametrize(("law", "told"), [(LAWS[0], False), (LAWS[1], True)])
-def test_what_grows_is_told_with_its_rate(law, told):
+def test_growing_modes_are_reported_with_their_rate(law, told):
     experiment = held_at_both_ends(bar(law, across=2))
     given = {name: value for name, value in CONSTANTS.items() if value}
     items = [Parameter(name, value, 0.5 * value, 2 * value) for name, value in given.items()]

@@ -225,7 +225,7 @@ def replaced(grasps, top):
     return (grasps[0], top, *grasps[2:])
 
 
-def test_a_static_problem_tells_nothing_of_damping_before_and_after():
+def test_a_static_problem_reports_no_damping_before_and_after():
     problem = cs.Problem([noisy(block("xyz", gravity_m_s2=HANGING))], parameters=GUESS)
     (note,) = static_concerns(problem.experiments, GUESS)
     assert note.message.startswith(
@@ -408,7 +408,7 @@ def bench(folder, zero_m: float = 1e-3) -> Path:
 
 
 @pytest.mark.long
-def test_a_test_bench_without_markers_tells_stiffness_and_zero(tmp_path):
+def test_a_test_bench_without_markers_determines_stiffness_and_zero(tmp_path):
     found = run(cs.Problem.read(bench(tmp_path)), seek_causes=False)
     assert found.estimates["young_pa"].value == pytest.approx(1e5, rel=2e-3)
     (part,) = found.solution.collocation.iterates(found.solution.z)

@@ -66,7 +66,7 @@ BLOCK = {"young_pa": 20e3, "poisson": 0.3, "gamma_r_s": 4e-3, "gamma_m_1_s": 0.2
 
 @pytest.mark.long
 @pytest.mark.parametrize("integrator", ["midpoint", "newmark"])
-def test_a_run_recovers_what_a_simulation_was_made_with_both_with_their_default_steps(integrator):
+def test_a_run_recovers_the_constants_of_a_simulation_with_default_steps(integrator):
     """With one step a sample the midpoint rule's twin gave E = 18.7 kPa (18.5 to 18.9)."""
     block = swung_block()
     tracks_m = cs.simulate(block, BLOCK, integrator).markers_m
@@ -79,7 +79,7 @@ def test_a_run_recovers_what_a_simulation_was_made_with_both_with_their_default_
 
 
 @pytest.mark.long
-def test_a_simulation_takes_as_many_steps_as_its_motion_needs_and_says_how_far_off_it_is():
+def test_a_simulation_chooses_its_steps_and_reports_its_error():
     block = swung_block()
     chosen = cs.simulate(block, BLOCK, "midpoint")
     fine = cs.simulate(block, BLOCK, "midpoint", substeps=64).positions_m
@@ -138,7 +138,7 @@ def test_a_scheme_of_first_order_has_its_error_in_the_interval_too():
     assert holds(euler.interval("gamma_r_s"), TRUTH["gamma_r_s"])
 
 
-def test_what_was_not_estimated_is_not_said_to_be_held():
+def test_unestimated_parameters_are_not_reported_as_held():
     coarse = found(3e-4, 1)
     unseen = replace(coarse.problem, rollout=cs.RolloutOptions("scheme"))
     blind = run(unseen, seek_causes=False)
@@ -162,7 +162,7 @@ def test_as_many_steps_are_taken_as_leave_half_a_standard_error():
     assert finer.trust.verdict == "good"
 
 
-def test_it_is_told_what_was_chosen_and_why():
+def test_the_chosen_substeps_are_reported_with_the_reason():
     finer = found(3e-4)
     (said,) = [note for note in finer.solution.notes if "standard errors" in note]
     many = finer.solution.collocation.substeps
@@ -231,7 +231,7 @@ def test_the_first_answer_counts_where_the_finer_is_not_found():
 
 
 @pytest.mark.parametrize("how", [cs.Status.INTERRUPTED, KeyboardInterrupt()])
-def test_an_interrupt_at_finer_steps_leaves_the_first_answer_and_says_so(how):
+def test_an_interrupt_at_finer_steps_leaves_the_first_answer_with_a_note(how):
     kept = run(twin(3e-4), fails_at_finer_steps(how), seek_causes=False)
     assert kept.parameters["mu_pa"] == pytest.approx(found(3e-4, 1).parameters["mu_pa"])
     assert "a finer time step" in kept.omitted_checks
@@ -263,7 +263,7 @@ def test_refine_goes_on_from_the_steps_that_were_chosen():
 # Value, interval, verdict and what the interval holds, together
 
 
-def test_every_view_has_value_interval_verdict_and_what_the_interval_holds():
+def test_every_view_has_value_interval_and_verdict():
     coarse = found(3e-4, 1)
     low, high = coarse.interval("mu_pa")
     contained = "noise, the step error, the mesh error and systematic effects"

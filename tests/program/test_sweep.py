@@ -125,7 +125,7 @@ def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     assert left == pytest.approx(np.sum(y[:, free] * residual), rel=1e-9)
 
 
-def test_what_is_given_does_not_move():
+def test_held_nodes_have_no_sensitivity():
     collocation = Collocation([released_cube(4)], GUESS)
     _, positions = disturbed(collocation)
     (found,) = forward(collocation, positions)

@@ -122,7 +122,7 @@ def test_the_frame_of_the_grasp_moves_along():
     np.testing.assert_allclose(about, in_world[:, 3:], atol=1e-12)
 
 
-def test_a_grasp_that_lets_go_tells_its_wrench_while_it_holds():
+def test_a_grasp_that_lets_go_has_a_wrench_while_it_holds():
     part = at_truth(sensing(bar_let_go(12)))
     still, moving = part.transcription.sensors
     assert still.observable.known_rows[-1] == 11
@@ -192,7 +192,7 @@ def test_the_slope_of_a_low_pass_is_its_derivative(lag_s: float, rng):
     np.testing.assert_allclose(slope, expected, rtol=1e-3, atol=0.02)
 
 
-def test_a_low_pass_lets_what_is_steady_through_and_nothing_without_a_lag(rng):
+def test_a_low_pass_passes_constants_and_delays_the_rest(rng):
     signal = rng.normal(size=20)
     np.testing.assert_allclose(low_passed(signal, 0.0).states.ravel(), signal, rtol=1e-14)
     np.testing.assert_allclose(low_passed(np.full(9, 3.0), 0.05).states, 3.0, rtol=1e-14)
@@ -201,7 +201,7 @@ def test_a_low_pass_lets_what_is_steady_through_and_nothing_without_a_lag(rng):
 # Static experiments and single axes ---------------------------------------------------------------
 
 
-def test_a_platen_gives_what_the_plate_and_the_weight_take():
+def test_platen_plate_and_weight_are_in_equilibrium():
     cube = pressed()
     below, above = simulate(cube, TRUTH).wrenches
     weight_n = 9.81 * cube.body.mass_kg

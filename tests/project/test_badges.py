@@ -65,7 +65,7 @@ def test_badges_are_inserted_and_removed_again():
     assert badges.with_badges(inserted, "") == badges.with_badges(page, "")
 
 
-def test_what_is_no_address_of_a_repository_is_refused():
+def test_an_invalid_repository_address_is_refused():
     with pytest.raises(ValueError, match="expected an address such as"):
         badges.repository_url(stating("someone/collocation_sysid"))
     with pytest.raises(ValueError, match="expected once"):
@@ -83,7 +83,7 @@ def test_every_notebook_has_badges_and_states_a_time_of_at_most_45_minutes():
         assert stated.start() < text.index("# %%\n")  # before the first cell
 
 
-def test_binder_installs_what_the_notebooks_need():
+def test_binder_installs_the_packages_of_the_notebooks():
     lines = (ROOT / ".binder/requirements.txt").read_text().splitlines()
     assert ".[notebook,interactive]" in lines
     runtime = (ROOT / ".binder/runtime.txt").read_text().strip()

@@ -53,7 +53,7 @@ def test_one_parameter_away_is_enough_to_miss_the_answer():
     assert reached_entry(track, TRUTH) is None
 
 
-def test_the_table_says_what_was_reached_and_what_is_not_installed():
+def test_the_table_shows_reached_and_missing_solvers():
     tracks = {
         "reduced-space": track_of(1.5, 1.001),
         "warp": track_of(2.0, 1.8, 1.5, 1.0),
@@ -113,7 +113,7 @@ def test_missing_packages_and_programs_are_named():
     assert Candidate("c", run, package="numpy").missing_requirement() is None
 
 
-def test_without_mujoco_a_message_says_how_to_install_it(monkeypatch, capsys):
+def test_without_mujoco_a_message_names_the_installation(monkeypatch, capsys):
     monkeypatch.setattr(benchmark_peers, "find_spec", lambda _: None)
     assert main([]) == 2
     assert "pip install mujoco" in capsys.readouterr().err

@@ -229,7 +229,7 @@ def test_the_page_on_motion_capture_has_the_table_of_nuisance_parameters(referen
     assert reference.nuisances() in page
 
 
-def test_the_reference_lists_what_is_public_and_nothing_else():
+def test_the_reference_lists_exactly_the_public_names():
     page = (ROOT / "docs" / "api.md").read_text()
     listed = re.findall(r"^   ([\w.]+)$", page, re.MULTILINE)
     listed += re.findall(r"^\.\. py:data:: collocation_sysid\.([\w.]+)$", page, re.MULTILINE)
@@ -265,7 +265,7 @@ SCRIPTS = [each for folder in ("scripts", "docs") for each in sorted((ROOT / fol
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=name_of)
-def test_scripts_import_what_there_is(script: Path):
+def test_scripts_import_existing_names(script: Path):
     for node in ast.walk(ast.parse(script.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("collocation_sysid"):
             module = importlib.import_module(str(node.module))

@@ -27,7 +27,7 @@ def test_the_version_stands_in_one_place():
         assert f'"{PROJECT["version"]}"' not in file.read_text()
 
 
-def test_the_changelog_tells_of_the_version():
+def test_the_changelog_has_the_version():
     dated = re.findall(r"^## \[([\d.]+)\] - \d{4}-\d\d-\d\d$", CHANGELOG, re.MULTILINE)
     assert dated[0] == PROJECT["version"]
 
@@ -111,7 +111,7 @@ def test_the_conda_recipe_has_the_same_dependencies():
     assert listed == [python, *((renamed.get(m[1], m[1]), m[2]) for m in wanted if m)]
 
 
-def test_every_dependency_has_its_licence_told():
+def test_every_dependency_states_its_licence():
     page = (ROOT / "docs" / "licences.md").read_text()
     extras = PROJECT["optional-dependencies"]
     told = ["surface", "c3d", "logs", "cluster", "film", "usd", "mujoco", "large"]
@@ -122,7 +122,7 @@ def test_every_dependency_has_its_licence_told():
         assert re.match(r"[\w-]+", requirement)[0] in page, requirement
 
 
-def test_all_data_of_others_have_their_licence_told():
+def test_all_data_of_others_state_their_licence():
     page = (ROOT / "docs" / "licences.md").read_text()
     scripts = [file.stem.removeprefix("get_") for file in (ROOT / "scripts").glob("get_*.py")]
     assert len(scripts) >= 4

@@ -222,7 +222,7 @@ def test_a_window_cuts_both():
     np.testing.assert_allclose(table.positions_m[:, 0, 0], t[20:31])
 
 
-def test_an_empty_window_tells_the_range():
+def test_an_empty_window_is_refused_with_the_range():
     t = 0.01 * np.arange(100)
     with pytest.raises(InputError, match=r"window_s = \[2, 3\].*from 0 s to 0\.99 s"):
         aligned(moving_poses(t), moving_table(t), window_s=(2.0, 3.0))
@@ -318,7 +318,7 @@ def test_poses_and_markers_that_share_too_little_are_refused(first_s, shared):
         align([moving_poses(first_s + t)], moving_table(t))
 
 
-def test_gaps_and_jumps_of_poses_are_told():
+def test_gaps_and_jumps_of_poses_are_reported():
     t = 0.02 * np.arange(51)
     gappy = moving_poses(np.delete(t, slice(20, 30)), "smooth")
     (note,) = align([gappy], moving_table(t)).notes

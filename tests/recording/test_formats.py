@@ -219,7 +219,7 @@ def test_a_unit_is_asked_for_and_never_guessed(file, name, old, new):
     np.testing.assert_allclose(read_markers(path, length_unit="mm").positions_m, TRACKS_M)
 
 
-def test_a_plain_wide_file_is_in_metres_unless_told_otherwise(file):
+def test_a_plain_wide_file_is_in_metres_unless_a_unit_is_stated(file):
     table = read_markers(file(WIDE), length_unit="mm")
     np.testing.assert_allclose(table.positions_m, TRACKS_M / 1000)
 
@@ -230,7 +230,7 @@ def test_units_are_spelled_in_many_ways(file, unit):
     np.testing.assert_allclose(table.positions_m, TRACKS_M * 1000)
 
 
-def test_a_rate_is_asked_for_where_nothing_tells_the_time(file):
+def test_a_rate_is_required_where_times_are_missing(file):
     path = file(replaced(QUALISYS, "FREQUENCY\t100\nNO_OF_A", "NO_OF_A"))
     message = refusal(path, length_unit="mm")
     assert "neither FREQUENCY nor a column of times" in message
@@ -363,7 +363,7 @@ def test_unlabelled_markers_are_taken_only_if_asked_for(file):
     assert read_markers(file(MOTIVE), names=["Unlabeled 7"]).names == ("Unlabeled 7",)
 
 
-def test_older_headers_do_not_say_which_row_is_which(file):
+def test_older_headers_do_not_name_rows(file):
     text = MOTIVE.replace("\n,Type,", "\n,,").replace("\n,Name,", "\n,,").replace("\n,ID,", "\n,,")
     np.testing.assert_allclose(read_markers(file(text)).positions_m, TRACKS_M)
 

@@ -30,7 +30,7 @@ def test_values_in_gaps_and_beyond_the_samples_are_missing(at_s):
     assert np.isnan(found).all()
 
 
-def test_a_missing_sample_leaves_its_neighbours_and_removes_what_is_between():
+def test_a_missing_sample_removes_only_the_interpolated_steps():
     values = positions(TIMES_S)
     values[1, 0] = np.nan
     at_s = np.array([0.0, 0.5, 1.0, 1.5, 2.0])

@@ -82,7 +82,7 @@ def test_nodes_beside_a_face_that_cuts_elements_are_counted(
         assert f"or {nearly_free} fewer if it is reduced by as much" in said
 
 
-def test_a_grasp_is_told_with_its_nodes_its_size_and_where_it_is():
+def test_a_grasp_is_reported_with_nodes_size_and_place():
     found = held(CORNER)
     assert (found.nodes, found.share) == (8, 8 / 216)
     assert grasp_sentence(found) == (

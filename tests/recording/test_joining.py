@@ -53,7 +53,7 @@ def with_noise(experiment: Experiment, seed: int) -> Experiment:
 
 
 @pytest.mark.parametrize("late", [0.0, 0.17, 0.5, 0.99])
-def test_shares_of_what_joins_between_two_steps_add_up_to_the_time_left(late: float):
+def test_shares_of_nodes_that_join_between_steps_add_up(late: float):
     u = np.arange(-5.0, 6.0) - late
     assert smooth_ramp(u).sum() == pytest.approx(5.5 - late)
     below, above = smooth_ramp(u - 1e-6), smooth_ramp(u + 1e-6)
@@ -62,7 +62,7 @@ def test_shares_of_what_joins_between_two_steps_add_up_to_the_time_left(late: fl
 
 
 @pytest.mark.parametrize("integrator", ["newmark", *SCHEMES])
-def test_what_joins_in_free_fall_falls_along(integrator: str):
+def test_markers_that_join_in_free_fall_fall_with_the_body(integrator: str):
     cube = hung_cube(8, start="undeformed", masses=(PointMass(TIP, 0.05, 0.0233),))
     cube = replace(cube, grasps=())
     undamped = {**TRUTH, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
@@ -132,7 +132,7 @@ def test_the_time_is_found_beside_the_material(method: str):
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 
 
-def test_errors_of_the_time_are_as_large_as_its_deviation_says():
+def test_errors_of_the_time_have_the_stated_deviation():
     exact, scores = seen(0.0634, 0.06), []
     for seed in range(5):
         collocation = Collocation([with_noise(exact, seed)], GUESS)
@@ -146,7 +146,7 @@ def test_errors_of_the_time_are_as_large_as_its_deviation_says():
     assert 0.21 < np.sum(np.square(scores)) < 20.5
 
 
-def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
+def test_a_time_taken_as_exact_biases_the_damping_with_a_note():
     tracks = [replace(seen(0.0634, 0.0734, j)) for j in (None, 0.01)]
     for k, cube in enumerate(tracks):
         precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 2e-4))
@@ -166,7 +166,7 @@ def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
     )
 
 
-def test_the_time_is_told_with_its_error(tmp_path: Path):
+def test_the_time_is_reported_with_its_error(tmp_path: Path):
     found = run(Problem([with_noise(seen(0.0634, 0.06), 1)], GUESS), seek_causes=False)
     said = " ".join(plain_text(run_summary(found.result, tmp_path, details=True)).split())
     assert re.search(

@@ -126,7 +126,7 @@ def test_joints_make_poses_of_a_link_by_the_robots_description(tmp_path: Path) -
     np.testing.assert_allclose(poses.quaternions_xyzw, [about_z(t) for t in T_S], atol=1e-9)
 
 
-def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_its_joints_is_said(
+def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_joints_is_stated(
     tmp_path: Path,
 ) -> None:
     count = 20
@@ -162,7 +162,7 @@ def test_json_messages_of_an_mcap_file_are_read_as_those_of_ros(tmp_path: Path) 
     np.testing.assert_allclose(read_poses(f"{log}#/tool").positions_m[:, 0], T_S, atol=1e-9)
 
 
-def test_a_log_tells_what_its_topics_can_serve_as(tmp_path: Path) -> None:
+def test_the_topics_of_a_log_are_listed_with_their_use(tmp_path: Path) -> None:
     of = Messages()
     place = {"left": (0, 0, 0), "right": (1, 0, 0)}
     messages = [
@@ -469,7 +469,7 @@ PIXELS = np.full((4, 6), 400, dtype="<u2")
         ("/camera/rect/depth", True),
     ],
 )
-def test_images_are_rectified_where_a_word_of_their_topic_says_so(
+def test_images_of_a_rectified_topic_are_rectified(
     tmp_path: Path, topic: str, rectified: bool
 ) -> None:
     of = Messages()
@@ -547,7 +547,7 @@ def test_messages_that_are_not_as_expected_are_refused_with_their_log_and_topic(
         _ = read_depth(Path(f"{log}#/bad"), None, 1.0).images_m[0]
 
 
-def test_a_camera_that_does_not_tell_its_lens_is_not_taken(tmp_path: Path) -> None:
+def test_a_camera_without_lens_model_is_refused(tmp_path: Path) -> None:
     camera = {"K": np.eye(3).ravel().tolist(), "P": [0.0] * 12, "height": 1, "width": 2}
     image = {"encoding": "16UC1", "height": 1, "width": 2, "step": 4, "data": "kAGQAQ=="}
     topics = {
@@ -592,7 +592,7 @@ def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
         ("notes#/tf", "is not a log; expected a ROS bag"),
     ],
 )
-def test_what_a_log_does_not_hold_is_refused(tmp_path: Path, address: str, message: str) -> None:
+def test_missing_topics_of_a_log_are_refused(tmp_path: Path, address: str, message: str) -> None:
     of = Messages()
     arm = of.transform(0.0, "base", "arm", (0, 0, 0), STILL)
     tool = of.transform(0.0, "arm", "tool", (0, 0, 0), STILL)

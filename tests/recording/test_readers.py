@@ -49,7 +49,7 @@ def refusal(read, path, **options):
 # Poses
 
 
-def test_pose_columns_are_told_apart_by_name(file):
+def test_pose_columns_are_distinguished_by_name(file):
     poses = read_poses(file(POSES))
     np.testing.assert_allclose(poses.positions_m, [[0, 0, 1], [0.5, 0, 1]])
     np.testing.assert_allclose(np.abs(poses.quaternions_xyzw), [[0, 0, 0, 1], [0, 0, 1, 0]])

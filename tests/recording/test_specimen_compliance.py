@@ -88,7 +88,7 @@ length_m = 0.02
 
 
 @pytest.mark.parametrize("has_area", [True, False])
-def test_the_displacement_of_a_bench_is_told_from_a_measured_strain(tmp_path, has_area):
+def test_the_displacement_of_a_bench_is_distinguished_from_a_strain(tmp_path, has_area):
     (gauge,) = measured("uniaxial").readings
     force_n = AREA_M2 * gauge.measured_values[:, 0]
     rows = np.column_stack([1e3 * LENGTH_M * STRAIN, force_n if has_area else force_n / AREA_M2])

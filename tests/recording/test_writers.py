@@ -108,7 +108,7 @@ def test_long_trajectories_are_thinned_evenly(tmp_path):
     assert len(list((tmp_path / "frames").iterdir())) == 9
 
 
-def test_frames_hold_what_the_material_feels(tmp_path):
+def test_frames_contain_strain_and_stress(tmp_path):
     body = Body(MESH, density_kg_m3=30.0)
     fields = ElementFields.from_body(body, np.array([200.0, 300.0, 0.0, 0.0]))
     stretch = np.linspace(1.0, 1.2, 3)[:, None, None]
@@ -240,7 +240,7 @@ def test_an_edited_file_keeps_an_earlier_run_from_being_replaced(tmp_path):
         pytest.fail("the work was started")
 
 
-def test_what_is_written_into_a_run_later_may_be_replaced_with_it(tmp_path):
+def test_files_added_to_a_run_are_replaced_with_it(tmp_path):
     target = earlier_run(tmp_path / "run")
     write_text_file(target / "report.html", "a page")
     write_text_file(target / "old.png", "drawn again")

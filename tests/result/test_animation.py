@@ -58,7 +58,7 @@ def frames_in(file: Path) -> list[np.ndarray]:
 # What is stored
 
 
-def test_a_run_stores_what_is_needed_to_look_at_it(run):
+def test_a_run_stores_the_frames_of_its_film(run):
     _, (swing, nod) = read_run(run)
     assert (swing.name, nod.name) == ("swing", "nod")
     assert swing.positions_m.shape == swing.rolled_out_positions_m.shape == (9, NODES, 3)
@@ -133,7 +133,7 @@ def test_the_body_fills_a_large_part_of_the_frame(run):
     assert max(height / room, width / FILM_WIDTH_MM) > 0.6
 
 
-def test_the_film_says_how_far_the_markers_are_off(run):
+def test_the_film_shows_the_distance_of_markers(run):
     _, (swing, _) = read_run(run)
     film = FilmFigure(swing)
     film.show_sample(8)

@@ -59,7 +59,7 @@ def seeing(pose: np.ndarray, factor: float = 1.0) -> cs.Experiment:
         (IN_MM, 1000.0, ["points were in mm", "pose were in mm"]),
     ],
 )
-def test_a_camera_that_sees_nothing_of_the_body_is_told_why(pose, factor, said):
+def test_a_camera_that_sees_nothing_is_reported_with_the_reason(pose, factor, said):
     (mistake,) = camera_hypotheses(seeing(pose, factor))
     assert mistake.cause == "camera"
     # Of those that do as well each has as many as are wrong.
@@ -68,7 +68,7 @@ def test_a_camera_that_sees_nothing_of_the_body_is_told_why(pose, factor, said):
     assert {each.count("(state") for each in either} == {len(said)}
 
 
-def test_an_inverted_pose_is_told_with_what_to_state():
+def test_an_inverted_pose_is_reported_with_what_to_state():
     (mistake,) = camera_hypotheses(seeing(INVERTED))
     assert mistake.message.endswith(
         "hardly any points are near the body; they would be if camera.pose were inverted (state "
@@ -77,21 +77,21 @@ def test_an_inverted_pose_is_told_with_what_to_state():
 
 
 @pytest.mark.parametrize("sides", [(1, -1, -1, 1), (-1, 1, -1, 1)])
-def test_frames_that_a_symmetric_body_cannot_tell_apart_are_both_named(sides):
+def test_equivalent_frames_of_a_symmetric_body_are_both_named(sides):
     (mistake,) = camera_hypotheses(seeing(POSE @ np.diag([*map(float, sides)])))
     one, other = mistake.data["mistakes"].split("; or if ")
     assert "x to the right, y up, z backwards" in one + other
     assert "x to the left, y down, z backwards" in one + other
 
 
-def test_a_frame_of_no_convention_is_not_told_as_two_at_once():
+def test_a_frame_of_no_convention_is_not_reported_twice():
     forward = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
     (mistake,) = camera_hypotheses(seeing(POSE @ forward.T @ np.diag([-1.0, -1, 1, 1])))
     assert "mistakes" not in mistake.data
     assert "check camera.pose" in mistake.message
 
 
-def test_a_camera_that_is_somewhere_else_is_told_to_see_nothing():
+def test_a_displaced_camera_is_reported_to_see_nothing():
     elsewhere = moved(np.zeros(3), np.array([0.0, 0.0, 0.7]))
     (mistake,) = camera_hypotheses(seeing(elsewhere))
     assert "only 0 % of the body's visible surface" in mistake.message
@@ -116,7 +116,7 @@ def test_outlines_before_a_fit_are_where_the_stated_camera_sees_the_body():
     assert len(depth_picture(rows).axes) == 2
 
 
-def test_what_is_not_in_view_is_said_in_the_picture():
+def test_the_picture_names_points_out_of_view():
     (rows,) = undeformed_rows(seeing(INVERTED)).values()
     said = [text.get_text() for text in depth_picture(rows).axes[0].texts]
     assert said == ["the body is not in view"]
@@ -141,7 +141,7 @@ def stated(folder: Path, pose: np.ndarray) -> Path:
 
 
 @pytest.mark.long
-def test_check_draws_the_image_and_the_body_and_names_what_is_wrong(tmp_path):
+def test_check_draws_image_and_body_and_names_the_mistake(tmp_path):
     file = stated(tmp_path, INVERTED)
     checked = run_command("check", str(file), "--out", str(tmp_path / "seen"))
     assert checked.code == 1
@@ -152,7 +152,7 @@ def test_check_draws_the_image_and_the_body_and_names_what_is_wrong(tmp_path):
 
 
 @pytest.mark.long
-def test_check_draws_the_image_of_a_camera_that_looks_away_and_says_that_it_does(tmp_path):
+def test_check_draws_and_reports_a_camera_that_looks_away(tmp_path):
     checked = run_command("check", stated(tmp_path, AWAY), "--out", tmp_path / "seen")
     assert checked.code == 1
     assert (tmp_path / "seen" / "depth_hanging_front.png").is_file()
@@ -198,7 +198,7 @@ def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path)
     assert {"depth_a_b_c", "depth_a_b_c_2"} <= all_pictures(shown, a_result()).keys()
 
 
-def test_models_are_not_compared_by_what_only_a_depth_camera_sees(tmp_path):
+def test_models_are_not_compared_by_depth_images_alone(tmp_path):
     file = stated(tmp_path, POSE)
     both = "neo-hookean,st-venant-kirchhoff"
     compared = run_command("compare-models", file, "--materials", both, "--out", tmp_path / "both")

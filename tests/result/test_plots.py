@@ -360,7 +360,7 @@ def test_only_faces_towards_the_viewer_are_drawn_the_nearest_last():
     assert len(oblique.visible_faces(mesh.points_m, mesh.surface).polygons) == 6
 
 
-def test_what_lies_behind_the_body_is_hidden():
+def test_lines_behind_the_body_are_hidden():
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
     camera = ParallelCamera.from_direction((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
     points = np.array([[0.4, 0.3, 1.0], [0.4, 0.3, 0.0], [2.0, 0.3, 0.0], [np.nan] * 3])
@@ -485,7 +485,7 @@ def test_wide_intervals_are_read_as_factors(tmp_path):
     save_pictures(tmp_path, {"wide": confidence_ellipses(wide)})
 
 
-def test_what_is_not_determined_is_left_out():
+def test_undetermined_parameters_are_not_drawn():
     covariance = np.array([[np.nan, np.nan], [np.nan, 0.01]])
     found = Confidence.from_result(told(covariance))
     assert found is not None
@@ -611,7 +611,7 @@ def test_validation_is_drawn_by_its_simulation():
 
 @pytest.mark.long
 @pytest.mark.parametrize(("first", "wrong"), [(0, np.inf), (6, np.nan)])
-def test_what_went_astray_leaves_gaps(tmp_path, wrong, first):
+def test_diverged_samples_leave_gaps(tmp_path, wrong, first):
     seen = replay()
     positions, markers = seen.positions_m.copy(), seen.markers_m.copy()
     positions[first:], markers[first:] = wrong, wrong
@@ -674,7 +674,7 @@ def test_letters_that_the_font_lacks_are_no_news(tmp_path):
 
 
 @pytest.mark.long
-def test_commands_say_nothing_of_matplotlibs_own_files(tmp_path):
+def test_commands_hide_messages_of_matplotlib_about_its_files(tmp_path):
     code = "from collocation_sysid.cli import main; main()"
     beside = {
         "MPLCONFIGDIR": str(tmp_path / "a_file"),

@@ -120,7 +120,7 @@ def test_text_is_escaped(run_folder: Path, tmp_path: Path):
     assert "<script>" not in (copy / "report.html").read_text()
 
 
-def test_what_a_terminal_shows_is_on_the_page(page: str, run_folder: Path):
+def test_the_page_contains_the_output_of_the_terminal(page: str, run_folder: Path):
     result = Result.read(run_folder)
     shown = plain_text(run_summary(result, run_folder, details=True)).splitlines()
     text = Elements(page).text
@@ -138,7 +138,7 @@ def test_a_result_read_back_is_shown_as_it_was(run_folder: Path):
     assert printed.split()[len(shown)] == "next:"
 
 
-def test_failures_and_predictions_are_told():
+def test_failures_and_predictions_are_reported():
     experiments = {
         "a": SimulatedExperiment(True, failed="no step"),
         "b": SimulatedExperiment(False, rms_m=3e-3, max_m=4e-3),
@@ -221,7 +221,7 @@ def test_a_damaged_comparison_is_refused(comparison: Path, tmp_path: Path):
     assert "summary.json is damaged" in outcome.err
 
 
-def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
+def test_concerns_name_their_remedy(run_folder: Path, tmp_path: Path):
     copy = tmp_path / "run"
     shutil.copytree(run_folder, copy)
     whole = Result.read(copy)

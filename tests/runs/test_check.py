@@ -101,7 +101,7 @@ def sentences(concerns: Iterable[Concern]) -> list[str]:
 
 
 @pytest.mark.long
-def test_where_no_substeps_are_stated_check_says_that_they_are_chosen(tiny: Path):
+def test_check_reports_chosen_substeps(tiny: Path):
     assert any("up to 8" in note for note in checked(tiny).notes)
     assert not any("up to 8" in note for note in checked(tiny, "transcription.substeps=2").notes)
 
@@ -148,7 +148,7 @@ def test_damping_at_the_guess_is_rayleighs(tiny: Path):
         assert mode.damping_ratio == pytest.approx(0.01 * omega + 0.25 / omega)
 
 
-def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
+def test_numerical_damping_is_compared_with_the_damping_of_the_guess(tiny: Path):
     def first(*overrides: str) -> ModeCheck:
         return checked_motion(tiny, *SILICONE, *overrides).modes[0]
 

@@ -62,7 +62,7 @@ def test_a_memory_that_is_not_there_is_not_found():
     assert share.statistical95 is None or share.statistical95[0] >= 0
 
 
-def test_a_branch_slower_than_the_recordings_is_told():
+def test_a_branch_slower_than_the_recordings_is_reported():
     slow = {"prony_1.share": Estimate(0.3, 0.01, (0.28, 0.32)), "prony_1.tau_s": Estimate(5.0)}
     (note,) = memory_notes(slow, 2.0)
     assert "slower than the longest recording of 2 s" in note
@@ -117,7 +117,7 @@ def test_a_slip_in_the_memory_is_one_message(tiny, old: str, new: str, expected:
 
 
 @pytest.mark.long
-def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
+def test_check_counts_the_memory_variables_of_interior_point(tiny, monkeypatch):
     MEMORY(tiny)
     problem = Problem.read(tiny / "problem.toml", [GUESSED])
     findings = check_problem(problem)

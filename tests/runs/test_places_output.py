@@ -65,7 +65,7 @@ def test_the_record_has_places_with_errors_that_hold(result: dict):
         assert (np.abs(off_m) < 3 * errors_m).all()
 
 
-def test_the_record_says_what_was_known(result: dict):
+def test_the_record_states_the_known_values(result: dict):
     places = result["places"]["swing"]
     assert {name: place["is_declared"] for name, place in places.items()} == {
         "low": True, "mid": True, "side": False,
@@ -157,7 +157,7 @@ def test_a_record_without_places_is_no_start(folder: Path, tmp_path: Path, resul
 # Shown
 
 
-def test_the_terminal_says_where_markers_are_and_the_priors(folder: Path):
+def test_the_terminal_shows_marker_places_and_priors(folder: Path):
     said = " ".join((folder / "printed.txt").read_text().split())
     moved = re.search(r"stated positions: up to ([\d.]+) mm \(mid; prior ±3 mm\)", said)
     assert moved is not None
@@ -180,7 +180,7 @@ def test_the_page_has_places_and_nuisance_parameters_in_their_units(folder: Path
     assert "[rad]" not in text.partition("Pictures")[0]
 
 
-def test_pictures_have_what_was_given_and_what_was_found(folder: Path):
+def test_pictures_contain_given_and_estimated_values(folder: Path):
     _, (seen,) = read_run(folder / "run")
     assert np.isnan(seen.declared_places_m).any(axis=1).tolist() == [False, False, True]
     assert seen.marker_places_m[1] == pytest.approx(PLACES_M["mid"], abs=1e-3)

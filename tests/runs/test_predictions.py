@@ -309,7 +309,7 @@ def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
 
 
 @pytest.mark.long
-def test_the_nearest_recording_is_copied_or_the_output_says_why_none_is():
+def test_the_nearest_recording_is_copied_or_the_reason_is_given():
     new = swing("new", 0.0, 1)
     near, far = swing("near", 1e-3, 2), swing("far", 8e-3, 3)
     found = nearest_recording_error(new, [far, near])

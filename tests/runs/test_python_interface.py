@@ -125,7 +125,7 @@ def test_experiments_of_one_problem_have_different_names():
         cs.Problem([swung(box()), swung(box())], UNKNOWN)
 
 
-def test_things_say_what_they_are():
+def test_objects_have_a_readable_representation():
     shown = repr(cs.Problem([hung_cube()], UNKNOWN | {"gamma_m_1_s": 1.0}, title="A cube"))
     assert shown.startswith(
         "Problem('A cube', experiments 'hung cube'; Parameters(lambda_pa = 200,"
@@ -139,7 +139,7 @@ def test_things_say_what_they_are():
 # Runs ---------------------------------------------------------------------------------------------
 
 
-def test_a_run_tells_its_parameters_with_their_error_bars():
+def test_a_run_reports_parameters_with_standard_uncertainties():
     run = identified()
     lower, upper = run.interval("mu_pa")
     assert lower < run.parameters["mu_pa"] < upper
@@ -199,7 +199,7 @@ def test_a_run_becomes_a_data_frame(monkeypatch):
     assert np.isnan(given["lambda_pa"]["combined_std_error"])
 
 
-def test_without_pandas_the_remedy_is_told(monkeypatch):
+def test_without_pandas_the_remedy_is_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(cs.InputError, match=r"pip install pandas"):
         identified().to_frame()
@@ -220,7 +220,7 @@ def test_a_notebook_shows_the_body_of_a_run_once():
 
 
 @pytest.mark.parametrize("field", ["von_mises_pa", "energy_density_j_m3", "det_f"])
-def test_a_drawn_body_is_coloured_by_what_its_material_feels(field):
+def test_a_drawn_body_is_coloured_by_strain(field):
     run = identified()
     (positions_m,), body = run.solution.positions_m, run.problem.bodies[0]
     felt = ElementFields.from_body(body, body.theta_from_values(run.parameters)).evaluate_at(
@@ -233,7 +233,7 @@ def test_a_drawn_body_is_coloured_by_what_its_material_feels(field):
     assert low == pytest.approx(outer.min(), rel=1e-6) or low == 0 < outer.min() < high / 5
 
 
-def test_what_cannot_be_drawn_is_told_with_what_can():
+def test_an_unknown_picture_is_refused_with_the_known_ones():
     with pytest.raises(cs.InputError, match=r"'det'; expected .* did you mean 'det_f'\?"):
         identified().plot(field="det")
     with pytest.raises(cs.InputError, match=r"found 'sway'; expected one of hung cube"):
@@ -365,7 +365,7 @@ def test_a_function_is_a_material():
     assert run.solution.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
 
 
-def test_wrong_options_name_what_is_possible():
+def test_wrong_options_name_the_choices():
     with pytest.raises(
         cs.InputError, match=r"integrator: found 'newmrk'; .*did you mean 'newmark'"
     ):

@@ -168,7 +168,7 @@ def test_the_estimate_from_the_roll_out_is_that_of_half_the_step(answer, refined
         assert answer.refinement.errors[name].step == pytest.approx(measured_change, rel=0.3)
 
 
-def test_roll_outs_that_are_no_finer_tell_nothing():
+def test_roll_outs_that_are_no_finer_give_no_estimate():
     step_s = coarse().experiments[0].timestep_s
     problem = replace(coarse(), rollout=RolloutOptions(timestep_s=step_s))
     assert run(problem, seek_causes=False).refinement is None
@@ -263,7 +263,7 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
 
 
 @pytest.mark.long
-def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeypatch):
+def test_an_interrupted_refinement_keeps_finished_levels(tmp_path, monkeypatch):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
     assert run_command("solve", problem, "--out", folder, "--method", "reduced-space").code == 0

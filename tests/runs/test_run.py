@@ -94,7 +94,7 @@ def test_the_material_is_found_within_its_error_bars(finished):
         )
 
 
-def test_the_result_says_what_its_error_bars_are_based_on(finished):
+def test_the_result_states_the_basis_of_its_uncertainties(finished):
     found = content(finished.result)["uncertainty"]
     assert (found["noise"], found["errors"]) == ("given", "independent")
     assert found["reduced_chi_squared"] == pytest.approx(1.0, abs=0.3)
@@ -205,7 +205,7 @@ def test_noise_may_be_estimated_and_profiles_asked_for(two, tmp_path):
     assert np.log(high / low) < 0.1
 
 
-def test_what_the_data_do_not_tell_has_no_error_bar(tmp_path):
+def test_undetermined_parameters_have_no_interval(tmp_path):
     """In bending alone E and ν are one."""
     folder = tmp_path
     write_problem(folder, {"swing": 25})

@@ -203,7 +203,7 @@ def test_a_bench_that_gives_way_presses_less():
     assert simulated[-1, :, 2].max() > 0
 
 
-def test_friction_holds_back_what_slides_on_platens():
+def test_friction_opposes_sliding_on_platens():
     friction, sliding, tracks = 1e-3, block(), []
     x, start = simulate(sliding, VALUES).positions_m, sliding.body.nodes_m
     for k in range(1, len(PRESSED_M)):

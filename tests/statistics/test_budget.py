@@ -155,7 +155,7 @@ def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(
     np.testing.assert_allclose(again.q - first.q, told, atol=atol)
 
 
-def test_what_is_estimated_is_not_considered():
+def test_estimated_nuisance_parameters_are_not_considered():
     experiment = measured(cube_with_nuisance(8))
     wide = replace(experiment, nuisance=replace(experiment.nuisance, calibration_scale=0.01))
     solution = solve(Problem([wide], GUESS))
@@ -205,7 +205,7 @@ def swings(*gamma_r_s: float) -> Problem:
 
 
 @pytest.mark.long
-def test_what_recordings_disagree_on_is_in_the_combined_interval():
+def test_disagreement_of_recordings_widens_the_combined_interval():
     truths = (4e-3, 9e-3, 14e-3)
     unlike = run(swings(*truths), seek_causes=False)
     line = unlike.budget["gamma_r_s"]
@@ -246,7 +246,7 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
         ("air_drag", '"off"', "uncertainty.assumptions.air_drag: found 'off'; expected"),
     ],
 )
-def test_what_cannot_be_assumed_is_one_message(tmp_path, key, value, said):
+def test_invalid_assumptions_are_one_message(tmp_path, key, value, said):
     file = write_problem(tmp_path, {"swing": 8})
     file.write_text(file.read_text() + f"\n[uncertainty.assumptions]\n{key} = {value}\n")
     outcome = run_command("check", file)

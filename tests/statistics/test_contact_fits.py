@@ -77,7 +77,7 @@ def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(off_m: 
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_truth_as_often_as_they_say():
+def test_intervals_contain_the_truth_at_their_nominal_rate():
     held = 0
     for seed in range(20):
         run = answer(poked(), seed)
@@ -89,7 +89,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 @pytest.mark.parametrize(
     ("off_m", "prior_m", "verdict"), [(2.5e-3, 5e-4, "check"), (1e-3, 1e-4, "doubtful")]
 )
-def test_an_obstacle_far_from_where_it_is_stated_is_told(
+def test_an_obstacle_far_from_where_it_is_stated_is_reported(
     off_m: float, prior_m: float, verdict: str
 ):
     run = answer(poked(off_m, prior_m))
@@ -124,7 +124,7 @@ FORGOTTEN = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("fault", ["friction", *FORGOTTEN])
-def test_wrong_friction_and_a_forgotten_obstacle_are_told(fault: str):
+def test_wrong_friction_and_a_forgotten_obstacle_are_reported(fault: str):
     stated = poked()
     others = [FORGOTTEN[fault]] if fault in FORGOTTEN else []
     actual = poked(friction=0.0 if others else 0.5)
@@ -143,11 +143,11 @@ def test_wrong_friction_and_a_forgotten_obstacle_are_told(fault: str):
     assert "noise/larger" in told(run)
 
 
-def test_an_obstacle_that_is_never_touched_is_told():
+def test_an_obstacle_that_is_never_touched_is_reported():
     assert "contact/never" in told(answer(poked(0.05, place_sigma_m=None)))
 
 
-def test_a_contact_of_few_faces_is_told():
+def test_a_contact_of_few_faces_is_reported():
     fine = poked(shape=SMALL)
     touch, wide = (touch_of(each) for each in (fine, poked()))
     assert 0 < touch.face_count < 4
@@ -173,7 +173,7 @@ def test_check_compares_derivatives_within_the_gap_and_looks_at_no_grasp_of_an_o
         ({"shape": FLAT, "depths_m": THERE_AND_BACK_M}, {"lost"}),
     ],
 )
-def test_check_says_what_contact_will_spoil_at_the_guess(changes: dict, codes: set[str]):
+def test_check_warns_of_contact_at_the_guess(changes: dict, codes: set[str]):
     concerns = check_problem(measured_once(poked(**changes)), full=True).concerns
     of_contact = [each for each in concerns if each.topic == "contact"]
     assert {each.code for each in of_contact} == {f"contact/{code}" for code in codes}
@@ -181,20 +181,20 @@ def test_check_says_what_contact_will_spoil_at_the_guess(changes: dict, codes: s
     assert all("at the guess" in each.message for each in of_contact)
 
 
-def test_check_says_nothing_of_contact_that_it_has_not_simulated(monkeypatch):
+def test_check_does_not_judge_contact_before_a_simulation(monkeypatch):
     monkeypatch.setattr("collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0)
     for changes in ({"higher_m": 0.05, "place_sigma_m": None}, {"shape": SMALL}):
         concerns = check_problem(measured_once(poked(**changes))).concerns
         assert not any(each.topic == "contact" for each in concerns)
 
 
-def test_what_several_recordings_share_is_said_once():
+def test_notes_shared_by_several_recordings_are_printed_once():
     often = [touch_of(replace(poked(shape=SMALL), name=name)) for name in ("a", "b", "c")]
     (one,) = contact_concerns(often)
     assert "'a' and 2 more" in one.message
 
 
-def test_what_friction_did_is_told_in_a_line_and_kept_in_the_result(tmp_path):
+def test_friction_is_reported_in_a_line_and_stored_in_the_result(tmp_path):
     run = answer(poked(friction=0.3, place_sigma_m=None))
     said = " ".join(
         plain_text(
@@ -221,7 +221,7 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
 
 @pytest.mark.parametrize("unknown", ["obstacle_offset_m", "obstacle_tilt_rad", "obstacle_time_s"])
 @pytest.mark.parametrize("zero", ["", "y"])
-def test_what_is_found_of_an_obstacle_moves_it_in_a_forward_simulation_as_in_the_fit(unknown, zero):
+def test_a_forward_simulation_uses_the_estimated_place_of_an_obstacle(unknown, zero):
     pressed = pressed_cube(8, nuisance=cs.Nuisance.none(**{unknown: 1e-4}))
     displaced = [replace(obstacle, zero=zero) for obstacle in pressed.obstacles]
     (transcription,) = (

@@ -56,7 +56,7 @@ def test_a_constant_part_is_a_marker_off_its_place(missing):
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.2])
-def test_an_oscillation_with_the_motion_tells_of_the_model(missing):
+def test_residuals_that_oscillate_with_the_motion_indicate_the_model(missing):
     swing = np.zeros((len(T_S), 3))
     swing[:, 2] = 20 * np.exp(-2 * T_S) * np.sin(2 * np.pi * 7.7 * T_S)
     found = diagnosis(noise() + swing, missing)
@@ -75,7 +75,7 @@ def test_an_oscillation_of_its_own_is_a_vibration():
     assert "not a frequency of the motion" in found.sentence
 
 
-def test_residuals_at_the_start_tell_of_the_release():
+def test_residuals_at_the_start_indicate_the_release():
     start = np.zeros((len(T_S), 3))
     start[:10, 2] = 30 * np.linspace(1, 0, 10)
     found = diagnosis(noise() + start)

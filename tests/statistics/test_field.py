@@ -241,7 +241,7 @@ def test_a_heavier_half_is_found_beside_the_stiffness():
     assert solution.parameters["young_pa"] == pytest.approx(YOUNG_PA, rel=0.1)
 
 
-def test_a_field_of_density_weighs_what_its_shapes_say(rng):
+def test_a_density_field_has_the_mass_of_its_shapes(rng):
     body = bar(OF_DENSITY)
     shares = rng.normal(size=20)
     values = {
@@ -271,7 +271,7 @@ def test_a_simulation_refuses_a_density_that_leaves_a_node_without_mass():
         cs.simulate(swung(body), {**values, "field_1": 30.0})
 
 
-def test_an_answer_without_mass_somewhere_is_doubtful_and_says_why_it_cannot_be_simulated():
+def test_an_answer_with_massless_parts_is_doubtful_with_the_reason():
     solution, field = weighed()
     assert "field/negative" not in [concern.code for concern in field.list_concerns()]
     light = too_light(solution)
@@ -315,14 +315,14 @@ def test_an_even_body_is_found_even():
     assert not field.list_concerns()
 
 
-def test_what_does_not_deform_is_as_the_prior_has_it():
+def test_undeformed_parts_of_a_field_keep_their_prior():
     field = found(1.0, 0.055)
     above = (bar().nodes_m[bar().cells, 2] > 0.055).all(axis=1)
     assert field.compute_deviation_over_prior()[above & (centres(bar())[:, 2] > 0.1)].min() > 0.9
     assert field.compute_deviation_over_prior()[~above].max() < 0.5
 
 
-def test_an_amplitude_that_is_too_small_is_told():
+def test_an_amplitude_that_is_too_small_is_reported():
     codes = [concern.code for concern in found(3.0, amplitude=0.05).list_concerns()]
     assert "field/amplitude" in codes
     assert not found(3.0, amplitude=1.0).list_concerns()
@@ -545,7 +545,7 @@ def test_a_file_states_fields_of_the_body_and_of_a_region(tiny: Path):
 
 
 @pytest.mark.parametrize(("length_m", "codes"), [(0.05, []), (0.003, ["field/shapes"])])
-def test_a_check_tells_what_the_shapes_can_show(length_m: float, codes: list[str]):
+def test_check_reports_the_fields_that_the_shapes_can_determine(length_m: float, codes: list[str]):
     body = bar(cs.Field(length_m, modes=10))
     seen = check_body(body, body.theta_from_values({**KNOWN, "young_pa": YOUNG_PA}), ("swing",))
     assert [each.code for each in seen.concerns if each.topic == "field"] == codes

@@ -51,7 +51,7 @@ def spread(deviations, correlations: dict[tuple[int, int], float] | None = None)
     return correlation * np.outer(deviations, deviations)
 
 
-def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
+def test_well_and_badly_determined_combinations_are_reported_with_intervals():
     (sentence,) = identifiability_sentences(uncertainty(spread([0.2, 0.01, 0.02, 0.05])))
     assert sentence == (
         "noise alone leaves mu_pa ±2 %, gamma_r_s ±4 % and gamma_m_1_s ±10 %; "
@@ -62,7 +62,7 @@ def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
 @pytest.mark.parametrize(
     ("deviation", "said"), [(0.2, "±48 %"), (0.23, "within a factor of 1.6"), (0.4, "of 2.2")]
 )
-def test_wide_intervals_are_told_by_their_factor(deviation, said):
+def test_wide_intervals_are_reported_by_their_factor(deviation, said):
     sentence, *_ = identifiability_sentences(uncertainty(spread([deviation, 0.01, 0.02, 0.05])))
     assert "lambda_pa only " in sentence
     assert f"{said} (95 %, statistical, no" in sentence
@@ -79,7 +79,7 @@ def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
     assert "fix it" in sentence
 
 
-def test_a_parameter_the_data_say_nothing_of_is_not_determined():
+def test_a_parameter_without_information_is_not_determined():
     found = uncertainty(spread([0.1, 0.01, 0.02, 1e4]))
     assert found.estimates["gamma_m_1_s"].statistical95 is None
     said = identifiability_sentences(found)
@@ -88,7 +88,7 @@ def test_a_parameter_the_data_say_nothing_of_is_not_determined():
     assert any(sentence.startswith(silent) for sentence in said)
 
 
-def test_confounded_parameters_are_told_by_the_combination_that_is_fixed():
+def test_confounded_parameters_are_reported_by_their_determined_combination():
     of = parameters(ENGINEERING)
     found = uncertainty(spread([0.15, 0.15, 0.02, 0.02], {(0, 1): -0.99}), of)
     sentences = identifiability_sentences(found)
@@ -156,14 +156,14 @@ WELL = np.log(1.25) / (Z95 * np.sqrt(2.01))
 
 
 @pytest.mark.parametrize(("deviation", "told"), [(0.01, 0), (0.99 * WELL, 0), (1.01 * WELL, 1)])
-def test_of_three_that_are_known_well_each_no_combination_is_told(deviation, told):
+def test_well_determined_parameters_have_no_combination(deviation, told):
     sentences = [
         s for s in identifiability_sentences(three_confounded(deviation)) if "confounded" in s
     ]
     assert len(sentences) == told
 
 
-def test_the_other_elastic_pair_is_told_where_it_is_known_better():
+def test_the_better_determined_elastic_pair_is_reported():
     found = uncertainty(spread([0.7, 0.02, 0.02, 0.02]))
     (sentence,) = [s for s in identifiability_sentences(found) if "other elastic constants" in s]
     assert "young_pa ±" in sentence
@@ -188,7 +188,7 @@ def test_an_interval_beyond_both_bounds_is_no_estimate():
     assert "between its bounds" in (estimate.reason or "")
 
 
-def test_no_sentence_is_said_twice():
+def test_no_sentence_is_printed_twice():
     found = uncertainty(spread([0.9, 0.9, 0.02, 1e4], {(0, 1): -0.99}))
     said = identifiability_sentences(found)
     assert len(set(said)) == len(said)

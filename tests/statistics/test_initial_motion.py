@@ -87,7 +87,7 @@ def test_one_reflection_is_no_motion():
 
 
 @pytest.mark.long
-def test_it_is_a_reason_of_the_verdict():
+def test_initial_motion_is_a_reason_of_the_verdict():
     known = {"poisson": 0.3, "gamma_m_1_s": 0.5}
     unknown = {"young_pa": cs.Unknown(), "gamma_r_s": cs.Unknown()}
     run = cs.run(cs.Problem([recorded("undeformed")], known | unknown))

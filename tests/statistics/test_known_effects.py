@@ -88,7 +88,7 @@ def test_half_of_the_height_takes_half_of_the_lag_of_the_machine():
     assert estimate.value == pytest.approx(YOUNG_PA, rel=5e-3)
 
 
-def test_intervals_are_moved_by_what_is_known_and_respect_bounds():
+def test_intervals_are_moved_by_corrections_and_respect_bounds():
     estimate = Estimate(2.0, 0.1, (1.8, 2.2))
     plain = combine("young_pa", estimate, None, 0.1)
     moved = combine("young_pa", estimate, None, 0.1, known_effect=0.2, bounds=(0.0, 2.5))

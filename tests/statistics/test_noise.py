@@ -51,7 +51,7 @@ def found(name: str, errors: str) -> list[tuple[Uncertainty, np.ndarray]]:
     return [(uncertainty_from_fit(fit, PARAMETERS, wrong[:4]), wrong[:4]) for fit, wrong in fits]
 
 
-def test_a_parameter_that_one_marker_tells_has_its_degrees_of_freedom_in_any_unit():
+def test_degrees_of_freedom_do_not_depend_on_the_unit_of_a_parameter():
     fit, _ = next(draws(PROBLEMS["three markers"], (1.0,)))
     level = estimate_noise_level(fit, factorise_information(fit))
     of_one = np.zeros((3, 1, 1))
@@ -70,7 +70,7 @@ def test_a_parameter_that_one_marker_tells_has_its_degrees_of_freedom_in_any_uni
 
 @pytest.mark.parametrize("errors", ERRORS)
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_intervals_hold_the_truth_whatever_sigma_says(name, errors):
+def test_intervals_contain_the_truth_for_any_stated_sigma(name, errors):
     held = [
         np.abs(wrong) < each.quantiles * np.sqrt(np.diag(each.covariance))
         for each, wrong in found(name, errors)
@@ -125,7 +125,7 @@ def test_a_common_variance_would_not_do_where_markers_differ():
     assert np.mean(held["estimated"]) < 0.9 < np.mean(held["auto"])
 
 
-def test_what_is_expected_besides_is_no_noise():
+def test_expected_model_errors_are_no_noise():
     of = PROBLEMS["three markers"]
     rng = np.random.default_rng(0)
     variance = np.zeros((60, 3, 3))
@@ -156,7 +156,7 @@ def test_what_is_expected_besides_is_no_noise():
 
 
 @pytest.mark.parametrize("noise", ["auto", "estimated"])
-def test_error_bars_for_correlated_errors_hold_what_is_expected_besides(noise):
+def test_uncertainties_of_correlated_errors_contain_expected_model_errors(noise):
     """A marker that sways slowly, which an autoregression of all markers misses."""
     of, rng = PROBLEMS["three markers"], np.random.default_rng(0)
     samples = np.zeros((201, *of.present[0].shape, 3))
@@ -181,7 +181,7 @@ def notes(deviations: tuple[float, ...], **options) -> tuple[str, ...]:
     return uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(**options)).notes
 
 
-def test_a_wrong_sigma_is_told_with_how_much():
+def test_a_wrong_sigma_is_reported_with_how_much():
     assert notes((1.0,)) == ()
     (large,) = notes((2.5,))
     assert (

@@ -58,7 +58,7 @@ def test_a_density_that_such_bodies_do_not_have_is_a_concern():
     assert not making_concerns(body(1.2 * 1070.0))
 
 
-def test_check_asks_what_is_not_stated():
+def test_check_asks_for_unstated_origins():
     theta = body().theta_from_values(
         {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.1}
     )
@@ -73,7 +73,7 @@ def test_check_asks_what_is_not_stated():
     assert asked(made="cast", mesh_from="cad") is None
 
 
-def test_the_answer_states_what_the_origin_would_change():
+def test_the_answer_states_the_effect_of_the_origin():
     experiment = measured(hung_cube(12))
     found = cs.run(cs.Problem([experiment], GUESS, substeps=1), seek_causes=False)
     widths = {each.answer: each.half_widths["mu_pa"] for each in found.origin_answers}

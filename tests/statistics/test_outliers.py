@@ -71,7 +71,7 @@ def test_a_sample_that_does_not_pull_is_only_to_be_checked():
     assert len(trust.reasons) == 1
 
 
-def test_it_hides_no_correlation_of_the_others():
+def test_an_outlier_hides_no_correlation_of_other_samples():
     for seed in range(5):
         errors = 5 * autoregressive(RNG(seed), 60, 3, 0.9)
         (_, alone), (trust, beside) = (judged(errors), judged(with_outlier(errors)))
@@ -117,7 +117,7 @@ def relaxing_bench() -> tuple[Experiment, dict[str, float]]:
 
 
 @pytest.mark.long
-def test_a_first_sample_that_is_no_rest_is_told():
+def test_a_first_sample_that_is_no_rest_is_reported():
     experiment, truth = relaxing_bench()
     unknown = {"mu_pa": 250.0, "prony_1.share": 0.3, "prony_1.tau_s": 3.0}
     still = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}

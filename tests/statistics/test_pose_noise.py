@@ -100,7 +100,7 @@ def test_noise_is_judged_by_how_rough_poses_are(noise_m, noise_rad):
     np.testing.assert_allclose(found, (noise_m, noise_rad), rtol=0.1)
 
 
-def test_one_recording_tells_the_noise():
+def test_one_recording_determines_the_noise():
     found = [estimate_pose_noise(swung(5e-4, 5e-3, 100, seed)) for seed in range(40)]
     assert (np.abs(np.array(found) / (5e-4, 5e-3) - 1).std(axis=0) < 0.1).all()
 

@@ -95,7 +95,7 @@ def test_refits_report_the_share_of_significant_assumptions():
 
 
 @pytest.mark.long
-def test_nothing_is_told_of_what_is_as_described():
+def test_nothing_is_reported_for_a_correct_description():
     faultless = probed()
     assert [p.name for p in faultless.probes if p.kind == "window"] == list(WINDOWS)
     assert not any(p.sentences for p in faultless.probes)
@@ -110,7 +110,7 @@ def test_nothing_is_told_of_what_is_as_described():
         ("clock_rate", 1e-3, "gamma_m_1_s"),
     ],
 )
-def test_what_is_off_is_told_by_freeing_it(name, off, of):
+def test_a_probe_finds_a_wrong_value_by_freeing_it(name, off, of):
     solved = probed(name, off)
     assert told(solved)[0] == name
     probe = named(solved, name)
@@ -130,7 +130,7 @@ def test_windows_of_time_have_the_stiffness_of_their_time():
 
 
 @pytest.mark.long
-def test_each_of_several_recordings_says_what_it_has_alone():
+def test_probes_are_reported_for_each_recording_alone():
     rng, swings = np.random.default_rng(2), []
     for k, damping in enumerate((5e-3, 9e-3)):
         swing = replace(hung_cube(25), name=f"swing {k}")

@@ -173,7 +173,7 @@ def test_faultless_fits_have_no_significant_probe():
     assert alarms == 0
 
 
-def test_what_is_stated_as_exact_is_tested_too():
+def test_quantities_stated_as_exact_are_probed_too():
     exact = dict.fromkeys(Assumptions().collect_deviations())
     assert {n: s for n, s in probed_deviations(exact).items() if s} == {
         DRIFT: 0.02,

@@ -54,7 +54,7 @@ def test_without_a_force_all_moduli_and_densities_are_open():
         {"young_pa": Unknown(500.0), "poisson": 0.3, "mass_kg": Unknown(0.03)},
     ],
 )
-def test_it_is_open_however_moduli_and_densities_are_given(given):
+def test_the_scale_is_open_however_moduli_and_densities_are_given(given):
     heavy = {} if "mass_kg" in given else HEAVY
     free = [name for name, each in given.items() if isinstance(each, Unknown)]
     expected = {*free, *heavy} - {"poisson"}
@@ -97,7 +97,7 @@ def test_one_of_two_recordings_with_a_known_mass_is_enough():
 
 
 @pytest.mark.long
-def test_it_is_said_before_the_solve_and_in_the_verdict():
+def test_an_open_scale_is_reported_before_the_solve_and_in_the_verdict():
     found = problem(OPEN)
     said = "only the ratios of lambda_pa, mu_pa and density_kg_m3 are identifiable (E/ρ)"
     assert any(said in note and "fix a density" in note for note in found.notes)
@@ -108,7 +108,7 @@ def test_it_is_said_before_the_solve_and_in_the_verdict():
     assert all(finished.estimates[name].statistical_std_error is None for name in NAMES)
 
 
-def test_where_a_mass_sets_the_scale_the_density_is_found_and_nothing_said():
+def test_a_mass_sets_the_scale_and_the_density_is_found_without_a_note():
     cube = hung_cube()
     found = problem(OPEN, masses=[PointMass(tip(cube), 0.01)])
     finished = run(found, seek_causes=False)
@@ -209,6 +209,6 @@ def test_densities_that_cannot_be_are_refused(tiny, edits, words):
         assert word in str(refused.value)
 
 
-def test_the_terminal_says_what_moduli_rest_on(tiny):
+def test_the_terminal_states_the_reference_of_the_moduli(tiny):
     shown = run_command("solve", "problem.toml")
     assert "relative to the stated density of" in " ".join(shown.out.split())

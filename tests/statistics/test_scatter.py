@@ -74,7 +74,7 @@ def test_recordings_that_agree_have_the_chi_squared_of_chance():
     np.testing.assert_array_equal(found[0].widen(same), same)
 
 
-def test_recordings_that_disagree_widen_the_interval_of_what_they_disagree_on():
+def test_disagreeing_recordings_widen_the_interval_of_the_parameter_concerned():
     calm, found = judged(1), judged(1, spread=SPREAD)
     assert scatter(found).find_disagreements().tolist() == [False, True, False, False]
     ratio = np.sqrt(np.diag(found.covariance) / np.diag(calm.covariance))
@@ -90,7 +90,7 @@ def test_recordings_that_disagree_widen_the_interval_of_what_they_disagree_on():
     assert not any("disagree" in note for note in calm.notes)
 
 
-def test_widened_intervals_hold_the_truth_as_often_as_they_say():
+def test_widened_intervals_contain_the_truth_at_their_nominal_rate():
     held = []
     for seed in range(SEEDS):
         found = judged(seed, spread=SPREAD)

@@ -26,7 +26,7 @@ def hanging(noise_m: float = 5e-4) -> Experiment:
     return with_markers(replace(still, name="hanging"), tracks + noise)
 
 
-def test_only_what_neither_moves_nor_changes_is_motionless():
+def test_only_a_constant_recording_is_motionless():
     assert is_motionless(hanging())
     assert is_motionless(hanging(noise_m=1e-3))
     swaying = measured(released_cube(30))  # by half a millimetre
@@ -39,7 +39,7 @@ def test_only_what_neither_moves_nor_changes_is_motionless():
     assert not is_motionless(replace(hanging(), forces=(pull,)))
 
 
-def test_it_is_said_before_solving():
+def test_stillness_is_reported_before_solving():
     problem = Problem([hanging()], GUESS)
     (note,) = [note for note in problem.notes if "no information on damping" in note]
     assert "fix gamma_r_s and gamma_m_1_s" in note

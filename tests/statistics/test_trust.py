@@ -269,7 +269,7 @@ def test_a_scheme_that_damps_or_slows_is_a_concern():
     assert scheme_concerns("a", 0.05, 0.0, -0.05)[0].grade == "check"
 
 
-def test_what_noise_alone_would_leave():
+def test_expected_residuals_of_noise_alone():
     assert rms_expected_from_noise_m(np.array([1e-3]), np.array([100.0]), 0) == pytest.approx(
         1e-3 * np.sqrt(3)
     )

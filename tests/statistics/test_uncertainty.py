@@ -128,7 +128,7 @@ def test_sensitivities_agree_with_simulations_at_other_parameters(scheme):
         )
 
 
-def test_what_is_given_does_not_depend_on_the_parameters():
+def test_given_motion_does_not_depend_on_the_parameters():
     collocation, z = simulated([released_cube(4)])
     (by_q,) = sensitivities(collocation, z)
     assert not by_q[0].any()

@@ -51,7 +51,7 @@ def test_methods_find_the_same_optimum():
     assert reduced.kkt_residual < 1e-6
 
 
-def test_a_sensor_improves_what_is_known_of_the_stiffness():
+def test_a_sensor_narrows_the_interval_of_the_stiffness():
     """Of a body whose density is known."""
     deviations = {}
     for name, experiment in (("felt", swung()), ("only seen", blind(swung()))):
@@ -120,7 +120,7 @@ def test_tare_clock_lag_and_tool_are_found():
 
 
 @pytest.mark.long
-def test_a_run_tells_of_the_wrench(tmp_path: Path):
+def test_a_run_reports_the_wrench(tmp_path: Path):
     experiment = swung(1, Nuisance.none(tare=10.0, sensor_time_s=0.002), 20)
     problem = Problem(
         [experiment],
@@ -165,7 +165,7 @@ def test_check_compares_the_slopes_of_wrenches():
     assert 0 < hessian < 1e-6
 
 
-def test_check_tells_the_variables_that_a_wrench_brings():
+def test_check_counts_the_variables_of_a_wrench():
     problem = Problem([swung(steps=12)], UNKNOWN)
     collocation = problem.collocation()
     findings, program = (check_problem(problem), with_lifted_variables(collocation))
@@ -182,7 +182,7 @@ def test_interior_point_finds_the_body_in_its_grasp_too():
     np.testing.assert_allclose(found.q, reduced.q, atol=1e-5)
 
 
-def test_a_sensor_tells_stiffness_and_density_apart():
+def test_a_sensor_separates_stiffness_and_density():
     """Without it only their ratio is told."""
     unknown = {**UNKNOWN, "density_kg_m3": cs.Unknown(45.0)}
     felt = Problem([swung()], unknown)
@@ -202,7 +202,7 @@ def test_a_sensor_tells_stiffness_and_density_apart():
     assert told["density_kg_m3"].statistical_std_error is None
 
 
-def test_equilibria_under_gravity_tell_the_density_too():
+def test_equilibria_under_gravity_determine_the_density_too():
     static = sensing(block("xyz", gravity_m_s2=HANGING))
     static = replace(static, body=static.body.with_free_densities([""]))
     made = simulate(static, TRUTH | {"density_kg_m3": 30.0})

@@ -214,7 +214,7 @@ def test_a_late_clock_comes_with_its_lag_and_sign(name: str, rng):
         assert f"{said} by about {fault.split()[1]} ms" in first.message
 
 
-def test_the_sentence_says_by_how_much_and_which_key(rng):
+def test_the_sentence_names_size_and_key(rng):
     (first, *_) = misspecification_hypotheses(FAULTS["poses in mm"](soft("block"), rng))
     assert "0.001 times as large" in first.message
     assert 'grasp.length_unit = "mm"' in first.message
@@ -234,7 +234,7 @@ def exchanged(problem: Problem, rows: slice, gap: int = 0) -> Problem:
 
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("gap", [0, 5])
-def test_names_exchanged_midway_are_told_with_their_time(name: str, gap: int):
+def test_names_exchanged_midway_are_reported_with_their_time(name: str, gap: int):
     given = soft(name)
     (experiment,) = given.experiments
     half, names = len(experiment.t_s) // 2, experiment.markers.names
@@ -244,7 +244,7 @@ def test_names_exchanged_midway_are_told_with_their_time(name: str, gap: int):
     assert f": {names[0]} is {names[1]}, {names[1]} is {names[0]};" in first.message
 
 
-def test_names_exchanged_and_back_are_told_with_both_times():
+def test_names_exchanged_and_back_are_reported_with_both_times():
     given = soft("bar")
     t_s = given.experiments[0].t_s
     (first, *_) = misspecification_hypotheses(exchanged(given, slice(20, 30)))
@@ -265,7 +265,7 @@ def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
 
 
 @pytest.mark.long
-def test_the_search_for_causes_is_bounded_by_what_the_fit_took(monkeypatch, rng):
+def test_the_search_for_causes_is_bounded_by_the_time_of_the_fit(monkeypatch, rng):
     solution, sweeps = solve(FAULTS["marker slips"](soft("block"), rng)), []
 
     class Counted(ReducedSpace):
@@ -307,12 +307,12 @@ def test_markers_that_are_hardly_ever_seen_are_nothing_sudden(count: int):
         (60.0, 1.1, ["length-unit", "density"]),
     ],
 )
-def test_odd_sizes_and_densities_are_told(edge_m, density_kg_m3, expected):
+def test_odd_sizes_and_densities_are_reported(edge_m, density_kg_m3, expected):
     body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
     assert [oddity.cause for oddity in size_and_density_hypotheses(body)] == expected
 
 
-def test_an_odd_size_leads_to_what_states_it():
+def test_an_implausible_size_is_reported_with_the_key_that_states_it():
     generated = box_mesh((60.0,) * 3, (1, 1, 1))
     read = TetMesh(generated.points_m, generated.tetrahedra)
     for mesh, words in (
@@ -344,7 +344,7 @@ def test_impossible_ones_are_refused(edge_m, density_kg_m3):
 
 
 @pytest.mark.parametrize("fault", ["density in g/cm3", "mass in g", "mesh in mm"])
-def test_they_come_first(fault, rng):
+def test_likely_mistakes_come_first(fault, rng):
     heavy = Body(box_mesh(*BODIES["block"]), density_kg_m3=1000.0)
     given = soft("block")
     silicone = replace(given, experiments=[replace(given.experiments[0], body=heavy)])
@@ -393,7 +393,7 @@ def test_a_good_fit_has_no_cause(name: str):
 
 
 @pytest.mark.long
-def test_a_clock_that_is_estimated_is_told(rng):
+def test_a_clock_that_is_estimated_is_reported(rng):
     problem = FAULTS["clock 10 ms late"](soft("bar"), rng)
     reasons = run(problem).trust.reasons
     assert any("ms" in said and "than their times state" in said for said in reasons), reasons

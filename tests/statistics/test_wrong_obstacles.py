@@ -42,7 +42,7 @@ def test_a_mistake_is_the_likeliest_cause(name: str):
 
 
 @pytest.mark.parametrize("name", SILENT)
-def test_what_another_stiffness_explains_is_not_doubted(name: str):
+def test_a_misfit_that_another_stiffness_explains_is_no_concern(name: str):
     wrong = POKING_FAULTS[name](poked_twin(1), np.random.default_rng(0))
     assert misspecification_hypotheses(wrong) == ()
 
@@ -87,7 +87,7 @@ def test_friction_that_is_estimated_is_not_doubted():
     assert [*obstacle_hypotheses(given)] == []
 
 
-def test_a_body_that_hangs_may_touch_what_it_would_not_undeformed():
+def test_a_hanging_body_may_touch_an_obstacle_clear_of_the_undeformed_mesh():
     """Its weight may take it to the obstacle or away."""
     (experiment,) = poked_twin(1).experiments
     away = POKING_FAULTS["obstacle: 5 mm away from the body"].change(

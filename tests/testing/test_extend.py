@@ -205,7 +205,7 @@ def test_a_force_across_the_velocity_is_found(method: str):
         ("gone", "there is no function 'gone'; expected one of drag, lift, wild"),
     ],
 )
-def test_what_is_no_force_is_one_message(tiny, function, said):
+def test_an_invalid_force_term_is_one_message(tiny, function, said):
     with_force(function)(tiny)
     write("mine.py", MINE)(tiny)
     with pytest.raises(InputError, match=said):

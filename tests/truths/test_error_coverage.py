@@ -60,7 +60,7 @@ def assert_covers(share: float) -> None:
 @pytest.mark.parametrize(
     ("name", "phi"), [*product(PROBLEMS, (0.0, 0.85)), ("one marker, 40 samples", 0.5)]
 )
-def test_intervals_hold_the_truth_as_often_as_they_say(name, phi):
+def test_intervals_contain_the_truth_at_their_nominal_rate(name, phi):
     assert_covers(coverage(PROBLEMS[name], phi, noise="estimated"))
 
 
@@ -96,7 +96,7 @@ def test_intervals_rarely_change_for_white_errors():
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_the_test_for_persistence_knows_what_the_fit_took_out(name):
+def test_the_test_for_persistence_accounts_for_the_fit(name):
     scores = []
     for fit, _ in draws(PROBLEMS[name], 0.0):
         found = analyse_dependence(fit, factorise_information(fit))
@@ -193,7 +193,9 @@ def test_local_parameters_have_standard_deviations():
 
 
 @pytest.mark.parametrize("bounded", [1, 4])
-def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free(bounded):
+def test_an_estimate_at_its_bound_has_no_interval_and_the_others_have_that_of_the_free_problem(
+    bounded,
+):
     fit, wrong = sample()
     at_bound = replace(fit, at_bound=np.arange(len(fit.names)) == bounded)
     found, free = (
@@ -219,7 +221,7 @@ def test_a_parameter_that_a_prior_determines_costs_no_degree_of_freedom():
 # What is said of the residuals
 
 
-def test_errors_that_persist_are_told_once():
+def test_errors_that_persist_are_reported_once():
     fit, wrong = sample(phi=0.9)
     found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4])
     assert found.errors == "autocorrelated"

@@ -60,7 +60,7 @@ def test_every_sector_of_the_outer_wall_has_one_region():
     assert (z > arm.ArmShape().cap_m).all()
 
 
-def test_tracks_begin_at_the_stated_positions_and_the_onset_is_where_it_is_said():
+def test_tracks_begin_at_stated_positions_and_the_stated_onset():
     require_recordings()
     for mbar in arm.PRESSURES_MBAR:
         rows = np.loadtxt(arm.FOLDER / f"{mbar}mbar.csv", delimiter=",", skiprows=1)

@@ -77,7 +77,7 @@ WRIST = {"young_pa": 2.5e4, "density_kg_m3": 120.0}
 
 @pytest.mark.long
 @pytest.mark.parametrize("felt", [True, False], ids=["with the sensor", "without"])
-def test_a_wrist_sensor_tells_stiffness_and_density_apart(felt: bool):
+def test_a_wrist_sensor_separates_stiffness_and_density(felt: bool):
     # What the steps are off by shows beside error bars as small as those with the sensor.
     steps = f"transcription.substeps={3 if felt else 1}"
     shorter = [steps, "experiment.swing.window_s=[0.0, 0.5]"]
@@ -102,7 +102,7 @@ def test_a_wrist_sensor_tells_stiffness_and_density_apart(felt: bool):
 
 
 @pytest.mark.long
-def test_a_poked_block_tells_its_stiffness_though_nobody_knows_where_it_begins():
+def test_a_poked_block_of_unknown_place_determines_its_stiffness():
     problem = Problem.read(
         PROBLEMS / "poked_block" / "problem.toml", ["parameters.young_pa.guess=1.7e4"]
     )

@@ -177,7 +177,7 @@ def test_a_strut_from_a_file_is_the_one_from_python(strutted):
         (('"maxwell"', '"made"'), "object.force.0.carries: found 6, but the force 'made' has "),
     ],
 )
-def test_what_a_force_in_a_file_cannot_carry_is_one_message(strutted, edit, said):
+def test_invalid_internal_variables_of_a_force_are_one_message(strutted, edit, said):
     replace_text(*edit)(strutted)
     write("mine.py", (strutted / "mine.py").read_text() + MADE)(strutted)
     done = run_command("check", "problem.toml", "--allow-code")

@@ -66,7 +66,7 @@ def test_interior_point_finds_the_optimum_of_reduced_space(branches: int, noise_
 
 
 @pytest.mark.long
-def test_regions_with_branches_of_their_own_are_told_apart():
+def test_regions_with_branches_of_their_own_are_distinguished():
     collocation = Collocation([swung(of_regions(), REGIONS, 16)], guesses(REGIONS, 1.2))
     found = InteriorPoint(tolerance=1e-10)(collocation)
     assert_same(found, ReducedSpace(tolerance=1e-10)(collocation), 1e-6)

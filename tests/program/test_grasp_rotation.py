@@ -49,7 +49,7 @@ def test_substeps_converge_at_the_schemes_order_where_poses_are_smooth_between_s
     assert observed_order(1 / substeps, errors) == pytest.approx(2, abs=0.15)
 
 
-def test_no_step_removes_what_linear_poses_leave_and_held_ones_get_worse(exact_m):
+def test_no_step_removes_the_error_of_linear_poses(exact_m):
     smooth, linear = (
         np.abs(positions_m(swung(interpolation=kind), 8) - exact_m).max()
         for kind in ("smooth", "linear")
@@ -97,7 +97,7 @@ def test_only_while_a_grasp_holds_its_turns_count():
     assert fastest_rotation(passing, 1).time_s == pytest.approx(0.01)
 
 
-def test_a_run_says_that_a_turn_is_too_fast_for_its_step_and_is_to_be_checked():
+def test_a_turn_too_fast_for_the_step_is_to_be_checked():
     unknown = TRUTH | {"mu_pa": Unknown(280.0)}
     slow, fast = (
         run(Problem([measured(swung(rate))], unknown, substeps=1), seek_causes=False)
