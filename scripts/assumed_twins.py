@@ -29,6 +29,11 @@ from collocation_sysid import (
 from collocation_sysid.fem.air import DRAG_COEFFICIENT, FACING_SHARE
 from collocation_sysid.fem.laws.constants import GAMMA_R
 from collocation_sysid.fem.laws.materials import DAMPINGS, DampingLaw, rayleigh
+from collocation_sysid.statistics.budget.shape_error import (
+    SURFACE_MODES,
+    surface_modes,
+    thickness_m,
+)
 from collocation_sysid.statistics.budget.systematic_effects import OBJECTIVE_DAMPINGS
 
 Array = NDArray[np.float64]
@@ -129,7 +134,10 @@ def _body(experiment: Experiment, values: Mapping[str, float], errors: Mapping[s
     (grasp,) = experiment.grasps
     pivot_m = old.nodes_m[grasp.nodes].mean(axis=0)
     scale = 1 + errors.get("body_scale", 0.0)
-    mesh = TetMesh(pivot_m + scale * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra)
+    points_m = pivot_m + scale * (old.mesh.points_m - pivot_m) + _surface_errors_m(old, errors)
+    # Held nodes that end before the body in the model does leave a compliant piece of material.
+    points_m[grasp.nodes] -= _gap_to_grip_m(old, grasp, errors)
+    mesh = TetMesh(points_m, old.mesh.tetrahedra)
     extra_stiffness = [errors.get(f"anisotropy {axis}", 0.0) for axis in AXES]
     body_options: dict[str, Any] = {"damping": _damping(old.parts[0].damping, errors)}
     if any(extra_stiffness):
@@ -151,6 +159,25 @@ def _body(experiment: Experiment, values: Mapping[str, float], errors: Mapping[s
     body._lumped_m3 = [lumped * np.repeat(factor, 3) for lumped in body._lumped_m3]
     body.node_mass = body.node_mass * factor
     return body
+
+
+def _surface_errors_m(body: Body, errors: Mapping[str, float]) -> Array:
+    """Return the displacements (n, 3) of the nodes by errors of the surface [m]."""
+    sizes = [errors.get(f"surface {mode + 1}", 0.0) for mode in range(SURFACE_MODES)]
+    if not any(sizes):
+        return np.zeros_like(body.mesh.points_m)
+    modes = surface_modes(body, np.array([], dtype=int))[:, : len(body.mesh.points_m)]
+    return thickness_m(body) * np.einsum("m,mni->ni", sizes, modes)
+
+
+def _gap_to_grip_m(body: Body, grasp: Grasp, errors: Mapping[str, float]) -> Array:
+    """Return the vector (3,) from the true place of the gripper to the grasped nodes [m].
+
+    A layer is never negative; the edge may be on either side.
+    """
+    length_m = abs(errors.get("grip_layer_m", 0.0)) + errors.get("grasp_edge_m", 0.0)
+    along = body.nodes_m.mean(axis=0) - body.nodes_m[grasp.nodes].mean(axis=0)
+    return length_m * along / np.linalg.norm(along)
 
 
 def _stiffness_factors(body: Body, errors: Mapping[str, float]) -> Array:

@@ -8,7 +8,8 @@ covariance. The solve starts from the true values. The table has the coverage of
 the median standard errors; for twins without errors also the ratio of standard errors with and
 without nuisance parameters. In the rows "assumed", the body deviates from an assumption of the
 budget by a random number with the standard deviation of this assumption; these rows have the
-coverage of the combined interval too, of a budget with this assumption or with all of them.
+coverage of the combined interval too, of a budget with this assumption or with all of them. In the
+rows "every effect" all default assumptions and nuisance parameters are wrong at once.
 """
 
 from __future__ import annotations
@@ -32,11 +33,16 @@ from study_coverage import QUANTITIES, SCHEME, intervals_with_truth, reference, 
 from study_starts import TRUTH, parameters
 
 from collocation_sysid import Problem
+from collocation_sysid.fem.body import Body
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
-from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
+from collocation_sysid.recording.nuisance import CALIBRATION_SCALE
+from collocation_sysid.statistics.budget.consider_analysis import (
+    changed_residuals,
+    changes_of_assumptions,
+)
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumption
 from collocation_sysid.statistics.budget.uncertainty_budget import (
     BudgetLine,
@@ -68,6 +74,8 @@ class FaultOutcome:
         1 if the statistical interval contains the truth, 0 if not, NaN without interval.
     combined_contains_truth : (6,)
         As `contains_truth`, for the combined interval.
+    half_widths : (6,)
+        Half widths of the combined intervals over the true values; NaN without interval.
     relative : (6,)
         Standard errors over the true values; NaN without standard error.
     without : (6,)
@@ -79,6 +87,7 @@ class FaultOutcome:
     converged: bool
     contains_truth: Array
     combined_contains_truth: Array
+    half_widths: Array
     relative: Array
     without: Array
     correlated: bool
@@ -127,8 +136,8 @@ def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
     true_recording, described = FAULTS[fault](exact_recording(), rng)
     tracks = true_recording.markers.positions_m
     tracks = tracks + true_recording.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
-    uncertainty, combined_contains_truth, converged = identified(
-        with_markers(described, tracks), ROWS.get(fault, ())
+    uncertainty, combined_contains_truth, half_widths, converged = identified(
+        with_markers(described, tracks), None if fault in EVERY else ROWS.get(fault, ())
     )
     errors_without_nuisance = np.full(len(QUANTITIES), np.nan)
     if true_recording is described:
@@ -138,6 +147,7 @@ def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
         converged,
         np.array(intervals_with_truth(uncertainty)),
         combined_contains_truth,
+        half_widths,
         relative_errors(uncertainty),
         errors_without_nuisance,
         uncertainty.errors == "autocorrelated",
@@ -158,21 +168,23 @@ def positions_m() -> Array:
 
 
 def identified(
-    experiment: Experiment, assumed: Sequence[Assumption] = ()
-) -> tuple[Uncertainty, Array, bool]:
+    experiment: Experiment, assumed: Sequence[Assumption] | None = ()
+) -> tuple[Uncertainty, Array, Array, bool]:
     """Identify an experiment with default options, starting from the truth.
 
     Parameters
     ----------
     experiment : Experiment
-    assumed : sequence of Assumption
-        Rows of the uncertainty budget.
+    assumed : sequence of Assumption or None
+        Rows of the uncertainty budget; None for the default budget.
 
     Returns
     -------
     uncertainty : Uncertainty
     combined_contains_truth : (6,) array
         1 if the combined interval contains the truth, 0 if not, NaN without interval.
+    half_widths : (6,) array
+        Half widths of the combined intervals over the true values.
     converged : bool
     """
     fit = fit_from_truth(experiment, assumed)
@@ -182,18 +194,27 @@ def identified(
         float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1]) if n in lines else np.nan
         for n in QUANTITIES
     ]
-    return fit.uncertainty, np.array(combined_contains_truth), fit.converged
+    half_widths = [
+        np.ptp(lines[n].combined95) / 2 / true[n] if n in lines else np.nan for n in QUANTITIES
+    ]
+    contained = np.array(combined_contains_truth)
+    return fit.uncertainty, contained, np.array(half_widths), fit.converged
 
 
-def fit_from_truth(experiment: Experiment, assumed: Sequence[Assumption]) -> BudgetedFit:
-    """Return the fit of an experiment from the truth, with a budget of some assumptions."""
+def fit_from_truth(experiment: Experiment, assumed: Sequence[Assumption] | None) -> BudgetedFit:
+    """Return the fit of an experiment from the truth, with a budget of some assumptions, or of all
+    for None.
+    """
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
     collocation = solution.collocation
     z = solution.z
     uncertainty = uncertainty_at(collocation, z)
-    deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
-    changes = changed_residuals(collocation, z, deviations)
+    if assumed is None:
+        changes = changes_of_assumptions(collocation, z, {})
+    else:
+        deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
+        changes = changed_residuals(collocation, z, deviations)
     fit = linearise_fit(collocation, z)
     sources = VarianceSources.from_fit(
         fit, changes, collocation.parameters, solution.q, uncertainty
@@ -252,11 +273,15 @@ def noisy_poses(size_m: float, degrees: float, is_stated: bool) -> Callable[...,
 
 def tilted(experiment: Experiment, rng: Generator) -> TrueAndStated:
     """Return a recording whose gravity is tilted by random angles of about 1° about x and y."""
+    return simulated(tilted_gravity(experiment, rng)), experiment
+
+
+def tilted_gravity(experiment: Experiment, rng: Generator) -> Experiment:
+    """Return the experiment with gravity tilted by random angles of about 1° about x and y."""
     angles = np.radians(rng.standard_normal(2))
     down = np.array([*angles, -1.0])
     gravity_m_s2 = 9.81 * down / np.linalg.norm(down)
-    tilted_gravity = replace(experiment, gravity_m_s2=tuple(gravity_m_s2.tolist()))
-    return simulated(tilted_gravity), experiment
+    return replace(experiment, gravity_m_s2=tuple(gravity_m_s2.tolist()))
 
 
 def misplaced_in_gripper(experiment: Experiment, rng: Generator) -> TrueAndStated:
@@ -321,16 +346,61 @@ def draw_assumption_errors(names: Sequence[str]) -> Callable[..., TrueAndStated]
     """
 
     def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
-        errors = {}
-        for row in (row for row in ASSUMPTIONS if row.name in names):
-            for name in row.list_components():
-                error = (row.sigma or 0.0) * rng.standard_normal()
-                # Coefficients of the air are not negative.
-                errors[name] = max(error, -0.99) if row.name in AIR else error
-        values = {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
-        return with_wrong_assumptions(experiment, values, errors), experiment
+        return with_wrong_assumptions(experiment, true_values(), _errors(names, rng)), experiment
 
     return fault
+
+
+def _errors(names: Sequence[str], rng: Generator) -> dict[str, float]:
+    errors = {}
+    for row in (row for row in ASSUMPTIONS if row.name in names):
+        for name in row.list_components():
+            error = (row.sigma or 0.0) * rng.standard_normal()
+            # Coefficients of the air are not negative.
+            errors[name] = max(error, -0.99) if row.name in AIR else error
+    return errors
+
+
+def true_values() -> dict[str, float]:
+    """Return E, ν and the damping constants of the twins."""
+    return {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
+
+
+def draw_every_error(names: Sequence[str]) -> Callable[..., TrueAndStated]:
+    """Return a fault that draws deviations from the named assumptions of a body with the default
+    damping law, and all nuisance parameters that are estimated or considered by default.
+    """
+
+    def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
+        described = replace(experiment, body=body_with_default_damping())
+        nuisance = described.nuisance
+        turned, (grasp,) = tilted_gravity(described, rng), described.grasps
+        matrix = np.eye(4)
+        turn_rad = (nuisance.hand_eye_rad or 0.0) * rng.standard_normal(3)
+        matrix[:3, :3] = Rotation.from_rotvec(turn_rad).as_matrix()
+        matrix[:3, 3] = (nuisance.hand_eye_m or 0.0) * rng.standard_normal(3)
+        held = replace(turned, grasps=(Grasp(grasp.nodes, grasp.poses.after(matrix)),))
+        moved = with_wrong_assumptions(held, true_values(), _errors(names, rng))
+        late_s = (nuisance.time_shift_s or 0.0) * rng.standard_normal()
+        seen_s = np.clip(described.t_s - late_s, 0.0, described.t_s[-1])
+        tracks_m = CubicSpline(described.t_s, moved.markers.positions_m)(seen_s)
+        pivot_m = tracks_m[0].mean(axis=0)
+        scale = 1 + (CALIBRATION_SCALE.considered or 0.0) * rng.standard_normal()
+        places_m = described.markers.predict_positions(described.body.nodes_m)
+        off_m = (nuisance.marker_offset_m or 0.0) * rng.standard_normal(places_m.shape)
+        return (
+            with_markers(described, pivot_m + scale * (tracks_m - pivot_m)),
+            at_places(described, places_m + off_m),
+        )
+
+    return fault
+
+
+@cache
+def body_with_default_damping() -> Body:
+    """Return the body of the twins with the default damping law."""
+    body = exact_recording().body
+    return Body(body.mesh, density_kg_m3=body.mass_kg / body.mesh.volume_m3)
 
 
 AIR = ("air_drag", "added_mass", "buoyancy")
@@ -350,6 +420,12 @@ SINGLE = (
 ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE}
 ASSUMED |= {"assumed: air": AIR, "assumed: all of these": SINGLE}
 ROWS = {f: tuple(r for r in ASSUMPTIONS if r.name in names) for f, names in ASSUMED.items()}
+# All effects of the default budget, and the nuisance parameters; the budget is the default one.
+WITHOUT_LAW = (*SINGLE, "surface", "grip_layer_m", "grasp_edge_m")
+EVERY = {
+    "every effect": (*WITHOUT_LAW, "damping_law"),
+    "every effect but the damping law": WITHOUT_LAW,
+}
 
 FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
     "none": without_fault,
@@ -364,7 +440,9 @@ FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
     "one marker 3 times as noisy": with_noisy_marker,
     "marker positions 1 mm": misplaced,
     "marker positions unknown": unplaced,
-} | {fault: draw_assumption_errors(names) for fault, names in ASSUMED.items()}
+}
+FAULTS |= {fault: draw_assumption_errors(names) for fault, names in ASSUMED.items()}
+FAULTS |= {fault: draw_every_error(names) for fault, names in EVERY.items()}
 
 
 # Table --------------------------------------------------------------------------------------------
@@ -386,7 +464,7 @@ def table_head() -> str:
     """Return the two lines of the head of the table."""
     columns = [
         f"{c} {kind}, %"
-        for kind in ("coverage", "combined coverage", "standard error")
+        for kind in ("coverage", "combined coverage", "combined half width", "standard error")
         for c in COLUMNS
     ]
     cells = ["fault", *columns, "correlated errors, %", "not converged"]
@@ -402,6 +480,7 @@ def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> str:
             for outcome in converged_outcomes
         ]
     ).T
+    half_widths = [outcome.half_widths for outcome in converged_outcomes]
     errors = 100 * np.nanmedian([outcome.relative for outcome in converged_outcomes], axis=0)
     correlated = 100 * np.mean([outcome.correlated for outcome in converged_outcomes])
     failures = len(outcomes) - len(converged_outcomes)
@@ -409,6 +488,7 @@ def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> str:
         [
             fault,
             *map(_coverage_cell, columns),
+            *map(_median_cell, np.array(half_widths).T),
             *map("{:.2g}".format, errors),
             f"{correlated:.0f}",
             f"{failures}",
@@ -427,6 +507,12 @@ def _coverage_cell(contained: Array) -> str:
         return "-"
     low, high = binom.interval(0.95, len(contained), 0.95)
     return f"{100 * contained.mean():.3g}{'' if low <= contained.sum() <= high else '*'}"
+
+
+def _median_cell(shares: Array) -> str:
+    """Return the median in percent of those that are not NaN."""
+    known = shares[np.isfinite(shares)]
+    return f"{100 * np.median(known):.2g}" if len(known) else "-"
 
 
 def loss_of_precision(outcomes: Sequence[FaultOutcome]) -> str:
