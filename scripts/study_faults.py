@@ -356,8 +356,11 @@ def _errors(names: Sequence[str], rng: Generator) -> dict[str, float]:
     for row in (row for row in ASSUMPTIONS if row.name in names):
         for name in row.list_components():
             error = (row.sigma or 0.0) * rng.standard_normal()
-            # Coefficients of the air are not negative.
+            # Coefficients of the air are not negative, and a negative share of another damping law
+            # would add energy where the body is stretched.
             errors[name] = max(error, -0.99) if row.name in AIR else error
+            if row.name == "damping_law":
+                errors[name] = abs(error)
     return errors
 
 
