@@ -9,7 +9,9 @@ the median standard errors; for twins without errors also the ratio of standard 
 without nuisance parameters. In the rows "assumed", the body deviates from an assumption of the
 budget by a random number with the standard deviation of this assumption; these rows have the
 coverage of the combined interval too, of a budget with this assumption or with all of them. In the
-rows "every effect" all default assumptions and nuisance parameters are wrong at once.
+rows "every effect" all default assumptions and nuisance parameters are wrong at once. If the damping
+law is wrong too, the intervals of γ_r and γ_m need not contain the true values, because both are
+constants of the stated law.
 """
 
 from __future__ import annotations

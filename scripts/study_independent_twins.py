@@ -32,7 +32,7 @@ import collocation_sysid as cs
 
 LENGTH_M = 0.12
 SAMPLE_S = 0.0125
-DURATION_S = 0.75
+DURATION_S = 0.5
 POSE_STEP_S = 0.00625
 CONSTANTS = {"young_pa": "E", "poisson": "ν", "gamma_r_s": "γ_r", "gamma_m_1_s": "γ_m"}
 DEGREE = np.pi / 180

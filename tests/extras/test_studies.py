@@ -12,7 +12,10 @@ import study_methods
 import study_mismatch
 import study_noise
 import study_table1
+from assumed_twins import _body
 from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, run_variants, worst_error
+
+from collocation_sysid.statistics.budget.shape_error import thickness_m
 
 pytestmark = pytest.mark.long
 
@@ -164,7 +167,7 @@ def test_a_twin_with_noisy_poses_is_identified_and_listed():
     assert found.contains_truth.sum() >= 3
     (line,) = cells(f"{study_faults.table_head()}\n{study_faults.table_row('poses', [found])}")
     assert line[0] == "poses"
-    assert float(line[13]) == pytest.approx(100 * found.relative[0], rel=0.05)
+    assert float(line[19]) == pytest.approx(100 * found.relative[0], rel=0.05)
     assert line[-1] == "0"
 
 
@@ -173,6 +176,26 @@ def test_a_twin_of_which_all_that_is_assumed_is_wrong_is_in_the_whole_intervals(
     assert found.converged
     assert found.contains_truth.sum() < found.combined_contains_truth.sum()
     assert found.combined_contains_truth.sum() >= 5
+
+
+def test_a_twin_with_every_effect_has_the_default_budget():
+    fault = "every effect but the damping law"
+    found = study_faults.run(fault, (0, *fault.encode(), 0))  # the first twin of the study
+    assert found.converged
+    assert found.combined_contains_truth.sum() >= 5
+    assert (found.half_widths > 1.96 * found.relative).all()
+
+
+def test_errors_of_surface_and_grip_move_the_nodes_by_their_size():
+    experiment = study_faults.exact_recording()
+    (grasp,), body = experiment.grasps, experiment.body
+    moved = _body(experiment, study_faults.true_values(), {"grasp_edge_m": 2e-3})
+    shifts_m = moved.nodes_m - body.nodes_m
+    assert np.linalg.norm(shifts_m[grasp.nodes], axis=1) == pytest.approx(2e-3)
+    assert np.delete(shifts_m, grasp.nodes, axis=0) == pytest.approx(0)
+    swollen = _body(experiment, study_faults.true_values(), {"surface 1": 0.01})
+    largest_m = np.linalg.norm(swollen.nodes_m - body.nodes_m, axis=1).max()
+    assert 0.1 < largest_m / (0.01 * thickness_m(body)) < 5
 
 
 def test_faults_are_as_large_as_they_are_called():
@@ -193,7 +216,7 @@ def test_faults_are_as_large_as_they_are_called():
 
 @pytest.mark.parametrize(("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")])
 def test_shares_beyond_chance_are_starred(count, shown):
-    outcome = study_faults.FaultOutcome(True, *(np.ones(6) for _ in range(4)), correlated=False)
+    outcome = study_faults.FaultOutcome(True, *(np.ones(6) for _ in range(5)), correlated=False)
     missed = replace(outcome, contains_truth=np.zeros(6))
     row = study_faults.table_row("none", [outcome] * count + [missed] * (200 - count))
     assert cells(f"a\nb\n{row}")[0][1] == shown
