@@ -37,6 +37,8 @@ from .measurement_results import (
     InstrumentPrediction,
     PictureKind,
     PredictionErrors,
+    Samples,
+    during,
 )
 
 # Messages of concerns about a fit or a prediction, by code.
@@ -83,6 +85,16 @@ def instruments(experiment: Experiment) -> list[str]:
     return [
         f"{sum(map(len, depth.clouds)):,} points of '{depth.name}'" for depth in experiment.depths
     ]
+
+
+def samples(experiment: Experiment) -> Iterator[Samples]:
+    """Yield which images of each camera during the recording have points."""
+    for depth in experiment.depths:
+        has_points = np.array([len(cloud) > 0 for cloud in depth.clouds], dtype=bool)
+        is_within = during(experiment, np.asarray(depth.t_s))
+        yield Samples(
+            f"the images of '{depth.name}'", ["points"], (has_points & is_within)[:, None]
+        )
 
 
 def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
@@ -432,6 +444,7 @@ CAMERAS = Feature(
     ],
     instruments=instruments,
     require_valid=require_depth_units,
+    samples=samples,
     predict=predict,
     fitted=fitted,
     reason_against_copy=reason_against_copy,

@@ -26,14 +26,25 @@ from .measurement_results import (
     PictureKind,
     PredictionErrors,
     PredictionResiduals,
+    Samples,
     SensorSeries,
     comparison_columns,
+    during,
 )
 
 
 def instruments(experiment: Experiment) -> list[str]:
     """Return the names of the sensors."""
     return [gauge.name for gauge in experiment.readings]
+
+
+def samples(experiment: Experiment) -> Iterator[Samples]:
+    """Yield the values of each sensor during the recording."""
+    for gauge in experiment.readings:
+        values = gauge.measured_values
+        is_within = during(experiment, gauge.sample_times_s)
+        names = [f"{gauge.name} {j + 1}" for j in range(values.shape[1])]
+        yield Samples(f"'{gauge.name}'", names, np.isfinite(values) & is_within[:, None])
 
 
 def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
@@ -265,6 +276,7 @@ CUSTOM_SENSORS = Feature(
         )
     ],
     instruments=instruments,
+    samples=samples,
     predict=predict,
     fitted=fitted,
     copied=copied,

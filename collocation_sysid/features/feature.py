@@ -30,6 +30,7 @@ from .measurement_results import (
     PictureKind,
     PredictionErrors,
     PredictionResiduals,
+    Samples,
     SensorSeries,
     SeriesKind,
 )
@@ -116,6 +117,9 @@ class Feature:
         as "sensor_columns" by the name of the kind.
     instruments : callable
         ``instruments(experiment)``: texts of what the feature measures in a recording.
+    samples : callable
+        ``samples(experiment)``: the measurements as `Samples`, of which `lost_samples` reports what
+        is missing.
     require_valid : callable
         ``require_valid(experiment)`` raises an `InputError` for data that cannot be fitted.
     predict : callable
@@ -206,6 +210,7 @@ class Feature:
     picture_kinds: Sequence[PictureKind] = ()
     series_kind: SeriesKind | None = None
     instruments: Callable[[Experiment], Iterable[str]] = _nothing
+    samples: Callable[[Experiment], Iterable[Samples]] = _nothing
     require_valid: Callable[[Experiment], object] = _nothing
     predict: Callable[[Transcription, Trajectory, Array], Fields] = _no_fields
     fitted: Callable[[ExperimentIterate, Solution], Fields] = _no_fields

@@ -22,6 +22,7 @@ from .measurement_results import (
     PictureKind,
     PredictionErrors,
     PredictionResiduals,
+    Samples,
 )
 
 # File of predicted tracks.
@@ -36,6 +37,14 @@ KEYS_OF_FILE = (
     "template_window_s",
     "max_template_residual_m",
 )
+
+
+def samples(experiment: Experiment) -> Iterator[Samples]:
+    """Yield the coordinates of all markers; nothing without a marker."""
+    markers = experiment.markers
+    if markers.names:
+        names = [f"{name} {axis}" for name in markers.names for axis in "xyz"]
+        yield Samples("the markers", names, markers.is_measured.reshape(-1, len(names)))
 
 
 def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
@@ -74,7 +83,7 @@ def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
 def errors(experiment: Experiment, predicted: InstrumentPrediction) -> dict[str, Any]:
     """Return RMS and largest distance of the markers [m]; None without any."""
     markers = experiment.markers
-    distance_m = np.linalg.norm(predicted.markers_m - markers.positions_m, axis=2)
+    distance_m = np.sqrt(markers.squared_distances_m2(predicted.markers_m))
     present_m = distance_m[markers.is_present & np.isfinite(distance_m)]
     return {
         "rms_m": root_mean(present_m**2) if present_m.size else None,
@@ -88,8 +97,9 @@ def misfits(experiment: Experiment, predicted: InstrumentPrediction) -> Iterator
     if not markers.is_present.any():
         return
     difference_m = (predicted.markers_m - markers.positions_m)[markers.is_present]
+    squares_m2 = markers.squared_distances_m2(predicted.markers_m)[markers.is_present]
     sigma_m = np.broadcast_to(markers.sigma_m, markers.is_present.shape)[markers.is_present]
-    rms_m = root_mean(np.sum(difference_m**2, axis=1))
+    rms_m = root_mean(squares_m2[np.isfinite(squares_m2)])
     yield misfit(
         "the markers",
         "sigma_m",
@@ -163,6 +173,7 @@ MARKERS = Feature(
             is_leading=True,
         )
     ],
+    samples=samples,
     predict=predict,
     fitted=fitted,
     copied=copied,

@@ -16,6 +16,8 @@ from ..common.array_types import Array
 from ..common.serialisation import optional
 from ..model.contact.contact_summary import FrictionSummary
 from ..program.depth.depth_comparison import DepthError, SurfaceComparison
+from ..recording.experiment import Experiment
+from ..recording.sample_times import TIME_TOLERANCE_S
 
 
 @dataclass(frozen=True)
@@ -236,6 +238,25 @@ class ForwardResult:
 
 
 @dataclass(frozen=True, eq=False)
+class Samples:
+    """Numbers of one measurement that are present.
+
+    Attributes
+    ----------
+    what : str
+        The measurement, for people.
+    names : sequence of K str
+        Names of its numbers.
+    is_present : (S, K) array of bool
+        Which of them are present at its S samples.
+    """
+
+    what: str
+    names: Sequence[str]
+    is_present: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
 class SensorSeries:
     """Numbers of one sensor over time: measured, fitted and simulated.
 
@@ -358,3 +379,9 @@ def comparison_columns(t_s: Array, measured: Array, *models: Array | None) -> Ar
     """
     columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
     return np.column_stack([t_s, measured, *columns])
+
+
+def during(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:
+    """Return the mask (S,) of the samples at times `t_s` (S,) [s] that are within a recording."""
+    first_s, last_s = experiment.t_s[[0, -1]]
+    return (t_s >= first_s - TIME_TOLERANCE_S) & (t_s <= last_s + TIME_TOLERANCE_S)

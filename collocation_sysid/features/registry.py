@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
+from ..errors import InputError
 from ..program.simulation import Trajectory
 from ..recording.experiment import Experiment
 from ..statistics.concerns import declare_messages, declare_topics
@@ -16,6 +19,9 @@ from .marker_feature import MARKERS
 from .measurement_results import InstrumentPrediction, PredictionResiduals
 from .wrench_feature import WRENCH
 
+# Share of the samples below which a note says what is missing, and most names in it.
+LEAST_SHARE = 0.5
+MOST_SHOWN = 3
 # In the order of the residuals of an experiment, see `Transcription.residuals`.
 FEATURES: tuple[Feature, ...] = (MARKERS, WRENCH, CUSTOM_SENSORS, CONTACT, CAMERAS)
 for _feature in FEATURES:
@@ -41,6 +47,36 @@ def prediction_residuals(
         if residuals is not None:
             return residuals
     raise ValueError(f"nothing is measured in '{experiment.name}'")
+
+
+def lost_samples(experiment: Experiment) -> list[str]:
+    """Return a note for each measurement of which less than half is present.
+
+    Raises
+    ------
+    InputError
+        If nothing of a measurement is present within the recording.
+    """
+    notes = []
+    for part in (part for feature in FEATURES for part in feature.samples(experiment)):
+        if not part.is_present.any():
+            raise InputError(
+                f"nothing of {part.what} of '{experiment.name}' is measured between "
+                f"{experiment.t_s[0]:.6g} s and {experiment.t_s[-1]:.6g} s; expected at least one "
+                "sample: check columns, labels and times, or leave it out",
+                where="experiment",
+            )
+        share = part.is_present.mean(axis=0)
+        few = np.flatnonzero(share < LEAST_SHARE).tolist()
+        if few:
+            shown = ", ".join(f"{part.names[k]} ({share[k]:.0%})" for k in few[:MOST_SHOWN])
+            more = ", …" if len(few) > MOST_SHOWN else ""
+            notes.append(
+                f"experiment '{experiment.name}': of {part.what}, {len(few)} of {len(share)} "
+                f"columns are present in less than half of the samples: {shown}{more}; what is "
+                "present is used"
+            )
+    return notes
 
 
 def merged_fields(contributions: Iterable[Fields]) -> dict[str, Any]:

@@ -28,9 +28,11 @@ from .measurement_results import (
     PictureKind,
     PredictionErrors,
     PredictionResiduals,
+    Samples,
     SensorSeries,
     SeriesKind,
     comparison_columns,
+    during,
 )
 from .wrench_at_guess import MESSAGE_OF_OFFSET, wrench_deviations
 from .wrench_causes import CHECKED_SAMPLES, MESSAGES, wrench_causes, wrench_mistakes
@@ -47,6 +49,15 @@ SERIES_KIND = SeriesKind("wrench", COMPONENTS, units=UNITS)
 def instruments(experiment: Experiment) -> list[str]:
     """Return one text if any wrench is measured."""
     return ["the wrench"] * bool(experiment.wrenches)
+
+
+def samples(experiment: Experiment) -> Iterator[Samples]:
+    """Yield the measured components of each sensor during the recording."""
+    for k, sensor in enumerate(experiment.wrenches, 1):
+        what = "the wrench" if len(experiment.wrenches) == 1 else f"wrench {k}"
+        measured = np.flatnonzero(sensor.is_measured.any(axis=0))
+        is_present = sensor.is_measured & during(experiment, sensor.t_s)[:, None]
+        yield Samples(what, [COMPONENTS[j] for j in measured], is_present[:, measured])
 
 
 def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
@@ -316,6 +327,7 @@ WRENCH = Feature(
     ],
     series_kind=SERIES_KIND,
     instruments=instruments,
+    samples=samples,
     predict=predict,
     fitted=fitted,
     copied=copied,

@@ -429,7 +429,7 @@ class Solution:
             self.collocation.transcriptions, self.readings_m, strict=True
         ):
             markers = transcription.experiment.markers
-            squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.is_present]
+            squares = markers.squared_distances_m2(readings)[markers.is_present]
             rms_by_experiment[transcription.experiment.name] = root_mean(squares)
         return rms_by_experiment
 

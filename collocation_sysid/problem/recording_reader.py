@@ -703,8 +703,10 @@ def _implausible_markers(experiment: Experiment) -> str | None:
     """
     markers = experiment.markers
     body_m = _diagonal(experiment.body.nodes_m)
-    k = int(markers.is_present.sum(axis=1).argmax())
-    is_measured = markers.is_present[k]
+    k = int(markers.is_complete.sum(axis=1).argmax())
+    is_measured = markers.is_complete[k]
+    if not is_measured.any():
+        return None
     measured = markers.positions_m[k, is_measured]
     span_m = _diagonal(measured)
     if len(measured) > 1 and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m:

@@ -200,9 +200,9 @@ class Transcription(MotionTranscription):
         if markers.located.all():
             return self.association, phi
         points_m, _ = markers.first_samples
-        first = rows[markers.is_present.argmax(axis=0)]
+        first = rows[markers.is_complete.argmax(axis=0)]
         places_m = self.marker_places_m(phi)
-        unknown = ~markers.located & (first < len(x)) & markers.is_present.any(axis=0)
+        unknown = ~markers.located & (first < len(x)) & markers.is_complete.any(axis=0)
         for row in np.unique(first[unknown]):
             starting = np.flatnonzero(unknown & (first == row))
             places_m[starting] = self.association.markers.places_of_points(
@@ -218,7 +218,7 @@ class Transcription(MotionTranscription):
         stated and there are no unlabelled points.
         """
         unknown = ~self.experiment.markers.located
-        first = self.experiment.markers.is_present[:, unknown].argmax(axis=0)
+        first = self.experiment.markers.is_complete[:, unknown].argmax(axis=0)
         rows = [int(self.markers.observable.rows[first].max())] if len(first) else []
         return 1 + max(rows + [each.first_row for each in self.reassociable], default=-1)
 

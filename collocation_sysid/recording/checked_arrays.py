@@ -70,6 +70,21 @@ def unconverted_or_none(values: ArrayLike | None) -> Array | None:
     return cast("Array | None", values)
 
 
+def read_only_coordinates(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
+    """Return a read-only copy of marker positions (T, M, 3), in which coordinates that are not
+    finite are NaN.
+
+    Raises
+    ------
+    InputError
+        If the values are not numbers, or the shape differs.
+    """
+    values = read_only_floats(values, shape, name=name, finite=False)
+    tracks = np.where(np.isfinite(values), values, np.nan)
+    tracks.setflags(write=False)
+    return tracks
+
+
 def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
     """Return a read-only copy of marker positions (T, M, 3).
 

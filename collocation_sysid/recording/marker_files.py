@@ -13,7 +13,7 @@ from ..common.array_types import Array
 from ..common.declarations import declaration, key
 from ..common.time_dependence import over_time
 from ..errors import InputError, hint_at, listed
-from .checked_arrays import float_converter, read_only_tracks
+from .checked_arrays import float_converter, read_only_coordinates
 from .formats import c3d, motive, plain_csv, qualisys, trc
 from .formats.raw_tracks import LabelChooser, RawTracks
 from .formats.text import decode, names_file_in_errors, read_bytes
@@ -41,7 +41,7 @@ class MarkerTable:
     names : tuple of str
         M marker names.
     positions_m : (T, M, 3) array
-        NaN where missing; a sample with one coordinate missing loses all three.
+        NaN where missing, which may be one coordinate of a sample.
     notes : tuple of str
         What was missing or assumed in the file, a sentence each.
     offsets_s : (T,) array, optional
@@ -55,13 +55,13 @@ class MarkerTable:
     offsets_s: Array | None = key(converter=np.asarray, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
-        """Check times and shapes, and mark incomplete samples as missing, in place; an `InputError`
-        for times that do not increase or another shape.
+        """Check times and shapes, in place; an `InputError` for times that do not increase or
+        another shape.
         """
         if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         shape = (len(self.t_s), len(self.names), 3)
-        tracks = read_only_tracks(self.positions_m, shape, name="marker positions")
+        tracks = read_only_coordinates(self.positions_m, shape, name="marker positions")
         vars(self)["positions_m"] = tracks
 
 
@@ -245,25 +245,30 @@ def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
 
 
 def _mark_missing(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
-    """Return coordinates (T, M, 3) with NaN for missing samples, and a note on how many are
-    missing.
+    """Return coordinates (T, M, 3) with NaN for missing ones, and a note on how many samples are
+    missing or incomplete.
 
-    A sample is missing if a coordinate is NaN, or all are 0 in a format in which zeros mean that.
-    The note lists all markers, those with the same losses together; without losses there is none.
+    A sample is missing if all coordinates are NaN, or 0 in a format in which zeros mean that. The
+    note lists all markers, those with the same losses together; without losses there is none.
     """
     x = raw.coordinates
-    blank = np.asarray(np.isnan(x).any(axis=2))
+    blank = np.asarray(np.isnan(x).all(axis=2))
+    incomplete = np.isnan(x).any(axis=2) & ~blank
     zero = np.asarray((x == 0.0).all(axis=2)) & raw.zeros_are_missing
     markers_by_loss: dict[str, list[str]] = {}
     for k, name in enumerate(names):
         counts = {"blank": blank[:, k].sum(), "zeros": zero[:, k].sum()}
+        losses_of_marker = []
         if missing := sum(counts.values()):
             kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-            loss = f"{missing} of {len(x)} samples missing ({kinds})"
-            markers_by_loss.setdefault(loss, []).append(name)
+            losses_of_marker.append(f"{missing} of {len(x)} samples missing ({kinds})")
+        if partial := int(incomplete[:, k].sum()):
+            losses_of_marker.append(f"{partial} of {len(x)} samples without all three coordinates")
+        if losses_of_marker:
+            markers_by_loss.setdefault(", ".join(losses_of_marker), []).append(name)
     losses = [
         f"{listed(markers)}: {'each ' * (len(markers) > 1)}{loss}"
         for loss, markers in markers_by_loss.items()
     ]
     notes = ["; ".join(losses)] if losses else []
-    return np.where((blank | zero)[:, :, None], np.nan, x), notes
+    return np.where(zero[:, :, None], np.nan, x), notes

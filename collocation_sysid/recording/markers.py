@@ -16,7 +16,7 @@ from ..common.declarations import Key, declaration, identity, identity_or_none, 
 from ..common.time_dependence import over_time
 from ..common.validated_types import Positive
 from ..errors import InputError
-from .checked_arrays import float_converter, read_only_floats, read_only_tracks
+from .checked_arrays import float_converter, read_only_coordinates, read_only_floats
 from .placement import AttachmentRule, LocatedBody, Placement, place_markers
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Markers:
     t_s : (T,) array
         Sample times.
     positions_m : (T, M, 3) array
-        Measured positions; NaN where missing. A sample with one coordinate missing is missing.
+        Measured positions; NaN where missing, which may be one coordinate of a sample.
     sigma_m : (M,) array or float
         Standard deviation of each marker's coordinates.
     names : sequence of str, optional
@@ -96,7 +96,7 @@ class Markers:
         `sigma_m` as an array (M,).
         """
         shape = len(self.t_s), None, 3
-        tracks = read_only_tracks(self.positions_m, shape, name="marker positions")
+        tracks = read_only_coordinates(self.positions_m, shape, name="marker positions")
         m = tracks.shape[1]
         if self.names is None:
             vars(self)["names"] = tuple(f"m{k}" for k in range(1, m + 1))
@@ -188,10 +188,10 @@ class Markers:
             points_m, times_s = self.first_samples
             back = points_m if undeformed_places is None else undeformed_places(points_m, times_s)
             for m in np.flatnonzero(~known).tolist():
-                if not self.is_present[:, m].any():
+                if not self.is_complete[:, m].any():
                     raise InputError(
-                        f"marker '{self.names[m]}' is never visible and has no position on the "
-                        "body; give its reference_m, or remove it"
+                        f"marker '{self.names[m]}' is never visible with all three coordinates and "
+                        "has no position on the body; give its reference_m, or remove it"
                     )
             located_body = LocatedBody(body.nodes_m, body)
             places[~known] = located_body.places_of_points(back[~known])
@@ -225,16 +225,26 @@ class Markers:
 
     @cached_property
     def first_samples(self) -> tuple[Array, Array]:
-        """First present sample (M, 3) of every marker [m], NaN if there is none, and its time (M,)
+        """First complete sample (M, 3) of every marker [m], NaN if there is none, and its time (M,)
         [s], then that of the first sample.
         """
-        rows = self.is_present.argmax(axis=0)
+        rows = self.is_complete.argmax(axis=0)
         return self.positions_m[rows, np.arange(len(self.names))], self.t_s[rows]
 
     @cached_property
     def is_present(self) -> NDArray[np.bool_]:
+        """(T, M) mask of samples with at least one coordinate."""
+        return np.asarray(self.is_measured.any(axis=2))
+
+    @cached_property
+    def is_complete(self) -> NDArray[np.bool_]:
         """(T, M) mask of samples with all three coordinates."""
-        return np.asarray(np.isfinite(self.positions_m[:, :, 0]))
+        return np.asarray(self.is_measured.all(axis=2))
+
+    @cached_property
+    def is_measured(self) -> NDArray[np.bool_]:
+        """(T, M, 3) mask of measured coordinates."""
+        return np.isfinite(self.positions_m)
 
     def count_missing(self) -> Index:
         """Return (M,) number of missing samples of each marker."""
@@ -247,22 +257,30 @@ class Markers:
     @cached_property
     def positions_at_samples_m(self) -> Array:
         """(T, M, 3) positions interpolated from the measured times to `t_s` [m], for descriptions
-        of a motion; NaN where missing.
+        of a motion; NaN where a coordinate is missing.
 
         A position is moved by the mean velocity to the samples before and after it, that to one of
         them if the other is missing, and stays if both are. Estimates use `positions_m` instead.
         """
+        positions_m = np.where(self.is_complete[..., None], self.positions_m, np.nan)
         if self.offsets_s is None or len(self.t_s) < 2:
-            return self.positions_m
+            return positions_m
         steps_s = np.diff(self.t_s + self.offsets_s)[:, None, None]
-        velocities_m_s = np.diff(self.positions_m, axis=0) / steps_s
+        velocities_m_s = np.diff(positions_m, axis=0) / steps_s
         unknown = np.full_like(velocities_m_s[:1], np.nan)
         before = np.concatenate([unknown, velocities_m_s])
         after = np.concatenate([velocities_m_s, unknown])
         before = np.where(np.isnan(before), after, before)
         after = np.where(np.isnan(after), before, after)
         mean_m_s = np.nan_to_num((before + after) / 2)
-        return self.positions_m - self.offsets_s[:, None, None] * mean_m_s
+        return positions_m - self.offsets_s[:, None, None] * mean_m_s
+
+    def squared_distances_m2(self, positions_m: ArrayLike) -> Array:
+        """Return the squared distances (T, M) [m²] of positions (T, M, 3) [m] from the measured
+        ones, along the measured coordinates; zero where nothing is measured.
+        """
+        squares = (np.asarray(positions_m) - self.positions_m) ** 2
+        return np.sum(np.where(self.is_measured, squares, 0.0), axis=2)
 
     def predict_positions(self, node_positions_m: ArrayLike) -> Array:
         """Return predicted marker positions (..., M, 3) from node positions (..., n, 3), by the

@@ -199,7 +199,9 @@ def align_to_template(
         )
     places = np.array([template[name] for name in template], dtype=np.float64)
     chosen = [table.names.index(name) for name in template]
-    samples = table.positions_m[inside][:, chosen]
+    samples = read_only_tracks(
+        table.positions_m[inside][:, chosen], (None, len(chosen), 3), name="marker positions"
+    )
     count = np.isfinite(samples[:, :, 0]).sum(axis=0)
     means = np.where(
         count[:, None] > 0, np.nansum(samples, axis=0) / np.maximum(count, 1)[:, None], np.nan

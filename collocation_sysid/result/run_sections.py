@@ -673,7 +673,7 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
             )
         if largest > LARGEST_NUMBER:
             raise ValueError(f"{key} contains numbers above {LARGEST_NUMBER:g}")
-        errors = np.nan_to_num(np.linalg.norm(residuals_m, axis=2))
+        errors = np.sqrt(np.nansum(residuals_m**2, axis=2))
         for _ in range(SHOWN_ERRORS if errors.size else 0):
             t, m = np.unravel_index(int(errors.argmax()), errors.shape)
             if not errors[t, m] > 0:

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..common.array_types import Array
 from ..common.step_counting import search_activity
 from ..errors import InputError
-from ..features.registry import FEATURES
+from ..features.registry import FEATURES, lost_samples
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
@@ -395,6 +395,8 @@ def _program_and_start(
     """Return the nonlinear program of a problem with complete guesses, the start of its search, and
     a note on it.
     """
+    for experiment in problem.experiments:
+        lost_samples(experiment)
     collocation = problem.collocation()
     for experiment in collocation.experiments:
         for feature in FEATURES:
@@ -422,7 +424,9 @@ def _feature_notes(solution: Solution) -> list[str]:
     """Return the notes of all features on the fitted experiments of a solution, in their order;
     empty without any.
     """
-    return [note for part in solution.parts for feature in FEATURES for note in feature.notes(part)]
+    parts = solution.parts
+    lost = [note for part in parts for note in lost_samples(part.transcription.experiment)]
+    return lost + [note for part in parts for feature in FEATURES for note in feature.notes(part)]
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:

@@ -244,7 +244,8 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
     sigma_m = np.concatenate([each.sigma_m for each in markers])
     measured = solution.collocation.count_measurements()
     fitted = 0.0 if uncertainty is None else measured - uncertainty.degrees_of_freedom
-    return rms_expected_from_noise_m(sigma_m, samples, parameter_count=float(fitted))
+    numbers = np.concatenate([each.is_measured.sum(axis=(0, 2)) for each in markers]).astype(float)
+    return rms_expected_from_noise_m(sigma_m, samples, numbers, parameter_count=float(fitted))
 
 
 def modes_by_experiment(problem: Problem, solution: Solution) -> dict[str, ModesCheck]:

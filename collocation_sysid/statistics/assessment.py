@@ -733,19 +733,21 @@ def scheme_concerns(
     ]
 
 
-def rms_expected_from_noise_m(sigma_m: Array, samples: Array, parameter_count: float) -> float:
-    """Return the RMS distance of markers that noise alone would leave, √(3 (1 − p/N) σ²), with the
-    mean σ² of all samples [m]; 0 without samples or if p ≥ N.
+def rms_expected_from_noise_m(
+    sigma_m: Array, samples: Array, numbers: Array, parameter_count: float
+) -> float:
+    """Return the RMS distance of markers that noise alone would leave [m], the root of (1 − p/N)
+    Σ n σ² / Σ s; 0 without samples or if p ≥ N.
 
     Parameters
     ----------
-    sigma_m, samples : (M,) arrays
-        Stated σ and number of samples of the markers of all experiments.
+    sigma_m, samples, numbers : (M,) arrays
+        Stated σ, number of samples s and of measured coordinates n of the markers of all
+        experiments.
     parameter_count : float
-        Number p of parameters that the data determine, of N = 3 Σ samples measurements.
+        Number p of parameters that the data determine, of N = Σ n measurements.
     """
     if not samples.sum():
         return 0.0
-    total = float(samples.sum())
-    remaining = max(0.0, 1 - parameter_count / (3 * total))
-    return float(np.sqrt(3 * remaining * (samples @ sigma_m**2) / total))
+    remaining = max(0.0, 1 - parameter_count / float(numbers.sum()))
+    return float(np.sqrt(remaining * (numbers @ sigma_m**2) / samples.sum()))

@@ -198,12 +198,12 @@ def is_motionless(experiment: Experiment) -> bool:
         return False
     if np.ptp(experiment.declared_node_forces_n(t_s), axis=0).any():
         return False
-    present = markers.is_present[..., None]
+    present = markers.is_measured
     counts = np.maximum(present.sum(axis=0), 1)
     mean = np.where(present, markers.positions_m, 0.0).sum(axis=0) / counts
     deviations = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
     # Of a mean of n samples, the deviations have n − 1 degrees of freedom.
-    freedom = 3 * float(np.maximum(present.sum(axis=0) - 1, 0).sum())
+    freedom = float(np.maximum(present.sum(axis=0) - 1, 0).sum())
     return bool(np.sum(deviations**2) <= chi2_isf(RARE, max(freedom, 1.0)))
 
 

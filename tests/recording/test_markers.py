@@ -209,17 +209,22 @@ def vertex_placement(m=2):
     )
 
 
-def test_a_sample_needs_all_three_coordinates():
+def test_single_coordinates_of_a_sample_are_kept():
     positions = np.zeros((4, 2, 3))
     positions[1, 0, 2] = np.nan
     positions[2:, 1] = np.nan
     markers = track(vertex_placement(), positions_m=positions)
     np.testing.assert_array_equal(
-        markers.is_present, [[True, True], [False, True], [True, False], [True, False]]
+        markers.is_present, [[True, True], [True, True], [True, False], [True, False]]
     )
-    np.testing.assert_array_equal(markers.count_missing(), [1, 2])
-    assert markers.count_samples() == 5
-    assert np.isnan(markers.positions_m[1, 0]).all()
+    assert not markers.is_complete[1, 0]
+    np.testing.assert_array_equal(markers.count_missing(), [0, 2])
+    assert markers.count_samples() == 6
+    np.testing.assert_array_equal(np.isnan(markers.positions_m[1, 0]), [False, False, True])
+    # Descriptions of the motion use complete samples only.
+    assert np.isnan(markers.positions_at_samples_m[1, 0]).all()
+    away = markers.squared_distances_m2(positions + np.array([0.3, 0.0, 0.4]))
+    np.testing.assert_allclose(away[:2], [[0.25, 0.25], [0.09, 0.25]])
 
 
 def test_one_sigma_serves_all_markers():

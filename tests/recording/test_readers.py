@@ -101,13 +101,13 @@ def test_a_bad_pose_is_named_by_its_line(file, found, replacement, words):
 # Markers
 
 
-def test_missing_samples_become_nan_as_a_whole(file):
+def test_missing_coordinates_become_nan(file):
     table = read_markers(file(MARKERS))
     assert table.names == ("tip", "base")
     np.testing.assert_array_equal(table.t_s, [0.0, 0.1, 0.2])
     nan = [np.nan] * 3
     np.testing.assert_array_equal(
-        table.positions_m, [[[1, 2, 3], [4, 5, 6]], [nan, nan], [[2, 2, 3], nan]]
+        table.positions_m, [[[1, 2, 3], [4, 5, 6]], [[1.5, np.nan, 3], nan], [[2, 2, 3], nan]]
     )
 
 

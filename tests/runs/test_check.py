@@ -307,8 +307,12 @@ def test_places_that_the_poses_determine_have_no_distance(tiny: Path):
 
 
 def blank(*samples: tuple[int, int]) -> Edit:
-    """Leave out the x of (line, marker)."""
-    edits = [replace_cell("swing_markers.csv", line, 1 + 3 * m, "") for line, m in samples]
+    """Leave out the position of (line, marker)."""
+    edits = [
+        replace_cell("swing_markers.csv", line, 1 + 3 * m + axis, "")
+        for line, m in samples
+        for axis in range(3)
+    ]
     return both(*edits)
 
 

@@ -270,10 +270,12 @@ def test_a_scheme_that_damps_or_slows_is_a_concern():
 
 
 def test_expected_residuals_of_noise_alone():
-    assert rms_expected_from_noise_m(np.array([1e-3]), np.array([100.0]), 0) == pytest.approx(
-        1e-3 * np.sqrt(3)
+    assert rms_expected_from_noise_m(
+        np.array([1e-3]), np.array([100.0]), np.array([300.0]), 0
+    ) == pytest.approx(1e-3 * np.sqrt(3))
+    fewer = rms_expected_from_noise_m(
+        np.array([1e-3, 2e-3]), np.array([50.0, 50.0]), np.array([150.0, 150.0]), 30.0
     )
-    fewer = rms_expected_from_noise_m(np.array([1e-3, 2e-3]), np.array([50.0, 50.0]), 30.0)
     assert fewer == pytest.approx(1e-3 * np.sqrt(3 * 2.5 * 0.9))
 
 

@@ -98,7 +98,7 @@ def _tip_record(finished: Run) -> dict[str, Any] | None:
         rollout.trajectory.markers_m[:, tip] if isinstance(rollout, ForwardSimulation) else None
     )
     error = None
-    if rolled is not None and markers.is_present[:, tip].any():
+    if rolled is not None and markers.is_complete[:, tip].any():
         error = float(np.nanmax(np.linalg.norm(rolled - measured, axis=1)))
     return {
         "experiment": experiment.name,

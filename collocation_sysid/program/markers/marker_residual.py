@@ -94,7 +94,7 @@ class MarkerResidual(MeasurementResidual):
         places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(-1, places.shape[1])
         shifted = preceding_times + np.arange(len(markers.t_s)) + clock_samples
         covered = (shifted < len(rows)) & ((shifted >= 0) | is_initially_at_rest)
-        is_compared = markers.is_present & covered[:, None]
+        is_compared = markers.is_measured & covered[:, None, None]
         return cls(
             observable=PointPositions(rows, association, coordinate_parameters=places),
             nuisance=nuisance,
@@ -103,7 +103,7 @@ class MarkerResidual(MeasurementResidual):
             t_s=markers.t_s,
             sigmas=markers.sigma_m,
             measured=markers.positions_m,
-            is_compared=np.repeat(is_compared[..., None], 3, axis=2),
+            is_compared=is_compared,
             own_parameters=nuisance.marker_indices(len(markers.names)),
             markers=markers,
             is_initially_at_rest=is_initially_at_rest,
@@ -113,8 +113,8 @@ class MarkerResidual(MeasurementResidual):
 
     @property
     def is_present(self) -> NDArray[np.bool_]:
-        """Mask (T, M) of the samples that are compared."""
-        return self.is_compared[..., 0]
+        """Mask (T, M) of the samples of which a coordinate is compared."""
+        return np.asarray(self.is_compared.any(axis=2))
 
     # One sample -------------------------------------------------------------------------------
 
@@ -221,12 +221,13 @@ class MarkerResidual(MeasurementResidual):
         return self.predict(self.observable.evaluate_positions(x, phi), phi)
 
     def squared_distances_m2(self, x: Array, phi: Array) -> Array:
-        """Return the squared distances [m²] of predictions at positions x (rows, 3n) and φ (k,)
-        from the P samples that are compared, flat, time by time; samples after the last row are
-        omitted. Infinite for a trial step whose motion diverges.
+        """Return the squared distances [m²], along the measured coordinates, of predictions at
+        positions x (rows, 3n) and φ (k,) from the P samples that are compared, flat, time by time;
+        samples after the last row are omitted. Infinite for a trial step whose motion diverges.
         """
         predicted = self.predict_positions(x, phi)
         tracks = self.markers.positions_m[: len(predicted)]
         present = self.is_present[: len(predicted)]
         with np.errstate(over="ignore"):
-            return np.sum((predicted - tracks) ** 2, axis=2)[present]
+            squares = np.where(self.is_compared[: len(predicted)], (predicted - tracks) ** 2, 0.0)
+            return np.sum(squares, axis=2)[present]

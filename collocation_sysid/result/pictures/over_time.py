@@ -211,8 +211,8 @@ def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> 
     """
     if measured_m.shape[1] <= count or not models_m:
         return list(range(min(count, measured_m.shape[1])))
-    squares = np.nan_to_num(np.sum((models_m[0] - measured_m) ** 2, axis=2)).sum(axis=0)
-    present = np.maximum(1, np.isfinite(measured_m[:, :, 0]).sum(axis=0))
+    squares = np.nansum((models_m[0] - measured_m) ** 2, axis=(0, 2))
+    present = np.maximum(1, np.isfinite(measured_m).any(axis=2).sum(axis=0))
     return sorted(np.argsort(-squares / present)[:count].tolist())
 
 
@@ -242,7 +242,9 @@ def marker_errors(
     axes = figure.subplots()
     totals = []
     for label, model_m, style in drawn_models(fitted_m, simulated_m):
-        squares = np.sum((model_m - measured_m) ** 2, axis=2)
+        apart_m = model_m - measured_m
+        lost = np.isnan(apart_m).all(axis=2)
+        squares = np.where(lost, np.nan, np.nansum(apart_m**2, axis=2))
         if not np.isfinite(squares).any():
             continue
         totals.append(float(1e3 * np.sqrt(np.nanmean(squares))))

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 from ...common.array_types import Array
 from ...common.serialisation import content
 from ...features.feature import SimulatedCheck
-from ...features.registry import FEATURES
+from ...features.registry import FEATURES, lost_samples
 from ...methods.initial_trajectories import initial_variables
 from ...methods.reduced_space import ReducedSpace
 from ...methods.stiffness_scan import SOFT_PA, start_problem, typical_constants, typical_parameters
@@ -269,6 +269,7 @@ def check_problem(
         nothing: a note states it, and the body is moved rigidly with the grasp instead.
     """
     report_progress = report_progress or (lambda _: None)
+    lost = [note for each in problem.experiments for note in lost_samples(each)]
     collocation = problem.collocation()
     notes = []
     if problem.parameters.list_names_without_guess():
@@ -344,7 +345,7 @@ def check_problem(
     notes += [SUBSTEPS_NOTE] * (problem.substeps == "auto" and bool(findings.motions))
     findings = replace(findings, concerns=concerns)
     known = [note for note in problem.notes if note not in findings.warnings]
-    return replace(findings, notes=(*known, *notes))
+    return replace(findings, notes=(*known, *lost, *notes))
 
 
 def _fit_to_markers_s(collocation: Collocation, total_s: float, samples: int) -> float:

@@ -111,8 +111,8 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
     markers = experiment.markers
     miss = np.zeros((0, len(markers.names)))
     if positions_m is not None:
-        measured_m = markers.positions_m[: len(positions_m)]
-        miss = np.linalg.norm(markers.predict_positions(positions_m) - measured_m, axis=2)
+        apart_m = markers.predict_positions(positions_m) - markers.positions_m[: len(positions_m)]
+        miss = np.sqrt(np.nansum(apart_m**2, axis=2))
     findings = []
     missing = markers.count_missing()
     for k, name in enumerate(markers.names):

@@ -430,7 +430,7 @@ def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
     residual = np.where(
         np.isfinite(experiment.markers.positions_m), _residual(experiment, predicted_m), 0.0
     )
-    moving = np.where(experiment.markers.is_present[..., None], v, 0.0)
+    moving = np.where(experiment.markers.is_measured, v, 0.0)
     return float(np.sum(residual * moving) / max(np.sum(moving**2), 1e-300))
 
 
@@ -463,9 +463,7 @@ def _with_shifted_grasps(experiment: Experiment, deeper: bool) -> Experiment | N
 def _residual(experiment: Experiment, predicted_m: Array) -> Array:
     """Return predicted less measured markers (T, M, 3) [m], NaN where missing."""
     return np.where(
-        experiment.markers.is_present[..., None],
-        predicted_m - experiment.markers.positions_m,
-        np.nan,
+        experiment.markers.is_measured, predicted_m - experiment.markers.positions_m, np.nan
     )
 
 
@@ -474,4 +472,4 @@ def _misfit(experiment: Experiment, predicted_m: Array) -> float:
     deviations; missing samples are ignored; 0 without samples.
     """
     scaled = _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
-    return root_mean(scaled[experiment.markers.is_present] ** 2)
+    return root_mean(scaled[experiment.markers.is_measured] ** 2)

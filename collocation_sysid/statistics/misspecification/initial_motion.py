@@ -78,7 +78,7 @@ def initial_motion(experiment: Experiment) -> InitialMotion | None:
     positions_m = markers.positions_at_samples_m
     noise_m = np.maximum(markers.sigma_m, _typical_noise_m(positions_m))
     for count in range(FEWEST_SAMPLES, most + 1):
-        is_complete = markers.is_present[:count].all(axis=0)
+        is_complete = markers.is_complete[:count].all(axis=0)
         if not is_complete.any():
             return None
         tracks_m = positions_m[:count, is_complete]

@@ -267,7 +267,7 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
         return
     markers = experiment.markers
     size_m = float(np.ptp(experiment.body.nodes_m, axis=0).max())
-    is_measured = markers.is_present.sum(axis=0) >= FEWEST_SAMPLES
+    is_measured = markers.is_complete.sum(axis=0) >= FEWEST_SAMPLES
     if not is_measured.any():
         return
     tracks_m = markers.positions_m[:, is_measured]

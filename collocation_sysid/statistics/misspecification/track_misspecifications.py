@@ -71,12 +71,12 @@ def filtered_tracks(part: ExperimentIterate) -> Iterator[Hypothesis]:
     markers = experiment.markers
     if experiment.is_static or len(experiment.t_s) < FEWEST_SAMPLES:
         return
-    complete = np.flatnonzero(markers.is_present.all(axis=0))
-    if not len(complete):
+    complete = markers.is_measured.all(axis=0)
+    if not complete.any():
         return
     predicted_m = part.transcription.markers.predict_positions(part.x, part.phi)
-    scaled = (predicted_m - markers.positions_m)[:, complete] / markers.sigma_m[complete, None]
-    frequency_hz, amplitude = _amplitudes(scaled.reshape(len(scaled), -1), experiment.timestep_s)
+    scaled = ((predicted_m - markers.positions_m) / markers.sigma_m[:, None])[:, complete]
+    frequency_hz, amplitude = _amplitudes(scaled, experiment.timestep_s)
     cutoff = _cutoff(amplitude)
     if cutoff is None:
         return
