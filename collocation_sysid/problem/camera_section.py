@@ -1,10 +1,8 @@
-"""Keys of [[experiment.depth]] and of the nuisance parameters of depth cameras, and how the files
-of a camera or scanner are read.
-"""
+"""Keys of [[experiment.depth]], and how the files of a camera or scanner are read."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -26,7 +24,6 @@ from ..recording.node_selection import Nodes
 from ..recording.time_tables import is_within_experiment
 from .measurement_section import MeasurementSection, RecordingFolder, require_file_name
 from .named_files import existing_file
-from .nuisance_priors import NuisancePriorSection
 
 
 class DepthCameraSection(Section):
@@ -191,79 +188,3 @@ class DepthSection(MeasurementSection):
             )
             raise InputError(message, where=f"{where}.t_s")
         return content, times
-
-
-class DepthPosePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: rotation of each depth camera about the middle of the body,
-    stated along the axes of the camera.
-
-    Attributes
-    ----------
-    prior_rad : float, optional
-        Standard deviation [rad].
-    prior_m : float, optional
-        Standard deviation [m].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior_rad: Positive | None = None
-    prior_m: Positive | None = None
-
-
-class DepthBiasPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: offset that is added to each depth of an image.
-
-    Attributes
-    ----------
-    prior_m : float, optional
-        Standard deviation [m].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior_m: Positive | None = None
-
-
-class DepthScalePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: scale error of each depth of an image: the factor minus one.
-
-    Attributes
-    ----------
-    prior : float, optional
-        Standard deviation [1].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior: Positive | None = None
-
-
-class DepthTimePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: delay of a depth camera, limited to three standard deviations
-    of its prior.
-
-    Attributes
-    ----------
-    prior_s : float, optional
-        Standard deviation [s].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior_s: Positive | None = None
-
-
-class DepthEdgePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: distance by which silhouettes in the images of each depth
-    camera end inside the outline of the body, in pixels.
-
-    Attributes
-    ----------
-    prior_px : float, optional
-        Standard deviation [px].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior_px: Positive | None = None
