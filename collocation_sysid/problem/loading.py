@@ -33,12 +33,12 @@ from ..recording.specimen_checks import require_equal_units
 from ..statistics.misspecification.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader
 from .density_guesses import with_declared_densities, with_guessed_densities
-from .load_schema import LOADS
 from .named_files import existing_file
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible
 from .recording_reader import RecordingReader
+from .recording_schema import LOADS
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
 from .specimen_reader import SpecimenReader
 from .specimen_schema import SpecimenSection
@@ -258,9 +258,9 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     names += [section.file for section in file.list_specimens()]
     for section in file.list_recordings():
         names += section.list_measurement_files()
-        for _, word, kind in LOADS:
-            keys = [key.name for _, key in keys_of(kind) if key.constant is not None]
-            names += [getattr(table, key) for table in getattr(section, word) for key in keys]
+        for table in (each for word in LOADS.values() for each in getattr(section, word)):
+            keys = [key.name for _, key in keys_of(table.of) if key.constant is not None]
+            names += [getattr(table, key) for key in keys]
     return tuple(folder / name for name in names if name is not None)
 
 
@@ -357,7 +357,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         """Return the spatially varying constant that a table states at the key `where`; None
         without a table.
         """
-        return None if section is None else Field(**declared_in(section, Field, where=where))
+        return None if section is None else Field(**declared_in(section, where=where))
 
     regions = [
         Region(
