@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from ..common.schema_tables import Section, declared_in
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, located
 from ..fem.body import Body
-from ..fem.laws.constants import FRICTION, GAMMA_M, GAMMA_R, Constant, constant_named
+from ..fem.laws.constants import FRICTION, Constant, constant_named, with_undamped
 from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import (
     box_of_edge,
@@ -87,7 +87,7 @@ def problem_arguments(
             mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
         else:
             body = cells.body_for(file.list_specimens()[0].test)
-            unknowns = cells.with_undamped(unknowns)
+            unknowns = with_undamped(unknowns, body.constants)
     with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
         sections = with_declared_densities(unknowns, body_with_friction)
@@ -203,16 +203,6 @@ class SpecimenCells:
                 made=self._section.made,
             )
         return self._bodies[has_inner_node]
-
-    def with_undamped(
-        self, parameters: Mapping[str, ParameterSection | float]
-    ) -> Mapping[str, ParameterSection | float]:
-        """Return a copy of parameters with zero for γ_r and γ_m if they are not given, on which no
-        equilibrium depends; `body_for` must have been called before.
-        """
-        constants = next(iter(self._bodies.values())).constants.values()
-        damping = {c.name: 0.0 for c in constants if c in (GAMMA_R, GAMMA_M)}
-        return {**parameters, **{n: v for n, v in damping.items() if n not in parameters}}
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:

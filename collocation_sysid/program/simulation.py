@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..errors import InputError, SimulationError
+from ..fem.laws.constants import with_undamped
 from ..model.dynamics import Dynamics
 from ..model.nuisance_map import NuisanceMap
 from ..model.parameters import Parameters, resolve_theta
@@ -156,7 +157,10 @@ def simulate(
         When a step fails even after halvings; names time and element, and where an equilibrium
         ceased to be stable the mode, see `program.find_stability_loss`.
     """
-    theta = resolve_theta(experiment.body, parameters)
+    body = experiment.body
+    if experiment.specimen is not None and isinstance(parameters, Mapping):
+        parameters = with_undamped(parameters, body.constants)
+    theta = resolve_theta(body, parameters)
     steps = _steps_per_sample(experiment, integrator, timestep_s=timestep_s, substeps=substeps)
     if (massless := experiment.body.mass_problem(theta)) is not None:
         raise InputError(massless)

@@ -941,8 +941,8 @@ ASSUMPTIONS = (
         "1",
         sigma=0.05,
         description="relative difference of the stiffness along one axis from that across it",
-        remedy="record a second motion with the body held the other way round, or press a cube "
-        "along each of its axes",
+        remedy="record a second motion with the body held the other way round, or test specimens "
+        "cut along each axis",
         effect=_anisotropy,
         component_names="x y z",
         of_specimens=True,
