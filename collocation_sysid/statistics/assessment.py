@@ -98,6 +98,11 @@ LAWS_ADVICE = (
     "; a wrong damping or material law has similar effects: compare the laws first, with "
     "compare-models --damping and --materials"
 )
+# The same without motion, where damping has no effect.
+STILL_ADVICE = (
+    "; memory or another material law has similar effects: compare them first, with "
+    "compare-models --prony 0,1 and --materials"
+)
 # The same for a branch of memory.
 MEMORY_ADVICE = (
     "; these estimates are of first order in the share, for a given relaxation time. The moduli "
@@ -392,19 +397,19 @@ def probe_concerns(
         "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
         "instead": (f"; alternatives that decrease χ² less: {instead}" if others else "")
         + (_hysteresis_text(experiments) if worst.name == DRIFT else "")
-        + _advice(worst),
+        + _advice(worst, is_still=all(each.kind == "static" for each in experiments)),
     }
     return [Concern("assumption/contradicted", data=data)]
 
 
-def _advice(probe: Probe) -> str:
+def _advice(probe: Probe, is_still: bool) -> str:
     """Return the addition to a message on a relaxed assumption that names what resembles it, or how
     to estimate it; "" for an assumption that is not probed in every solve.
     """
     if not is_routine_assumption(probe.name):
         return ""
     if assumption_name(probe.name) != MEMORY:
-        return LAWS_ADVICE
+        return STILL_ADVICE if is_still else LAWS_ADVICE
     return MEMORY_ADVICE
 
 

@@ -229,7 +229,8 @@ TOPICS: dict[str, Topic] = {
         remedy="Find out whether the assumption is wrong, for instance by repeating the first "
         "recording at the end, or whether the model lacks an effect with similar "
         "consequences, as a missing memory resembles a drift, and a wrong damping law a clock "
-        "rate. The commands compare-models --damping and --materials test other laws. The command "
+        "rate. The command compare-models tests other laws, with --materials, with --damping for motions, "
+        "and with --prony for slow loads that relax. The command "
         "solve --probe (probe=True in Python) computes the effect beyond first order and relaxes "
         "the other assumptions.",
         messages={
