@@ -30,6 +30,7 @@ from .forward.loss_of_stability import explain_failure
 from .forward.newmark import simulate_newmark
 from .forward.newton_solver import NewtonOptions
 from .forward.scheme_simulation import Progress, simulate_scheme
+from .forward.stable_path import BranchChange, find_branch_change
 from .observables import ObservedMotion, ReactionForces
 from .reactions.reaction_forces import reactions_at
 from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
@@ -85,6 +86,9 @@ class Trajectory:
         Largest error of node positions at the samples due to the time step [m], estimated by
         halving the step; None where the step was stated, the experiment is static, or only the
         finest steps could be simulated.
+    branch_change : BranchChange or None
+        First sample of a static experiment that is not on the path of stable equilibria to which
+        its loads lead, see `program.find_branch_change`; None if there is none.
     """
 
     t_s: Array
@@ -96,6 +100,7 @@ class Trajectory:
     custom_sensor_values: tuple[Array, ...] = ()
     steps_per_sample: int = 1
     step_error_m: float | None = None
+    branch_change: BranchChange | None = None
 
 
 def require_steps(experiment: Experiment, step_s: float) -> None:
@@ -292,6 +297,7 @@ def _with_steps(
     Velocities of a collocation scheme are central differences of its positions.
     """
     sensed = sensed_dofs(experiment)
+    change = None
     if integrator == NEWMARK and not experiment.is_static:
         motion = simulate_newmark(
             experiment,
@@ -312,6 +318,7 @@ def _with_steps(
         )
         grid = simulate_scheme(experiment, dynamics, options=options, progress=progress)
         x = grid[::steps]
+        change = find_branch_change(experiment, dynamics, grid)
         zeros = np.zeros_like(grid)
         v = zeros if experiment.is_static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
         at = ReactionGrid.from_dynamics(dynamics)
@@ -335,6 +342,7 @@ def _with_steps(
             experiment, positions, reactions=(at, forced), ideal=ideal
         ),
         steps_per_sample=steps,
+        branch_change=change,
     )
 
 

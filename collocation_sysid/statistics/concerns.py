@@ -371,6 +371,8 @@ TOPICS: dict[str, Topic] = {
             "grows": "the motion of '{experiment}' is unstable at t = {time_s:.3g} s: disturbances "
             "grow at a rate of {growth_1_s:.2g} 1/s. If the body does not buckle there, use "
             'damping = "kelvin-voigt", and check moduli and densities',
+            "branch": "the equilibria of '{experiment}' from {time_s:.4g} s on are not those that "
+            "its loads lead to from the samples before, and depend on mesh and rounding: {why}",
             "material": "the material {material}{where} is unstable at strains of '{experiment}' "
             "(Drucker): at {time_s:.3g} s and the principal stretches {stretches} a further strain "
             "lowers its stress; use a law with fewer terms, or bound its constants",
