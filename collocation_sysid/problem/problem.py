@@ -196,7 +196,7 @@ class Problem:
         """Standard deviations of all systematic effects by name, None for what is exact: the stated
         ones, and the defaults of bodies that were made like those of the problem.
         """
-        return self.uncertainty.collect_considered(self.bodies)
+        return self.uncertainty.collect_considered(self.bodies, self.parameters)
 
     def collect_lengths_m(self) -> dict[str, float]:
         """Return the correlation lengths of spatially varying constants [m], by name of the

@@ -574,17 +574,37 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
 
 
-def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
-    to a fixed one), in all such parts together; None if there is none.
-    """
-    items = {item.name: item for item in at.parameters.components}
-    constants = {
+def _stated_poisson_names(parameters: Parameters) -> set[str]:
+    """Return the names of Poisson's ratios that are fixed, or tied to a fixed one."""
+    items = {item.name: item for item in parameters.components}
+    return {
         name
         for name, item in items.items()
         if without_region(name) == "poisson"
         and (items[item.tied.to] if item.tied else item).is_fixed
     }
+
+
+def limited_poisson_deviation(deviation: float, parameters: Parameters) -> float:
+    """Return the standard deviation of stated Poisson's ratios on the scale ln(1 − 2ν), which ends
+    at the incompressible body, per unit of ν: a value that is lower by `deviation` is one standard
+    deviation away on this scale. It is that of the largest stated ratio below ½.
+    """
+    items = {item.name: item for item in parameters.components}
+    tied = {name: items[name].tied for name in _stated_poisson_names(parameters)}
+    stated = [items[name if to is None else to.to].guess for name, to in tied.items()]
+    below = [nu for nu in stated if nu is not None and nu < INCOMPRESSIBLE_POISSON]
+    if not below:
+        return deviation
+    distance = INCOMPRESSIBLE_POISSON - max(below)
+    return distance * float(np.log1p(deviation / distance))
+
+
+def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
+    to a fixed one), in all such parts together; None if there is none.
+    """
+    constants = _stated_poisson_names(at.parameters)
     if not constants:
         return None
     values = at.parameters.values(at.iterate.q)
@@ -982,9 +1002,9 @@ ASSUMPTIONS = (
         "",
         sigma=0.02,
         description="error of a stated Poisson's ratio",
-        remedy="measure Poisson's ratio in a tension test, or estimate it; solid rubber is nearly "
-        "incompressible: state poisson = 0.499 in [parameters], and the deviation of this value, "
-        "poisson = 0.0005, in [uncertainty.assumptions]",
+        remedy="measure Poisson's ratio in a tension test, or estimate it; if it is known "
+        "better, state its deviation, poisson = …, in [uncertainty.assumptions]: the bulk modulus of "
+        "solid rubber, 1.5 to 2 GPa, determines it to about 0.0001",
         effect=_poisson,
         of_specimens=True,
     ),
