@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from assumed_twins import anisotropic_law
 from scipy.signal import butter, sosfiltfilt
 from script_arguments import make_parser
 from twins import random_poses
@@ -51,6 +52,8 @@ BAR_DENSITY_KG_M3 = 100.0
 WIDE = 0.04
 LOW_PASS_HZ = 6.0
 SCAN_GRAVITY_M_S2 = (0.0, -9.81, 0.0)
+# Stiffness along the bar, by fibres, over that across it, less one.
+FIBRES = 0.3
 
 
 @dataclass(frozen=True)
@@ -249,6 +252,13 @@ def with_other_law(seed: int) -> HiddenError:
     return HiddenError(actual, without_places(bar_recording(seed)))
 
 
+def with_fibres(seed: int) -> HiddenError:
+    """Return the bent bar with fibres along it; the true E is that across them."""
+    law = anisotropic_law([0.0, 0.0, FIBRES])
+    body = bent_bar(rest_shape="stress_free", material=law, evaluator="casadi")
+    return HiddenError(bar_recording(seed, body), without_places(bar_recording(seed)))
+
+
 ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "none": ("none", no_error),
     "markers": ("8 markers of 0.5 g on the body of 25 g", with_heavy_markers),
@@ -266,6 +276,7 @@ ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "filtered": ("the same, tracks low-passed at 6 Hz", filtered),
     "twice": ("the same, one track in place of another", twice),
     "law": ("the same, another material and damping law", with_other_law),
+    "fibres": ("the same, fibres along the bar: E along it 30 % larger", with_fibres),
     "gradient": ("stiffness ± 10 % at the ends", with_gradient),
 }
 

@@ -120,6 +120,9 @@ TOPICS: dict[str, Topic] = {
             "{damping}: compare laws with compare-models --materials and --damping",
             "mesh-width": "the mesh is about {percent:.2g} % too {way} along its {axis} axis: compare "
             "its extents with those of the real body",
+            "mesh-coarse": "the mesh is too coarse for such accurate measurements: its estimated error "
+            "changes the predictions by {sigmas:.2g} sigma (RMS), which the constants do not absorb; "
+            "{remedy}",
             "mesh-mirrored": "the mesh is a mirror image of the body, along its {axis} axis: compare "
             "it with the real body",
             "rest-shape": "the mesh is the shape of the body under its weight, with gravity along "

@@ -51,6 +51,9 @@ from .consider_analysis import changed_residuals
 from .discretisation_error import estimate_changes
 from .systematic_effects import Assumption, Effect, ExperimentAtAnswer
 
+# Largest number of nodes of a body whose error of the mesh is estimated in every solve: with more,
+# the search starts on a coarser mesh, and a note compares both meshes.
+LARGEST_NODE_COUNT = 1500
 # Relative accuracy of e: that of an estimate of an error.
 ACCURACY = 1e-2
 # Weight of the shape function of a node below which it is zero apart from rounding.
@@ -76,12 +79,18 @@ def mesh_change(collocation: Collocation, z: Array, fit: LinearisedFit) -> Array
     SimulationError, numpy.linalg.LinAlgError
         If the equations are singular.
     """
+    changes = changed_residuals(collocation, z, assumptions=[(finer_mesh_row(collocation), 1.0)])
+    return estimate_changes(fit, changes.blocks)[: collocation.nq, 0]
+
+
+def finer_mesh_row(collocation: Collocation) -> Assumption:
+    """Return the assumption that the meshes are fine enough: its effect is that of meshes with every
+    tetrahedron split into eight.
+    """
     bodies = dict.fromkeys(t.body for t in collocation.transcriptions if _has_mesh(t.experiment))
     finer = {id(body): refine_body(body) for body in bodies}
     effect = partial(_effect, scheme=collocation.scheme, finer=finer)
-    row = Assumption("mesh", "", None, "", remedy="", effect=effect)
-    changes = changed_residuals(collocation, z, assumptions=[(row, 1.0)])
-    return estimate_changes(fit, changes.blocks)[: collocation.nq, 0]
+    return Assumption("mesh", "", None, "", remedy="", effect=effect)
 
 
 def _has_mesh(experiment: Experiment) -> bool:
