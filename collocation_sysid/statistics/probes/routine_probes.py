@@ -45,8 +45,11 @@ MEMORY_SHARE = 0.1
 # draws of the noise of one faultless recording was significant.
 FALSE_ALARMS = 1e-4
 # Standard deviation of the prior of a probe's amplitude, in deviations of the budget: it must not
-# shrink towards the assumption that it tests, and stay bounded where the data say nothing.
+# shrink towards the assumption that it tests, and stay bounded where the data say nothing. That of
+# anisotropy is smaller: across the axis of bending hardly anything depends on it, so that any error of
+# the model needs an impossible anisotropy (0.7 to 0.9 in twins without any).
 WIDENING = 10.0
+WIDENING_OF_ANISOTROPY = 4.0
 # Least change of an estimate that is relevant, in half widths of its combined interval, which is the
 # one to publish: with the deviations of real bodies and laboratories every assumption is violated a
 # little, and the interval contains that. Memory left out changes E by two half widths and more.
@@ -113,8 +116,10 @@ def one_step_probes(solved_fit: SolvedFit, names: Iterable[str]) -> Iterator[Pro
 
 def prior_widening(name: str) -> float:
     """Return the standard deviation of an assumption's prior, in deviations of the budget, for its
-    name with component: `WIDENING` for routine assumptions, else 1.
+    name with component: `WIDENING` or `WIDENING_OF_ANISOTROPY` for routine assumptions, else 1.
     """
+    if assumption_name(name) == ANISOTROPY:
+        return WIDENING_OF_ANISOTROPY
     return WIDENING if is_routine_assumption(name) else 1.0
 
 
