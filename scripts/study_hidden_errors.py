@@ -4,7 +4,7 @@ A block of foam is moved at random, as in `twins`. Its tracks are simulated with
 described body does not have, or with another body, and are fitted with all options at their
 default. The estimated parameters absorb such errors, so that the residuals look like noise. The
 table has the smallest and the largest estimated E over the true one, how many combined intervals
-contain the true E, and the verdicts.
+contain the true E, the verdicts, and the codes of the first reasons.
 
     python scripts/study_hidden_errors.py [--twins 5] [--only markers memory]
 """
@@ -259,6 +259,17 @@ def with_fibres(seed: int) -> HiddenError:
     return HiddenError(bar_recording(seed, body), without_places(bar_recording(seed)))
 
 
+def with_coarse_mesh(seed: int) -> HiddenError:
+    """Return the bent bar of quadratic elements, with linear ones on the same mesh in the
+    description.
+    """
+    actual = bar_recording(seed, bent_bar(rest_shape="stress_free", element="tet10"))
+    body = bent_bar(rest_shape="stress_free")
+    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    grasp = cs.Grasp(held, actual.grasps[0].poses)
+    return HiddenError(actual, replace(without_places(actual), body=body, grasps=[grasp]))
+
+
 ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "none": ("none", no_error),
     "markers": ("8 markers of 0.5 g on the body of 25 g", with_heavy_markers),
@@ -276,6 +287,10 @@ ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "filtered": ("the same, tracks low-passed at 6 Hz", filtered),
     "twice": ("the same, one track in place of another", twice),
     "law": ("the same, another material and damping law", with_other_law),
+    "coarse": (
+        "the same, linear elements where the body is that of quadratic ones",
+        with_coarse_mesh,
+    ),
     "fibres": ("the same, fibres along the bar: E along it 30 % larger", with_fibres),
     "gradient": ("stiffness ± 10 % at the ends", with_gradient),
 }

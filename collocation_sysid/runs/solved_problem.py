@@ -75,7 +75,7 @@ class SolvedProblem:
     systematic_effects : VarianceSources or None
         Systematic effects on the estimates; None without error bars.
     probes : tuple of Probe
-        Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
+        Refits with an assumption relaxed: those of every solve, see `routine_probes`; or all, and
         of parts of the data, where these were requested. Empty without error bars.
     elapsed_s : Elapsed
         Durations of search and checks.

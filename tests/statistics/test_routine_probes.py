@@ -19,6 +19,7 @@ from collocation_sysid import (
     PoseSequence,
     Problem,
     Run,
+    Specimen,
     UncertaintyOptions,
     Unknown,
     run,
@@ -30,6 +31,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.result.probe_sections import DEEPER_CHECK_ADVICE, is_deeper_check_worthwhile
 from collocation_sysid.result.run_summary import next_step, run_summary
 from collocation_sysid.statistics.assessment import Assessment, probe_concerns
+from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS
 from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
@@ -318,6 +320,27 @@ def test_a_static_recording_shows_a_drift_only_where_its_load_returns(heights_m,
     changes = probed_changes(collocation, z, {**none, DRIFT: 0.02})
     column = changes.names.index(DRIFT)
     assert any(block[..., column].any() for block in changes.blocks) is drifts
+
+
+def test_specimens_are_not_probed_for_anisotropy():
+    """In tests of one material along several axes, another material law has the same effect."""
+    stretch = np.linspace(1.05, 1.5, 6)
+    stress_pa = 1e5 * (stretch - stretch**-2)
+    specimen = Specimen("uniaxial", stretch - 1, stress_pa, sigma_pa=1e3, strain_zero=0.0)
+    fixed = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    collocation = Collocation(
+        [specimen.experiment("neo-hookean", "pull")],
+        Parameters.from_mapping({"mu_pa": Unknown(1e5), **fixed}),
+    )
+    z, _ = initial_variables(collocation)
+    none = dict.fromkeys(Assumptions().collect_deviations())
+    deviations = {**none, ANISOTROPY: 0.05}
+    for changes, is_shown in (
+        (changes_of_assumptions(collocation, z, deviations), True),
+        (probed_changes(collocation, z, deviations), False),
+    ):
+        columns = [k for k, name in enumerate(changes.names) if name in ANISOTROPY_PROBES]
+        assert any(block[..., columns].any() for block in changes.blocks) is is_shown
 
 
 def test_a_significant_routine_probe_recommends_the_comparison_of_laws():

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.problem_files import both, replace_text, run_command
-from kit.problems import GUESS, TRUTH, box, released_cube
+from kit.problems import GUESS, TRUTH, box, hung_cube, released_cube
 from twins import BODIES, SOFT, STIFF, twin
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, reordered
@@ -286,7 +286,7 @@ def test_the_search_for_causes_is_bounded_by_the_time_of_the_fit(monkeypatch, rn
 
 def test_steps_within_a_fast_motion_are_no_slips():
     """Of a motion with few samples the second differences are large, and may turn round."""
-    (experiment,) = soft("block").experiments
+    experiment = hung_cube(36)
     rng = np.random.default_rng(2)
     t_s = 0.02 * np.arange(36)
     names = experiment.markers.names
