@@ -189,9 +189,12 @@ def bar_recording(seed: int, body: cs.Body | None = None) -> cs.Experiment:
 
 def without_places(experiment: cs.Experiment) -> cs.Experiment:
     """Return the experiment with markers at unknown places."""
-    markers = experiment.markers
-    unplaced = replace(markers, placement=None, located=None, places_m=None)
-    return replace(experiment, markers=unplaced)
+    return replace(experiment, markers=unplaced(experiment.markers))
+
+
+def unplaced(markers: cs.Markers) -> cs.Markers:
+    """Return the markers at unknown places."""
+    return replace(markers, placement=None, located=None, places_m=None)
 
 
 def bar_without_error(seed: int) -> HiddenError:
@@ -267,7 +270,8 @@ def with_coarse_mesh(seed: int) -> HiddenError:
     body = bent_bar(rest_shape="stress_free")
     held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
     grasp = cs.Grasp(held, actual.grasps[0].poses)
-    return HiddenError(actual, replace(without_places(actual), body=body, grasps=[grasp]))
+    markers = unplaced(actual.markers)
+    return HiddenError(actual, replace(actual, body=body, grasps=[grasp], markers=markers))
 
 
 ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {

@@ -143,7 +143,7 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(faul
 
 
 @pytest.mark.long
-def test_fibres_along_an_axis_mean_check_with_the_moduli_along_and_across_them():
+def test_fibres_along_an_axis_give_check_with_the_moduli_along_and_across_them():
     fibrous = solved("anisotropy z", 0.3, noise_m=NOISE_M / 4)
     truth_pa = TRUTH["young_pa"]
     assert fibrous.interval("young_pa")[0] > truth_pa
