@@ -404,7 +404,7 @@ def probe_concerns(
         "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
         "instead": (f"; alternatives that decrease χ² less: {instead}" if others else "")
         + (_hysteresis_text(experiments) if worst.name == DRIFT else "")
-        + _advice(worst, is_still=all(each.kind == "static" for each in experiments)),
+        + _advice(worst, is_still={each.kind for each in experiments} == {"static"}),
     }
     return [Concern("assumption/contradicted", data=data)]
 
