@@ -228,7 +228,9 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     assert (folder / "budget.png").exists()
     told = Result.read(folder)
     assert set(told.budget["mu_pa"]) == set(finished.budget["mu_pa"].shares)
-    short, whole = (plain_text(run_summary(told, folder, budget=b)) for b in (False, True))
+    short, whole = (
+        plain_text(run_summary(told, folder, details=True, budget=b)) for b in (False, True)
+    )
     assert "± syst" in short
     assert "% of the variance" not in short
     assert "% of the variance" in whole

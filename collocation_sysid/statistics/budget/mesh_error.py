@@ -30,7 +30,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
-from ...common.time_dependence import at_times
 from ...errors import InputError
 from ...fem.body import Body
 from ...fem.meshes.refinement import refine_body
@@ -147,7 +146,7 @@ def _condensed_forces(
     """
     unbalanced_n = _forces_less_inertia(dynamics, x)
     xi, nu = dynamics.evaluation_states(x)
-    forces = dynamics.forces_with_histories(dynamics.histories(x))
+    histories = dynamics.histories(x)
     sequence = FactorSequence(
         Factoriser.cached(dynamics.pattern, new),
         NodeRotation(new, dynamics.pattern.size // 3),
@@ -156,7 +155,9 @@ def _condensed_forces(
     relative = np.zeros(dynamics.pattern.size)
     for k in range(len(xi)):
         now = slice(k, k + 1)
-        stiffness = -at_times(forces, now).linearise(xi[now], nu[now]).by_position[0]
+        row = dynamics.first_row + k
+        forces = dynamics.forces_with_histories(histories, slice(row, row + 1))
+        stiffness = -forces.linearise(xi[now], nu[now]).by_position[0]
         system = ReusedFactor(sequence, Matrix(stiffness, NONE), points_m=xi[k].reshape(-1, 3))
         relative[new] = system.solve(unbalanced_n[k, new], guess=relative[new])
         unbalanced_n[k] -= dynamics.pattern.products(stiffness[None], relative[None])[0]
