@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,8 +79,11 @@ class SpecimenReader:
                 "used instead"
             )
         specimen = self._specimen(table)
+        deformation = replace(specimen.find_deformation(), columns=table.columns)
         with located(file):
-            require_plausible_specimen(specimen)
+            require_plausible_specimen(
+                specimen, is_stretch=not {"stretch", "volume_ratio"}.isdisjoint(table.columns)
+            )
         for warning in order_warnings(specimen):
             self._add_note(warning)
         if table.is_displacement and section.area_m2 is None:
@@ -87,11 +91,18 @@ class SpecimenReader:
                 "the compliance of the test bench is not part of the budget: state area_m2, the "
                 "undeformed area of the specimen, unless an extensometer measured the displacement"
             )
+        if table.is_displacement and deformation.lateral and specimen.strain.max() > 0:
+            self._add_note(
+                f"length_m = {section.length_m:g} is the length that is stretched: between the grips "
+                "of a strip, but of a dogbone the effective length of its narrow part, because the "
+                "shoulders hardly stretch (10 % less is common). The entry effective_length of "
+                '[uncertainty.assumptions] contains 5 %; state "none" for an extensometer or a strip'
+            )
         self._note_unknown_past(specimen)
         experiment = specimen.experiment(
             name=section.name, validation=section.validation, body=self.body
         )
-        return specimen, experiment
+        return specimen, replace(experiment, specimen=deformation)
 
     def _add_note(self, note: str) -> None:
         """Add a note that begins with the experiment's name."""
@@ -106,6 +117,7 @@ class SpecimenReader:
         if len(rows) < len(table.t_s):
             self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
         arguments = values_over_time(at_times(table, rows))
+        arguments |= dict.fromkeys(self._placeholders(arguments))
         if table.is_displacement and section.area_m2 is not None:
             arguments |= {"length_m": section.length_m, "area_m2": section.area_m2}
         return Specimen(
@@ -117,6 +129,25 @@ class SpecimenReader:
             area_error=deviation(section.area_error),
             stress_zero_pa=deviation(section.stress_zero_pa),
         )
+
+    def _placeholders(self, arguments: Mapping[str, Array | None]) -> list[str]:
+        """Return the names of measurements that are all 0 although they cannot be, and note that
+        they are not used.
+        """
+        names = []
+        for name, what, is_impossible in (
+            ("second_stress_pa", "second stresses", self.section.test == "planar"),
+            ("lateral_stretch", "lateral stretches", True),
+        ):
+            values = arguments[name]
+            known = np.zeros(0) if values is None else values[np.isfinite(values)]
+            if is_impossible and known.size and not known.any():
+                names.append(name)
+                self._add_note(
+                    f"all {known.size} {what} in {self.section.file} are 0, which is impossible in a "
+                    f"{self.section.test} test: they are taken as not measured"
+                )
+        return names
 
     def _rows(self, table: SpecimenTable) -> Index:
         """Return the indices (k,) of the rows to use; all rows of a simulation.

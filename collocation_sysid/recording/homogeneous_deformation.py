@@ -55,6 +55,9 @@ class HomogeneousDeformation:
         Undeformed area over undeformed length [m] of a specimen whose strain e₁ is the displacement
         of a test bench over that length, so that the compliance of the bench adds to it; 0 if the
         strain was measured on the specimen.
+    columns : tuple of str
+        Quantities of the columns of its file, such as "displacement" and "lateral_strain"; empty
+        without a file.
     """
 
     test: str
@@ -66,6 +69,12 @@ class HomogeneousDeformation:
     lateral: str = ""
     young_ratio: float = 1.0
     area_over_length_m: float = 0.0
+    columns: tuple[str, ...] = ()
+
+    @property
+    def is_displacement(self) -> bool:
+        """Whether the strain is the displacement of grips over a length."""
+        return bool(self.area_over_length_m) or "displacement" in self.columns
 
     def displaced_nodes(self) -> dict[int, tuple[Array, Array]]:
         """Return for each moving node of the cell, by its index from 0, the displacement by a unit

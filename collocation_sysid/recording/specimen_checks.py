@@ -43,13 +43,14 @@ MIXED = 0.3
 NOISE_SIGMAS = 4.0
 
 
-def require_plausible_specimen(specimen: Specimen) -> None:
+def require_plausible_specimen(specimen: Specimen, *, is_stretch: bool = False) -> None:
     """Raise an `InputError` if strains or stresses of a specimen are impossible as described.
 
     Refused are strains above `LARGEST_STRAIN`, strains that look like stretches, a correlation of
     strain and stress below `AGAINST`, and "confined" or "volumetric" tests whose largest strain is
-    positive. The last two are not checked with fewer than `FEWEST_SAMPLES` stresses, or if strain
-    or stress is constant.
+    positive; and stresses that are all zero. Signs are not checked with fewer than `FEWEST_SAMPLES`
+    stresses, or if strain or stress is constant. No sign acts on the stretches of a file that has
+    them (`is_stretch`).
     """
     strain = specimen.strain
     stress_pa = specimen.stress_pa
@@ -65,20 +66,35 @@ def require_plausible_specimen(specimen: Specimen) -> None:
     if is_measured.sum() < FEWEST_SAMPLES or not np.ptp(strain[is_measured]):
         return
     if not np.ptp(stress_pa[is_measured]):
+        if not stress_pa[is_measured].any():
+            raise InputError(
+                f"all {is_measured.sum()} stresses are 0, although the strain reaches {largest:.4g}; "
+                "expected the measured stress: is this column a placeholder?"
+            )
         return
     correlation = float(np.corrcoef(strain[is_measured], stress_pa[is_measured])[0, 1])
     if correlation < AGAINST:
         raise InputError(
             f"strain and stress have opposite signs (correlation {correlation:.2f}); expected "
-            "both positive in tension and negative in compression: strain_sign = -1 or "
-            "stress_sign = -1 for the column in which compression is positive"
+            "both positive in tension and negative in compression: "
+            + (
+                "stretches below 1 in compression, and stress_sign = -1 if the stress is positive "
+                "in it"
+                if is_stretch
+                else "strain_sign = -1 or stress_sign = -1 for the column in which compression is "
+                "positive"
+            )
         )
     mostly_positive = strain[int(np.abs(strain).argmax())] > 0
     if specimen.test in ("confined", "volumetric") and mostly_positive:
         raise InputError(
             f"a {specimen.test} test compresses, but the strains reach +{strain.max():.4g}; "
-            "expected negative strains and stresses in compression: strain_sign = -1 and "
-            "stress_sign = -1, unless the columns are stretches and pressures"
+            "expected negative strains and stresses in compression: "
+            + (
+                "stretches or volume ratios below 1, and stress_sign = -1 if the stress is positive"
+                if is_stretch
+                else "strain_sign = -1 and stress_sign = -1 where compression is positive"
+            )
         )
 
 

@@ -142,8 +142,8 @@ class SpecimenTable:
         None if the table has no such column; stress and stretch NaN where the cell is blank.
     is_incompressible : bool
         Whether true stresses were converted as those of an incompressible specimen.
-    is_displacement : bool
-        Whether the strain is a displacement over the length of the specimen.
+    columns : tuple of str
+        Quantities that the table has, such as "stretch" and "lateral_strain".
     """
 
     t_s: Array = field(metadata=over_time())
@@ -153,7 +153,12 @@ class SpecimenTable:
     second_stress_pa: Array | None = field(metadata=over_time())
     lateral_stretch: Array | None = field(metadata=over_time())
     is_incompressible: bool
-    is_displacement: bool
+    columns: tuple[str, ...]
+
+    @property
+    def is_displacement(self) -> bool:
+        """Whether the strain is a displacement over the length of the specimen."""
+        return DISPLACEMENT.key in self.columns
 
 
 @names_file_in_errors
@@ -210,7 +215,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         is_incompressible=layout.stress == "true"
         and lateral is None
         and layout.test in ("uniaxial", "equibiaxial", "planar", "biaxial"),
-        is_displacement=DISPLACEMENT.key in table.values,
+        columns=tuple(table.values),
     )
 
 

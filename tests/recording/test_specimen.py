@@ -231,6 +231,8 @@ STRAIN = np.linspace(0.05, 0.8, 12)
         ("strain (-),stress (kPa)", (100.0, 1e-3), "", "strain.*(%)"),
         ("stretch,stress (kPa)", (100.0, 1e-3), "", "stretch"),
         ("strain (-),stress (kPa)", (1.0, -1e-3), "", "opposite signs.*stress_sign = -1"),
+        ("stretch,stress (kPa)", (1.0, -1e-3), "", "opposite signs.*stretches below 1 in"),
+        ("strain (-),stress (kPa)", (1.0, 0.0), "", "all 12 stresses are 0"),
         ("strain (-),stress (GPa)", (1.0, 1.0), "", "Check the unit"),
         ("strain,stress (kPa)", (1.0, 1e-3), "", "names no unit"),
         ("strain (-),force (N)", (1.0, 1.0), "", "area_m2"),
@@ -247,6 +249,29 @@ def test_mistakes_in_a_table_are_named(tmp_path, header, factors, keys, message)
     with pytest.raises(cs.InputError, match=message) as raised:
         cs.Problem.read(path)
     assert "problem.toml" in str(raised.value) or "pull.csv" in str(raised.value)
+
+
+def test_a_second_stress_of_zeros_is_not_used(tmp_path):
+    rows = np.column_stack([STRAIN, simulated("planar", STRAIN)["stress"], 0 * STRAIN])
+    text = PROBLEM.replace("uniaxial", "planar")
+    path = written(tmp_path, text, "strain (-),stress (Pa),second stress (Pa)", rows)
+    problem = cs.Problem.read(path)
+    assert [each.name for each in problem.experiments[0].readings] == ["stress"]
+    assert any("all 12 second stresses in pull.csv are 0" in note for note in problem.notes)
+
+
+@pytest.mark.parametrize(
+    ("header", "factors", "is_noted"),
+    [
+        ("extension (mm),stress (Pa)", (20.0, 1.0), True),
+        ("strain (-),stress (Pa)", (1.0, 1.0), False),
+    ],
+)
+def test_a_length_between_grips_is_noted(tmp_path, header, factors, is_noted):
+    rows = np.column_stack([STRAIN, simulated("uniaxial", STRAIN)["stress"]]) * factors
+    text = PROBLEM + "length_m = 0.02\narea_m2 = 4e-4\n"
+    problem = cs.Problem.read(written(tmp_path, text, header, rows))
+    assert any("of a dogbone the effective length" in note for note in problem.notes) == is_noted
 
 
 def test_strains_that_begin_at_one_are_stretches(tmp_path):

@@ -52,6 +52,21 @@ def test_the_combined_interval_contains_the_modulus_of_a_wrong_length(test):
     assert without[1] / without[0] < high / low
 
 
+@pytest.mark.parametrize(("sign", "is_counted"), [(1.0, True), (-1.0, False)])
+def test_the_length_between_grips_that_pull_may_be_too_long(sign, is_counted):
+    """A dogbone whose effective length is 9 % shorter than the distance of its grips."""
+    strain = sign * STRAIN
+    true = cs.Specimen("uniaxial", 1.09 * strain, 0 * strain, **KEYS).experiment(name="pull")
+    (stress_pa,) = cs.simulate(true, {**CONSTANTS, "young_pa": YOUNG_PA}).custom_sensor_values
+    stated = cs.Specimen(
+        "uniaxial", strain, stress_pa[:, 0], **KEYS, length_m=0.1, area_m2=4e-5
+    ).experiment(name="pull")
+    run = cs.run(cs.Problem([stated], {**CONSTANTS, "young_pa": cs.Unknown()}))
+    assert ("effective_length" in run.result.budget["young_pa"]) == is_counted
+    low, high = run.estimates["young_pa"].combined95
+    assert low <= YOUNG_PA <= high
+
+
 def test_the_row_belongs_to_specimens_by_default_and_not_to_bodies():
     assert cs.Assumptions().gauge_length == 0.01
     swung = hung_cube()

@@ -95,6 +95,70 @@ def test_nothing_is_named_after_a_search_that_did_not_converge():
     assert not run.causes
 
 
+# Kinds of test, zeros, and all data ---------------------------------------------------------------
+
+
+def causes_of_test(test, unknown, **measured):
+    """Causes of a fit of one test with a neo-Hookean law."""
+    keys = {"lateral_sigma": 5e-4} if "lateral_stretch" in measured else {}
+    specimen = cs.Specimen(test, STRAIN, sigma_pa=SIGMA_PA, **measured, **keys)
+    return cs.run(cs.Problem([specimen.experiment(name="pull")], unknown)).causes
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("declared", "true", "stress_pa"),
+    [
+        ("planar", "simple-shear", 1e5 * STRAIN),
+        ("uniaxial", "equibiaxial", 1e5 * (1 + STRAIN - (1 + STRAIN) ** -5)),
+        ("simple-shear", "planar", 1e5 * (1 + STRAIN - (1 + STRAIN) ** -3)),
+    ],
+)
+def test_another_kind_of_test_is_named(declared, true, stress_pa):
+    noise_pa = SIGMA_PA * np.random.default_rng(5).normal(size=25)
+    unknown = {"mu_pa": cs.Unknown()} | FIXED
+    causes = causes_of_test(declared, unknown, stress_pa=stress_pa + noise_pa)
+    (kind,) = (each for each in causes if each.cause == "specimen-kind")
+    assert f"that of a {true} test" in kind.message
+
+
+@pytest.mark.long
+def test_a_hypothesis_keeps_the_lateral_stretches_that_refute_it():
+    """An auxetic foam in tension, with a stated positive Poisson's ratio, is no compression test."""
+    rng = np.random.default_rng(5)
+    young_pa, poisson = 1e5, -0.4
+    strain = np.linspace(0.01, 0.1, 25)
+    lateral = 1 - poisson * strain + 5e-4 * rng.normal(size=25)
+    specimen = cs.Specimen(
+        "uniaxial",
+        strain,
+        young_pa * strain + 50 * rng.normal(size=25),
+        50.0,
+        lateral_stretch=lateral,
+        lateral_sigma=5e-4,
+    )
+    fixed = {"poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    problem = cs.Problem(
+        [specimen.experiment("neo-hookean", "pull")], {"young_pa": cs.Unknown()} | fixed
+    )
+    causes = [each.cause for each in cs.run(problem).causes]
+    assert "specimen-compression" not in causes
+
+
+@pytest.mark.long
+def test_lateral_stretches_of_one_are_named_as_a_placeholder():
+    noise_pa = SIGMA_PA * np.random.default_rng(5).normal(size=25)
+    unknown = {"mu_pa": cs.Unknown()} | FIXED
+    causes = causes_of_test(
+        "uniaxial",
+        unknown,
+        stress_pa=neo_hookean_pa(STRAIN) + noise_pa,
+        lateral_stretch=1 + 0 * STRAIN,
+    )
+    assert causes[0].cause == "specimen-placeholder"
+    assert "its lateral strain is zero in all rows" in causes[0].message
+
+
 # Words --------------------------------------------------------------------------------------------
 
 

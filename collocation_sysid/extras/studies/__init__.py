@@ -7,8 +7,7 @@ Studies: `study_kinds` names their kinds, `study_arguments` parses command-line 
 of the search for a motion (package `design`).
 
 Model comparison: `model_variants` derives models from a problem file, `model_choice` compares their
-predictions, `model_comparison` does so in Python, and `law_disagreements` evaluates how much an
-estimate depends on the model.
+predictions, and `law_disagreements` evaluates how much an estimate depends on the model.
 """
 
 from .run_execution import RunOptions, RunStore, run_all

@@ -2,8 +2,10 @@
 
 Mistakes in a table that show without a fit are in `recording.specimen_checks`. The others leave a
 plausible curve: true in place of engineering stress, compression with positive signs, percent in
-place of ratios, and stresses in another unit. All specimens are fitted again with one of them
-corrected; the misfit contains the nuisance parameters, so that a wrong area does not explain all.
+place of ratios, stresses in another unit, another kind of test, and columns of zeros that were not
+measured. All specimens are fitted again with one of them corrected; the misfit contains the nuisance
+parameters, so that a wrong area does not explain all. A correction keeps all measurements, unless
+the mistake is that one was none.
 
 A law that is too simple, a toe region or hysteresis also decrease the misfit of some correction. A
 mistake is therefore named only if the corrected description explains the data, see `_is_explained`.
@@ -13,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +26,16 @@ from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
-from ...recording.homogeneous_deformation import HomogeneousDeformation
+from ...recording.homogeneous_deformation import DEFORMATIONS, HomogeneousDeformation
 from ...recording.markers import Markers
-from ...recording.specimen import LATERAL_NAME, STRESS_UNIT
+from ...recording.specimen import (
+    LATERAL_NAME,
+    SECOND_STRESS_NAME,
+    STRESS_NAME,
+    STRESS_UNIT,
+    Specimen,
+    cell_body,
+)
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
 from .misspecification_hypothesis import Hypothesis, HypothesisTest
@@ -40,7 +50,7 @@ FEWEST_SAMPLES = 4
 # Most iterations of one refit, and its tolerance: a misfit is needed, not an estimate.
 MOST_ITERATIONS = 15
 TOLERANCE = 1e-2
-# Factor of the misfit from which on no other hypothesis is tested.
+# Factor of the misfit from which on no other specimen is tested.
 CERTAIN = 4.0
 # Samples of each specimen that are refitted.
 REFITTED_SAMPLES = 8
@@ -61,6 +71,16 @@ DECIDING_SAMPLES = 60
 DECIDING_ITERATIONS = 30
 # Units that stresses are confused in: name of the factor that corrects the file.
 UNIT_FACTORS = {"kPa": 1e-3, "MPa": 1e3}
+# Causes that show with any law.
+EVIDENT = ("specimen-unit", "specimen-placeholder")
+# Kinds of test that each kind is confused with, besides that of compression without free sides.
+CONFUSED_TESTS = {
+    "uniaxial": ("planar", "equibiaxial", "simple-shear"),
+    "planar": ("simple-shear", "uniaxial", "equibiaxial"),
+    "equibiaxial": ("uniaxial", "planar"),
+    "simple-shear": ("planar", "uniaxial"),
+    "confined": ("uniaxial",),
+}
 # Largest strain from which on a table of ratios may be one of percent.
 PERCENT_STRAIN = 1.0
 
@@ -70,9 +90,10 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
     specimens, where they fit, after a search that did not converge, or if refits fail.
 
     The specimens with the largest misfit are tested first; a nearly certain hypothesis (`CERTAIN`)
-    ends the search. A hypothesis is returned only if the corrected description explains the data
-    (`_is_explained`). A wrong unit needs no explanation: the initial slopes of the tests show it
-    with any law.
+    about one ends the search, after all those about it, several of which may explain its data. A
+    hypothesis is returned only if the corrected description explains the data (`_is_explained`). A
+    wrong unit and a column of zeros need no explanation: the initial slopes of the tests, or the
+    zeros, show it with any law.
 
     Parameters
     ----------
@@ -112,13 +133,13 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
             continue
         other_slopes_pa = slopes_pa[:index] + slopes_pa[index + 1 :]
         for hypothesis in test.accepted(_hypotheses(experiment, other_slopes_pa)):
-            if hypothesis.cause != "specimen-unit" and not _is_explained(
-                solution, originals, index=index, code=hypothesis.code, stated_misfit=stated_misfit
+            if hypothesis.cause not in EVIDENT and not _is_explained(
+                solution, originals, index=index, tested=hypothesis, stated_misfit=stated_misfit
             ):
                 continue
             hypotheses.append(hypothesis)
-            if hypothesis.strength > CERTAIN:
-                return hypotheses
+        if any(each.strength > CERTAIN for each in hypotheses):
+            break
     return hypotheses
 
 
@@ -140,7 +161,7 @@ def _is_explained(
     solution: Solution,
     experiments: Sequence[Experiment],
     index: int,
-    code: str,
+    tested: Hypothesis,
     stated_misfit: float,
 ) -> bool:
     """Return whether the data are as expected from noise if one mistake is corrected.
@@ -150,7 +171,11 @@ def _is_explained(
     plausible (`PLAUSIBLE_NUISANCE`), and χ² smaller by at least `DECISIVE`.
     """
     chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
-    corrected = [each.corrected for each in _hypotheses(chosen[index], ()) if each.code == code]
+    corrected = [
+        each.corrected
+        for each in _hypotheses(chosen[index], ())
+        if (each.code, each.data) == (tested.code, tested.data)
+    ]
     if not corrected:
         return False
     chosen[index] = corrected[0]
@@ -250,11 +275,16 @@ def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Ite
         yield Hypothesis(
             "specimen-true-stress", of, data={}, corrected=_with_stress(experiment, areas)
         )
-    is_invertible = (strain >= 0).all() and strain.max() < 1.0
+    # No sign acts on the stretches of a file.
+    is_invertible = (
+        (strain >= 0).all() and strain.max() < 1.0 and "stretch" not in deformation.columns
+    )
     if deformation.test in ("uniaxial", "equibiaxial", "planar") and is_invertible:
         yield Hypothesis("specimen-compression", of, data={}, corrected=_compressed(experiment))
     if strain.max() > PERCENT_STRAIN and deformation.test != "volumetric":
         yield Hypothesis("specimen-percent", of, data={}, corrected=_strained(experiment, 0.01))
+    yield from _placeholder_hypotheses(experiment, of)
+    yield from _kind_hypotheses(experiment, of)
     ratios = [other / _initial_slope(experiment) for other in other_slopes_pa]
     for unit, factor in UNIT_FACTORS.items():
         decades = np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
@@ -262,6 +292,71 @@ def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Ite
             corrected = _with_stress(experiment, np.full_like(strain, factor))
             yield Hypothesis(
                 "specimen-unit", of, data={"unit": unit, "factor": factor}, corrected=corrected
+            )
+
+
+def _kind_hypotheses(experiment: Experiment, of: str) -> Iterator[Hypothesis]:
+    """Yield the other kinds of test that the measurements of a specimen can be from."""
+    assert experiment.specimen is not None
+    strain, _ = specimen_strains(experiment)
+    kinds = CONFUSED_TESTS.get(experiment.specimen.test, ())
+    if experiment.specimen.test == "uniaxial" and (strain <= 0).all():
+        kinds = (*kinds, "confined")
+    for test in kinds:
+        corrected = _of_another_kind(experiment, test)
+        if corrected is not None:
+            yield Hypothesis("specimen-kind", of, data={"test": test}, corrected=corrected)
+
+
+def _of_another_kind(experiment: Experiment, test: str) -> Experiment | None:
+    """Return a copy of the experiment with the same numbers, but those of another kind of test;
+    None if that test cannot have all of them.
+    """
+    assert experiment.specimen is not None
+    strain, _ = specimen_strains(experiment)
+    values = {gauge.name: gauge.measured_values[:, 0] for gauge in experiment.readings}
+    body = experiment.body
+    if bool(DEFORMATIONS[test].free) != bool(experiment.specimen.free):
+        (part,) = body.parts
+        body = cell_body(
+            test, part.material, prony=part.prony, damping=part.damping, made=body.made
+        )
+    second_pa: Any = values.get(SECOND_STRESS_NAME)
+    lateral: Any = values.get(LATERAL_NAME)
+    try:
+        other = Specimen(
+            test,
+            strain,
+            values[STRESS_NAME],
+            sigma_pa=1.0,
+            t_s=experiment.t_s,
+            second_stress_pa=second_pa,
+            lateral_stretch=lateral,
+        ).experiment(name=experiment.name, body=body)
+    except (InputError, KeyError):
+        return None
+    made = {gauge.name: gauge for gauge in other.readings}
+    readings = [
+        replace(made[gauge.name], sigma=gauge.sigma, unknowns=gauge.unknowns)
+        for gauge in experiment.readings
+    ]
+    return replace(other, readings=readings, nuisance=experiment.nuisance)
+
+
+def _placeholder_hypotheses(experiment: Experiment, of: str) -> Iterator[Hypothesis]:
+    """Yield a hypothesis for each further measurement of a specimen whose strains, or stresses, are
+    all exactly zero: that it was not measured.
+    """
+    for gauge in experiment.readings[1:]:
+        values = gauge.measured_values[np.isfinite(gauge.measured_values)]
+        if (values == (1.0 if gauge.name == LATERAL_NAME else 0.0)).all():
+            others = [each for each in experiment.readings if each is not gauge]
+            quantity = "lateral strain" if gauge.name == LATERAL_NAME else gauge.name
+            yield Hypothesis(
+                "specimen-placeholder",
+                of,
+                data={"quantity": quantity},
+                corrected=replace(experiment, readings=others),
             )
 
 
@@ -302,9 +397,16 @@ def _strained(experiment: Experiment, factor: float) -> Experiment:
 
 
 def _compressed(experiment: Experiment) -> Experiment:
-    """Return a copy of the experiment with strains and stresses of the opposite sign, without
-    measured lateral strains.
+    """Return a copy of the experiment with strains and stresses of the opposite sign, and lateral
+    strains, if the file has these and not stretches.
     """
     reversed_stress = _with_stress(experiment, np.full(len(experiment.t_s), -1.0))
-    lateral = [gauge for gauge in reversed_stress.readings if gauge.name != LATERAL_NAME]
-    return _strained(replace(reversed_stress, readings=lateral), -1.0)
+    assert experiment.specimen is not None
+    is_reversed = "lateral_strain" in experiment.specimen.columns
+    readings = [
+        replace(gauge, values=2.0 - gauge.measured_values)
+        if gauge.name == LATERAL_NAME and is_reversed
+        else gauge
+        for gauge in reversed_stress.readings
+    ]
+    return _strained(replace(reversed_stress, readings=readings), -1.0)
