@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from . import datasets, testing
     from .errors import InputError, SimulationError
     from .extras import live
+    from .extras.studies.model_comparison import ModelComparison, compare_models
     from .fem.body import Body
     from .fem.laws.constants import Constant
     from .fem.laws.materials import DampingLaw, Material, Prony
@@ -106,6 +107,7 @@ __all__ = [
     "Iteration",
     "Markers",
     "Material",
+    "ModelComparison",
     "Named",
     "NodeForce",
     "Nuisance",
@@ -145,6 +147,7 @@ __all__ = [
     "Unknown",
     "Wrench",
     "box_mesh",
+    "compare_models",
     "cylinder_mesh",
     "datasets",
     "depth_image",

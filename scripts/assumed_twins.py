@@ -141,7 +141,7 @@ def _body(experiment: Experiment, values: Mapping[str, float], errors: Mapping[s
     extra_stiffness = [errors.get(f"anisotropy {axis}", 0.0) for axis in AXES]
     body_options: dict[str, Any] = {"damping": _damping(old.parts[0].damping, errors)}
     if any(extra_stiffness):
-        body_options |= {"material": _anisotropic_law(extra_stiffness), "evaluator": "casadi"}
+        body_options |= {"material": anisotropic_law(extra_stiffness), "evaluator": "casadi"}
     more_drag = errors.get("air_drag", 0.0) - errors.get("added_mass", 0.0)
     if more_drag:
         body_options["forces"] = [_drag(more_drag * experiment.air_density_kg_m3)]
@@ -196,7 +196,9 @@ def _stiffness_factors(body: Body, errors: Mapping[str, float]) -> Array:
     return factors
 
 
-def _anisotropic_law(shares: Sequence[float]) -> Material:
+def anisotropic_law(shares: Sequence[float]) -> Material:
+    """Return Neo-Hooke's law, stiffer along each axis (3,) by a share of E."""
+
     def energy(f, lambda_pa, mu_pa):
         j = ca.det(f)
         young_pa = mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa)

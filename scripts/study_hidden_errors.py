@@ -4,7 +4,7 @@ A block of foam is moved at random, as in `twins`. Its tracks are simulated with
 described body does not have, or with another body, and are fitted with all options at their
 default. The estimated parameters absorb such errors, so that the residuals look like noise. The
 table has the smallest and the largest estimated E over the true one, how many combined intervals
-contain the true E, and the verdicts.
+contain the true E, the verdicts, and the codes of the first reasons.
 
     python scripts/study_hidden_errors.py [--twins 5] [--only markers memory]
 """
@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from assumed_twins import anisotropic_law
 from scipy.signal import butter, sosfiltfilt
 from script_arguments import make_parser
 from twins import random_poses
@@ -51,6 +52,8 @@ BAR_DENSITY_KG_M3 = 100.0
 WIDE = 0.04
 LOW_PASS_HZ = 6.0
 SCAN_GRAVITY_M_S2 = (0.0, -9.81, 0.0)
+# Stiffness along the bar, by fibres, over that across it, less one.
+FIBRES = 0.3
 
 
 @dataclass(frozen=True)
@@ -186,9 +189,12 @@ def bar_recording(seed: int, body: cs.Body | None = None) -> cs.Experiment:
 
 def without_places(experiment: cs.Experiment) -> cs.Experiment:
     """Return the experiment with markers at unknown places."""
-    markers = experiment.markers
-    unplaced = replace(markers, placement=None, located=None, places_m=None)
-    return replace(experiment, markers=unplaced)
+    return replace(experiment, markers=unplaced(experiment.markers))
+
+
+def unplaced(markers: cs.Markers) -> cs.Markers:
+    """Return the markers at unknown places."""
+    return replace(markers, placement=None, located=None, places_m=None)
 
 
 def bar_without_error(seed: int) -> HiddenError:
@@ -249,6 +255,25 @@ def with_other_law(seed: int) -> HiddenError:
     return HiddenError(actual, without_places(bar_recording(seed)))
 
 
+def with_fibres(seed: int) -> HiddenError:
+    """Return the bent bar with fibres along it; the true E is that across them."""
+    law = anisotropic_law([0.0, 0.0, FIBRES])
+    body = bent_bar(rest_shape="stress_free", material=law, evaluator="casadi")
+    return HiddenError(bar_recording(seed, body), without_places(bar_recording(seed)))
+
+
+def with_coarse_mesh(seed: int) -> HiddenError:
+    """Return the bent bar of quadratic elements, with linear ones on the same mesh in the
+    description.
+    """
+    actual = bar_recording(seed, bent_bar(rest_shape="stress_free", element="tet10"))
+    body = bent_bar(rest_shape="stress_free")
+    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    grasp = cs.Grasp(held, actual.grasps[0].poses)
+    markers = unplaced(actual.markers)
+    return HiddenError(actual, replace(actual, body=body, grasps=[grasp], markers=markers))
+
+
 ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "none": ("none", no_error),
     "markers": ("8 markers of 0.5 g on the body of 25 g", with_heavy_markers),
@@ -266,6 +291,11 @@ ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "filtered": ("the same, tracks low-passed at 6 Hz", filtered),
     "twice": ("the same, one track in place of another", twice),
     "law": ("the same, another material and damping law", with_other_law),
+    "coarse": (
+        "the same, linear elements where the body is that of quadratic ones",
+        with_coarse_mesh,
+    ),
+    "fibres": ("the same, fibres along the bar: E along it 30 % larger", with_fibres),
     "gradient": ("stiffness ± 10 % at the ends", with_gradient),
 }
 

@@ -229,17 +229,24 @@ def simulate(options: SimulateCommand) -> None:
 
     problem = options.read_problem(simulation=True)
     require_possible(options.out)
+    notes: list[str] = []
     with SolveProgress(
         error_console, problem, quiet=options.quiet, activity="simulating"
     ) as progress:
         try:
             written = write_data(
-                problem, options.out, recipe=options.recipe, progress=progress.share
+                problem,
+                options.out,
+                recipe=options.recipe,
+                progress=progress.share,
+                report=notes.append,
             )
         except SimulationError as error:
             if error.stability_loss is not None:
                 _draw_instability(error, options.out)
             raise
+    for note in notes:
+        error_console.print(Text(f"note: {note}"), soft_wrap=True)
     if options.as_json:
         typer.echo(json.dumps([str(file) for file in written]))
     else:

@@ -83,8 +83,8 @@ class ExportCommand(RunFolderOptions):
     Attributes
     ----------
     to : FILE|FORMAT
-        Destination: a file .xml (MuJoCo), .usda, .py (Newton), .scn (SOFA), .feb, .inp (CalculiX),
-        .json or .rrd (Rerun); or a format: mujoco, usd, newton, sofa, febio, calculix, json, rerun.
+        Destination: a file .xml (MuJoCo), .usda, .py (Newton), .inp (CalculiX), .json or .rrd
+        (Rerun); or a format: mujoco, usd, newton, calculix, json, rerun.
     out : DIR
         Folder for a format, instead of export-FORMAT in the run folder.
     verify : bool

@@ -169,6 +169,12 @@ def compare_models(options: CompareModelsCommand) -> None:
             Problem.read(variant.path, variant.overrides, allow_code=options.allow_code)
             complete_steps(StepUnit.PROBLEM)
     planned = plan_models(problem, variants, method=method, allow_code=options.allow_code)
+    if not (options.quiet or options.dry_run):
+        error_console.print(
+            f"{len(planned)} fits: {len(variants)} models, each to all data and without held-out "
+            "data; the first fit shows how long they take",
+            soft_wrap=True,
+        )
     _run_study(MODEL_STUDY, options, planned=planned)
 
 

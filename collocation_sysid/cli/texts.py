@@ -287,7 +287,10 @@ def new(options: NewCommand) -> None:
         "put your mesh, poses and marker tracks into the same folder and write their names "
         "into the problem file"
     )
-    example = "the problem runs as it is, with simulated data; then replace them by your own"
+    example = (
+        "the problem runs as it is, with simulated data whose true constants its first lines state; "
+        "then replace the data by your own"
+    )
     is_empty = kind is None and options.dataset is None
     if options.dataset is not None:
         example = "the problem runs as it is; its comments state the source of the data"

@@ -39,12 +39,15 @@ class Key:
     constant : str, optional
         For a key that names a file with a table: the field whose key states a constant instead;
         None for all other keys.
+    description : str
+        Meaning of a key whose name differs from the field's; "" for all others.
     """
 
     name: str
     form: Any
     read: Callable[[Any], Any] | None = None
     constant: str | None = None
+    description: str = ""
 
 
 def identity(value: T) -> T:

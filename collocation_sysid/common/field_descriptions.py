@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import inspect
 import re
+import textwrap
+from collections.abc import Callable, Mapping
 from dataclasses import fields
+from typing import TypeVar
+
+T = TypeVar("T")
+_HEADING = "Attributes\n----------\n"
+_IN = 4 * " "
 
 
 def attributes(kind: type) -> dict[str, tuple[str, str]]:
@@ -32,3 +39,30 @@ def documented(kind: type) -> dict[str, str]:
     return {
         each.name: descriptions[each.name][1] for each in fields(kind) if each.name in descriptions
     }
+
+
+def with_attributes(entries: Mapping[str, tuple[str, str]]) -> Callable[[type[T]], type[T]]:
+    """Return a decorator that inserts entries at the beginning of the section "Attributes" of a
+    class's docstring.
+
+    Parameters
+    ----------
+    entries : mapping of name to (str, str)
+        Type and description of each field.
+    """
+
+    def described(kind: type[T]) -> type[T]:
+        summary, _, others = inspect.cleandoc(kind.__doc__ or "").partition(_HEADING)
+        section = "".join(
+            f"{name} : {form}\n{textwrap.fill(text, 96, initial_indent=_IN, subsequent_indent=_IN)}\n"
+            for name, (form, text) in entries.items()
+        )
+        kind.__doc__ = f"{summary.rstrip()}\n\n{_HEADING}{section}{others}"
+        return kind
+
+    return described
+
+
+def sentence(text: str) -> str:
+    """Return a phrase as a sentence: with a capital letter and a full stop."""
+    return f"{text[0].upper()}{text[1:]}."

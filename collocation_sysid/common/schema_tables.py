@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Union, get_args
+from dataclasses import MISSING, dataclass, is_dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Discriminator, GetCoreSchemaHandler, Tag
+import pydantic
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    GetCoreSchemaHandler,
+    Tag,
+    model_validator,
+)
 
 from ..errors import located
-from .declarations import keys_of
+from .declarations import Key, keys_of
 from .field_descriptions import attributes
 from .validated_types import Boundless, Finite
 
@@ -51,27 +59,83 @@ class Among:
         return handler.generate_schema(Literal[self.words])
 
 
+# Annotation of a key in the body of a table that has form, default and description of the class
+# `Section.of`: it states the place of the key among the others.
+Declared = Any
+
+
 class Section(BaseModel):
     """Base class of the tables of a problem file.
 
     The class docstring and its Attributes become the descriptions in the schema and in messages.
+    ``class GraspSection(Section, of=Grasp)`` is the table of a class that is decorated with
+    `declaration`: it has the keys of that class (`keys_of`) with their forms, defaults and
+    descriptions, and its summary unless the table has a docstring. Its body states only the keys of
+    the file itself, and those that differ; they follow the keys that the body does not mention.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+    # Class of which this is the table; `object` if there is none.
+    of: ClassVar[type] = object
+
+    def __init_subclass__(cls, *, of: type | None = None, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if of is None:
+            return
+        cls.of = of
+        stated = dict(inspect.get_annotations(cls))
+        declared: dict[str, Any] = {}
+        for name, key in _keys_by_name(cls).items():
+            if stated.get(key.name, "Declared") == "Declared":
+                (stated if key.name in stated else declared)[key.name] = key.form
+                setattr(cls, key.name, pydantic.Field(_default(cls.of, name, key)))
+        cls.__annotations__ = declared | stated
 
     @classmethod
-    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        for name, (_, description) in attributes(cls).items():
-            if name in cls.model_fields:
-                cls.model_fields[name].description = description
-        text = inspect.cleandoc(cls.__doc__ or "").partition("\n\nAttributes\n")[0]
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        declared = {key.name: key.description for key in _keys_by_name(cls).values()}
+        described = {name: text for name, (_, text) in attributes(cls.of).items()}
+        own = {name: text for name, (_, text) in attributes(cls).items()}
+        for name, field in cls.model_fields.items():
+            text = own.get(name) or declared.get(name) or (name in declared and described.get(name))
+            field.description = text or field.description
+        text = inspect.cleandoc(cls.__doc__ or cls.of.__doc__ or "")
+        text = text.partition("\n\nAttributes\n")[0]
         summary, gap, details = text.partition("\n\n")
-        cls.__doc__ = " ".join(summary.split("\n")) + gap + details
+        summary = " ".join(summary.split("\n"))
+        cls.__doc__ = summary + gap + details if cls.__doc__ else summary
+
+    @model_validator(mode="after")
+    def _require_file_or_constant(self) -> Self:
+        """Return the section itself; raise `ValueError` unless exactly one of a constant and a file
+        with a table is given for each key that has both.
+        """
+        for key in _keys_by_name(type(self)).values():
+            if key.constant is not None:
+                require_one(self, key.constant, key.name)
+        return self
 
 
-def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
-    """Return the fields of a class that a table states, by field name, converted by the `read` of
-    their keys.
+def _keys_by_name(section: type[Section]) -> dict[str, Key]:
+    """Return the keys of the class of which a section is the table, by the name of the field."""
+    return dict(keys_of(section.of)) if is_dataclass(section.of) else {}
+
+
+def _default(kind: type, name: str, key: Key) -> Any:
+    """Return the default of a key in a file, from that of the field; ... if it must be stated."""
+    field = kind.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    if type(None) in get_args(key.form):
+        return None  # the class has the default
+    if field.default_factory is not MISSING:
+        return field.default_factory()
+    if field.default is MISSING:
+        return ...
+    return [*field.default] if get_origin(key.form) is list else field.default
+
+
+def declared_in(section: Section, where: str) -> dict[str, Any]:
+    """Return the fields of the class of a table (`Section.of`) that the table states, by field
+    name, converted by the `read` of their keys.
 
     Keys that the table does not state (None) are left out, and so are keys that name a file with a
     table (`Key.constant`).
@@ -79,9 +143,7 @@ def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
     Parameters
     ----------
     section : Section
-        Table of a problem file; it has an attribute for each key.
-    kind : type
-        Class decorated with `declaration`.
+        Table of a problem file.
     where : str
         Location of the table, for messages.
 
@@ -91,7 +153,7 @@ def declared_in(section: Section, kind: type, where: str) -> dict[str, Any]:
         For an invalid value; the message names its key.
     """
     fields: dict[str, Any] = {}
-    for name, key in keys_of(kind):
+    for name, key in _keys_by_name(type(section)).items():
         value = getattr(section, key.name)
         if value is not None and key.constant is None:
             with located(where=f"{where}.{key.name}"):

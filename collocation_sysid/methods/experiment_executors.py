@@ -204,6 +204,9 @@ class DaskExecutor:
                 return future.result(timeout=LOOK_EVERY_S)
             except distributed().TimeoutError:
                 _require_workers(self.client.nthreads())
+            except UnboundLocalError as lost:  # Dask's `sync` where the future is cancelled
+                _require_workers(self.client.nthreads())
+                raise distributed().client.CancelledError(future.key) from lost
 
     @contextmanager
     def _end_search_if_disconnected(self) -> Iterator[None]:

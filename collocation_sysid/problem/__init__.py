@@ -6,9 +6,10 @@ to a problem, `recording_reader` reads the files of one experiment (`marker_trac
 `recording_frames` the frames of logs, `code_loader` Python files, `named_files` finds those that a
 key names, `bench_files` tables of a test bench, `density_guesses` the mass), and `problem_size`
 estimates memory and time; `specimen_reader` reads tests without a mesh, and `gripper_transforms`
-the poses of bodies in grippers. `schema`, `recording_schema`, `load_schema`, `camera_section` (a
-`measurement_section`, which reads its own files), `nuisance_schema` (with `nuisance_priors`),
-`specimen_schema` and `solver_schema` define the keys, `editor_schema` describes them for editors,
+the poses of bodies in grippers. `schema`, `recording_schema`, `camera_section` (a
+`measurement_section`, which reads its own files), `nuisance_schema`, `specimen_schema` and
+`solver_schema` define the keys, those of declared classes by reference to these
+(`common.schema_tables.Section`); `editor_schema` describes the keys for editors,
 `key_descriptions` for readers, and `validation_messages` words validation errors. `new_problem`
 writes the file of a new problem.
 

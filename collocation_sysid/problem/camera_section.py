@@ -1,86 +1,45 @@
-"""Keys of [[experiment.depth]] and of the nuisance parameters of depth cameras, and how the files
-of a camera or scanner are read.
-"""
+"""Keys of [[experiment.depth]], and how the files of a camera or scanner are read."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
 from ..common.array_types import Array
-from ..common.schema_tables import Section, Unit, Vector, declared_in
+from ..common.schema_tables import Section, Unit, declared_in
 from ..common.validated_types import Finite, Positive, Text
 from ..errors import InputError, located
 from ..recording import Depth, DepthCamera, read_poses
-from ..recording.depth_camera import (
-    Background,
-    PoseMatrix,
-    points_from_image,
-    samples_with_outlines,
-)
+from ..recording.depth_camera import points_from_image, samples_with_outlines
 from ..recording.formats.depth_files import DepthFileContent, read_depth
 from ..recording.formats.units import METRES_PER_UNIT
-from ..recording.node_selection import Nodes
 from ..recording.time_tables import is_within_experiment
 from .measurement_section import MeasurementSection, RecordingFolder, require_file_name
 from .named_files import existing_file
-from .nuisance_priors import NuisancePriorSection
 
 
-class DepthCameraSection(Section):
+class DepthCameraSection(Section, of=DepthCamera):
     """A depth camera, or the frame of a scanner; keys that an .npz or a log contains may be
     omitted.
 
     Attributes
     ----------
-    matrix : list, optional
-        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; a cloud needs
-        no matrix. If a cloud has one, an offset and a scale error of the depth are estimated, and
-        surfaces that face away from the camera are not used.
-    distortion : list
-        k1, k2, p1, p2, k3 of the model of Brown and Conrady.
-    pose : list, optional
-        Transform from the frame of the camera to the world or, with `poses`, to the frame whose
-        poses these are (hand–eye transform).
     poses : str, optional
         File of poses of the rigid body that carries the camera; by default the camera is at rest.
     """
 
-    matrix: tuple[Vector, Vector, Vector] | None = None
-    distortion: list[Finite] = Field([])
-    pose: PoseMatrix | None = None
     poses: Text | None = None
 
 
-class DepthSection(MeasurementSection):
+class DepthSection(MeasurementSection, of=Depth):
     """Depth images or point clouds of the body from a camera or a scanner, without labels.
 
     Attributes
     ----------
     name : str
         Name in messages, error bars and pictures.
-    sigma_m : float
-        Standard deviation of the noise along the normal of the surface.
-    spacing_m : float
-        Approximate distance to which the points are thinned, because the noise of neighbouring
-        pixels is correlated.
-    gate_m : float
-        Distance from the surface beyond which points are assumed to belong to other objects and are
-        not used.
-    faces : Nodes, optional
-        Faces that may be visible: those whose corners are all selected. All by default.
-    background : {"auto", "empty", "unknown"}
-        Meaning of a pixel without a depth. "empty": nothing is there, so that the body cannot be
-        there. "unknown": anything may be there, as where the sensor gets no echo from dark or steep
-        surfaces. "auto": "empty" in images where hardly any pixel shows something far behind the
-        body, otherwise "unknown". A measured depth well behind the body shows in either case that
-        the body is not there.
-    outline_sigma_px : float
-        Standard deviation [pixels] of the distance between the body's outline and the edge of its
-        silhouette in an image, at points of the outline that are `spacing_m` apart. Rounding to
-        pixels alone gives 0.3.
     file : str
         Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
         a folder of these in the order of their names, with times.csv or t_s; or a topic of a log,
@@ -97,12 +56,6 @@ class DepthSection(MeasurementSection):
     """
 
     name: Annotated[str, AfterValidator(require_file_name)] = "depth"
-    sigma_m: Positive
-    spacing_m: Positive = 0.004
-    gate_m: Positive = 0.01
-    faces: Nodes | None = None
-    background: Background = "auto"
-    outline_sigma_px: Positive = 0.5
     file: Text
     camera: DepthCameraSection = Field(default_factory=lambda: DepthCameraSection.model_construct())
     t_s: list[Finite] | None = None
@@ -137,7 +90,7 @@ class DepthSection(MeasurementSection):
                 image = content.images_m[sample]
                 clouds.append(points_from_image(image, camera))
                 images.append(image if number in outlined else None)
-            arguments = {"name": self.name, **declared_in(self, Depth, where=where)}
+            arguments = {"name": self.name, **declared_in(self, where=where)}
             depth = Depth(
                 t_s=at_s[is_used], clouds=clouds, camera=camera, images_m=images, **arguments
             )
@@ -152,7 +105,7 @@ class DepthSection(MeasurementSection):
         """
         names = ("matrix", "pose", "distortion")
         arguments: dict[str, Any] = {name: getattr(content, name) for name in names}
-        arguments |= declared_in(self.camera, DepthCamera, where=where)
+        arguments |= declared_in(self.camera, where=where)
         if self.camera.poses is not None:
             file = existing_file(folder.path, self.camera.poses, key=f"{where}.poses")
             arguments["poses"] = read_poses(file)
@@ -191,79 +144,3 @@ class DepthSection(MeasurementSection):
             )
             raise InputError(message, where=f"{where}.t_s")
         return content, times
-
-
-class DepthPosePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: rotation of each depth camera about the middle of the body,
-    stated along the axes of the camera.
-
-    Attributes
-    ----------
-    prior_rad : float, optional
-        Standard deviation [rad].
-    prior_m : float, optional
-        Standard deviation [m].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior_rad: Positive | None = None
-    prior_m: Positive | None = None
-
-
-class DepthBiasPrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: offset that is added to each depth of an image.
-
-    Attributes
-    ----------
-    prior_m : float, optional
-        Standard deviation [m].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior_m: Positive | None = None
-
-
-class DepthScalePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: scale error of each depth of an image: the factor minus one.
-
-    Attributes
-    ----------
-    prior : float, optional
-        Standard deviation [1].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior: Positive | None = None
-
-
-class DepthTimePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: delay of a depth camera, limited to three standard deviations
-    of its prior.
-
-    Attributes
-    ----------
-    prior_s : float, optional
-        Standard deviation [s].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior_s: Positive | None = None
-
-
-class DepthEdgePrior(NuisancePriorSection):
-    """Prior of a nuisance parameter: distance by which silhouettes in the images of each depth
-    camera end inside the outline of the body, in pixels.
-
-    Attributes
-    ----------
-    prior_px : float, optional
-        Standard deviation [px].
-    """
-
-    has_default: ClassVar[bool] = True
-
-    prior_px: Positive | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from ..common.schema_tables import Section, declared_in
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, located
 from ..fem.body import Body
-from ..fem.laws.constants import FRICTION, GAMMA_M, GAMMA_R, Constant, constant_named
+from ..fem.laws.constants import FRICTION, Constant, constant_named, with_undamped
 from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import (
     box_of_edge,
@@ -33,12 +33,12 @@ from ..recording.specimen_checks import require_equal_units
 from ..statistics.misspecification.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader
 from .density_guesses import with_declared_densities, with_guessed_densities
-from .load_schema import LOADS
 from .named_files import existing_file
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible
 from .recording_reader import RecordingReader
+from .recording_schema import LOADS
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
 from .specimen_reader import SpecimenReader
 from .specimen_schema import SpecimenSection
@@ -87,7 +87,7 @@ def problem_arguments(
             mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
         else:
             body = cells.body_for(file.list_specimens()[0].test)
-            unknowns = cells.with_undamped(unknowns)
+            unknowns = with_undamped(unknowns, body.constants)
     with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
         sections = with_declared_densities(unknowns, body_with_friction)
@@ -204,16 +204,6 @@ class SpecimenCells:
             )
         return self._bodies[has_inner_node]
 
-    def with_undamped(
-        self, parameters: Mapping[str, ParameterSection | float]
-    ) -> Mapping[str, ParameterSection | float]:
-        """Return a copy of parameters with zero for γ_r and γ_m if they are not given, on which no
-        equilibrium depends; `body_for` must have been called before.
-        """
-        constants = next(iter(self._bodies.values())).constants.values()
-        damping = {c.name: 0.0 for c in constants if c in (GAMMA_R, GAMMA_M)}
-        return {**parameters, **{n: v for n, v in damping.items() if n not in parameters}}
-
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
     """Return the numbers of corner nodes and of elements of a box or cylinder to be generated; None
@@ -258,9 +248,9 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     names += [section.file for section in file.list_specimens()]
     for section in file.list_recordings():
         names += section.list_measurement_files()
-        for _, word, kind in LOADS:
-            keys = [key.name for _, key in keys_of(kind) if key.constant is not None]
-            names += [getattr(table, key) for table in getattr(section, word) for key in keys]
+        for table in (each for word in LOADS.values() for each in getattr(section, word)):
+            keys = [key.name for _, key in keys_of(table.of) if key.constant is not None]
+            names += [getattr(table, key) for key in keys]
     return tuple(folder / name for name in names if name is not None)
 
 
@@ -357,7 +347,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         """Return the spatially varying constant that a table states at the key `where`; None
         without a table.
         """
-        return None if section is None else Field(**declared_in(section, Field, where=where))
+        return None if section is None else Field(**declared_in(section, where=where))
 
     regions = [
         Region(

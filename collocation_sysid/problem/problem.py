@@ -13,6 +13,7 @@ from ..common.array_types import Array
 from ..common.declarations import declaration, key
 from ..errors import InputError, located
 from ..fem.body import Body
+from ..fem.laws.constants import with_undamped
 from ..fem.spatial_field import FieldModes
 from ..fem.two_phase import TwoPhaseModes
 from ..methods import METHODS, require_method
@@ -35,14 +36,19 @@ def _unconverted(parameters: Parameters | Mapping[str, Unknown | Tied | float]) 
 
 
 def _as_parameters(
-    parameters: Parameters | Mapping[str, Unknown | Tied | float], bodies: Iterable[Body]
+    parameters: Parameters | Mapping[str, Unknown | Tied | float], experiments: Iterable[Experiment]
 ) -> Parameters:
     """Return parameters as they are; a mapping by name is converted by `Parameters.from_mapping`
-    with the definitions of the constants of the bodies.
+    with the definitions of the constants of the bodies. Without a recording, γ_r and γ_m are 0 if
+    they are not stated.
     """
     if isinstance(parameters, Parameters):
         return parameters
-    definitions = {name: constant for body in bodies for name, constant in body.constants.items()}
+    definitions = {
+        name: constant for each in experiments for name, constant in each.body.constants.items()
+    }
+    if all(each.specimen is not None for each in experiments):
+        parameters = with_undamped(parameters, definitions)
     return Parameters.from_mapping(parameters, definitions=definitions)
 
 
@@ -57,7 +63,8 @@ class Problem:
         bodies may differ.
     parameters : Parameters, or mapping of name to Unknown, Tied or a fixed number
         Parameters of the bodies, estimated or fixed. What a mapping omits (bounds, scale, prior)
-        follows from the `Constant` of the body.
+        follows from the `Constant` of the body; if all experiments are specimens, γ_r and γ_m that
+        it omits are 0.
     scheme : str or Scheme, default "midpoint"
         Time discretisation.
     substeps : int or "auto"
@@ -110,7 +117,7 @@ class Problem:
         """Complete the bodies with free densities, the parameters with those of fields, and the
         notes; then validate the problem.
         """
-        vars(self)["parameters"] = _as_parameters(self.parameters, self.bodies)
+        vars(self)["parameters"] = _as_parameters(self.parameters, self.experiments)
         vars(self)["experiments"] = _with_free_densities(self.experiments, self.parameters)
         vars(self)["parameters"] = self.parameters.with_fields(self.bodies)
         cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
@@ -189,7 +196,7 @@ class Problem:
         """Standard deviations of all systematic effects by name, None for what is exact: the stated
         ones, and the defaults of bodies that were made like those of the problem.
         """
-        return self.uncertainty.collect_considered(self.bodies)
+        return self.uncertainty.collect_considered(self.bodies, self.parameters)
 
     def collect_lengths_m(self) -> dict[str, float]:
         """Return the correlation lengths of spatially varying constants [m], by name of the

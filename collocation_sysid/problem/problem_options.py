@@ -12,11 +12,13 @@ from typing import Annotated, Literal
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Text
 from ..fem.body import Body
+from ..model.parameters import Parameters
 from ..statistics.budget.shape_error import CORRELATION
 from ..statistics.budget.systematic_effects import (
     CORRELATION_KEY,
     Assumptions,
     ExactIfNone,
+    limited_poisson_deviation,
     usual_deviations,
 )
 from ..statistics.uncertainty import ErrorModel
@@ -60,11 +62,19 @@ class UncertaintyOptions(ErrorModel):
     assumptions: Annotated[Assumptions, ExactIfNone()] = field(default_factory=Assumptions)
     surface_correlation: Positive = CORRELATION
 
-    def collect_considered(self, bodies: Iterable[Body] = ()) -> dict[str, float | None]:
+    def collect_considered(
+        self, bodies: Iterable[Body] = (), parameters: Parameters | None = None
+    ) -> dict[str, float | None]:
         """Return the standard deviations of systematic effects by name (None for exact ones), with
         the defaults for `bodies`, and the surface's correlation length under `CORRELATION_KEY`.
+
+        With `parameters`, that of Poisson's ratio ends before the incompressible body, see
+        `limited_poisson_deviation`.
         """
         deviations = self.assumptions.collect_deviations(usual_deviations(bodies))
+        stated = deviations["poisson"]
+        if parameters is not None and stated is not None:
+            deviations["poisson"] = limited_poisson_deviation(stated, parameters)
         return deviations | {CORRELATION_KEY: self.surface_correlation}
 
 

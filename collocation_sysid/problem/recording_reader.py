@@ -45,7 +45,6 @@ from ..recording.time_tables import is_within_experiment, read_custom_sensor
 from ..statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader
-from .load_schema import LOADS
 from .marker_tracking import (
     gripper_markers,
     poses_from_markers,
@@ -58,6 +57,7 @@ from .nuisance_schema import nuisance_from_section
 from .problem_size import MOST_SAMPLES, Say, Size, require_feasible
 from .recording_frames import RecordingFrames
 from .recording_schema import (
+    LOADS,
     MEASUREMENT_TABLES,
     ExperimentSection,
     ForceSensorSection,
@@ -142,10 +142,10 @@ class RecordingReader:
             )
             raise InputError(message, where="grasp")
         loads: dict[str, Any] = {
-            name: [self._from_table(kind, word, k=k) for k in range(len(getattr(section, word)))]
-            for name, word, kind in LOADS
+            name: [self._from_table(word, k=k) for k in range(len(getattr(section, word)))]
+            for name, word in LOADS.items()
         }
-        declared = declared_in(section, Experiment, where="")
+        declared = declared_in(section, where="")
         declared["gravity_m_s2"] = self._frames.gravity_m_s2()
         self._add_notes(*self._frames.gravity_notes())
         experiment = Experiment(
@@ -293,7 +293,7 @@ class RecordingReader:
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasp_list)
         defaults = {"name": f"obstacle {number}"} if is_obstacle else {}
-        arguments: dict[str, Any] = defaults | declared_in(section, kind, where=self._grasp_key(k))
+        arguments: dict[str, Any] = defaults | declared_in(section, where=self._grasp_key(k))
         wrench = section.sensor and self._wrench(
             section.sensor, self._grasp_key(k, word), k=k, t_s=t_s
         )
@@ -331,7 +331,7 @@ class RecordingReader:
         are any. Stated sigmas are divided by the section's `symmetry`.
         """
         name = self.section.file_of(section)
-        arguments: dict[str, Any] = declared_in(section, Wrench, where=key)
+        arguments: dict[str, Any] = declared_in(section, where=key)
         for sigma in {"sigma_n", "sigma_nm"} & arguments.keys():
             arguments[sigma] /= section.symmetry
         with located(where=key):
@@ -360,7 +360,7 @@ class RecordingReader:
         If a simulation has no file, the values are None and the times are t_s.
         """
         key = f"reading.{k}"
-        arguments: dict[str, Any] = {"name": section.name, **declared_in(section, Gauge, where=key)}
+        arguments: dict[str, Any] = {"name": section.name, **declared_in(section, where=key)}
         _, arguments["expression"] = self.code.function(
             section.code, section.function, key=f"{key}.code"
         )
@@ -395,7 +395,7 @@ class RecordingReader:
             for key, tables in self.section.measurement_tables.items()
         }
 
-    def _from_table(self, kind: type, list_key: str, k: int) -> Any:
+    def _from_table(self, list_key: str, k: int) -> Any:
         """Return the object of a table in a list, such as a tendon or a pressure, on the body.
 
         Values over time are read from the files that the table names. An object without a name is
@@ -404,13 +404,13 @@ class RecordingReader:
         table = getattr(self.section, list_key)[k]
         where = f"{list_key}.{k}"
         defaults = {"name": f"{list_key}_{k + 1}"} if "name" in type(table).model_fields else {}
-        arguments = defaults | declared_in(table, kind, where=where)
-        for name, key in keys_of(kind):
+        arguments = defaults | declared_in(table, where=where)
+        for name, key in keys_of(table.of):
             if key.constant and key.read and (file_name := getattr(table, key.name)):
                 file = existing_file(self.folder, file_name, key=f"{where}.{key.name}")
                 arguments[name], arguments[key.constant] = key.read(file)
         with located(where=f"{where}.nodes" if "nodes" in arguments else where):
-            return kind(**arguments).on_body(self.body)
+            return table.of(**arguments).on_body(self.body)
 
     # Markers --------------------------------------------------------------------------------------
 
@@ -617,7 +617,7 @@ class RecordingReader:
                 f"found no value for the marker {missing_name!r}; expected one for every marker"
             )
             raise InputError(message, where="markers.sigma_m")
-        arguments: dict[str, Any] = declared_in(section, Markers, where="markers")
+        arguments: dict[str, Any] = declared_in(section, where="markers")
         return Markers(
             t_s,
             table.positions_m,

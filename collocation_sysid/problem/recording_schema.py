@@ -1,5 +1,6 @@
 """Keys of [[experiment]]: grasps, obstacles, loads, measurements and nuisance parameters."""
 
+# ruff: noqa: D101 (the table of a class has the summary of that class)
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -9,30 +10,43 @@ from pydantic import AfterValidator, Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
-from ..common.schema_tables import ByForm, Section, Unit, Vector, used_keys
-from ..common.validated_types import (
-    AtLeastOne,
-    Boundless,
-    Finite,
-    Flag,
-    NotNegative,
-    Positive,
-    Text,
+from ..common.schema_tables import ByForm, Declared, Section, Unit, Vector, used_keys
+from ..common.validated_types import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
+from ..recording import (
+    Experiment,
+    Force,
+    Gauge,
+    Grasp,
+    Markers,
+    Obstacle,
+    PointMass,
+    Pressure,
+    Tendon,
+    Wrench,
 )
-from ..recording.experiment import EARTH_M_S2, Kind, StartRule
-from ..recording.grasp import Axes
 from ..recording.markers import Places
-from ..recording.node_selection import Nodes
-from ..recording.placement import AttachmentRule
-from ..recording.poses import Frame
-from ..recording.solid_sections import SolidSection
 from .camera_section import DepthSection
-from .load_schema import ForceSection, PointMassSection, PressureSection, TendonSection
 from .measurement_section import MeasurementSection, NamedSection
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
 # Fields of `Experiment` by the key of the tables that read themselves.
 MEASUREMENT_TABLES = {"depth": "depths"}
+
+
+# Fields of `Experiment` and the keys of the tables that state their entries.
+LOADS = {"masses": "mass", "forces": "force", "tendons": "tendon", "pressures": "pressure"}
+
+
+class PointMassSection(Section, of=PointMass): ...
+
+
+class ForceSection(Section, of=Force): ...
+
+
+class TendonSection(Section, of=Tendon): ...
+
+
+class PressureSection(Section, of=Pressure): ...
 
 
 class TransformSection(Section):
@@ -118,7 +132,7 @@ class DisplacementSection(TableSection):
         return self
 
 
-class ForceSensorSection(TableSection):
+class ForceSensorSection(TableSection, of=Wrench):
     """The measured force and torque that the grasp or the obstacle exerts on the body.
 
     The table has the column t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other
@@ -128,16 +142,6 @@ class ForceSensorSection(TableSection):
 
     Attributes
     ----------
-    sigma_n : float
-        Standard deviation of the noise of each force [N].
-    sigma_nm : float, optional
-        Standard deviation of the noise of each torque [N m]; needed if torques are measured.
-    frame : {"world", "grasp"}
-        Axes of the components. "world": those of the world frame of the poses. "grasp": those of
-        the undeformed body, which move with the grasp.
-    point_m : list
-        Point [x, y, z] about which the torque is measured; it is fixed in the frame "world", and in
-        the frame "grasp" it is stated on the undeformed body and moves with the grasp.
     sensor_frame : str, optional
         Frame of the log in which the sensor measures, instead of frame and point_m. The static
         transforms of the log rotate the components to the axes of the body or of the world, and
@@ -151,10 +155,8 @@ class ForceSensorSection(TableSection):
         results are reported for the complete specimen.
     """
 
-    sigma_n: Positive
-    sigma_nm: Positive | None = None
-    frame: Frame = "world"
-    point_m: Vector = (0.0, 0.0, 0.0)
+    frame: Declared
+    point_m: Declared
     sensor_frame: Text | None = None
     symmetry: AtLeastOne = 1
     area_m2: Positive | None = None
@@ -264,37 +266,15 @@ class MovedSection(Section):
         return self
 
 
-class GraspSection(MovedSection):
+class GraspSection(MovedSection, of=Grasp):
     """Nodes held by a gripper or a test bench, and how it moves.
 
     Attributes
     ----------
-    nodes : Nodes
-        Selection: a table of box_m, ball_m, face or indices, or the name of a point array or
-        physical group.
-    from_s : float, optional
-        First time [s] at which the grasp or obstacle acts; the start of the recording by default.
-    until_s : float, optional
-        Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
-        grasp ends at the first sample, the body is released from its equilibrium in this grasp.
-    sigma_m : float, optional
-        Standard deviation of the noise in each position of the poses [m]; by default it is
-        estimated from the roughness of the poses.
-    sigma_rad : float, optional
-        Standard deviation of the noise in each rotation, about each axis [rad]; by default it is
-        estimated from the roughness of the poses.
-    axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
-        Axes of the world along which the nodes are held; along the other axes they slide freely.
     wrench : ForceSensorSection, optional
         Measured force and torque on the body: file, sigma_n, sigma_nm, …
     """
 
-    nodes: Nodes
-    from_s: Finite | None = None
-    until_s: Finite | None = None
-    sigma_m: NotNegative | None = None
-    sigma_rad: NotNegative | None = None
-    axes: Axes = "xyz"
     wrench: ForceSensorSection | None = None
 
     @property
@@ -303,59 +283,20 @@ class GraspSection(MovedSection):
         return self.wrench
 
 
-class ObstacleSection(MovedSection):
+class ObstacleSection(MovedSection, of=Obstacle):
     """A rigid solid that the body may touch, and how it moves.
 
     Attributes
     ----------
-    from_s : float, optional
-        First time [s] at which the grasp or obstacle acts; the start of the recording by default.
-    until_s : float, optional
-        Last time [s] at which the grasp or obstacle acts; the end of the recording by default. If a
-        grasp ends at the first sample, the body is released from its equilibrium in this grasp.
-    sigma_m : float, optional
-        Standard deviation of the noise in each position of the poses [m]; by default it is
-        estimated from the roughness of the poses.
-    sigma_rad : float, optional
-        Standard deviation of the noise in each rotation, about each axis [rad]; by default it is
-        estimated from the roughness of the poses.
-    axes : {"x", "y", "z", "xy", "xz", "yz", "xyz"}
-        Axes of the world along which the nodes are held; along the other axes they slide freely.
-    shape : SolidSection
-        Plane, Sphere, Cylinder, Capsule or Cuboid.
-    name : str, optional
-        Name in messages and pictures.
-    friction : float or str
-        Coefficient of friction; or the name of a parameter, whose bounds are 0 and 2.
-    faces : Nodes, optional
-        Faces of the body that may touch the obstacle: those whose corners are all selected. All by
-        default.
-    stiffness_pa_m : float, optional
-        Contact stiffness κ [Pa/m] in the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; by default
-        100 times Young's modulus at the current parameters over the mean edge of the face at each
-        point.
-    width_m : float, optional
-        Gap δ at which the pressure begins [m]; by default the mean edge of the face over 5000, or
-        over 500 with friction.
-    slip : float, optional
-        Sliding speed [m/s] at which friction is 0.7 of its limit; in a static experiment, sliding
-        distance from sample to sample [m].
     force : ForceSensorSection, optional
         Measured force on the body: file, sigma_n, …
     """
 
-    from_s: Finite | None = None
-    until_s: Finite | None = None
-    sigma_m: NotNegative | None = None
-    sigma_rad: NotNegative | None = None
-    axes: Axes = "xyz"
-    shape: SolidSection
-    name: Text | None = None
-    friction: NotNegative | Text = 0.0
-    faces: Nodes | None = None
-    stiffness_pa_m: Positive | None = None
-    width_m: Positive | None = None
-    slip: Positive | None = None
+    friction: Declared
+    faces: Declared
+    stiffness_pa_m: Declared
+    width_m: Declared
+    slip: Declared
     force: ForceSensorSection | None = None
 
     @property
@@ -369,7 +310,7 @@ Sigma = Annotated[dict[str, Positive] | Positive, ByForm(dict)]
 ReferenceSigma = Annotated[dict[str, NotNegative] | NotNegative, ByForm(dict)]
 
 
-class MarkersSection(Section):
+class MarkersSection(Section, of=Markers):
     """Tracked points.
 
     Attributes
@@ -377,12 +318,6 @@ class MarkersSection(Section):
     places : {"free", "surface"}
         Where the estimated positions of markers may be: anywhere in the undeformed body ("free"),
         or on its surface ("surface").
-    attach : {"auto", "vertex", "embedded"}
-        Nodes that carry a marker. "vertex": the nearest node. "embedded": the nodes of the
-        tetrahedron that contains the marker or is nearest to it. "auto": the nearest node if it
-        lies within 5 % of the mean edge length, otherwise "embedded".
-    max_distance_m : float, optional
-        Largest distance of a marker from the body; the mean edge length by default.
     file : str, optional
         Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; not needed for `simulate`.
     sigma_m : Sigma
@@ -414,8 +349,8 @@ class MarkersSection(Section):
     """
 
     places: Places = "free"
-    attach: AttachmentRule = "auto"
-    max_distance_m: Positive | None = None
+    attach: Declared
+    max_distance_m: Declared
     file: Text | None = None
     sigma_m: Sigma = 0.001
     names: list[str] | None = None
@@ -452,32 +387,16 @@ class MarkersSection(Section):
 Grasps = Annotated[list[GraspSection] | GraspSection, ByForm(list)]
 
 
-class ReadingSection(NamedSection):
+class ReadingSection(NamedSection, of=Gauge):
     """A custom sensor: a Python function of positions or forces and of its own unknowns.
 
     Attributes
     ----------
     name : str
         Name of the sensor in results, and of the file that `simulate` writes.
-    sigma : float
-        Standard deviation of the noise of each measured number, in the unit of that number.
-    points_m : list
-        Points [x, y, z] on the undeformed body whose motion the sensor measures.
-    unknowns : mapping of name to float
-        Prior standard deviation of each unknown of the sensor, by the name of the argument of the
-        function; no unknowns by default. The prior mean is zero: write an unknown factor as ``1 +
-        gain``. In a simulation all unknowns are zero.
     grasp : int, optional
         Instead of points: the number of the grasp, from 1, whose force and torque the sensor
         measures.
-    frame : {"world", "grasp"}
-        Axes and origin of force and torque. "grasp": those of the undeformed body, which move with
-        the grasp. "world": those of the world frame of the poses.
-    columns : list of str
-        Columns of the file with the measured numbers, in the order in which the function returns
-        them; by default all except t_s.
-    unit : str
-        Unit of the numbers, for the terminal, reports and figures.
     code : str
         Python file; it is executed, for which commands need the option --allow-code.
     function : str
@@ -487,42 +406,26 @@ class ReadingSection(NamedSection):
         for `simulate`.
     """
 
-    sigma: Positive
-    points_m: list[Vector] = Field([])
-    unknowns: dict[str, Positive] = Field({})
-    grasp: AtLeastOne | None = None
-    frame: Frame = "grasp"
-    columns: list[Text] = Field([])
-    unit: str = ""
+    grasp: Declared
+    frame: Declared
+    columns: Declared
+    unit: Declared
     code: Text
     function: Text
     file: Text | None = None
 
 
-class ExperimentSection(NamedSection):
+class ExperimentSection(NamedSection, of=Experiment):
     """One recording.
 
     Attributes
     ----------
-    gravity_m_s2 : list
-        Acceleration of gravity [x, y, z].
     gravity_frame : str, optional
         Frame of the log in whose axes gravity_m_s2 is stated, such as "base_link"; it must be fixed
         in the frame of the poses by static transforms. The frame of the poses by default.
-    kind : {"dynamic", "static"}
-        "dynamic": a motion. "static": each sample is an equilibrium, and a material with memory
-        relaxes between the samples.
     start : {"equilibrium", "undeformed"}
         State of the body at the first time. "equilibrium": at rest under its loads. "undeformed":
         undeformed and at rest.
-    start_rule : {"standard", "paper"}
-        Inertia in the first time step. "standard": from the initial velocity. "paper": zero
-        acceleration.
-    loaded_since_s : float, optional
-        How long a body with memory has been in the shape of its initial equilibrium [s]; by default
-        the material is completely relaxed.
-    validation : bool
-        Whether the recording is only predicted, not fitted.
     mass : list of PointMassSection
         [[experiment.mass]] tables: point masses tied to the body.
     force : list of ForceSection
@@ -557,13 +460,13 @@ class ExperimentSection(NamedSection):
         no nuisance parameters.
     """
 
-    gravity_m_s2: Vector = EARTH_M_S2
+    gravity_m_s2: Declared
     gravity_frame: Text | None = None
-    kind: Kind = "dynamic"
+    kind: Declared
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
-    start_rule: StartRule = "standard"
-    loaded_since_s: NotNegative | None = None
-    validation: Flag = False
+    start_rule: Declared
+    loaded_since_s: Declared
+    validation: Declared
     mass: list[PointMassSection] = Field([])
     force: list[ForceSection] = Field([])
     tendon: list[TendonSection] = Field([])

@@ -1,5 +1,6 @@
 """Keys of the problem file: SI units, with the unit in the key; unknown keys are errors."""
 
+# ruff: noqa: D101 (the table of a class has the summary of that class)
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -7,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from ..common.schema_tables import Among, ByForm, Section, Unit, Vector, require_one, used_keys
-from ..common.validated_types import AtLeastOne, Count, Finite, Flag, NotNegative, Positive, Text
+from ..common.validated_types import Count, Finite, Flag, NotNegative, Positive, Text
 from ..errors import InputError
 from ..fem.body import Made, MeshOrigin
 from ..fem.elements import ELEMENTS
 from ..fem.laws.constants import Scale
 from ..fem.laws.materials import DAMPINGS, MATERIALS
-from ..fem.spatial_field import ALL_MODULI, SMOOTH, Lengths, Prior
+from ..fem.spatial_field import Field as SpatialField
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.environment import usual_air_density
 from ..recording.node_selection import Nodes
@@ -66,35 +67,7 @@ class NodeForceSection(CodeSection):
     carries: Count = 0
 
 
-class FieldSection(Section):
-    """Stiffness, density or another constant that varies in space within a material.
-
-    Attributes
-    ----------
-    length_m : float or list
-        Correlation length: two points at this distance have the correlation 1/e. If several lengths
-        are given, the most likely one is used.
-    parameter : str
-        Constant that varies: one of the material or of its damping law, young_pa for all moduli of
-        a material together, or density_kg_m3.
-    modes : int
-        Number of shapes of the field. Each shape adds one right-hand side to the linear system of
-        every time step.
-    amplitude : float, optional
-        Prior standard deviation of the logarithm of the constant, 0.5 by default; for a density,
-        prior standard deviation of its ratio to the stated density, 0.3 by default. With prior =
-        "two-phase", the prior standard deviation of the logarithm of the contrast, 1 by default.
-    prior : {"smooth", "two-phase"}
-        "smooth": the logarithm of the constant is a smooth normal field. "two-phase": the constant
-        has two values with a boundary between them; the parameter contrast is the ratio of the
-        value in inclusions to that in the surroundings.
-    """
-
-    length_m: Lengths
-    parameter: Text = ALL_MODULI
-    modes: AtLeastOne = 40
-    amplitude: Positive | None = None
-    prior: Prior = SMOOTH
+class FieldSection(Section, of=SpatialField): ...
 
 
 Material = Annotated[MaterialName | CodeSection, ByForm(str)]

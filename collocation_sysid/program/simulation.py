@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..errors import InputError, SimulationError
+from ..fem.laws.constants import with_undamped
 from ..model.dynamics import Dynamics
 from ..model.nuisance_map import NuisanceMap
 from ..model.parameters import Parameters, resolve_theta
@@ -29,6 +30,7 @@ from .forward.loss_of_stability import explain_failure
 from .forward.newmark import simulate_newmark
 from .forward.newton_solver import NewtonOptions
 from .forward.scheme_simulation import Progress, simulate_scheme
+from .forward.stable_path import BranchChange, find_branch_change
 from .observables import ObservedMotion, ReactionForces
 from .reactions.reaction_forces import reactions_at
 from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
@@ -84,6 +86,9 @@ class Trajectory:
         Largest error of node positions at the samples due to the time step [m], estimated by
         halving the step; None where the step was stated, the experiment is static, or only the
         finest steps could be simulated.
+    branch_change : BranchChange or None
+        First sample of a static experiment that is not on the path of stable equilibria to which
+        its loads lead, see `program.find_branch_change`; None if there is none.
     """
 
     t_s: Array
@@ -95,6 +100,7 @@ class Trajectory:
     custom_sensor_values: tuple[Array, ...] = ()
     steps_per_sample: int = 1
     step_error_m: float | None = None
+    branch_change: BranchChange | None = None
 
 
 def require_steps(experiment: Experiment, step_s: float) -> None:
@@ -156,7 +162,10 @@ def simulate(
         When a step fails even after halvings; names time and element, and where an equilibrium
         ceased to be stable the mode, see `program.find_stability_loss`.
     """
-    theta = resolve_theta(experiment.body, parameters)
+    body = experiment.body
+    if experiment.specimen is not None and isinstance(parameters, Mapping):
+        parameters = with_undamped(parameters, body.constants)
+    theta = resolve_theta(body, parameters)
     steps = _steps_per_sample(experiment, integrator, timestep_s=timestep_s, substeps=substeps)
     if (massless := experiment.body.mass_problem(theta)) is not None:
         raise InputError(massless)
@@ -288,6 +297,7 @@ def _with_steps(
     Velocities of a collocation scheme are central differences of its positions.
     """
     sensed = sensed_dofs(experiment)
+    change = None
     if integrator == NEWMARK and not experiment.is_static:
         motion = simulate_newmark(
             experiment,
@@ -308,6 +318,7 @@ def _with_steps(
         )
         grid = simulate_scheme(experiment, dynamics, options=options, progress=progress)
         x = grid[::steps]
+        change = find_branch_change(experiment, dynamics, grid)
         zeros = np.zeros_like(grid)
         v = zeros if experiment.is_static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
         at = ReactionGrid.from_dynamics(dynamics)
@@ -331,6 +342,7 @@ def _with_steps(
             experiment, positions, reactions=(at, forced), ideal=ideal
         ),
         steps_per_sample=steps,
+        branch_change=change,
     )
 
 

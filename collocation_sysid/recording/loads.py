@@ -188,7 +188,13 @@ class PointMass(Load):
         return mass
 
 
-_TABLE = Key("file", Text | None, read=read_forces, constant="force_n")
+_TABLE = Key(
+    "file",
+    Text | None,
+    read=read_forces,
+    constant="force_n",
+    description="CSV with the columns t_s, fx_n, fy_n, fz_n.",
+)
 
 
 @declaration

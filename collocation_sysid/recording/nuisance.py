@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.field_descriptions import sentence, with_attributes
 from ..errors import InputError, listed
 
 DEGREE = float(np.pi / 180)
@@ -794,6 +795,7 @@ GAUGE = NuisanceRow("reading", "", sigma=None, of="gauge", changes=())
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_attributes({row.name: ("float or None", sentence(row.description)) for row in KINDS})
 class Nuisance:
     """Standard deviations of an experiment's nuisance parameters; None: not estimated.
 
@@ -802,84 +804,6 @@ class Nuisance:
 
     Attributes
     ----------
-    marker_offset_m : float or None
-        Errors of the positions in reference_m without a reference_sigma_m; they rotate with the
-        body.
-    camera_offset_m : float or None
-        A constant offset of each marker in the cameras' frame.
-    calibration_scale : float or None
-        Scale error of all lengths that the cameras measure: the factor minus one.
-    calibration_distortion_1_m2 : float or None
-        Coefficient k of a radial distortion by the cameras: distances r from the middle of the body
-        are multiplied by 1 + k r².
-    time_shift_s : float or None
-        How much later than stated the markers were measured, by the clock of the grasps.
-    clock_rate : float or None
-        How much slower the clock of the markers runs than the clock of the grasps.
-    pose_turn_rad : float or None
-        A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
-        body's frame.
-    pose_shift_m : float or None
-        A constant translation of grasps and body in the cameras' frame.
-    gravity_rad : float or None
-        A tilt of the direction of gravity.
-    hand_eye_rad : float or None
-        A constant rotation of the body in its grasps.
-    hand_eye_m : float or None
-        A constant translation of the body in its grasps; rotation and translation are estimated if
-        the start is an equilibrium and there are markers.
-    strain_zero : float or None
-        A constant offset of the strains of a specimen.
-    displacement_zero_m : float or None
-        A constant offset of each prescribed displacement along each of its axes.
-    obstacle_offset_m : float or None
-        A constant offset of each obstacle along its normal, or along the axis of its displacement;
-        it changes the time at which the obstacle touches the body.
-    obstacle_tilt_rad : float or None
-        A constant tilt of each obstacle that is a plane or a box, about the point of the plane or
-        the middle of the box.
-    obstacle_time_s : float or None
-        Delay of each obstacle's motion, to first order.
-    tension_factor : float or None
-        Scale error of the tension of each tendon: the factor minus one.
-    tension_lost_n : float or None
-        Tension of each tendon that is lost by friction.
-    pressure_factor : float or None
-        Scale error of each pressure: the factor minus one.
-    pressure_lost_pa : float or None
-        Amount by which each pressure is lower than stated.
-    pressure_lag : float or None
-        Logarithm of the ratio of the true lag of each pressure to the stated lag_s.
-    joining_s : float or None
-        Delay of the time at which each point mass or force begins or ends, if this time is within
-        the recording.
-    tare : float or None
-        A constant offset of each component of a force sensor, in multiples of its sigma.
-    sensor_time_s : float or None
-        Delay of the force sensors, limited to three standard deviations of its prior.
-    sensor_lag_s : float or None
-        Time constant of a first-order low-pass in the sensor, limited to values between zero and
-        three standard deviations of its prior.
-    tool_kg : float or None
-        Mass of the tool between a sensor and the body.
-    tool_m : float or None
-        Centre of the tool relative to the point of the sensor; in the frame of the world, relative
-        to the centre of the grasped nodes.
-    depth_turn_rad : float or None
-        Rotation of each depth camera about the middle of the body, stated along the axes of the
-        camera.
-    depth_shift_m : float or None
-        Translation of each depth camera; if neither prior is stated, the search begins by aligning
-        the first image with the body.
-    depth_bias_m : float or None
-        Offset that is added to each depth of an image.
-    depth_scale : float or None
-        Scale error of each depth of an image: the factor minus one.
-    depth_time_s : float or None
-        Delay of a depth camera, limited to three standard deviations of its prior.
-    depth_edge_px : float or None
-        Distance by which silhouettes in the images of each depth camera end inside the outline of
-        the body, in pixels.
     scope : mapping of name to str
         "shared", or "shared" and a word, for parameters with the same value in all recordings that
         have the word, by field; other parameters have a value of each recording.

@@ -43,7 +43,13 @@ def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
     return faces
 
 
-_TABLE = Key("pressure", Text | None, read=read_pressure, constant="pressure_pa")
+_TABLE = Key(
+    "pressure",
+    Text | None,
+    read=read_pressure,
+    constant="pressure_pa",
+    description="CSV with the columns t_s and pressure_pa, which covers the complete recording.",
+)
 
 
 @declaration

@@ -1,86 +1,27 @@
 """Tables of a problem file that state the rigid solid of an obstacle."""
 
+# ruff: noqa: D101 (the table of a class has the summary of that class)
 from __future__ import annotations
 
 from pydantic import model_validator
 
-from ..common.schema_tables import Section, Vector, declared_in, require_one
-from ..common.validated_types import NotNegative, Positive
-from .obstacle_solids import KINDS, Solid
+from ..common.schema_tables import Section, declared_in, require_one
+from .obstacle_solids import Capsule, Cuboid, Cylinder, Plane, Solid, Sphere
 
 
-class PlaneSection(Section):
-    """The half-space behind a plane.
-
-    Attributes
-    ----------
-    normal : list
-        Direction out of the solid.
-    point_m : list
-        A point on the plane.
-    """
-
-    normal: Vector = (0.0, 0.0, 1.0)
-    point_m: Vector = (0.0, 0.0, 0.0)
+class PlaneSection(Section, of=Plane): ...
 
 
-class SphereSection(Section):
-    """A ball, such as the tip of a probe.
-
-    Attributes
-    ----------
-    radius_m : float
-    centre_m : list
-    """
-
-    radius_m: Positive
-    centre_m: Vector = (0.0, 0.0, 0.0)
+class SphereSection(Section, of=Sphere): ...
 
 
-class SolidCylinderSection(Section):
-    """A cylinder with flat ends, whose edges may be rounded.
-
-    Attributes
-    ----------
-    radius_m : float
-    ends_m : list
-        Centres of both ends.
-    rounding_m : float
-        Radius of the rounded edges [m]; zero for sharp edges.
-    """
-
-    radius_m: Positive
-    ends_m: tuple[Vector, Vector]
-    rounding_m: NotNegative = 0.0
+class SolidCylinderSection(Section, of=Cylinder): ...
 
 
-class CapsuleSection(Section):
-    """A cylinder with a half-ball at each end, such as a finger.
-
-    Attributes
-    ----------
-    radius_m : float
-    ends_m : list
-        Centres of the balls.
-    """
-
-    radius_m: Positive
-    ends_m: tuple[Vector, Vector]
+class CapsuleSection(Section, of=Capsule): ...
 
 
-class CuboidSection(Section):
-    """A box along the axes of its frame, whose edges may be rounded.
-
-    Attributes
-    ----------
-    corners_m : list
-        Lowest and highest corner.
-    rounding_m : float
-        Radius of the rounded edges [m]; zero for sharp edges.
-    """
-
-    corners_m: tuple[Vector, Vector]
-    rounding_m: NotNegative = 0.0
+class CuboidSection(Section, of=Cuboid): ...
 
 
 class SolidSection(Section):
@@ -116,8 +57,6 @@ class SolidSection(Section):
 
 
 def solid_from_section(section: SolidSection) -> Solid:
-    """Return the solid that a `SolidSection` states by its only key; errors of the solid name that
-    key.
-    """
+    """Return the solid that a table states by its only key; errors of the solid name that key."""
     ((name, own),) = ((name, own) for name, own in section if own is not None)
-    return KINDS[name](**declared_in(own, KINDS[name], where=name))
+    return own.of(**declared_in(own, where=name))

@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 FARTHEST_POINT_EDGES = 1.0
 
 
-_TABLE = Key("tension", Text | None, read=read_tension, constant="tension_n")
+_TABLE = Key(
+    "tension",
+    Text | None,
+    read=read_tension,
+    constant="tension_n",
+    description="CSV with the columns t_s and tension_n, which covers the complete recording.",
+)
 
 
 @declaration

@@ -33,6 +33,8 @@ CAPTIONS = {
     "success": "Success rate over the error of the worst initial guess.",
     "basins": "Initial guesses: pairs of guesses relative to the true values, or to the best "
     "estimate.",
+    "models": "Prediction error of each model with its standard error, and estimates with their "
+    "combined 95 % intervals; red: the chosen model.",
     "tip": "Motion of the tip: measured, and simulated with the best estimate of each method.",
     "sweep": "Estimates with their 95 % intervals over the values of the swept key; crosses: not "
     "converged.",

@@ -40,6 +40,7 @@ from ..program.simulation import NEWMARK, Trajectory, simulate
 from ..recording import Experiment, write_gauge_csv, write_markers_csv, write_poses_csv
 from ..recording.recording_writers import write_columns_csv
 from ..recording.specimen_files import SpecimenLayout, specimen_columns
+from ..statistics.concerns import message_of
 from .run_writers import (
     FRAMES_FILE,
     replaced_folder,
@@ -115,6 +116,7 @@ def write_data(
     folder: str | Path,
     recipe: Recipe | None = None,
     progress: Callable[[float], None] | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Simulate every experiment at the parameters' guesses and write tables of its measurements,
     with noise, and of its poses.
@@ -140,6 +142,8 @@ def write_data(
         Integrator, noise and seed; without noise by default.
     progress : callable, optional
         Called with the completed share of all simulations, ascending from 0 to 1.
+    report : callable, optional
+        Called with a sentence for each experiment whose equilibria leave their stable path.
 
     Returns
     -------
@@ -183,6 +187,15 @@ def write_data(
     ]
     if progress is not None:
         progress(1.0)
+    for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
+        change = trajectory.branch_change
+        if report is not None and change is not None:
+            data = {
+                "experiment": experiment.name,
+                "time_s": change.time_s,
+                "why": change.describe(),
+            }
+            report(message_of("stability/branch", data))
     written: list[Path] = []
     drafts_of: dict[Path, Path] = {}
     with ExitStack() as stack:  # all files appear at its end, or none

@@ -18,7 +18,7 @@ from ..fem.laws.moduli import ELASTIC
 from ..methods.solution import Solution
 from ..problem import Problem
 from ..statistics.budget.discretisation_error import Refinement, with_estimated_mesh
-from ..statistics.budget.mesh_error import mesh_change
+from ..statistics.budget.mesh_error import LARGEST_NODE_COUNT, mesh_change
 from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
@@ -31,9 +31,6 @@ MESH = "mesh"
 MESH_ERROR = "mesh/error"
 # Relative change of an elastic constant on a finer mesh that is too large for an estimate.
 LARGEST_CHANGE = 0.5
-# Largest number of nodes of a body whose error of the mesh is estimated in every solve: with more,
-# the search starts on a coarser mesh, and a note compares both meshes.
-LARGEST_NODE_COUNT = 1500
 # Largest change of a logarithm: a larger one is no estimate.
 LARGEST_STEP = 2.0
 # Lowest order of convergence of the elements.

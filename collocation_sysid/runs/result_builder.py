@@ -74,7 +74,7 @@ def build_result(answer: SolvedProblem) -> Result:
             for item in answer.solution.collocation.parameters.components
         },
         derived={name: values[name] for name in answer.derived},
-        basis=tuple(_reference_sentences(problem)),
+        basis=tuple(_reference_sentences(answer)),
         budget={name: line.shares for name, line in answer.budget.items()},
         alternatives=answer.alternatives,
         origin_answers=answer.origin_answers,
@@ -139,10 +139,12 @@ def _scale(problem: Problem) -> ScaleReference | None:
     )
 
 
-def _reference_sentences(problem: Problem) -> Iterator[str]:
-    """Yield up to two sentences on what the values refer to: the damping law of γ_r if a body that
-    moves has it, and how moduli are scaled if no force is measured.
+def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
+    """Yield up to three sentences on what the values refer to: the damping law of γ_r if a body that
+    moves has it, the axis along which E is measured, and how moduli are scaled if no force is
+    measured.
     """
+    problem = answer.problem
     parts = [part for each in problem.experiments if not each.is_static for part in each.body.parts]
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
     law_names = [
@@ -150,6 +152,8 @@ def _reference_sentences(problem: Problem) -> Iterator[str]:
     ]
     if law_names:
         yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
+    if sentence := answer.modulus_axis_sentence():
+        yield sentence
     if (scale := _scale(problem)) is not None:
         yield scale.sentence
 

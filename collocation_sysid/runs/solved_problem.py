@@ -20,6 +20,7 @@ from ..statistics.budget.alternatives import (
     Alternative,
     OriginAnswer,
     find_alternatives,
+    modulus_axis_sentence,
     origin_answers,
 )
 from ..statistics.budget.combined_intervals import combine
@@ -74,7 +75,7 @@ class SolvedProblem:
     systematic_effects : VarianceSources or None
         Systematic effects on the estimates; None without error bars.
     probes : tuple of Probe
-        Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
+        Refits with an assumption relaxed: those of every solve, see `routine_probes`; or all, and
         of parts of the data, where these were requested. Empty without error bars.
     elapsed_s : Elapsed
         Durations of search and checks.
@@ -208,6 +209,15 @@ class SolvedProblem:
                 stated=self.problem.uncertainty.assumptions,
             )
         )
+
+    def modulus_axis_sentence(self) -> str:
+        """Return a sentence on the axis along which E is measured, see `modulus_axis_sentence`; ""
+        without systematic effects, or if there is no such axis.
+        """
+        if self.systematic_effects is None:
+            return ""
+        anisotropy = self.problem.assumed_deviations["anisotropy"]
+        return modulus_axis_sentence(self.systematic_effects, self.estimates, anisotropy)
 
     def collect_discretisation_errors(self) -> Mapping[str, DiscretisationError]:
         """Return the known discretisation errors, by name of the estimate; empty without

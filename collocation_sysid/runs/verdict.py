@@ -41,7 +41,7 @@ from ..statistics.misspecification.plausibility import (
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.specimen_concerns import as_specimen_concerns
-from ..statistics.stability_concerns import strain_stability_concerns
+from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
 from .check.modes_check import ModesCheck, check_modes
 from .forward_simulation import ForwardSimulation
@@ -119,6 +119,7 @@ def solution_concerns(
             yield from clock_concerns(name, float(part.phi[k]) * scale, prior_s=scale)
     yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
     yield from strain_stability_concerns(solution.parts)
+    yield from branch_concerns(solution.parts)
     for feature in FEATURES:
         yield from feature.concerns(solution.parts)
     if not solution.collocation.nq:

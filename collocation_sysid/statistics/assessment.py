@@ -30,7 +30,7 @@ from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name, is_liquid
 from .instrument_misfit import InstrumentMisfit
 from .misspecification.misspecification_hypothesis import Hypothesis
-from .probes.relaxed_assumptions import DRIFT, MEMORY, Probe, assumption_name
+from .probes.relaxed_assumptions import ANISOTROPY, DRIFT, MEMORY, Probe, assumption_name
 from .probes.routine_probes import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import PERSISTENT
 from .residuals.noise_level import NoiseLevel
@@ -98,11 +98,22 @@ LAWS_ADVICE = (
     "; a wrong damping or material law has similar effects: compare the laws first, with "
     "compare-models --damping and --materials"
 )
+# The same without motion, where damping has no effect.
+STILL_ADVICE = (
+    "; memory or another material law has similar effects: compare them first, with "
+    "compare-models --prony 0,1 and --materials"
+)
 # The same for a branch of memory.
 MEMORY_ADVICE = (
     "; these estimates are of first order in the share, for a given relaxation time. The moduli "
     "without memory are too large for slow loads: add a branch to the material ([[object.prony]], "
     "in Python Body(prony=...)), and estimate it"
+)
+# The same for a stiffness that is higher along one axis.
+ANISOTROPY_ADVICE = (
+    "; the modulus along this axis of the mesh is that of the estimates without this assumption "
+    "times one plus the anisotropy. A wrong material law, or a mesh of another width, has similar "
+    "effects"
 )
 # Codes of the concern about an estimated, and about a measured discretisation error.
 NUMERICAL = "scheme/step", "mesh/refined"
@@ -351,6 +362,7 @@ def numerical_concerns(
 RELAXED = {
     DRIFT: "the stiffness is constant during a recording",
     MEMORY: "the material has no viscoelastic memory",
+    ANISOTROPY: "the material is equally stiff along all axes",
     "clock_rate": "the clocks of cameras and robot run at the same rate",
     "time_scale": "all clocks run at the right rate",
 }
@@ -392,20 +404,19 @@ def probe_concerns(
         "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
         "instead": (f"; alternatives that decrease χ² less: {instead}" if others else "")
         + (_hysteresis_text(experiments) if worst.name == DRIFT else "")
-        + _advice(worst),
+        + _advice(worst, is_still={each.kind for each in experiments} == {"static"}),
     }
     return [Concern("assumption/contradicted", data=data)]
 
 
-def _advice(probe: Probe) -> str:
+def _advice(probe: Probe, is_still: bool) -> str:
     """Return the addition to a message on a relaxed assumption that names what resembles it, or how
     to estimate it; "" for an assumption that is not probed in every solve.
     """
     if not is_routine_assumption(probe.name):
         return ""
-    if assumption_name(probe.name) != MEMORY:
-        return LAWS_ADVICE
-    return MEMORY_ADVICE
+    advice = {MEMORY: MEMORY_ADVICE, ANISOTROPY: ANISOTROPY_ADVICE}
+    return advice.get(assumption_name(probe.name), STILL_ADVICE if is_still else LAWS_ADVICE)
 
 
 def _hysteresis_text(experiments: Iterable[Experiment]) -> str:

@@ -120,6 +120,9 @@ TOPICS: dict[str, Topic] = {
             "{damping}: compare laws with compare-models --materials and --damping",
             "mesh-width": "the mesh is about {percent:.2g} % too {way} along its {axis} axis: compare "
             "its extents with those of the real body",
+            "mesh-coarse": "the mesh is too coarse for such accurate measurements: its estimated error "
+            "changes the predictions by {sigmas:.2g} sigma (RMS), which the constants do not absorb; "
+            "{remedy}",
             "mesh-mirrored": "the mesh is a mirror image of the body, along its {axis} axis: compare "
             "it with the real body",
             "rest-shape": "the mesh is the shape of the body under its weight, with gravity along "
@@ -233,7 +236,8 @@ TOPICS: dict[str, Topic] = {
         remedy="Find out whether the assumption is wrong, for instance by repeating the first "
         "recording at the end, or whether the model lacks an effect with similar "
         "consequences, as a missing memory resembles a drift, and a wrong damping law a clock "
-        "rate. The commands compare-models --damping and --materials test other laws. The command "
+        "rate. The command compare-models tests other laws, with --materials, with --damping for motions, "
+        "and with --prony for slow loads that relax. The command "
         "solve --probe (probe=True in Python) computes the effect beyond first order and relaxes "
         "the other assumptions.",
         messages={
@@ -374,6 +378,8 @@ TOPICS: dict[str, Topic] = {
             "grows": "the motion of '{experiment}' is unstable at t = {time_s:.3g} s: disturbances "
             "grow at a rate of {growth_1_s:.2g} 1/s. If the body does not buckle there, use "
             'damping = "kelvin-voigt", and check moduli and densities',
+            "branch": "the equilibria of '{experiment}' from {time_s:.4g} s on are not those that "
+            "its loads lead to from the samples before, and depend on mesh and rounding: {why}",
             "material": "the material {material}{where} is unstable at strains of '{experiment}' "
             "(Drucker): at {time_s:.3g} s and the principal stretches {stretches} a further strain "
             "lowers its stress; use a law with fewer terms, or bound its constants",

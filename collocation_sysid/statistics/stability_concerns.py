@@ -1,4 +1,6 @@
-"""Concerns about materials that are unstable at the strains of a motion, or at rest."""
+"""Concerns about materials that are unstable at the strains of a motion or at rest, and about
+equilibria that are not on the stable path of the loads.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,7 @@ from ..common.array_types import Array
 from ..fem.body import Body
 from ..fem.laws.material_stability import is_examined, principal_stretches, stability_margins
 from ..program.experiment_iterate import ExperimentIterate
+from ..program.forward.stable_path import find_branch_change
 from .concerns import Concern
 
 # Number of states of a motion that are examined.
@@ -69,6 +72,26 @@ def strain_stability_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator
                 stretches=stretches,
                 experiment=experiment.name,
                 t_s=experiment.t_s[samples],
+            )
+
+
+def branch_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator[Concern]:
+    """Yield a concern for each static experiment whose equilibria leave the stable path of its
+    loads: "doubtful" if its surface wrinkles, which depends on the mesh, "check" if it buckles.
+    """
+    for iterate in iterates:
+        experiment = iterate.transcription.experiment
+        change = find_branch_change(experiment, iterate.equations.dynamics, iterate.x)
+        if change is not None:
+            wrinkles = change.loss is not None and change.loss.is_surface_instability
+            yield Concern(
+                "stability/branch",
+                "doubtful" if wrinkles else "check",
+                data={
+                    "experiment": experiment.name,
+                    "time_s": change.time_s,
+                    "why": change.describe(),
+                },
             )
 
 

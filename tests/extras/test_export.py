@@ -179,43 +179,6 @@ def test_mujoco_gets_nodes_cells_and_the_flex(run_folder, tmp_path):
     assert flex.get("body", "").split().count("grasp0") == (~free).sum()
 
 
-def test_sofa_gets_moduli_damping_and_the_grasp(run_folder, tmp_path):
-    body = IdentifiedBody.read(run_folder)
-    scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn")
-    force = scene.find(".//TetrahedronHyperelasticityFEMForceField")
-    solver = scene.find(".//EulerImplicitSolver")
-    fixed = scene.find(".//FixedProjectiveConstraint")
-    assert force is not None
-    assert solver is not None
-    assert fixed is not None
-    (region,) = body.regions
-    assert force.get("materialName") == "NeoHookean"
-    np.testing.assert_array_equal(
-        numbers_in(force.get("ParameterSet")), [region.mu_pa, region.lambda_pa]
-    )
-    assert float(solver.get("rayleighStiffness", "")) == region.gamma_r_s
-    assert float(solver.get("rayleighMass", "")) == region.gamma_m_1_s
-    np.testing.assert_array_equal(
-        numbers_in(fixed.get("indices")), np.flatnonzero(body.is_prescribed.any(axis=1))
-    )
-
-
-def test_sofa_gets_the_mesh_the_masses_and_the_weight(run_folder, tmp_path):
-    body = IdentifiedBody.read(run_folder)
-    scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn").getroot()
-    given = {each.tag: each.attrib for each in scene.iter()}
-    mesh = given["TetrahedronSetTopologyContainer"]
-    np.testing.assert_array_equal(numbers_in(mesh["position"]).reshape(-1, 3), body.nodes_m)
-    np.testing.assert_array_equal(numbers_in(mesh["tetrahedra"]).reshape(-1, 4), body.body.cells)
-    masses_kg = numbers_in(given["DiagonalMass"]["vertexMass"])
-    assert masses_kg.sum() == pytest.approx(30.0 * 0.06 * 0.06 * 0.09)
-    assert len(masses_kg) == len(body.nodes_m)
-    np.testing.assert_array_equal(numbers_in(scene.get("gravity")), body.experiment.gravity_m_s2)
-    assert 0 < float(scene.get("dt", "")) < body.experiment.timestep_s
-    order = [each.tag for each in scene.iter()]  # components find those that stand before them
-    assert order.index("MechanicalObject") < order.index("DiagonalMass")
-
-
 def test_newton_gets_the_constants_of_its_own_energy(run_folder, tmp_path):
     body = IdentifiedBody.read(run_folder)
     folder = exported(body, "newton", tmp_path)
@@ -327,21 +290,6 @@ def test_usd_has_a_material_for_each_region_and_names_limits_of_simulators(tmp_p
     assert "uses that of the largest" in text
 
 
-def test_febio_gets_energy_and_memory(tmp_path):
-    values = {"c10_pa": 4e3, "c01_pa": 1e3, "kappa_pa": 1e5, "prony_1.share": 0.4}
-    body = held_bar("mooney-rivlin", {**values, "prony_1.tau_s": 0.2}, prony=("prony_1",))
-    model = ElementTree.parse(exported(body, "febio", tmp_path) / "body.feb")
-    material = model.find(".//Material/material")
-    assert material is not None
-    assert material.get("type") == "uncoupled viscoelastic"
-    inner = {each.tag: each.text for each in material.iter() if each.text}
-    for tag, value in {"g1": 0.4, "t1": 0.2, "c1": 4e3, "c2": 1e3, "k": 1e5}.items():
-        assert float(inner[tag] or "") == value
-    assert len(model.findall(".//elem")) == len(body.body.cells)
-    nodes = [numbers_in((node.text or "").replace(",", " ")) for node in model.iterfind(".//node")]
-    np.testing.assert_array_equal(nodes, body.nodes_m)
-
-
 def scaled_terms(terms, kappa_pa: float | None = None) -> dict[str, float]:
     """Constants of terms for a shear modulus of 300 Pa, scaled to 20 kPa."""
     scale = 20e3 / 300
@@ -388,9 +336,7 @@ def test_calculix_gets_the_terms_of_the_foam(count, tmp_path):
     [
         ("ogden-4", OGDEN_TERMS[4], "calculix"),
         ("hyperfoam-4", FOAM_TERMS[4], "calculix"),
-        ("hyperfoam-1", FOAM_TERMS[1], "febio"),
-        ("ogden-2", OGDEN_TERMS[2], "sofa"),
-        ("hyperfoam-1", FOAM_TERMS[1], "sofa"),
+        ("hyperfoam-1", FOAM_TERMS[1], "mujoco"),
         ("ogden-1", OGDEN_TERMS[1], "mujoco"),
     ],
 )
@@ -402,79 +348,6 @@ def test_an_exporter_without_the_material_states_the_replacement(
         material in limit and ("neo-Hookean" in limit or "same E and ν" in limit)
         for limit in exported_files.limitations
     )
-
-
-def test_febio_gets_the_terms_of_ogdens_law(tmp_path):
-    model = ElementTree.parse(
-        exported(held_bar("ogden-2", OGDEN_TERMS[2]), "febio", tmp_path) / "body.feb"
-    )
-    material = model.find(".//Material/material")
-    assert material is not None
-    assert material.get("type") == "Ogden"
-    found = {each.tag: float(each.text or "") for each in material}
-    c = OGDEN_TERMS[2]
-    for p in (1, 2):  # c/m² there is μ/α here
-        assert found[f"c{p}"] == pytest.approx(c[f"mu_{p}_pa"] * c[f"alpha_{p}"])
-        assert found[f"m{p}"] == c[f"alpha_{p}"]
-    assert found["k"] == pytest.approx(5e4)
-    assert found["pressure_model"] == 2
-
-
-def test_sofa_gets_ogdens_law_of_one_term(tmp_path):
-    folder = exported(held_bar("ogden-1", OGDEN_TERMS[1]), "sofa", tmp_path)
-    scene = ElementTree.parse(folder / "body.scn")
-    force = scene.find(".//TetrahedronHyperelasticityFEMForceField")
-    assert force is not None
-    assert force.get("materialName") == "Ogden"
-    c = OGDEN_TERMS[1]
-    expected = [c["mu_1_pa"] * c["alpha_1"], c["alpha_1"], 5e4]
-    np.testing.assert_allclose(numbers_in(force.get("ParameterSet") or ""), expected)
-    assert "½ κ ln² J" in (folder / "body.scn").read_text()
-
-
-def in_febio(body: IdentifiedBody, folder: Path) -> ElementTree.Element:
-    return ElementTree.parse(exported(body, "febio", folder) / "body.feb").getroot()
-
-
-def indices_in(text: str | None) -> np.ndarray:
-    """Nodes of FEBio, which counts from one."""
-    return numbers_in((text or "").replace(",", " ")).astype(int) - 1
-
-
-def test_febio_gets_moduli_grasp_and_weight(run_folder, tmp_path):
-    body = IdentifiedBody.read(run_folder)
-    model = in_febio(body, tmp_path)
-    assert model.get("version") == "4.0"
-    (region,) = body.regions
-    (material,) = model.iterfind("Material/material")
-    assert material.get("type") == "neo-Hookean"
-    for tag, value in {"density": 30.0, "E": region.young_pa, "v": region.poisson}.items():
-        assert float(material.findtext(tag, "")) == pytest.approx(value)
-    (domain,), (elements,) = (model.iterfind("MeshDomains/*"), model.iterfind("Mesh/Elements"))
-    assert (domain.get("name"), domain.get("mat")) == (elements.get("name"), material.get("name"))
-    sets = {each.get("name"): indices_in(each.text) for each in model.iterfind("Mesh/NodeSet")}
-    for axis, held in zip("xyz", body.is_prescribed.T, strict=True):
-        np.testing.assert_array_equal(sets[f"held_{axis}"], np.flatnonzero(held))
-    conditions = list(model.iterfind("Boundary/bc"))
-    assert {each.get("node_set") for each in conditions} == set(sets)
-    assert {each.get("type") for each in conditions} == {"zero displacement"}
-    force = model.find("Loads/body_load/force")
-    assert force is not None
-    against = numbers_in((force.text or "").replace(",", " "))
-    np.testing.assert_array_equal(against, -body.experiment.gravity_m_s2)
-    controllers = {each.get("id") for each in model.iterfind("LoadData/load_controller")}
-    assert force.get("lc") in controllers
-
-
-def test_mid_nodes_stand_in_febios_order(tmp_path):
-    body = held_bar(element="tet10")
-    model = in_febio(body, tmp_path)
-    (elements,) = model.iterfind("Mesh/Elements")
-    assert elements.get("type") == "tet10"
-    edges = np.array([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)])
-    for element in elements:
-        places = body.nodes_m[indices_in(element.text)]
-        np.testing.assert_allclose(places[4:], places[edges].mean(axis=1), atol=1e-12)
 
 
 def test_calculix_gets_mesh_material_and_grasp(run_folder, tmp_path):
@@ -506,7 +379,7 @@ def test_no_number_of_a_deck_is_longer_than_calculix_reads(tmp_path):
     ("to", "expected"),
     [
         ("mujoco", "only those of the first sample are exported"),
-        ("febio", "point masses on nodes are not exported"),
+        ("usd", "point masses on nodes are not exported"),
     ],
 )
 def test_a_point_mass_that_ends_has_one_sentence_by_target(to, expected, tmp_path):
@@ -519,7 +392,7 @@ def test_a_point_mass_that_ends_has_one_sentence_by_target(to, expected, tmp_pat
     assert expected in sentence
 
 
-@pytest.mark.parametrize("to", ["mujoco", "newton", "calculix", "sofa", "febio"])
+@pytest.mark.parametrize("to", ["mujoco", "newton", "calculix"])
 def test_unexported_air_is_reported_and_left_out_of_the_equilibrium(to, tmp_path):
     bar = held_bar()
     in_air = replace(bar, experiment=replace(bar.experiment, air_density_kg_m3=1.2))
@@ -563,11 +436,11 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
 HOSTILE = "a --- b --> \"<&'\x00\x1b[2J\x0c\ufffe\n"
 
 
-@pytest.mark.parametrize("to", ["mujoco", "febio", "calculix", "sofa", "newton", "usd"])
+@pytest.mark.parametrize("to", ["mujoco", "calculix", "newton", "usd"])
 def test_any_title_or_name_is_written_in_the_form_of_the_target(to: str, tmp_path: Path):
     bar = box_mesh(BAR_M, DIVISIONS)
     cells = np.arange(len(bar.tetrahedra))
-    names = ["a-²"] if to == "sofa" else ["a-²", "a_²"]  # nothing else may be in one
+    names = ["a-²", "a_²"]
     parts = np.array_split(cells, len(names))
     regions = [Region(name, part) for name, part in zip(names, parts, strict=True)]
     body = Body(bar, "neo-hookean", 900.0, regions=regions)
@@ -584,18 +457,16 @@ def test_any_title_or_name_is_written_in_the_form_of_the_target(to: str, tmp_pat
     for file in folder.iterdir():
         text = file.read_text(encoding="utf-8")
         assert all(mark.isprintable() or mark in "\n\t" for mark in text)
-        if file.suffix in (".xml", ".feb", ".scn"):
+        if file.suffix == ".xml":
             ElementTree.parse(file)
         elif file.suffix == ".py":
             compile(text, file, "exec")
 
 
 def test_a_pure_energy_is_exported_without_reserve(tmp_path):
-    body = held_bar()
-    for to in ("mujoco", "sofa"):
-        said = " ".join(write_export(body, to, tmp_path / to).limitations)
-        assert "small strain, but stresses differ" not in said
-        assert "becomes" not in said
+    said = " ".join(write_export(held_bar(), "mujoco", tmp_path / "out").limitations)
+    assert "small strain, but stresses differ" not in said
+    assert "becomes" not in said
 
 
 # What is refused
@@ -634,9 +505,9 @@ def test_an_export_is_not_written_through_a_link(run_folder: Path, tmp_path: Pat
 
 
 def test_an_earlier_export_is_replaced(run_folder, tmp_path):
-    for to in ("sofa", "json"):
+    for to in ("newton", "json"):
         assert run_command("export", run_folder, "--to", to, "--out", tmp_path / "out").code == 0
-    assert not (tmp_path / "out" / "body.scn").exists()
+    assert not (tmp_path / "out" / "body.py").exists()
 
 
 # Destinations
@@ -745,10 +616,8 @@ def test_an_experiment_that_is_not_there_is_refused(run_folder, tmp_path):
 def test_models_that_a_target_cannot_represent_are_refused(tmp_path):
     with pytest.raises(InputError, match="grasp 2 holds only z"):
         write_export(held_bar(axes="z"), "mujoco", tmp_path / "out")
-    with pytest.raises(InputError, match="one region of linear tetrahedra"):
-        write_export(held_bar(element="tet10"), "sofa", tmp_path / "out")
     with pytest.raises(InputError, match="cannot be run by this program"):
-        verify_export(held_bar(), "sofa", exported(held_bar(), "sofa", tmp_path))
+        verify_export(held_bar(), "newton", exported(held_bar(), "newton", tmp_path))
     assert not (tmp_path / "out").exists()
 
 
@@ -1020,62 +889,6 @@ def test_a_body_of_which_only_a_force_was_measured_is_exported(tmp_path):
         for k, each in enumerate((body, lone))
     ]
     assert decks[0] == decks[1]
-
-
-def test_obstacles_are_rigid_facets_in_febio(tmp_path):
-    body = pressed_block(SOLIDS["sphere"], SOLIDS["plane"], friction=0.2)
-    model = in_febio(body, tmp_path)
-    ids = [node.get("id") for node in model.iterfind("Mesh/Nodes/node")]
-    assert ids == [str(k) for k in range(1, len(ids) + 1)]
-    places = numbers_in(
-        " ".join(n.text or "" for n in model.iterfind("Mesh/Nodes/node")).replace(",", " ")
-    )
-    places = places.reshape(-1, 3)
-    for k, pair in enumerate(model.iterfind("Mesh/SurfacePair")):
-        surfaces = {each.get("name"): each for each in model.iterfind("Mesh/Surface")}
-        wall = surfaces[pair.findtext("secondary", "")]
-        corners = places[[indices_in(each.text) for each in wall]]
-        assert corners[..., 2].min() > 0.04 - 5e-5  # it is further out by half of the width
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert (normals[:, 2] < 0).any()
-        cells = [
-            numbers
-            for each in model.iterfind("Mesh/Elements")
-            if each.get("name") == f"cells_wall_{k}"
-            for numbers in each
-        ]
-        tetrahedra = places[[indices_in(each.text) for each in cells]]
-        assert (np.linalg.det(tetrahedra[:, 1:] - tetrahedra[:, :1]) > 0).all()
-        contact = model.findall("Contact/contact")[k]
-        assert contact.get("surface_pair") == pair.get("name")
-        assert float(contact.findtext("fric_coeff", "")) == 0.2
-        assert float(contact.findtext("penalty", "")) > 1e7
-    down = model.findall("Rigid/rigid_bc[dof='z']/value")
-    assert [float(each.text or "") for each in down] == pytest.approx([-0.0014] * 2, abs=5e-5)
-
-
-def test_sofa_gets_planes_and_balls_and_other_solids_are_reported(tmp_path):
-    body = pressed_block(*SOLIDS.values(), friction=0.2)
-    scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn")
-    plane, ball = (scene.find(".//PlaneForceField"), scene.find(".//SphereForceField"))
-    assert plane is not None
-    assert ball is not None
-    np.testing.assert_allclose(numbers_in(plane.get("normal")), (0, 0, -1), atol=1e-12)
-    # Their surface is as far out as that at which the pressure begins: by half of the width.
-    out_m = faceted_obstacles(body)[0].width_m / 2
-    assert out_m > 1e-6
-    assert float(plane.get("d", "")) == pytest.approx(-0.0386 + out_m, rel=1e-9)
-    np.testing.assert_allclose(numbers_in(ball.get("center")), (0.02, 0.02, 0.0586))
-    ball_m = SOLIDS["sphere"]
-    assert isinstance(ball_m, Sphere)
-    assert float(ball.get("radius", "")) == pytest.approx(ball_m.radius_m + out_m, rel=1e-9)
-    told = json.loads((tmp_path / "sofa" / "identified.json").read_text())["not_expressed"]
-    for said in (
-        "it 0: friction is not exported",
-        "it 2: an obstacle of the kind",
-        "it 4: an obstacle of the kind",
-    ):
-        assert any(said in each for each in told)
 
 
 def test_usd_gets_solids_their_motion_and_friction(tmp_path):

@@ -17,6 +17,7 @@ from kit.region_files import TWO_REGIONS
 from kit.static import block
 from kit.wrenches import fitted, predicted_wrenches
 
+import collocation_sysid as cs
 from collocation_sysid import Unknown
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.studies import PlannedRun, plan_models
@@ -606,6 +607,36 @@ sigma_pa = 1e3
     record = fit_record(problem, "reduced-space", "")
     assert record["converged"]
     assert record["at_bound"] == at_bound
+
+
+@pytest.mark.long
+def test_a_comparison_in_python_has_the_estimates_of_a_solve():
+    stretch = np.linspace(1.05, 1.8, 12)
+    noise_pa = np.random.default_rng(3).normal(scale=1e3, size=len(stretch))
+    stress_pa = 1e5 * (stretch - stretch**-2) + noise_pa
+    pull = cs.Specimen("uniaxial", stretch - 1, stress_pa, sigma_pa=1e3)
+    problems = {
+        "neo-hookean": cs.Problem(
+            [pull.experiment("neo-hookean", "pull")], {"mu_pa": cs.Unknown(), "kappa_pa": 1e9}
+        ),
+        "yeoh": cs.Problem(
+            [pull.experiment("yeoh", "pull")],
+            {**{f"c{k}0_pa": cs.Unknown() for k in (1, 2, 3)}, "kappa_pa": 1e9},
+        ),
+    }
+    compared = cs.compare_models(problems)
+    assert compared.chosen == "neo-hookean"
+    assert "Use neo-hookean" in str(compared)
+    for row in compared.rows:
+        solved = cs.run(problems[row["model"]], seek_causes=False)
+        assert row["parameters"]["young_pa"] == solved.derived["young_pa"]
+        assert row["budget"]["young_pa"]["combined95"] == solved.interval("young_pa")
+    assert compared.tables[-1].title.startswith("95 % intervals")
+    (prediction, young, *_) = compared.plot().axes
+    assert prediction.get_title(loc="left") + prediction.get_title()
+    assert young.get_xlabel().endswith("[Pa]")
+    with pytest.raises(cs.InputError, match="two or more"):
+        cs.compare_models({"yeoh": problems["yeoh"]})
 
 
 def test_the_law_is_a_source_of_the_chosen_ones_budget():

@@ -170,7 +170,9 @@ def test_a_guess_that_cannot_be_simulated_starts_from_the_rigid_shape():
         "the initial trajectory is the rest shape moving rigidly with the grasp"
     )
     solution = replace(PRECISE, initial="simulation")(collocation)
-    assert solution.notes == tuple(notes)
+    *others, certificate = solution.notes
+    assert others == notes
+    assert certificate.startswith("optimality of the complete program")
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-5
 
@@ -239,7 +241,7 @@ def test_where_reduced_space_finds_no_motion_ipopt_starts_without_it():
     collocation = Collocation([measured(hung_cube())], soft_guess())
     solution = PRECISE(collocation)
     assert "found none" in note_of(solution)
-    assert "the rest shape moving rigidly" in solution.notes[-1]
+    assert any("the rest shape moving rigidly" in note for note in solution.notes)
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-5
 

@@ -85,7 +85,7 @@ def test_a_driven_box_is_read_solved_and_shown(driven):
     assert [actuator.name for actuator in experiment.actuators] == ["tendon_1", "air"]
     np.testing.assert_allclose(experiment.tendons[0].energy_amplitude_at([0.025]), 0.0025)
     with pictures_drawn():
-        done = run_command("solve", driven / "problem.toml", "--out", driven / "run")
+        done = run_command("solve", driven / "problem.toml", "--out", driven / "run", "--details")
     assert done.code == 0, done.err
     said = " ".join(done.out.split())
     assert "tendon_1, more than stated by" in said

@@ -18,7 +18,7 @@ from collocation_sysid.fem.meshes.mesh import ElementNodes
 from collocation_sysid.fem.meshes.selection import Face
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
-from collocation_sysid.problem.new_problem import TEMPLATES
+from collocation_sysid.problem.new_problem import TEMPLATES, create_problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
@@ -296,13 +296,14 @@ def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
         arrays.append(np.load(tmp_path / name / "trajectory.npz")["second/wrench_1"])
     np.testing.assert_allclose(arrays[0][:, 3], [0, -2.5, -6, -9])  # as in the file
     np.testing.assert_allclose(arrays[0][:, 1:], 4 * arrays[1][:, 1:], rtol=1e-6)
-    said = plain_text(run_summary(found.result, tmp_path / "whole"))
+    said = plain_text(run_summary(found.result, tmp_path / "whole", details=True))
     words = (
         "loads of 'first' and 'second' are those of the whole specimen, 4 times those of the "
         "modelled part"
     )
     assert words in said
-    assert "specimen" not in plain_text(run_summary(alone.result, tmp_path / "part"))
+    alone_said = plain_text(run_summary(alone.result, tmp_path / "part", details=True))
+    assert "whole specimen" not in alone_said
     priors_n = [
         float(re.search(r"tare: up to \S+ N \(prior ±(\S+) N\)", said)[1])
         for each in (found.result, alone.result)
@@ -412,12 +413,30 @@ def test_a_new_problem_of_each_kind_runs_as_it_is(tmp_path, monkeypatch, kind, d
     problem = Problem.read("mine/problem.toml", guessed[1:])
     found = run(problem, seek_causes=False)
     assert found.trust.verdict == "good"
-    name, truth = {
-        "swing": ("young_pa", SWUNG["young_pa"]),
-        "specimen": ("mu_pa", SHEAR_MODULUS_PA),
-    }.get(kind, ("young_pa", YOUNG_PA))
-    low, high = found.interval(name)
-    assert low < truth < high
+    truth = {"swing": SWUNG, "specimen": {"mu_pa": SHEAR_MODULUS_PA}}.get(
+        kind, {"young_pa": YOUNG_PA, "poisson": 0.49}
+    )
+    assert _stated_truth(Path("mine/problem.toml")) == truth
+    free = [item.name for item in problem.parameters.free]
+    for name, value in truth.items():
+        if name in free:
+            low, high = found.interval(name)
+            assert low < value < high
+        else:
+            assert problem.parameters.guesses[name] == value
+
+
+def _stated_truth(file: Path) -> dict[str, float]:
+    """True constants in the comment at the head of a template."""
+    head, _ = file.read_text().split("[object]")
+    _, stated = head.split("was simulated with")
+    found = re.findall(r"([a-z_0-9]+) = (\d[\d.e]*\d)", stated)
+    return {name: float(value) for name, value in found}
+
+
+def test_an_empty_problem_states_no_truth_of_an_example(tmp_path):
+    file, *_ = create_problem(tmp_path / "mine")
+    assert "simulated" not in file.read_text()
 
 
 @pytest.mark.long

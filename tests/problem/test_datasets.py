@@ -76,6 +76,15 @@ def test_a_law_fits_kawabatas_small_stretches_well():
     assert found == pytest.approx(exact, rel=3e-3)
 
 
+@pytest.mark.long
+def test_the_shipped_law_describes_kawabatas_rubber():
+    found = cs.run(cs.datasets.read_problem("kawabata_1981"), seek_causes=False)
+    assert found.trust.verdict != "doubtful"
+    # Initial slope of the uniaxial stress, from its smallest stretches up to 1.1.
+    low, high = found.interval("young_pa")
+    assert low < 1.2e6 < high
+
+
 def test_new_copies_a_dataset_that_can_be_checked(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     outcome = run_command("new", "rubber", "--dataset", "treloar_1944")

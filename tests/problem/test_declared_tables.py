@@ -5,17 +5,13 @@ from __future__ import annotations
 import inspect
 import re
 from dataclasses import fields
-from typing import Any, get_args, get_type_hints
-
-import pytest
-from pydantic_core import PydanticUndefined
+from typing import get_args, get_type_hints
 
 from collocation_sysid import Nuisance
 from collocation_sysid.common.field_descriptions import documented
 from collocation_sysid.fem.body import Made, MeshOrigin
 from collocation_sysid.problem.nuisance_schema import KEYS, NuisanceSection
-from collocation_sysid.problem.validation_messages import table_models
-from collocation_sysid.recording.nuisance import KINDS, NuisanceRow
+from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
     OF_KNOWN_SIGN,
@@ -27,11 +23,6 @@ from collocation_sysid.statistics.budget.systematic_effects import (
 
 def as_sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
-
-
-def described_prior(row: NuisanceRow) -> str:
-    """Key of a prior, followed by its default if it has one."""
-    return row.prior_key() if row.sigma is None else f"{row.prior_key()}, {row.usual} by default"
 
 
 # Nuisance parameters -------------------------------------------------------------------------
@@ -52,31 +43,6 @@ def test_fields_of_nuisance_are_described_as_the_kinds():
 
 def test_the_table_has_a_key_for_each_kind():
     assert list(NuisanceSection.model_fields) == [*KEYS, "own"]
-    for key, rows in KEYS.items():
-        description = " ".join(
-            as_sentence(f"{row.description}: {described_prior(row)}") for row in rows
-        )
-        assert NuisanceSection.model_fields[key].description == description
-
-
-def prior_section(key: str) -> Any:
-    """Class of the table of a key of [experiment.nuisance]."""
-    return next(iter(table_models(NuisanceSection.model_fields[key].annotation)))
-
-
-@pytest.mark.parametrize(("key", "rows"), KEYS.items(), ids=KEYS)
-def test_the_table_of_a_key_has_the_priors_of_its_kinds(key: str, rows: list[NuisanceRow]):
-    section = prior_section(key)
-    stated = section.model_fields
-    assert list(stated) == ["scope", *(row.prior_key() for row in rows)]
-    assert section.__doc__ == f"Prior of a nuisance parameter: {rows[0].description}."
-    assert section.has_default == any(row.sigma is not None for row in rows)
-    # A prior that refers to another one needs it.
-    needs_all = any(row.reference is not None for row in rows)
-    for row in rows:
-        assert stated[row.prior_key()].description == f"Standard deviation [{row.unit}]."
-        missing = PydanticUndefined if needs_all else None
-        assert stated[row.prior_key()].default == (row.reference or missing)
 
 
 # Systematic effects ---------------------------------------------------------------------------

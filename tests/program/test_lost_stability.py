@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from kit.static import LAW, SIZE_M, compressed
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
@@ -19,40 +20,6 @@ from collocation_sysid.program.forward.loss_of_stability import (
 )
 from collocation_sysid.program.modes.stability import growth_rate_1_s
 from collocation_sysid.runs.check import check_problem
-
-LAW = {"young_pa": 2e4, "poisson": 0.45, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-SIZE_M = (0.08, 0.01, 0.06)
-
-
-def compressed(
-    divisions: tuple[int, int, int], size_m: tuple[float, float, float]
-) -> cs.Experiment:
-    """Return a block that is compressed along x to three tenths, in plane strain, free above."""
-    body = cs.Body(cs.box_mesh(size_m, divisions), density_kg_m3=1000.0)
-    t_s = np.arange(15.0)
-    way_m = np.outer(np.linspace(0, -0.7 * size_m[0], 15), [1.0, 0.0, 0.0])
-    ends = cs.PoseSequence(t_s, way_m, np.tile([0.0, 0.0, 0.0, 1.0], (15, 1)))
-    fixed = cs.PoseSequence.fixed()
-
-    def face(axis: int, place_m: float) -> np.ndarray:
-        return np.flatnonzero(np.abs(body.nodes_m[:, axis] - place_m) < 1e-9)
-
-    # A slender body is clamped at its ends instead of lying on a smooth plane.
-    slender = size_m[2] < size_m[0] / 4
-    axes = "xz" if slender else "x"
-    grasps = [
-        cs.Grasp(face(0, 0.0), fixed, axes=axes),
-        cs.Grasp(
-            face(0, size_m[0]), ends, axes=axes, wrench=cs.Wrench(t_s, np.zeros((15, 3)), 1.0)
-        ),
-        cs.Grasp(face(1, 0.0), fixed, axes="y"),
-        cs.Grasp(face(1, size_m[1]), fixed, axes="y"),
-    ]
-    if not slender:
-        grasps.append(cs.Grasp(face(2, 0.0), fixed, axes="z"))
-    return cs.Experiment(
-        body, t_s, grasps, kind="static", gravity_m_s2=(0.0, 0.0, 0.0), nuisance=cs.Nuisance.none()
-    )
 
 
 @cache

@@ -26,8 +26,8 @@ from collocation_sysid.statistics.assessment import prediction_concerns
 NOISE_M = 1e-3
 
 
-def shown(finished: cs.Run) -> str:
-    return plain_text(run_summary(finished.result, Path("runs")))
+def shown(finished: cs.Run, details: bool = True) -> str:
+    return plain_text(run_summary(finished.result, Path("runs"), details=details))
 
 
 def stored(finished: cs.Run) -> dict:
@@ -305,7 +305,7 @@ def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
     assert copied.copied == "fitted"
     assert copied.error.rms_m == pytest.approx(np.sqrt(6) * 2e-4, rel=0.1)  # the noise of both
     assert stored(alike)["rollout"]["new"]["copied"]["copied"] == "fitted"
-    assert "(measurements of 'fitted' as the prediction: " in shown(alike)
+    assert "(measurements of 'fitted' as the prediction: " in shown(alike, details=False)
 
 
 @pytest.mark.long

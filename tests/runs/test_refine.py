@@ -299,7 +299,8 @@ def test_an_interrupted_refinement_keeps_finished_levels(tmp_path, monkeypatch):
 def test_a_problem_may_ask_for_it(tmp_path):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
-    asked = run_command("solve", problem, "--out", folder, "--set", "uncertainty.numerical=true")
+    numerical = ("--set", "uncertainty.numerical=true")
+    asked = run_command("solve", problem, "--out", folder, "--details", *numerical)
     assert asked.code == 0
     assert "half the step" in asked.out
     assert json.loads((folder / "refinement.json").read_text())["levels"]

@@ -12,6 +12,7 @@ from kit.problems import EDGE_M, box, hung_cube, smooth_poses
 from kit.static import PRESSED_M, TIMES, block
 
 from collocation_sysid import (
+    Assumptions,
     Body,
     Collocation,
     Experiment,
@@ -22,9 +23,13 @@ from collocation_sysid import (
     Nuisance,
     PointMass,
     PoseSequence,
+    Problem,
+    Specimen,
     Tied,
+    UncertaintyOptions,
     Unknown,
     box_mesh,
+    run,
     simulate,
 )
 from collocation_sysid.fem.air import AIR_KG_M3
@@ -294,3 +299,36 @@ def test_a_law_of_a_users_own_stays_as_it_is():
     own = DampingLaw("own", (GAMMA_R,), stress=stress)
     body = Body(experiment.body.mesh, density_kg_m3=60.0, damping=own)
     assert not changed(replace(experiment, body=body), "damping_law kelvin-voigt").any()
+
+
+@pytest.mark.parametrize(("poisson", "limited"), [(0.3, 0.0191), (0.49, 0.0110), (0.4999, 5.3e-4)])
+def test_the_deviation_of_a_stated_poisson_ratio_ends_before_the_incompressible_body(
+    poisson, limited
+):
+    deviation = UncertaintyOptions().collect_considered((), parameters(poisson=poisson))["poisson"]
+    assert deviation == pytest.approx(limited, rel=0.01)
+    stated = UncertaintyOptions(assumptions=Assumptions(poisson=1e-6))
+    considered = stated.collect_considered((), parameters(poisson=poisson))
+    assert considered["poisson"] == pytest.approx(1e-6, rel=0.01)
+    exact = UncertaintyOptions(assumptions=Assumptions(poisson="none"))
+    assert exact.collect_considered((), parameters(poisson=poisson))["poisson"] is None
+
+
+def test_the_largest_of_several_stated_poisson_ratios_limits_their_deviation():
+    several = parameters(
+        **{"poisson": 0.3, "core.poisson": Tied("rim.poisson"), "rim.poisson": 0.499}
+    )
+    deviation = UncertaintyOptions().collect_considered((), several)["poisson"]
+    assert deviation == pytest.approx(1e-3 * np.log(21.0), rel=1e-6)
+
+
+@pytest.mark.long
+def test_a_tension_test_of_rubber_determines_its_stiffness_at_a_stated_poisson_ratio():
+    stretch = np.linspace(1.1, 3.0, 12)
+    stress_pa = 2e5 * (stretch - stretch**-2.0)
+    test = Specimen("uniaxial", stretch - 1, stress_pa, sigma_pa=2e3)
+    unknown = {"c10_pa": Unknown(), "c01_pa": 0.0, "poisson": 0.4999}
+    answer = run(Problem([test.experiment("mooney-rivlin", "pull")], unknown))
+    low, high = answer.interval("young_pa")
+    assert low < 6e5 < high
+    assert high < 1.5 * low

@@ -228,7 +228,9 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     assert (folder / "budget.png").exists()
     told = Result.read(folder)
     assert set(told.budget["mu_pa"]) == set(finished.budget["mu_pa"].shares)
-    short, whole = (plain_text(run_summary(told, folder, budget=b)) for b in (False, True))
+    short, whole = (
+        plain_text(run_summary(told, folder, details=True, budget=b)) for b in (False, True)
+    )
     assert "± syst" in short
     assert "% of the variance" not in short
     assert "% of the variance" in whole
@@ -300,7 +302,8 @@ def test_the_constant_of_a_damping_law_has_a_note_and_moduli_a_wider_interval(
     wrong = fitted_block(made_with, fitted_with, **stated)
     truth = BLOCK["gamma_r_s"]
     line = wrong.budget["gamma_r_s"]
-    assert not line.combined95[0] < truth < line.combined95[1]
+    low, high = wrong.estimates["gamma_r_s"].statistical95
+    assert not low < truth < high
     assert not {"damping_law", "rayleigh_damping"} & set(line.shares)
     (other,) = wrong.alternatives
     assert other.condition == f"with the damping law {made_with}"

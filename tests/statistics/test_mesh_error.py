@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -11,6 +12,7 @@ import pytest
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.runs.mesh_resolution import estimate_mesh_error, mesh_resolution_concerns
+from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.numerical_error import finer_mesh
 from collocation_sysid.runs.solving import solve
 from collocation_sysid.statistics.budget.discretisation_error import Refinement, with_estimated_mesh
@@ -25,10 +27,13 @@ LENGTH_M = 0.06
 NO_TURN = [0, 0, 0, 1.0]
 
 
-def deformed_block(element: str) -> cs.Experiment:
+def deformed_block(element: str, prony: Sequence[str] = ()) -> cs.Experiment:
     """A block with two elements across, bent, compressed and twisted between its ends."""
     body = cs.Body(
-        cs.box_mesh((0.03, 0.03, LENGTH_M), (2, 2, 3)), density_kg_m3=1000.0, element=element
+        cs.box_mesh((0.03, 0.03, LENGTH_M), (2, 2, 3)),
+        density_kg_m3=1000.0,
+        element=element,
+        prony=prony,
     )
     t_s = np.arange(4.0)
     moved_m = np.array([[0, 0, 0], [6e-3, 0, 0], [0, 0, 4e-3], [0, 0, 0]])
@@ -97,12 +102,63 @@ def test_intervals_contain_the_error_of_the_mesh(element):
 
 
 @pytest.mark.long
+def test_a_body_with_memory_has_a_mesh_error():
+    experiment = deformed_block("tet4", prony=["prony_1"])
+    constants = TRUTH | {"prony_1.share": 0.5, "prony_1.tau_s": 1.0}
+    truth = cs.simulate(experiment, constants)
+    measured = with_wrenches(cs.with_markers(experiment, truth.markers_m), truth.wrenches)
+    problem = cs.Problem([measured], constants | {"young_pa": cs.Unknown(14e3)})
+    solution = solve(problem)
+    fit = linearise_fit(solution.collocation, solution.z)
+    change = mesh_change(solution.collocation, solution.z, fit)
+    after = parameter_values(solution.collocation, solution.q + change)["young_pa"]
+    assert 1.02 < after / TRUTH["young_pa"] < 1.3  # a finer mesh needs a stiffer material
+
+
+@pytest.mark.long
 def test_recordings_that_are_declared_to_be_simulated_have_no_mesh_error():
     exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
     problem = replace(coarse_problem("tet10"), uncertainty=exact)
     solution = solve(problem)
     fit = linearise_fit(solution.collocation, solution.z)
     assert estimate_mesh_error(problem, solution, fit, {}, None) == (None, "")
+
+
+def shaken_bar(element: str) -> cs.Experiment:
+    """A bar with two elements across that is swung fast at one end."""
+    body = cs.Body(
+        cs.box_mesh((0.03, 0.03, 0.09), (2, 2, 4)),
+        density_kg_m3=1000.0,
+        element=element,
+        rest_shape="stress_free",
+    )
+    t_s = 0.02 * np.arange(16)
+    rise = np.clip(t_s / 0.1, 0, 1) ** 2
+    moved_m = rise[:, None] * np.sin(np.outer(t_s, [14.0, 11.0, 19.0])) * [0.02, 0.015, 0.01]
+    poses = cs.PoseSequence(t_s, moved_m, np.tile(NO_TURN, (16, 1)))
+    places_m = [[0, 0, 0], [0.03, 0, 0], [0, 0.03, 0], [0.03, 0.03, 0.045], [0, 0.03, 0.045]]
+    markers = cs.Markers(t_s, np.zeros((16, 5, 3)), 1e-4, places_m=places_m)
+    held = cs.Grasp(cs.Box((-1, -1, 0.09 - 1e-9), (1, 1, 1)), poses)
+    return cs.Experiment(body, t_s, [held], markers, nuisance=cs.Nuisance.none())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("element", ["tet4", "tet10"])
+def test_a_mesh_that_is_too_coarse_for_the_noise_is_the_cause_of_the_misfit(element):
+    constants = TRUTH | {"gamma_r_s": 5e-3}
+    tracks_m = cs.simulate(shaken_bar("tet10"), constants, "midpoint", substeps=1).markers_m
+    tracks_m = tracks_m + np.random.default_rng(0).normal(scale=1e-4, size=tracks_m.shape)
+    unknown = constants | {"young_pa": cs.Unknown(14e3), "gamma_r_s": cs.Unknown(4e-3)}
+    problem = cs.Problem(
+        [cs.with_markers(shaken_bar(element), tracks_m)], unknown, scheme="midpoint", substeps=1
+    )
+    causes = find_misspecifications(solve(problem))
+    if element == "tet10":
+        assert causes == ()
+        return
+    (cause,) = causes
+    assert cause.code == "mesh-coarse"
+    assert 'set object.element = "tet10"' in cause.message
 
 
 def estimated(halved: float, least_order: float = 1.0) -> Refinement:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from kit.problem_files import run_command, write_problem
 from kit.problems import GUESS, hung_cube, measured
@@ -12,7 +13,10 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.runs.check.body_check import check_body
+from collocation_sysid.statistics.budget.alternatives import modulus_axis_sentence
 from collocation_sysid.statistics.budget.systematic_effects import usual_deviations
+from collocation_sysid.statistics.budget.uncertainty_budget import VarianceSources
+from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.misspecification.plausibility import making_concerns
 
 BOX = cs.box_mesh((0.04, 0.04, 0.08), (1, 1, 2))
@@ -98,3 +102,27 @@ def test_a_problem_file_states_the_origin(tmp_path):
     assert (own.made, own.mesh_from) == ("foam", "scan")
     assert read.assumed_deviations["anisotropy"] == 0.2
     assert run_command("check", file, "object.made=steel").code == 2
+
+
+@pytest.mark.parametrize(
+    ("anisotropy", "along_z", "is_said"),
+    [(0.05, 0.9, True), (0.05, 0.5, False), (0.005, 0.9, False), (None, 0.9, False)],
+)
+def test_the_answer_states_along_which_axis_the_modulus_is_measured(anisotropy, along_z, is_said):
+    """E of 1000 Pa, of which q is the logarithm, changes by these shares of the anisotropy."""
+    shares = np.array([0.05, 0.02, along_z])
+    names = tuple(f"anisotropy {axis}" for axis in "xyz") if anisotropy else ()
+    empty = np.zeros((1, 0))
+    sources = VarianceSources(
+        names,
+        shares[None] * anisotropy if anisotropy else empty,
+        covariance_free=np.eye(1),
+        covariance_known=np.eye(1),
+        derivatives={"young_pa": np.array([1000.0])},
+        widening=np.ones(1),
+        recording_sensitivities=empty,
+    )
+    estimates = {"young_pa": Estimate(1000.0, 10.0, (980.0, 1020.0))}
+    sentence = modulus_axis_sentence(sources, estimates, anisotropy)
+    assert ("E is mainly the modulus along the z axis of the mesh" in sentence) is is_said
+    assert ("E is 90% of this larger" in sentence) is is_said

@@ -19,6 +19,7 @@ from collocation_sysid import (
     PoseSequence,
     Problem,
     Run,
+    Specimen,
     UncertaintyOptions,
     Unknown,
     run,
@@ -30,6 +31,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.result.probe_sections import DEEPER_CHECK_ADVICE, is_deeper_check_worthwhile
 from collocation_sysid.result.run_summary import next_step, run_summary
 from collocation_sysid.statistics.assessment import Assessment, probe_concerns
+from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS
 from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
@@ -54,12 +56,16 @@ NOISE_M = 2.5e-4
 # Timesteps of the truth, and of the fit, between two samples: else the scheme's own error shows.
 FINER, SUBSTEPS = 6, 4
 DRIFT, MEMORY, CLOCK = "stiffness_drift", "memory_share", "clock_rate"
+ANISOTROPY = "anisotropy"
+ANISOTROPY_PROBES = [f"{ANISOTROPY} {axis}" for axis in "xyz"]
 # Relaxation times between the interval of the samples and the duration of the recording.
 MEMORY_PROBES = [f"{MEMORY} τ={tau_s:g}s" for tau_s in (0.01, 0.03, 0.1, 0.3)]
 
 
 @cache
-def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
+def swung(
+    fault: str = "", off: float = 0.0, samples: int = 60, noise_m: float = NOISE_M
+) -> Problem:
     """A cube that was swung, of which something is off, described as if nothing were."""
     hung = hung_cube(samples)
     hung = replace(hung, body=Body(hung.body.mesh, density_kg_m3=60.0))
@@ -70,12 +76,12 @@ def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
         markers=vertex_markers(hung.body, nodes_where(hung.body, 2, 0.0), fine_s),
         grasps=(Grasp(hung.grasps[0].nodes, smooth_poses(fine_s)),),
     )
-    recorded = with_wrong_assumptions(fine, TRUTH, {fault: off} if fault == DRIFT else {})
+    recorded = with_wrong_assumptions(fine, TRUTH, {} if fault == CLOCK else {fault: off})
     tracks = recorded.markers.positions_m[::FINER]
     if fault == CLOCK:  # the times of the cameras are too large
         tracks = CubicSpline(hung.t_s, tracks)(hung.t_s * (1 - off))
-    tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
-    sigma_m = np.full(tracks.shape[1], NOISE_M)
+    tracks = tracks + noise_m * np.random.default_rng(0).standard_normal(tracks.shape)
+    sigma_m = np.full(tracks.shape[1], noise_m)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
     estimated = {name: Unknown(TRUTH[name]) for name in ("young_pa", "poisson", "gamma_r_s")}
     parameters = Parameters.from_mapping(TRUTH | estimated)
@@ -87,8 +93,8 @@ def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
 
 
 @cache
-def solved(fault: str = "", off: float = 0.0) -> Run:
-    return run(swung(fault, off), "reduced-space", seek_causes=False)
+def solved(fault: str = "", off: float = 0.0, noise_m: float = NOISE_M) -> Run:
+    return run(swung(fault, off, noise_m=noise_m), "reduced-space", seek_causes=False)
 
 
 def named(finished: Run, name: str) -> Probe:
@@ -102,7 +108,12 @@ def named(finished: Run, name: str) -> Probe:
 @pytest.mark.long
 def test_a_faultless_solve_has_all_routine_probes_and_no_alarm():
     faultless = solved()
-    assert [probe.name for probe in faultless.probes] == [DRIFT, *MEMORY_PROBES, CLOCK]
+    assert [probe.name for probe in faultless.probes] == [
+        *ANISOTROPY_PROBES,
+        DRIFT,
+        *MEMORY_PROBES,
+        CLOCK,
+    ]
     assert not any(probe.sentences for probe in faultless.probes)
     assert faultless.trust.verdict == "good"
     assert not is_deeper_check_worthwhile(faultless.result)
@@ -131,6 +142,23 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(faul
     assert next_step(wrongly.result, Path("runs"), "solve").startswith("solve --probe ")
 
 
+@pytest.mark.long
+def test_fibres_along_an_axis_give_check_with_the_moduli_along_and_across_them():
+    fibrous = solved("anisotropy z", 0.3, noise_m=NOISE_M / 4)
+    truth_pa = TRUTH["young_pa"]
+    assert fibrous.interval("young_pa")[0] > truth_pa
+    assert fibrous.trust.verdict == "check"
+    (concern,) = (c for c in fibrous.trust.concerns if c.topic == "assumption")
+    assert "the material is equally stiff along all axes: with anisotropy z = " in concern.message
+    assert "the modulus along this axis" in concern.message
+    probe = named(fibrous, "anisotropy z")
+    assert probe.chi_squared > 0
+    assert abs(probe.size - 0.3) < 0.1
+    young_pa = probe.moves["young_pa"].value
+    assert abs(young_pa / truth_pa - 1) < 0.03
+    assert young_pa * (1 + probe.size) == pytest.approx(1.3 * truth_pa, rel=0.06)
+
+
 # Level of significance ----------------------------------------------------------------------------
 
 
@@ -141,7 +169,8 @@ def answered(problem: Problem) -> SolvedFit:
     fit = linearise_fit(collocation, z)
     deviations = probed_deviations(Assumptions().collect_deviations())
     kept = {
-        name: deviations[name] if name in (DRIFT, MEMORY, CLOCK) else None for name in deviations
+        name: deviations[name] if name in (DRIFT, MEMORY, CLOCK, ANISOTROPY) else None
+        for name in deviations
     }
     return SolvedFit(
         collocation=collocation,
@@ -173,12 +202,43 @@ def test_faultless_fits_have_no_significant_probe():
     assert alarms == 0
 
 
+def with_residuals(at: SolvedFit, residuals: list[np.ndarray]) -> SolvedFit:
+    """A fit with other residuals, at its optimum."""
+    changed = [
+        replace(block, residual=residual * block.is_measured, misfit=None)
+        for block, residual in zip(at.fit.blocks, residuals, strict=True)
+    ]
+    fit = replace(at.fit, blocks=tuple(changed))
+    fit = fit.after_step(gauss_newton_step(fit))
+    known = at.uncertainty_of_refit(fit, at.read_parameters())
+    return replace(at, fit=fit, statistical={**known.estimates, **known.derived})
+
+
+def test_an_assumption_must_explain_the_residuals_and_not_only_a_part_of_them():
+    at = answered(swung(samples=24))
+    name = f"{MEMORY} τ=0.1s"
+    column = at.changes.names.index(name)
+    rng = np.random.default_rng(5)
+    noise = [rng.standard_normal(block.residual.shape) for block in at.fit.blocks]
+    of_memory = [noise[k] - 5 * at.changes.blocks[k][..., column] for k in range(len(noise))]
+    waves = 2 * np.sin(0.8 * np.arange(len(noise[0])))[:, None, None]
+    of_model = [each + waves * np.sign(rng.standard_normal(each.shape[1:])) for each in of_memory]
+    for residuals, suffices in ((of_memory, True), (of_model, False)):
+        probes = {probe.name: probe for probe in routine_probes(with_residuals(at, residuals))}
+        probe = replace(probes[name], relevance=1.0)
+        assert probe.sentences
+        assert probe.size > 0
+        assert probe.suffices is suffices
+        assert is_alarming(probe) is suffices
+
+
 def test_quantities_stated_as_exact_are_probed_too():
     exact = dict.fromkeys(Assumptions().collect_deviations())
     assert {n: s for n, s in probed_deviations(exact).items() if s} == {
         DRIFT: 0.02,
         MEMORY: 0.1,
         CLOCK: 1e-4,
+        ANISOTROPY: 0.05,
     }
     assert probed_deviations({**exact, DRIFT: 0.1})[DRIFT] == 0.1
 
@@ -199,6 +259,7 @@ def test_a_probe_alarms_if_it_is_significant_and_relevant():
     assert not is_alarming(probe(0.5 * RELEVANT))
     assert not is_alarming(probe(2 * RELEVANT, is_significant=False))
     assert not is_alarming(replace(probe(2.0), kind="window"))
+    assert not is_alarming(replace(probe(2.0), suffices=False))
 
 
 def test_a_negative_share_is_no_memory():
@@ -259,6 +320,27 @@ def test_a_static_recording_shows_a_drift_only_where_its_load_returns(heights_m,
     changes = probed_changes(collocation, z, {**none, DRIFT: 0.02})
     column = changes.names.index(DRIFT)
     assert any(block[..., column].any() for block in changes.blocks) is drifts
+
+
+def test_specimens_are_not_probed_for_anisotropy():
+    """In tests of one material along several axes, another material law has the same effect."""
+    stretch = np.linspace(1.05, 1.5, 6)
+    stress_pa = 1e5 * (stretch - stretch**-2)
+    specimen = Specimen("uniaxial", stretch - 1, stress_pa, sigma_pa=1e3, strain_zero=0.0)
+    fixed = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    collocation = Collocation(
+        [specimen.experiment("neo-hookean", "pull")],
+        Parameters.from_mapping({"mu_pa": Unknown(1e5), **fixed}),
+    )
+    z, _ = initial_variables(collocation)
+    none = dict.fromkeys(Assumptions().collect_deviations())
+    deviations = {**none, ANISOTROPY: 0.05}
+    for changes, is_shown in (
+        (changes_of_assumptions(collocation, z, deviations), True),
+        (probed_changes(collocation, z, deviations), False),
+    ):
+        columns = [k for k, name in enumerate(changes.names) if name in ANISOTROPY_PROBES]
+        assert any(block[..., columns].any() for block in changes.blocks) is is_shown
 
 
 def test_a_significant_routine_probe_recommends_the_comparison_of_laws():

@@ -143,7 +143,7 @@ def test_a_run_reports_the_wrench(tmp_path: Path):
     from collocation_sysid.result.run_sections import run_report
     from collocation_sysid.result.run_summary import run_summary
 
-    said = plain_text(run_summary(run.result, folder))
+    said = plain_text(run_summary(run.result, folder, details=True))
     assert "wrench of 'hung cube'" in said
     assert "tare: up to" in said
     assert "delay of the sensor:" in said

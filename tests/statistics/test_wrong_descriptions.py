@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.problem_files import both, replace_text, run_command
-from kit.problems import GUESS, TRUTH, box, released_cube
+from kit.problems import GUESS, TRUTH, box, hung_cube, released_cube
 from twins import BODIES, SOFT, STIFF, twin
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, reordered
@@ -282,6 +282,30 @@ def test_the_search_for_causes_is_bounded_by_the_time_of_the_fit(monkeypatch, rn
     assert len(sweeps) > 1
     assert max(sweeps) <= max(15, solution.iterations) + 2  # simulations count when they are done
     assert sum(sweeps) <= 3 * max(15, solution.iterations) + 2
+
+
+def test_steps_within_a_fast_motion_are_no_slips():
+    """Of a motion with few samples the second differences are large, and may turn round."""
+    experiment = hung_cube(36)
+    rng = np.random.default_rng(2)
+    t_s = 0.02 * np.arange(36)
+    names = experiment.markers.names
+    frequencies_hz = rng.uniform(3, 8, size=(4, len(names), 3))
+    phases = rng.uniform(0, 6, size=frequencies_hz.shape)
+    waves = np.sin(2 * np.pi * frequencies_hz * t_s[:, None, None, None] + phases)
+    tracks_m = 0.005 * waves.sum(axis=1) + rng.normal(scale=1e-4, size=(36, len(names), 3))
+    markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
+    poses = PoseSequence.fixed()
+    fast = replace(
+        experiment, t_s=t_s, markers=markers, grasps=[Grasp(experiment.grasps[0].nodes, poses)]
+    )
+    assert [*step_hypotheses(fast)] == []
+    slipped_m = (
+        tracks_m + 0.1 * (np.arange(36) > 20)[:, None, None] * np.eye(len(names))[0][:, None]
+    )
+    (slip,) = step_hypotheses(with_markers(fast, slipped_m))
+    assert slip.code == "marker-slip/alone"
+    assert slip.data["marker"] == names[0]
 
 
 @pytest.mark.parametrize("count", [0, 4])

@@ -2,7 +2,7 @@
 
 `write_export` writes the files of a target in `TARGETS`, `verify_export` runs the target and
 compares its prediction with that of this package. One module per simulator: `mujoco`, `newton`,
-`usd`, `sofa`, `febio` and `calculix`. For all of them, `identified` reads the body from a run
+`usd` and `calculix`. For all of them, `identified` reads the body from a run
 folder, `export_destination` finds format and place of the option --to, `export_target` describes
 what a simulator can express, and `obstacle_shapes` converts obstacles. `rerun_recording` writes the
 motion of a run for a viewer instead.
@@ -20,7 +20,7 @@ from ...common.serialisation import as_json
 from ...errors import InputError, hint_at
 from ...recording import write_poses_csv
 from ...result.run_writers import replaced_folder
-from . import calculix, febio, mujoco, newton, rerun_recording, sofa, usd
+from . import calculix, mujoco, newton, rerun_recording, usd
 from .export_destination import ExportDestination, parse_destination
 from .export_target import ExportedFiles, ExportTarget, PredictionComparison
 from .identified import IdentifiedBody
@@ -32,8 +32,6 @@ TARGETS: dict[str, ExportTarget] = {
     "mujoco": ExportTarget("MuJoCo", mujoco.MODEL, export=mujoco.export, verify=mujoco.verify),
     "newton": ExportTarget("Newton", newton.MODULE_FILE, export=newton.export),
     "usd": ExportTarget("OpenUSD", usd.STAGE_FILE, export=usd.export, verify=usd.verify),
-    "sofa": ExportTarget("SOFA", sofa.SCENE, export=sofa.export),
-    "febio": ExportTarget("FEBio", febio.MODEL, export=febio.export),
     "calculix": ExportTarget(
         "CalculiX", calculix.DECK, export=calculix.export, verify=calculix.verify
     ),

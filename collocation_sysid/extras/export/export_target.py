@@ -19,7 +19,6 @@ from ...model.forces import Forces
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.simulation import simulate
 from .identified import IdentifiedBody
-from .obstacle_shapes import Primitive
 
 LINEAR_ONLY = (
     "each quadratic tetrahedron is split into eight linear ones with the same nodes, which are "
@@ -36,9 +35,6 @@ VISCOELASTICITY = (
 MOTION = (
     "grasped nodes are fixed at their positions of the first sample; the motion is in the CSV "
     "files of poses beside this file, and your simulation has to apply it"
-)
-UNTESTED = (
-    "untested: written according to the description of the format, but never read by the simulator"
 )
 
 
@@ -122,53 +118,41 @@ class TargetCapabilities:
         and the names of constants of a region. Empty if the simulator expresses the damping.
     damping_law : str
         Name of the damping law that the simulator has, for which no sentence is needed.
-    has_viscoelasticity, has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool
-        Whether it has viscoelastic branches, moving grasps, moving obstacles, and elements with
-        nodes on their edges (which are split otherwise).
+    has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool
+        Whether it has moving grasps, moving obstacles, and elements with nodes on their edges
+        (which are split otherwise).
     node_forces, point_masses : str
         Sentences for forces and for point masses on nodes; empty if the simulator has them.
-    obstacle_shapes : tuple of str
-        Kinds of `Primitive` that obstacles may have.
-    has_rounded_edges, has_face_selection, has_friction : bool
-        Whether obstacles may have rounded edges, be limited to some faces of the body, and have
-        friction.
-    is_tested : bool
-        Whether such files have been read by the simulator itself.
+    has_rounded_edges, has_face_selection : bool
+        Whether obstacles may have rounded edges, and be limited to some faces of the body.
     """
 
     materials: Mapping[str, str]
-    other_materials: str = (
-        "{material} becomes the neo-Hookean material of the same λ and μ at small strain"
-    )
+    other_materials: str
     stiffness_damping: str = ""
     mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not supported"
     damping_law: str = ""
-    has_viscoelasticity: bool = False
     has_moving_grasps: bool = False
     has_moving_obstacles: bool = False
     node_forces: str = "forces on nodes are not exported"
     point_masses: str = ""
     has_quadratic_elements: bool = False
-    obstacle_shapes: tuple[str, ...] = ("plane", "sphere", "box", "cylinder", "capsule")
     has_rounded_edges: bool = True
     has_face_selection: bool = True
-    has_friction: bool = True
-    is_tested: bool = True
 
     def limitations(self, body: IdentifiedBody) -> list[str]:
         """Return sentences on what the simulator cannot express of a body, and what was done
         instead.
 
-        The order is: what no target expresses, obstacles, regions, motion, elements, forces and
-        point masses on nodes, and whether the target was tested. Sentences may end with a period or
-        not; the list is a new one.
+        The order is: what no target expresses, obstacles, regions, motion, elements, and forces and
+        point masses on nodes. Sentences may end with a period or not; the list is a new one.
         """
         sentences = [*_common_limitations(body)]
         sentences += self._obstacle_limitations(body)
         for region in body.regions:
             damped = bool(region.gamma_r_s)
             templates = [
-                *[VISCOELASTICITY] * (bool(region.branches) and not self.has_viscoelasticity),
+                *[VISCOELASTICITY] * (bool(region.branches)),
                 *[self.other_materials] * (region.material not in self.materials),
                 *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),
@@ -185,8 +169,7 @@ class TargetCapabilities:
         elif body.body.element.mean_dilatation:
             worst = max(region.poisson for region in body.regions)
             sentences.append(MEAN_DILATATION.format(worst=worst))
-        sentences += self._load_limitations(body)
-        return sentences if self.is_tested else [*sentences, UNTESTED]
+        return [*sentences, *self._load_limitations(body)]
 
     def _load_limitations(self, body: IdentifiedBody) -> Iterator[str]:
         """Yield sentences on forces and point masses on nodes that the simulator cannot express, or
@@ -209,21 +192,12 @@ class TargetCapabilities:
             )
 
     def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
-        """Yield sentences on what the simulator cannot express of the obstacles of a body; none
-        without obstacles.
-
-        Of an obstacle whose shape is not exported nothing else is said.
-        """
+        """Yield sentences on what the simulator cannot express of the obstacles of a body."""
         for each in body.obstacles:
-            if (kind := Primitive.from_solid(each.shape).kind) not in self.obstacle_shapes:
-                yield f"{each.name}: an obstacle of the kind {kind} is not exported"
-                continue
             if getattr(each.shape, "rounding_m", 0.0) and not self.has_rounded_edges:
                 yield f"{each.name}: its edges are not rounded"
             if each.faces is not None and not self.has_face_selection:
                 yield f"{each.name}: the whole surface of the body may touch it"
-            if each.friction and not self.has_friction:
-                yield f"{each.name}: friction is not exported"
             if len(each.poses.t_s) > 1 and not self.has_moving_obstacles:
                 yield (
                     f"{each.name} is fixed at its position of the first sample; its motion is "

@@ -7,7 +7,8 @@ Studies: `study_kinds` names their kinds, `study_arguments` parses command-line 
 of the search for a motion (package `design`).
 
 Model comparison: `model_variants` derives models from a problem file, `model_choice` compares their
-predictions, and `law_disagreements` evaluates how much an estimate depends on the model.
+predictions, `model_comparison` does so in Python, and `law_disagreements` evaluates how much an
+estimate depends on the model.
 """
 
 from .run_execution import RunOptions, RunStore, run_all

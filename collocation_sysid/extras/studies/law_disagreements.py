@@ -74,6 +74,13 @@ class Disagreement:
         )
 
 
+def is_comparable(name: str) -> bool:
+    """Return whether a parameter means the same in every law: a modulus at small strain, or a
+    damping coefficient.
+    """
+    return without_region(name) in MODULI or is_damping(name)
+
+
 def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
     """Return the moduli and damping coefficients whose estimates differ notably between models.
 
@@ -94,9 +101,7 @@ def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
     result = []
     for name in chosen["parameters"]:
         values = {r["model"]: r["parameters"].get(name) for r in (chosen, *others)}
-        if (without_region(name) in MODULI or is_damping(name)) and all(
-            v and v > 0 for v in values.values()
-        ):
+        if is_comparable(name) and all(v and v > 0 for v in values.values()):
             estimates = {model: float(value or 0.0) for model, value in values.items()}
             if max(estimates.values()) > LEAST_DISAGREEMENT_RATIO * min(estimates.values()):
                 result.append(

@@ -20,6 +20,7 @@ number of independent samples: samples over 1 + 2 Σ_k (1 − k/T) ρ_k along ti
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import exp, log, sqrt
@@ -27,18 +28,17 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, SimulationError
+from ...errors import SimulationError
 from ...features.registry import FEATURES, merged_fields, prediction_residuals
 from ...fem.laws.constants import symbol_of, unit_of
 from ...methods.solution import Solution
+from ...pipeline import run as solve_and_check
 from ...problem import Problem, RolloutOptions
 from ...recording.experiment import Experiment
 from ...recording.measurement_selection import without_later_measurements
 from ...recording.specimen import STRESS_UNIT
 from ...runs.forward_simulation import ForwardSimulation, simulate_experiment
 from ...runs.solving import solve
-from ...statistics.budget.consider_analysis import changes_of_assumptions
-from ...statistics.budget.uncertainty_budget import VarianceSources, budget
 from ...statistics.linearised import (
     AT_BOUND,
     LinearisedFit,
@@ -49,7 +49,6 @@ from ...statistics.linearised import (
 )
 from ...statistics.residuals.autocorrelation import ErrorProcess, error_processes
 from ...statistics.residuals.noise_level import ROUNDING
-from ...statistics.uncertainty import uncertainty_from_fit
 from .law_disagreements import Disagreement, find_disagreements
 from .run_execution import Record
 from .study_planning import PlannedRun, fitted_recordings
@@ -578,28 +577,13 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     StopIteration
         If the problem has no recording called `test_name`.
     """
-    known, start_s = reserve_test_data(problem, test_name) if test_name else (problem, np.inf)
+    if not test_name:
+        return _complete_record(problem, method)
+    known, start_s = reserve_test_data(problem, test_name)
     solution = solve(known, method)
-    record: dict[str, Any] = {
-        "status": solution.status.value,
-        "converged": solution.status.converged,
-        "rms": merged_fields(each.fit_rms(solution) for each in FEATURES),
-        "parameters": parameter_values(solution.collocation, solution.q),
-        "at_bound": _names_at_bounds(solution),
-        "free": [item.name for item in problem.parameters.free],
-        "time_s": solution.timing.total,
-    }
+    record = _solution_record(solution)
     if not solution.status.converged:
         return record
-    if not test_name:
-        try:
-            fit = linearise_fit(solution.collocation, solution.z)
-        except SimulationError as error:
-            return record | {"converged": False, "status": str(error)}
-        return record | {
-            "evidence": asdict(evidence_from_fit(fit)),
-            "budget": _budget_record(problem, solution, fit=fit),
-        }
     experiment = next(e for e in known.experiments if e.name == test_name)
     # With the scheme that was fitted: what is compared are models, not integrators.
     rollout = simulate_experiment(
@@ -609,6 +593,42 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
         return record | {"prediction": None, "failure": rollout}
     complete_experiment = next(e for e in problem.experiments if e.name == test_name)
     return record | {"prediction": _prediction_error(complete_experiment, rollout, start_s=start_s)}
+
+
+def _complete_record(problem: Problem, method: str) -> dict[str, Any]:
+    """Return the record of a fit to all recordings, with the estimates and the budget that the
+    command solve reports; see `fit_record`.
+    """
+    began_s = time.perf_counter()
+    finished = solve_and_check(problem, method, seek_causes=False)
+    solution = finished.solution
+    record: dict[str, Any] = _solution_record(solution)
+    record["time_s"] = time.perf_counter() - began_s
+    if not solution.status.converged:
+        return record
+    try:
+        fit = linearise_fit(solution.collocation, solution.z)
+    except SimulationError as error:
+        return record | {"converged": False, "status": str(error)}
+    reported = {name: each.value for name, each in finished.estimates.items()}
+    return record | {
+        "parameters": {n: reported.get(n, value) for n, value in record["parameters"].items()},
+        "evidence": asdict(evidence_from_fit(fit)),
+        "budget": {name: asdict(line) for name, line in finished.budget.items()},
+    }
+
+
+def _solution_record(solution: Solution) -> dict[str, Any]:
+    """Return the part of a record that every solution has, see `fit_record`."""
+    return {
+        "status": solution.status.value,
+        "converged": solution.status.converged,
+        "rms": merged_fields(each.fit_rms(solution) for each in FEATURES),
+        "parameters": parameter_values(solution.collocation, solution.q),
+        "at_bound": _names_at_bounds(solution),
+        "free": [item.name for item in solution.collocation.parameters.free],
+        "time_s": solution.timing.total,
+    }
 
 
 def _names_at_bounds(solution: Solution) -> dict[str, str]:
@@ -628,31 +648,6 @@ def _names_at_bounds(solution: Solution) -> dict[str, str]:
         elif upper - coordinate < AT_BOUND:
             at_bound[item.name] = "upper"
     return at_bound
-
-
-def _budget_record(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[str, Any]:
-    """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh, as
-    the fields of `BudgetLine` by name.
-
-    Empty if the error bars cannot be computed.
-    """
-    options = problem.uncertainty
-    parameters = solution.collocation.parameters
-    try:
-        known = uncertainty_from_fit(fit, parameters, q=solution.q, error_model=options)
-        changes = changes_of_assumptions(
-            solution.collocation, solution.z, deviations=problem.assumed_deviations
-        )
-    except (InputError, SimulationError):
-        return {}  # without error bars there is none
-    means = options.assumptions.collect_means()
-    sources = VarianceSources.from_fit(
-        fit, changes, parameters=parameters, q=solution.q, uncertainty=known, means=means
-    )
-    return {
-        name: asdict(line)
-        for name, line in budget(sources, known, numerical={}, parameters=parameters).items()
-    }
 
 
 def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:

@@ -14,12 +14,12 @@ from ...common.display import Items, Line, Shown, Table, TitledParts, as_markdow
 from ...common.files import SCHEMA, replaced_file, write_text_file
 from ...common.serialisation import as_json
 from ...fem.laws.constants import symbol_of, symbol_with_unit, unit_of
-from .law_disagreements import law_table
+from .law_disagreements import is_comparable, law_table
 from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
 from .run_execution import Record, RunStore
 from .study_kinds import METHOD_STUDY, MODEL_STUDY
 from .study_planning import PlannedRun, shortened_keys
-from .study_plots import comparison_plots, sweep_plots
+from .study_plots import comparison_plots, model_plots, sweep_plots
 from .study_rows import (
     COLUMNS,
     NumberColumn,
@@ -236,8 +236,8 @@ def write_report(report: StudyReport, folder: Path) -> None:
     """Write ``runs.csv``, ``summary.json``, ``summary.md`` and the plots (PNG) of a study into a
     folder.
 
-    A comparison of methods has also ``summary.csv``; a comparison of models has no plots. Earlier
-    files are replaced, but plots that are no longer made stay.
+    A comparison of methods has also ``summary.csv``. Earlier files are replaced, but plots that are
+    no longer made stay.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def write_report(report: StudyReport, folder: Path) -> None:
     write_text_file(folder / "summary.json", as_json(report_json(report)) + "\n")
     write_text_file(folder / "summary.md", as_markdown([report_section(report)]))
     if report.kind == MODEL_STUDY:
-        figures = {}
+        figures = model_plots(rows, comparable_names(rows))
     elif report.kind == METHOD_STUDY:
         figures = comparison_plots(rows, report.records, yardstick=report.yardstick)
     else:
@@ -458,9 +458,10 @@ def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
 
 
 def model_views(rows: Sequence[Row]) -> list[Table]:
-    """Return the tables "Models" (fit and prediction, the chosen model with an arrow) and
-    "Parameters"; with several held-out recordings there is one between them, "Recordings held out",
-    with the prediction error of each.
+    """Return the tables "Models" (fit and prediction, the chosen model with an arrow),
+    "Parameters", and the combined intervals of comparable parameters, if there are any; with
+    several held-out recordings the second is "Recordings held out", with the prediction error of
+    each.
 
     Parameters
     ----------
@@ -496,10 +497,20 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
                 rows=rows,
             )
         )
-    return [
-        *views,
-        _transposed_view("Parameters", {"model": _text_cell("model")}, cells=moduli, rows=rows),
-    ]
+    views.append(
+        _transposed_view("Parameters", {"model": _text_cell("model")}, cells=moduli, rows=rows)
+    )
+    intervals = {symbol_with_unit(n): _interval_cell(n) for n in comparable_names(rows)}
+    if intervals:
+        views.append(
+            _transposed_view(
+                "95 % intervals, each if its model is right",
+                {"model": _text_cell("model")},
+                cells=intervals,
+                rows=rows,
+            )
+        )
+    return views
 
 
 def _transposed_view(
@@ -575,6 +586,24 @@ def _bounded_cell(name: str) -> Cell:
         """Return the text of the cell in a row."""
         bound = row["at_bound"].get(name)
         return f"{number(row)} (at {bound} bound)" if bound else number(row)
+
+    return cell
+
+
+def comparable_names(rows: Sequence[Row]) -> list[str]:
+    """Return the names of the estimates that mean the same in every model and have an interval in
+    one of the rows of `model_rows`, in the order of their parameters.
+    """
+    names = dict.fromkeys(name for row in rows for name in row["parameters"])
+    return [n for n in names if is_comparable(n) and any(n in row["budget"] for row in rows)]
+
+
+def _interval_cell(name: str) -> Cell:
+    """Return the cell of the combined interval of a parameter; "–" if a model has none."""
+
+    def cell(row: Row) -> str:
+        line = row["budget"].get(name)
+        return "–" if line is None else "{:.3g} … {:.3g}".format(*line["combined95"])
 
     return cell
 

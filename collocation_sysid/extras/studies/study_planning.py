@@ -288,16 +288,7 @@ def plan_models(
         For a model that its problem file does not accept, and for a fitted recording that has
         neither markers nor a measured force, and is no test of a specimen.
     """
-    for each in problem.experiments:
-        is_compared = (
-            each.markers.count_samples() or each.sensors_by_grasp or each.specimen is not None
-        )
-        if not (each.validation or is_compared):
-            raise InputError(
-                f"'{each.name}' has neither markers nor a measured force; expected one of these, "
-                "because models are compared by their predictions of these, not of images "
-                "or readings"
-            )
+    require_predictable(problem)
     planned = []
     for test_name in ("", *fitted_recordings(problem)):
         for variant in variants:
@@ -310,6 +301,22 @@ def plan_models(
                 )
             )
     return planned
+
+
+def require_predictable(problem: Problem) -> None:
+    """Raise an `InputError` for a fitted recording that has neither markers nor a measured force,
+    and is no test of a specimen: models are compared by their predictions of these.
+    """
+    for each in problem.experiments:
+        is_compared = (
+            each.markers.count_samples() or each.sensors_by_grasp or each.specimen is not None
+        )
+        if not (each.validation or is_compared):
+            raise InputError(
+                f"'{each.name}' has neither markers nor a measured force; expected one of these, "
+                "because models are compared by their predictions of these, not of images "
+                "or readings"
+            )
 
 
 def fitted_recordings(problem: Problem) -> list[str]:

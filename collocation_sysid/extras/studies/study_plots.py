@@ -93,6 +93,68 @@ def comparison_plots(
     return figures
 
 
+@own_settings()
+def model_plots(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Figure]:
+    """Return the figure "models" of a comparison of models: the prediction error of each model
+    relative to the best, with its standard error, and estimates with combined intervals.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`; models without a prediction or an interval have an empty line.
+    names : sequence of str
+        Estimates to draw, a panel each.
+
+    Returns
+    -------
+    dict
+        Empty if nothing was predicted and there are no estimates.
+    """
+    predicted = any(row["log_ratio"] is not None for row in rows)
+    panels = [*(["prediction"] if predicted else []), *names]
+    if not panels:
+        return {}
+    figure = new_figure(max(PAGE_MM / 2, 45 * len(panels)), 20 + 7 * len(rows))
+    places = np.arange(len(rows))
+    axes_of_panels = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, panel in zip(axes_of_panels, panels, strict=True):
+        for place, row in zip(places, rows, strict=True):
+            ends = _model_ends(row, panel)
+            if ends is None:
+                continue
+            low, value, high = ends
+            colour = VERMILION if row["chosen"] else BLUE
+            bar = [[value - low], [high - value]]
+            axes.errorbar(
+                [value], [place], xerr=bar, fmt="o", ms=3, lw=LINE_PT, capsize=2, color=colour
+            )
+        if panel == "prediction":
+            style_axes(axes, "Held-out data", xlabel="error relative to the best", ylabel="")
+        else:
+            label = f"{symbol_as_mathtext(panel)} [{unit_of(panel)}]".removesuffix(" []")
+            style_axes(axes, "95 % interval", xlabel=label, ylabel="")
+    axes_of_panels[0].set_yticks(places, [row["model"] for row in rows])
+    axes_of_panels[0].set_ylim(len(rows) - 0.5, -0.5)
+    return {"models": figure}
+
+
+def _model_ends(row: Row, panel: str) -> tuple[float, float, float] | None:
+    """Return low end, value and high end of a model in a panel of `model_plots`; None if the model
+    has no such value.
+    """
+    if panel == "prediction":
+        if row["log_ratio"] is None or not np.isfinite(row["log_ratio_error"]):
+            return None
+        low, value, high = np.exp(row["log_ratio"] + row["log_ratio_error"] * np.array([-1, 0, 1]))
+        return float(low), float(value), float(high)
+    line = row["budget"].get(panel)
+    if line is None:
+        return None
+    low, high = line["combined95"]
+    value = min(max(row["parameters"][panel], low), high)
+    return low, value, high
+
+
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
     """Return colour and rows of each method by its name, in the order of their first rows; colours
     repeat if there are more methods than colours. `rows` are those of `run_row`.

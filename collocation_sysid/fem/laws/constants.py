@@ -8,9 +8,9 @@ region is preceded by the region: ``core.mu_pa``.
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 from ...errors import InputError
 
@@ -366,6 +366,17 @@ def is_density(name: str) -> bool:
 def is_damping(name: str) -> bool:
     """Return whether a constant is γ_r or γ_m, which bodies at rest do not determine."""
     return without_region(name) in (GAMMA_R.name, GAMMA_M.name)
+
+
+T = TypeVar("T")
+
+
+def with_undamped(statements: Mapping[str, T], constants: Iterable[str]) -> Mapping[str, T | float]:
+    """Return statements with zero for those of γ_r and γ_m among the constants that are not stated,
+    for specimens, on whose equilibria no damping acts.
+    """
+    missing = {name: 0.0 for name in constants if is_damping(name) and name not in statements}
+    return {**statements, **missing}
 
 
 def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | None:

@@ -89,12 +89,12 @@ def _solve_equilibrium(
     path = SolutionPath(separate.ravel(), halvings=solver.options.max_halvings, guess=guess)
     while path.share < 1.0:
         x, share = path.next_guess()
-        residual, linearise = _static_equations(scale_loads(forces, share), share, free=solver.free)
+        residual, linearise = static_equations(scale_loads(forces, share), share, free=solver.free)
         # Grasps that are off are there at the end: the way there may be any.
         goal = (
             goals_m
             if share == 1
-            else _partial_displacement(experiment, separate, time_s=at_s, share=share).ravel()
+            else partial_displacement(experiment, separate, time_s=at_s, share=share).ravel()
         )
         try:
             solution = solver.solve_equilibrium(
@@ -115,7 +115,7 @@ def _solve_equilibrium(
     return path.x
 
 
-def _static_equations(loaded: Forces, share: float, free: Index) -> tuple[Residual, Linearise]:
+def static_equations(loaded: Forces, share: float, free: Index) -> tuple[Residual, Linearise]:
     """Return the force balance (3n,) [N] of a body at rest as a function of its positions (3n,)
     [m], and its linearisation, which also reports the state of the search.
     """
@@ -152,7 +152,7 @@ def _with_separate_obstacles(forces: Forces, shape: Array) -> Array:
     return places
 
 
-def _partial_displacement(
+def partial_displacement(
     experiment: Experiment, displaced_m: Array, time_s: float, share: float
 ) -> Array:
     """Return a copy of positions with the grasps that hold moved by a share of their displacement

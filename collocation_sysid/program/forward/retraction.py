@@ -31,6 +31,8 @@ from ...fem.body import Body
 # Weight of the distance to x + δ beside that of the gradients, relative to the square of the body's
 # size: it determines a translation where nothing holds the body along an axis, and nothing else.
 ANCHOR = 1e-10
+# Largest logarithmic strain of an increment, far beyond those that are accepted.
+LARGEST_STRAIN = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +117,8 @@ class Retraction:
 def _exponential(strain: Array) -> Array:
     """Return the exponentials of symmetric matrices (points, 3, 3)."""
     values, vectors = np.linalg.eigh(strain)
+    # Steps of a nearly singular matrix may be of any length; they are halved later.
+    values = values.clip(-LARGEST_STRAIN, LARGEST_STRAIN)
     return (vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
 
 

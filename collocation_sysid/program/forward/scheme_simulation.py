@@ -131,7 +131,7 @@ def continue_simulation(
     done = len(known)
     x[:done] = known
     # Total force at every evaluation so far.
-    forces, previous_histories = _forces_and_histories(dynamics, x, row_count=done)
+    forces, previous_histories = forces_and_histories(dynamics, x, row_count=done)
     intervals = dynamics.compute_intervals_to_next_s()
     for t in range(done, dynamics.row_count):
         row = RowEquations(dynamics, x, forces=forces, t=t, previous=previous_histories)
@@ -180,7 +180,7 @@ def _body_failure(dynamics: Dynamics) -> SimulationError | None:
     return None
 
 
-def _forces_and_histories(
+def forces_and_histories(
     dynamics: Dynamics, x: Array, row_count: int
 ) -> tuple[Array, tuple[PreviousState, ...]]:
     """Return the forces at the evaluations of known rows, and the history variables after them."""

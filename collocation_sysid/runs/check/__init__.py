@@ -33,7 +33,7 @@ from ...statistics.misspecification.misspecification_hypothesis import Hypothesi
 from ...statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
 from ...statistics.misspecification.plausibility import size_and_density_hypotheses
 from ...statistics.scale_identifiability import scale_concerns, static_concerns
-from ...statistics.stability_concerns import strain_stability_concerns
+from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from .body_check import (
     BodyCheck,
     ElementShape,
@@ -332,6 +332,7 @@ def check_problem(
     concerns = (
         *_concerns(problem, findings, unstable=find_instabilities(simulated, z)),
         *strain_stability_concerns(parts),
+        *(branch_concerns(parts) if not start_notes else ()),
         *at_guess,
     )
     notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]

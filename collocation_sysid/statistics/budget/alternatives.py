@@ -24,6 +24,9 @@ from .uncertainty_budget import ALTERNATIVES, BudgetLine, VarianceSources, is_de
 
 # Smallest relative change of an estimate that is reported.
 LEAST_CHANGE = 0.01
+YOUNG = "young_pa"
+# Relative change of E over the anisotropy along an axis from which on E is the modulus along it.
+ALONG = 0.7
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,31 @@ def find_alternatives(
             condition = ALTERNATIVES[row].alternative.format(component=component)
             largest[row] = change, Alternative(row, condition, values)
     return tuple(alternative for _, alternative in largest.values())
+
+
+def modulus_axis_sentence(
+    sources: VarianceSources, estimates: Mapping[str, Estimate], anisotropy: float | None
+) -> str:
+    """Return a sentence on the axis of the mesh along which Young's modulus is measured, as in
+    bending; "" if there is none, or if the deviation of the anisotropy changes E by less than
+    `LEAST_CHANGE`.
+    """
+    known = estimates.get(YOUNG)
+    if not anisotropy or known is None or not known.value or YOUNG not in sources.derivatives:
+        return ""
+    by_axis = {
+        component: float(sources.derivatives[YOUNG] @ way) / known.value / anisotropy
+        for name, way in zip(sources.names, sources.sensitivities.T, strict=True)
+        for row, _, component in [name.partition(" ")]
+        if row == "anisotropy"
+    }
+    axis = max(by_axis, key=lambda each: by_axis[each], default="")
+    if not axis or by_axis[axis] < ALONG or by_axis[axis] * anisotropy < LEAST_CHANGE:
+        return ""
+    return (
+        f"E is mainly the modulus along the {axis} axis of the mesh: if the body is 10 % stiffer "
+        f"along it than across it, E is {by_axis[axis]:.0%} of this larger than across it"
+    )
 
 
 def origin_answers(

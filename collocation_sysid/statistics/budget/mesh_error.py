@@ -30,7 +30,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
-from ...common.time_dependence import at_times
 from ...errors import InputError
 from ...fem.body import Body
 from ...fem.meshes.refinement import refine_body
@@ -51,6 +50,9 @@ from .consider_analysis import changed_residuals
 from .discretisation_error import estimate_changes
 from .systematic_effects import Assumption, Effect, ExperimentAtAnswer
 
+# Largest number of nodes of a body whose error of the mesh is estimated in every solve: with more,
+# the search starts on a coarser mesh, and a note compares both meshes.
+LARGEST_NODE_COUNT = 1500
 # Relative accuracy of e: that of an estimate of an error.
 ACCURACY = 1e-2
 # Weight of the shape function of a node below which it is zero apart from rounding.
@@ -76,12 +78,18 @@ def mesh_change(collocation: Collocation, z: Array, fit: LinearisedFit) -> Array
     SimulationError, numpy.linalg.LinAlgError
         If the equations are singular.
     """
+    changes = changed_residuals(collocation, z, assumptions=[(finer_mesh_row(collocation), 1.0)])
+    return estimate_changes(fit, changes.blocks)[: collocation.nq, 0]
+
+
+def finer_mesh_row(collocation: Collocation) -> Assumption:
+    """Return the assumption that the meshes are fine enough: its effect is that of meshes with every
+    tetrahedron split into eight.
+    """
     bodies = dict.fromkeys(t.body for t in collocation.transcriptions if _has_mesh(t.experiment))
     finer = {id(body): refine_body(body) for body in bodies}
     effect = partial(_effect, scheme=collocation.scheme, finer=finer)
-    row = Assumption("mesh", "", None, "", remedy="", effect=effect)
-    changes = changed_residuals(collocation, z, assumptions=[(row, 1.0)])
-    return estimate_changes(fit, changes.blocks)[: collocation.nq, 0]
+    return Assumption("mesh", "", None, "", remedy="", effect=effect)
 
 
 def _has_mesh(experiment: Experiment) -> bool:
@@ -138,7 +146,7 @@ def _condensed_forces(
     """
     unbalanced_n = _forces_less_inertia(dynamics, x)
     xi, nu = dynamics.evaluation_states(x)
-    forces = dynamics.forces_with_histories(dynamics.histories(x))
+    histories = dynamics.histories(x)
     sequence = FactorSequence(
         Factoriser.cached(dynamics.pattern, new),
         NodeRotation(new, dynamics.pattern.size // 3),
@@ -147,7 +155,9 @@ def _condensed_forces(
     relative = np.zeros(dynamics.pattern.size)
     for k in range(len(xi)):
         now = slice(k, k + 1)
-        stiffness = -at_times(forces, now).linearise(xi[now], nu[now]).by_position[0]
+        row = dynamics.first_row + k
+        forces = dynamics.forces_with_histories(histories, slice(row, row + 1))
+        stiffness = -forces.linearise(xi[now], nu[now]).by_position[0]
         system = ReusedFactor(sequence, Matrix(stiffness, NONE), points_m=xi[k].reshape(-1, 3))
         relative[new] = system.solve(unbalanced_n[k, new], guess=relative[new])
         unbalanced_n[k] -= dynamics.pattern.products(stiffness[None], relative[None])[0]

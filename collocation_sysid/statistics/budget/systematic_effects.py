@@ -21,6 +21,7 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from ...common.array_types import Array, Index
+from ...common.field_descriptions import sentence, with_attributes
 from ...common.schema_tables import ByForm, Section
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive
@@ -37,7 +38,7 @@ from ...program.collocation import ExperimentIterate
 from ...program.reactions.reaction_forces import forces_on_dofs, reaction_forces
 from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
-from ...recording.nuisance import DEGREE
+from ...recording.nuisance import DEGREE, KINDS
 from ...recording.placement import place_markers
 from ...recording.specimen_files import specimen_strains
 from .memory_effect import (
@@ -574,17 +575,37 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
 
 
-def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
-    to a fixed one), in all such parts together; None if there is none.
-    """
-    items = {item.name: item for item in at.parameters.components}
-    constants = {
+def _stated_poisson_names(parameters: Parameters) -> set[str]:
+    """Return the names of Poisson's ratios that are fixed, or tied to a fixed one."""
+    items = {item.name: item for item in parameters.components}
+    return {
         name
         for name, item in items.items()
         if without_region(name) == "poisson"
         and (items[item.tied.to] if item.tied else item).is_fixed
     }
+
+
+def limited_poisson_deviation(deviation: float, parameters: Parameters) -> float:
+    """Return the standard deviation of stated Poisson's ratios on the scale ln(1 − 2ν), which ends
+    at the incompressible body, per unit of ν: a value that is lower by `deviation` is one standard
+    deviation away on this scale. It is that of the largest stated ratio below ½.
+    """
+    items = {item.name: item for item in parameters.components}
+    tied = {name: items[name].tied for name in _stated_poisson_names(parameters)}
+    stated = [items[name if to is None else to.to].guess for name, to in tied.items()]
+    below = [nu for nu in stated if nu is not None and nu < INCOMPRESSIBLE_POISSON]
+    if not below:
+        return deviation
+    distance = INCOMPRESSIBLE_POISSON - max(below)
+    return distance * float(np.log1p(deviation / distance))
+
+
+def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
+    to a fixed one), in all such parts together; None if there is none.
+    """
+    constants = _stated_poisson_names(at.parameters)
     if not constants:
         return None
     values = at.parameters.values(at.iterate.q)
@@ -953,8 +974,8 @@ ASSUMPTIONS = (
         "1",
         sigma=0.05,
         description="relative difference of the stiffness along one axis from that across it",
-        remedy="record a second motion with the body held the other way round, or press a cube "
-        "along each of its axes",
+        remedy="record a second motion with the body held the other way round, or test specimens "
+        "cut along each axis",
         effect=_anisotropy,
         component_names="x y z",
         of_specimens=True,
@@ -994,9 +1015,9 @@ ASSUMPTIONS = (
         "",
         sigma=0.02,
         description="error of a stated Poisson's ratio",
-        remedy="measure Poisson's ratio in a tension test, or estimate it; solid rubber is nearly "
-        "incompressible: state poisson = 0.499 in [parameters], and the deviation of this value, "
-        "poisson = 0.0005, in [uncertainty.assumptions]",
+        remedy="measure Poisson's ratio in a tension test, or estimate it; if it is known "
+        "better, state its deviation, poisson = …, in [uncertainty.assumptions]: the bulk modulus of "
+        "solid rubber, 1.5 to 2 GPa, determines it to about 0.0001",
         effect=_poisson,
         of_specimens=True,
     ),
@@ -1169,7 +1190,18 @@ KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
 OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n", "marker_mass_kg")
 
 
+def _assumption_entries() -> dict[str, tuple[str, str]]:
+    """Return type and description of each field of `Assumptions`, by name."""
+    entries = {}
+    for row in (*ASSUMPTIONS, *KINDS):
+        form = 'float, "none" or table' if row.name in OF_KNOWN_SIGN else 'float or "none"'
+        optional = ", optional" if isinstance(row, Assumption) and row.usual else ""
+        entries[row.name] = (form + optional, sentence(f"{row.description} [{row.unit or 1}]"))
+    return entries
+
+
 @validated(kw_only=True)
+@with_attributes(_assumption_entries())
 class Assumptions:
     """Standard deviations of systematic effects; "none" for an effect that is exactly zero.
 
@@ -1178,144 +1210,6 @@ class Assumptions:
     There is a field for each row of `ASSUMPTIONS` and of `recording.nuisance.KINDS`. Fields that are
     None have the default of bodies that were made like those of the problem, see
     `usual_deviations`.
-
-    Attributes
-    ----------
-    body_scale : float or "none", optional
-        Relative error of the size of the mesh [1].
-    rest_shape : float or "none", optional
-        Share of the weight of the body under which the mesh was deformed when it was made, along
-        each axis, if object.rest_shape is not stated [1].
-    surface : float or "none", optional
-        Displacement of the surface of the body from that of the mesh along its normal, relative to
-        the thickness [1].
-    mass : float or "none"
-        Relative error of the mass of the body, if the mass is not estimated [1].
-    marker_mass_kg : float, "none" or table
-        Mass of each marker, which is not part of the mass of the body [kg].
-    density_gradient : float or "none", optional
-        Relative difference of the density at one end of the body from that in its middle [1].
-    stiffness_gradient : float or "none", optional
-        Relative difference of the stiffness at one end of the body from that in its middle [1].
-    anisotropy : float or "none", optional
-        Relative difference of the stiffness along one axis from that across it [1].
-    stiffness_drift : float or "none", optional
-        Relative change of the stiffness from the beginning to the end of a recording [1].
-    memory_share : float or "none"
-        Share of a branch of viscoelastic memory (Prony term) that the material lacks, for each
-        relaxation time that the recording can show [1].
-    time_scale : float or "none"
-        Relative error of the rate of all clocks [1].
-    poisson : float or "none"
-        Error of a stated Poisson's ratio [1].
-    damping_law : float or "none"
-        Effect of another objective damping law, as a fraction of the complete difference of its
-        damping force from that of the stated law [1].
-    rayleigh_damping : float or "none"
-        Effect of Rayleigh damping, as a fraction of the complete difference of its damping force
-        from that of the stated law [1].
-    grip_layer_m : float, "none" or table
-        Compliance of grip and skin, as the thickness of a layer of the body's material [m].
-    grasp_edge_m : float or "none"
-        Distance by which the gripper holds more or less of the body than the grasped nodes [m].
-    machine_compliance_m_n : float, "none" or table
-        Compliance of the test bench [m/N].
-    effective_length : float or "none"
-        Relative error of length_m as the effective length of a specimen that is pulled by its
-        grips, whose shoulders stretch less [1].
-    gauge_length : float or "none"
-        Relative error of the length to which the strains of a specimen refer [1].
-    platen_friction : float or "none"
-        Coefficient of friction of platens between which nodes slide [1].
-    platen_slip : float or "none"
-        Slip of faces that are pressed by platens and held along all axes, as a fraction of that
-        without friction, if only loads are measured [1].
-    contact_stiffness : float or "none"
-        Compliance of the contact with obstacles, as a fraction of that of the pressure law [1].
-    buoyancy : float or "none"
-        Relative error of the buoyancy, because of the density of the air [1].
-    added_mass : float or "none"
-        Relative error of the added mass of the air [1].
-    air_drag : float or "none"
-        Relative error of the drag of the air [1].
-    marker_offset_m : float or "none"
-        Errors of the positions in reference_m without a reference_sigma_m; they rotate with the
-        body [m].
-    camera_offset_m : float or "none"
-        A constant offset of each marker in the cameras' frame [m].
-    calibration_scale : float or "none"
-        Scale error of all lengths that the cameras measure: the factor minus one [1].
-    calibration_distortion_1_m2 : float or "none"
-        Coefficient k of a radial distortion by the cameras: distances r from the middle of the body
-        are multiplied by 1 + k r² [1/m²].
-    time_shift_s : float or "none"
-        How much later than stated the markers were measured, by the clock of the grasps [s].
-    clock_rate : float or "none"
-        How much slower the clock of the markers runs than the clock of the grasps [1].
-    pose_turn_rad : float or "none"
-        A constant rotation of grasps and body in the cameras' frame, which rotates gravity in the
-        body's frame [rad].
-    pose_shift_m : float or "none"
-        A constant translation of grasps and body in the cameras' frame [m].
-    gravity_rad : float or "none"
-        A tilt of the direction of gravity [rad].
-    hand_eye_rad : float or "none"
-        A constant rotation of the body in its grasps [rad].
-    hand_eye_m : float or "none"
-        A constant translation of the body in its grasps; rotation and translation are estimated if
-        the start is an equilibrium and there are markers [m].
-    strain_zero : float or "none"
-        A constant offset of the strains of a specimen [1].
-    displacement_zero_m : float or "none"
-        A constant offset of each prescribed displacement along each of its axes [m].
-    obstacle_offset_m : float or "none"
-        A constant offset of each obstacle along its normal, or along the axis of its displacement;
-        it changes the time at which the obstacle touches the body [m].
-    obstacle_tilt_rad : float or "none"
-        A constant tilt of each obstacle that is a plane or a box, about the point of the plane or
-        the middle of the box [rad].
-    obstacle_time_s : float or "none"
-        Delay of each obstacle's motion, to first order [s].
-    tension_factor : float or "none"
-        Scale error of the tension of each tendon: the factor minus one [1].
-    tension_lost_n : float or "none"
-        Tension of each tendon that is lost by friction [N].
-    pressure_factor : float or "none"
-        Scale error of each pressure: the factor minus one [1].
-    pressure_lost_pa : float or "none"
-        Amount by which each pressure is lower than stated [Pa].
-    pressure_lag : float or "none"
-        Logarithm of the ratio of the true lag of each pressure to the stated lag_s [1].
-    joining_s : float or "none"
-        Delay of the time at which each point mass or force begins or ends, if this time is within
-        the recording [s].
-    tare : float or "none"
-        A constant offset of each component of a force sensor, in multiples of its sigma [σ].
-    sensor_time_s : float or "none"
-        Delay of the force sensors, limited to three standard deviations of its prior [s].
-    sensor_lag_s : float or "none"
-        Time constant of a first-order low-pass in the sensor, limited to values between zero and
-        three standard deviations of its prior [s].
-    tool_kg : float or "none"
-        Mass of the tool between a sensor and the body [kg].
-    tool_m : float or "none"
-        Centre of the tool relative to the point of the sensor; in the frame of the world, relative
-        to the centre of the grasped nodes [m].
-    depth_turn_rad : float or "none"
-        Rotation of each depth camera about the middle of the body, stated along the axes of the
-        camera [rad].
-    depth_shift_m : float or "none"
-        Translation of each depth camera; if neither prior is stated, the search begins by aligning
-        the first image with the body [m].
-    depth_bias_m : float or "none"
-        Offset that is added to each depth of an image [m].
-    depth_scale : float or "none"
-        Scale error of each depth of an image: the factor minus one [1].
-    depth_time_s : float or "none"
-        Delay of a depth camera, limited to three standard deviations of its prior [s].
-    depth_edge_px : float or "none"
-        Distance by which silhouettes in the images of each depth camera end inside the outline of
-        the body, in pixels [px].
     """
 
     body_scale: UsualDeviation = None

@@ -30,17 +30,21 @@ from ...recording.grasp import Grasp
 from ...recording.nuisance import GRASP_SHIFT, GRASP_TURN, TILT, TIME
 from ...recording.poses import PoseSequence
 from ..distributions import normal_isf
+from ..probes.relaxed_assumptions import NOISE
 from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
 from .modal_misspecifications import (
     ModalComparison,
     find_misspecifications_by_modes,
     gravity_hypotheses,
 )
-from .model_misspecifications import mirror_images, screened_bodies
+from .model_misspecifications import (
+    LinearCorrection,
+    coarse_mesh_hypotheses,
+    mirror_images,
+    screened_bodies,
+)
 from .track_misspecifications import filtered_tracks, same_tracks
 
-# RMS residual in standard deviations up to which there is nothing to explain.
-NOISE = 1.15
 # Factor by which the misfit of a refit must decrease, unless only noise remains.
 BETTER = 1.5
 # Factor by which two means, before and after, must explain residuals better than one.
@@ -67,6 +71,9 @@ SAME_LAG_S = 5e-4
 ESTIMATED_LAGS = 2.0
 # Discrepancy from which on mirror images of the mesh are fitted.
 MIRRORED = 2.0
+# Factor by which a correction that is known to first order must decrease the misfit to be the cause:
+# what remains is of second order.
+LINEAR = 2.0
 # Difference of losses (χ²) below which two corrections explain the data equally well.
 INDISTINGUISHABLE = 10.0
 # Strength over the largest one from which on a correction that does not suffice is mentioned.
@@ -175,6 +182,7 @@ def _refit_hypotheses(
                 *_slip_hypotheses(first, fitted_m, of=of),
                 *turned,
                 *bodies,
+                *coarse_mesh_hypotheses(solution, of),
                 *mirrored,
                 *_grasp_layer_hypotheses(first, of),
             ]
@@ -186,11 +194,16 @@ def _refit_hypotheses(
 def _named_alone_or_together(
     tested: Sequence[Hypothesis], loss_of: Callable[[Any], float]
 ) -> list[Hypothesis]:
-    """Return the hypothesis that brings the residuals to the noise; as one of several if others do
-    so with a loss that is larger by at most `INDISTINGUISHABLE`; if none does, those that reduce
-    them most, as one hypothesis.
+    """Return the hypothesis that brings the residuals to the noise, or that does so as far as a
+    linear correction can (`LINEAR`); as one of several if others do so with a loss that is larger by
+    at most `INDISTINGUISHABLE`; if none does, those that reduce them most, as one hypothesis.
     """
-    sufficient = [each for each in tested if each.remaining is not None and each.remaining <= 1.0]
+    sufficient = [
+        each
+        for each in tested
+        if (each.remaining is not None and each.remaining <= 1.0)
+        or (isinstance(each.corrected, LinearCorrection) and each.strength >= LINEAR)
+    ]
     if not sufficient:
         partial = sorted(tested, key=lambda each: -each.strength)
         partial = [each for each in partial if each.strength > PARTIAL * partial[0].strength]
@@ -298,6 +311,7 @@ class _Refitter:
         work = EFFORT * self.each * rows // len(declared.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
         self.near_answer: set[Experiment] = set()
+        self.declared = declared
         parameters = solution.collocation.parameters
         values = parameters.values(solution.q)
         self.answer = {item.name: values[item.name] for item in parameters.free}
@@ -313,15 +327,29 @@ class _Refitter:
             self.known[experiment] = self._fit(experiment)
         return self.known[experiment]
 
-    def discrepancy_after_refit(self, experiment: Experiment) -> float | None:
-        """Return the discrepancy after a refit, see `_discrepancy`; None if there is no fit."""
-        fitted = self.fit(experiment)
-        return None if fitted is None else _discrepancy(fitted)
+    def discrepancy_after_refit(self, corrected: Experiment | LinearCorrection) -> float | None:
+        """Return the discrepancy after a refit, see `_discrepancy`, or with a linear correction;
+        None if there is no fit.
+        """
+        fitted, share = self._fit_and_share(corrected)
+        return None if fitted is None else _discrepancy(fitted) * float(np.sqrt(share))
 
-    def loss_after_refit(self, experiment: Experiment) -> float:
-        """Return the loss with priors after a refit; infinite if there is no fit."""
-        fitted = self.fit(experiment)
-        return np.inf if fitted is None else fitted.history[-1].loss
+    def loss_after_refit(self, corrected: Experiment | LinearCorrection) -> float:
+        """Return the loss with priors after a refit, or with a linear correction; infinite if there
+        is no fit.
+        """
+        fitted, share = self._fit_and_share(corrected)
+        return np.inf if fitted is None else fitted.history[-1].loss * share
+
+    def _fit_and_share(
+        self, corrected: Experiment | LinearCorrection
+    ) -> tuple[Solution | None, float]:
+        """Return the fit of a changed experiment; or that of the stated one, with the share of its
+        χ² that a linear correction leaves.
+        """
+        if isinstance(corrected, LinearCorrection):
+            return self.fit(self.declared), corrected.share
+        return self.fit(corrected), 1.0
 
     def _fit(self, experiment: Experiment) -> Solution | None:
         """Return the fit of one experiment, and subtract its sweeps from those allowed.

@@ -2,9 +2,10 @@
 made.
 
 Each hypothesis is one more column of the linearised fit: the change of the residuals along the
-motion of the fit if the body had another law, another width along an axis of the mesh, or if its
-mesh had been made under its weight. The decrease of χ² by one Gauss–Newton step says which are
-worth a refit (`screened_bodies`). Mirror images of the mesh are too different for a linear step.
+motion of the fit if the body had another law, another width along an axis of the mesh, a finer mesh,
+or if its mesh had been made under its weight. The decrease of χ² by one Gauss–Newton step says which
+are worth a refit (`screened_bodies`); of a finer mesh this step is the only test. Mirror images of
+the mesh are too different for a linear step.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ...common.array_types import Array
-from ...errors import InputError
+from ...errors import InputError, SimulationError
 from ...fem.body import Body
 from ...fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
 from ...fem.meshes.mesh import TetMesh
@@ -25,6 +26,7 @@ from ...fem.rest_shape import UnderGravity
 from ...methods.solution import Solution
 from ...recording.experiment import Experiment
 from ..budget.consider_analysis import changed_residuals
+from ..budget.mesh_error import LARGEST_NODE_COUNT, finer_mesh_row
 from ..budget.shape_error import GRAVITY_M_S2, sag_m
 from ..budget.systematic_effects import Assumption, Effect, ExperimentAtAnswer
 from ..linearised import linearise_fit
@@ -42,8 +44,24 @@ WIDEST = 0.25
 # Distance of the nodes of a mirrored mesh from the mesh, over the largest extent, up to which they
 # are the same shape.
 SAME_SHAPE = 0.02
+# Smallest and largest error of a mesh over the change to half the edge lengths: with the order of
+# convergence n it is 2ⁿ / (2ⁿ − 1), 1.3 to 3.4 for the lowest orders, to first order.
+MESH_AMPLITUDES = (0.5, 3.5)
 # Share of the weight in a scan that is taken as the whole weight.
 WHOLE_WEIGHT = (0.4, 2.0)
+
+
+@dataclass(frozen=True)
+class LinearCorrection:
+    """Correction of the description whose effect is known to first order only.
+
+    Attributes
+    ----------
+    share : float
+        χ² of the fit with the correction over that without.
+    """
+
+    share: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +238,39 @@ def screened_bodies(solution: Solution, experiment: Experiment) -> Iterator[Hypo
         if count[hypothesis.code] < MOST_OF_A_KIND and count.total() < MOST_REFITS:
             count[hypothesis.code] += 1
             yield hypothesis
+
+
+def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
+    """Yield the hypothesis, about the subject `of`, that a finer mesh explains the residuals, with a
+    `LinearCorrection`; nothing if it hardly decreases χ², for large bodies, or if its effect cannot
+    be computed.
+    """
+    collocation = solution.collocation
+    bodies = [each.body for each in collocation.transcriptions if each.experiment.specimen is None]
+    if max((len(body.nodes.points_m) for body in bodies), default=0) > LARGEST_NODE_COUNT:
+        return
+    try:
+        row = finer_mesh_row(collocation)
+        columns = changed_residuals(collocation, solution.z, [(row, 1.0)])
+    except (InputError, SimulationError, np.linalg.LinAlgError):
+        return
+    gram = _projected_gram(solution, columns.blocks)
+    amplitude = -gram[1, 0] / max(gram[1, 1], 1e-300)
+    if amplitude < MESH_AMPLITUDES[0]:
+        return
+    amplitude = min(amplitude, MESH_AMPLITUDES[1])
+    decrease = -2 * amplitude * gram[1, 0] - amplitude**2 * gram[1, 1]
+    if decrease > LEAST_DECREASE:
+        count = collocation.count_measurements()
+        linear = any(body.element.name == "tet4" for body in bodies)
+        data = {
+            "sigmas": float(amplitude * np.sqrt(gram[1, 1] / count)),
+            "remedy": 'set object.element = "tet10", or refine the mesh'
+            if linear
+            else "refine the mesh",
+        }
+        corrected = LinearCorrection(1 - decrease / gram[0, 0])
+        yield Hypothesis("mesh-coarse", of, data=data, corrected=corrected)
 
 
 def _projected_gram(solution: Solution, blocks: Sequence[Array]) -> Array:

@@ -198,6 +198,9 @@ def _pushing_axis(grasp: Grasp, shifts_m: Array, frame: Frame) -> str:
 SUDDEN = 4.0
 # Quantile of the changes that counts as usual.
 LIVELY = 0.9
+# Share of the usual second difference of a motion that is no step: in fast motions with few samples,
+# successive second differences are large and may have opposite directions.
+WITHIN_MOTION = 0.5
 # Fewest samples in which steps are searched.
 FEWEST = 8
 
@@ -231,7 +234,13 @@ def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]
     sizes = step_sizes(tracks_m[rows], times_s).min(axis=1)
     k = int(sizes.argmax())
     grasp_step_m = step_sizes(moved_m[rows], times_s).max(axis=1)[k]
-    usual_m = max(_usual_change(sizes), float(grasp_step_m), 2 * float(np.median(sigma_m)))
+    swift_m = min(_median_second_difference(track_m) for track_m in tracks_m[rows].swapaxes(0, 1))
+    usual_m = max(
+        _usual_change(sizes),
+        float(grasp_step_m),
+        2 * float(np.median(sigma_m)),
+        WITHIN_MOTION * swift_m,
+    )
     yield from _step_hypothesis(
         "markers-jump", experiment, k=int(rows[k]), size_m=float(sizes[k]), usual_m=usual_m
     )
@@ -348,7 +357,8 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
         others = np.delete(sizes[k], m)
         size_m = float(sizes[k, m])
         most_m = float(others[np.isfinite(others)].max(initial=0.0))
-        usual_m = max(_usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
+        swift_m = WITHIN_MOTION * _median_second_difference(tracks_m[:, m])
+        usual_m = max(_usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]), swift_m)
         if _is_lasting(tracks_m, m, sample=k + 2, step_m=size_m):
             yield from _step_hypothesis(
                 "marker-slip/alone", experiment, k=k, size_m=size_m, usual_m=usual_m, marker=name
@@ -390,6 +400,14 @@ def _usual_change(sizes: Array) -> float:
     """
     rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
     return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0
+
+
+def _median_second_difference(track_m: Array) -> float:
+    """Return the median norm of the second differences of a track (T, 3) [m], without gaps; 0 if
+    there are none.
+    """
+    norms_m = np.linalg.norm(np.diff(track_m, 2, axis=0), axis=1)
+    return float(np.median(norms_m[np.isfinite(norms_m)])) if np.isfinite(norms_m).any() else 0.0
 
 
 # Factor by which exchanged names must fit better.

@@ -175,10 +175,12 @@ def _with_significant_moves(probe: Probe, limit: float) -> Probe:
 def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     """Return a significant probe after further steps, from where its first step leads.
 
-    The steps end after `STEPS`, if no shared parameter changes by more than `SETTLED`, or if a
-    simulation fails. Memory takes no further step: its effect is not linear in the share, and its
-    estimates depend on a relaxation time that is not estimated, so that a branch has to be added to
-    the material in any case. `sentences` has the name of the assumption if it is still significant.
+    The decrease of χ² remains that of the first step, because the others leave out the second order
+    of the amplitude in the residuals. The steps end after `STEPS`, if no shared parameter changes by
+    more than `SETTLED`, or if a simulation fails. Memory takes no further step: its effect is not
+    linear in the share, and its estimates depend on a relaxation time that is not estimated, so that
+    a branch has to be added to the material in any case. `sentences` has the name of the assumption
+    if it is still significant.
     """
     if assumption_name(probe.name) == MEMORY:
         complete_steps(StepUnit.ASSUMPTION)
@@ -190,6 +192,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
     wide = with_relaxed_assumption(
         at.fit, at.changes, name=probe.name, widening=prior_widening(probe.name)
     )
+    decrease = {"chi_squared": probe.chi_squared, "suffices": probe.suffices}
     p = at.read_parameters()
     _, positions = collocation.unpack(at.z)
     steps = 0
@@ -207,7 +210,7 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         wide = with_relaxed_assumption(
             there, changes, name=probe.name, widening=prior_widening(probe.name)
         )
-        probe = relaxed_probe(at, probe.name, wide=wide, p=p)
+        probe = replace(relaxed_probe(at, probe.name, wide=wide, p=p), **decrease)
         steps += 1
         complete_steps(StepUnit.ASSUMPTION, 1 / STEPS)
         if np.abs(step[: wide.shared_count]).max(initial=0.0) < SETTLED:

@@ -23,16 +23,22 @@ from ..budget.systematic_effects import ExperimentAtAnswer
 from ..budget.uncertainty_budget import BudgetLine, is_definition
 from ..estimates import Estimate
 from ..linearised import DerivedModuli, LinearisedFit, gauss_newton_step, least_squares_of_fit
+from ..residuals.autocorrelation import PERSISTENT
 from ..residuals.recording_scatter import TELLING
 from ..uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 DRIFT = "stiffness_drift"
 MEMORY = "memory_share"
+ANISOTROPY = "anisotropy"
 # Share of the range of the load by which it may return in a static recording that still counts as
 # monotonic: measured displacements scatter.
 RETURN = 0.02
 # Fewest samples of a static recording in which the load can return.
 FEWEST_SAMPLES = 3
+# RMS residual over σ up to which residuals count as noise, whatever their correlation.
+NOISE = 1.15
+# Least share of what exceeds χ² of noise that an assumption explains, if the rest is not noise.
+SUFFICIENT = 0.5
 Kind = Literal["window", "recording", "assumption"]
 
 
@@ -84,6 +90,9 @@ class Probe:
     relevance : float or None
         For an assumption the largest change of an estimate, in half widths of the combined
         interval, see `relevance`; None for parts of the data.
+    suffices : bool
+        For an assumption whether the residuals without it are as noise is, or closer to it by
+        `SUFFICIENT` of the way at least; else it is a substitute for something else.
     """
 
     kind: Kind
@@ -95,6 +104,7 @@ class Probe:
     sentences: tuple[str, ...] = ()
     routine: bool = False
     relevance: float | None = None
+    suffices: bool = True
 
     def is_beyond(self, limit: float) -> bool:
         """Whether the absolute size of a relaxed assumption exceeds `limit` of its standard errors;
@@ -199,7 +209,7 @@ def probed_changes(
 
     In a static recording whose load only rises, or only falls, "stiffer at the end" and "stiffer at
     large strain" are the same, so that a wrong material law would look like a drift: there the
-    column of the drift is zero.
+    column of the drift is zero. For the same reason that of anisotropy is zero for specimens.
 
     Parameters
     ----------
@@ -222,16 +232,20 @@ def probed_changes(
         if changes is None
         else changes
     )
-    columns = [k for k, name in enumerate(known.names) if name == DRIFT]
-    if not columns:
-        return known
+    of_drift, of_anisotropy = (
+        [k for k, name in enumerate(known.names) if assumption_name(name) == row]
+        for row in (DRIFT, ANISOTROPY)
+    )
     blocks = iter(known.blocks)
     masked = []
     for part in collocation.iterates(z):
-        hidden = part.transcription.experiment.is_static and has_monotonic_load(part, collocation)
+        experiment = part.transcription.experiment
+        columns = of_anisotropy if experiment.specimen is not None else []
+        if of_drift and experiment.is_static and has_monotonic_load(part, collocation):
+            columns = [*columns, *of_drift]
         for _ in part.transcription.residuals:
             change = next(blocks)
-            if hidden:
+            if columns:
                 change = change.copy()
                 change[..., columns] = 0.0
             masked.append(change)
@@ -314,7 +328,8 @@ def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> P
     uncertainty = fit.uncertainty_of_refit(after, p + step[:first])
     before = least_squares_of_fit(fit.fit)
     remaining = least_squares_of_fit(after)
-    decrease = before.loss(np.zeros(first)) - remaining.loss(np.zeros(len(step)))
+    stated = before.loss(np.zeros(first))
+    decrease = stated - remaining.loss(np.zeros(len(step)))
     unit = fit.deviations[assumption_name(name)] or 1.0
     errors = np.array([*uncertainty.nuisance.values()][first - wide.shared_count :])
     worst = int(np.argmax(np.nan_to_num(np.abs(own) / errors)))
@@ -322,7 +337,17 @@ def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> P
         "assumption", name, chi_squared=decrease, moves=fit.changes_of_estimates(uncertainty)
     )
     probe = replace(probe, size=float(unit * own[worst]), size_error=float(unit * errors[worst]))
-    return replace(probe, relevance=relevance(fit, probe))
+    excess = stated - fit.fit.count_measurements()
+    suffices = _are_noise(uncertainty) or decrease >= SUFFICIENT * excess
+    return replace(probe, relevance=relevance(fit, probe), suffices=suffices)
+
+
+def _are_noise(uncertainty: Uncertainty) -> bool:
+    """Return whether the residuals of a fit are as small as noise, or not correlated in time."""
+    is_small = uncertainty.level.pooled <= NOISE**2
+    dependence = uncertainty.dependence
+    is_white = np.isfinite(dependence.lag1_deviation) and abs(dependence.lag1) <= PERSISTENT
+    return bool(is_small or is_white)
 
 
 def relevance(fit: SolvedFit, probe: Probe) -> float:

@@ -1,17 +1,17 @@
-"""Tests of three assumptions in every solve: constant stiffness, a material without memory, and
-clocks of equal rate.
+"""Tests of four assumptions in every solve: constant stiffness, a material without memory, clocks
+of equal rate, and an isotropic material.
 
-A drift of the stiffness, a branch of viscoelastic memory with each of several relaxation times, and
-a rate of the cameras' clock join the linearised fit as one more column each, see
-`relaxed_assumptions`. The columns are computed together with those of the uncertainty budget, so
-that a probe costs one least-squares problem and no simulation. `deep_probes` (``solve --probe``)
-relaxes all other assumptions, refits parts of the data, and follows effects that are too large for
-one linear step.
+A drift of the stiffness, a branch of viscoelastic memory with each of several relaxation times, a
+rate of the cameras' clock, and a stiffness that is higher along one axis of the mesh join the
+linearised fit as one more column each, see `relaxed_assumptions`. The columns are computed together
+with those of the uncertainty budget, so that a probe costs one least-squares problem and no
+simulation. `deep_probes` (``solve --probe``) relaxes all other assumptions, refits parts of the data,
+and follows effects that are too large for one linear step.
 
 A probe is *significant* if its amplitude is farther from zero than noise explains, and *relevant*
-if relaxing the assumption changes what is reported. Only what is both gives concern, see
-`assessment.probe_concerns`: with much data any imperfection is significant, and with little data
-any change is large.
+if relaxing the assumption changes what is reported. Only what is both, and explains the residuals,
+gives concern, see `assessment.probe_concerns`: with much data any imperfection is significant, with
+little data any change is large, and any error of the model is absorbed by any assumption in part.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from ..budget.consider_analysis import ResidualChanges
 from ..budget.systematic_effects import ASSUMPTIONS
 from ..distributions import normal_isf
 from .relaxed_assumptions import (
+    ANISOTROPY,
     DRIFT,
     MEMORY,
     Probe,
@@ -36,7 +37,7 @@ from .relaxed_assumptions import (
 
 # Assumptions that are probed in every solve: each can be wrong while the residuals look white,
 # biases the estimates, and is determined by a single recording.
-ROUTINE = (DRIFT, MEMORY, CLOCK_RATE.name)
+ROUTINE = (DRIFT, MEMORY, CLOCK_RATE.name, ANISOTROPY)
 # Unit of the share of a branch of memory, which is not in the budget by default.
 MEMORY_SHARE = 0.1
 # Probability that any routine probe of a faultless run is significant, as of every other test of
@@ -44,8 +45,11 @@ MEMORY_SHARE = 0.1
 # draws of the noise of one faultless recording was significant.
 FALSE_ALARMS = 1e-4
 # Standard deviation of the prior of a probe's amplitude, in deviations of the budget: it must not
-# shrink towards the assumption that it tests, and stay bounded where the data say nothing.
+# shrink towards the assumption that it tests, and stay bounded where the data say nothing. That of
+# anisotropy is smaller: across the axis of bending hardly anything depends on it, so that any error of
+# the model needs an impossible anisotropy (0.7 to 0.9 in twins without any).
 WIDENING = 10.0
+WIDENING_OF_ANISOTROPY = 4.0
 # Least change of an estimate that is relevant, in half widths of its combined interval, which is the
 # one to publish: with the deviations of real bodies and laboratories every assumption is violated a
 # little, and the interval contains that. Memory left out changes E by two half widths and more.
@@ -112,8 +116,10 @@ def one_step_probes(solved_fit: SolvedFit, names: Iterable[str]) -> Iterator[Pro
 
 def prior_widening(name: str) -> float:
     """Return the standard deviation of an assumption's prior, in deviations of the budget, for its
-    name with component: `WIDENING` for routine assumptions, else 1.
+    name with component: `WIDENING` or `WIDENING_OF_ANISOTROPY` for routine assumptions, else 1.
     """
+    if assumption_name(name) == ANISOTROPY:
+        return WIDENING_OF_ANISOTROPY
     return WIDENING if is_routine_assumption(name) else 1.0
 
 
@@ -145,13 +151,14 @@ def significance_limit(changes: ResidualChanges, name: str) -> float:
 
 
 def is_alarming(probe: Probe) -> bool:
-    """Whether a probe relaxes an assumption that is significant (it has `sentences`), and relevant
-    to the estimates (`relevance` at least `RELEVANT`); false for parts of the data, and for memory
-    with a negative share, which no material has.
+    """Whether a probe relaxes an assumption that is significant (it has `sentences`), relevant to
+    the estimates (`relevance` at least `RELEVANT`), and explains the residuals (`suffices`); false
+    for parts of the data, and for memory with a negative share, which no material has.
     """
     is_possible = assumption_name(probe.name) != MEMORY or (probe.size or 0.0) > 0
     return (
         is_possible
+        and probe.suffices
         and bool(probe.sentences)
         and probe.kind == "assumption"
         and (probe.relevance or 0.0) >= RELEVANT
