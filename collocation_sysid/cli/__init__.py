@@ -16,6 +16,7 @@ from __future__ import annotations
 import ast
 import logging
 import sys
+import warnings
 from collections.abc import Callable
 from contextlib import chdir
 from functools import cache
@@ -177,6 +178,8 @@ def main() -> None:
     """Run the command line and end the process: errors become one message on stderr and an exit
     code, see the module; it does not return.
     """
+    # Trial steps of a search overflow, and are then shortened.
+    warnings.filterwarnings("ignore", category=RuntimeWarning)
     try:
         _run_command()
     except KeyboardInterrupt:  # before or after the command itself

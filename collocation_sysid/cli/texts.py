@@ -14,7 +14,7 @@ import typer
 
 from ..common.console import PlainConsole
 from ..common.display import Shown, Table
-from ..common.pages import page_files, page_text, page_title
+from ..common.pages import glossary_terms, page_files, page_text, page_title
 from ..common.serialisation import as_json
 from ..errors import InputError, hint_at, located
 from .command_options import AsJson, command
@@ -98,8 +98,8 @@ class ExplainCommand:
     "explain theory | less",
 )
 def explain(options: ExplainCommand) -> None:
-    """Show pages of the documentation, or list their topics; describe keys of the problem file,
-    constants and rows of the uncertainty budget.
+    """Show pages of the documentation, or list their topics; describe keys of the problem file, and
+    words of the output, such as constants and rows of the uncertainty budget.
 
     Pages are part of the installation; no network is needed. If the output is not a terminal, they
     are printed as Markdown.
@@ -114,10 +114,9 @@ def explain(options: ExplainCommand) -> None:
             )
         )
         return
-    for topic in options.topics:
-        _require_topic(topic)
+    topics = [_known_topic(topic) for topic in options.topics]
     console = PlainConsole()
-    for topic in options.topics:
+    for topic in topics:
         if topic not in page_files():
             for table in (_key_table(topic), _word_table(topic)):
                 if table.rows:
@@ -130,19 +129,24 @@ def explain(options: ExplainCommand) -> None:
             typer.echo(page_text(topic))
 
 
-def _require_topic(topic: str) -> None:
-    """Raise an `InputError` unless a page, a key of the problem file, a constant or a row of the
-    uncertainty budget has this name.
+def _known_topic(topic: str) -> str:
+    """Return the topic, or its part before " of ", as in "area_error of stress".
+
+    Raises
+    ------
+    InputError
+        Unless a page, a key of the problem file, or a word of the output has this name.
     """
     from ..problem.key_descriptions import all_keys, find_keys
 
-    if topic in page_files() or find_keys(topic) or _word_table(topic).rows:
-        return
+    for each in (topic, topic.split(" of ")[0]):
+        if each in page_files() or find_keys(each) or _word_table(each).rows:
+            return each
     names = [each.path.rpartition(".")[2] for each in all_keys()]
     known = [*page_files(), *dict.fromkeys(names)]
     raise InputError(
-        f"found {topic!r}; expected one of {', '.join(page_files())}, or a key of the problem "
-        f"file{hint_at(topic, known)}",
+        f"found {topic!r}; expected one of {', '.join(page_files())}, a key of the problem "
+        f"file, or a word of the output{hint_at(topic, known)}",
         where="TOPIC",
     )
 
@@ -159,10 +163,11 @@ def _key_table(name: str) -> Table:
 
 
 def _word_table(word: str) -> Table:
-    """Return the table of the constants with a name or symbol, and of the rows of the uncertainty
-    budget with a label: name, symbol and meaning.
+    """Return the table of the constants with a name or symbol, of the rows of the uncertainty budget
+    with a label, of nuisance parameters, and of terms of the glossary: name, symbol and meaning.
     """
     from ..fem.laws.constants import KNOWN, constants_with_symbol, unit_of
+    from ..recording.nuisance import nuisances_called
     from ..statistics.budget.systematic_effects import ASSUMPTIONS
     from ..statistics.budget.uncertainty_budget import source_label
     from ..statistics.remedies import REMEDIES
@@ -171,6 +176,10 @@ def _word_table(word: str) -> Table:
     rows = [
         (name, f"{KNOWN[name].symbol} {unit_of(name)}".strip(), KNOWN[name].meaning)
         for name in constants
+    ]
+    rows += [
+        (row.key or row.name, "nuisance parameter", row.description)
+        for row in nuisances_called(word)
     ]
     sources = {
         component: (each.name, each.description)
@@ -184,6 +193,9 @@ def _word_table(word: str) -> Table:
     if about := sources.get(word) or labels.get(word):
         name, meaning = about
         rows.append((name, "uncertainty", f"{meaning}; to reduce it, {REMEDIES[name]}"))
+    if not rows and (term := glossary_terms().get(word.lower())):
+        meaning, topic = term
+        rows.append((word, "", f"{meaning} (explain {topic})"))
     return Table("", ("name", "", "meaning"), rows=tuple(rows), names=2, texts=1)
 
 

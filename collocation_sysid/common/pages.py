@@ -115,3 +115,22 @@ def documentation_url() -> str | None:
         return None
     urls = dict(each.split(", ", 1) for each in project_urls)
     return urls["Documentation"].rstrip("/") if "Documentation" in urls else None
+
+
+@cache
+def glossary_terms() -> dict[str, tuple[str, str]]:
+    """Return meaning and topic of the page of each term of the glossary, in lower case; empty where
+    neither a wheel nor a checkout is installed. A row of the glossary may have several terms.
+    """
+    if "glossary" not in page_files():
+        return {}
+    rows = re.findall(
+        r"^\| (.+?) \| (.+) \| \[.+?\]\((?:\w+/)?(\w+)\.md\) \|$",
+        page_files()["glossary"].read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+    return {
+        term.lower(): (meaning, topic)
+        for terms, meaning, topic in rows
+        for term in (terms, *terms.split(", "))
+    }

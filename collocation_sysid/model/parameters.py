@@ -302,6 +302,15 @@ def complete_parameter(
     for what, value in (("lower", user_statement.lower), ("upper", user_statement.upper)):
         if value is not None and not is_known:
             _require_admissible(constant, float(value), f"{name}: {what}")
+        if value is not None and constant.widest is not None and is_modulus(name):
+            softest, stiffest = constant.widest
+            if value > 0 and not softest <= value <= stiffest:
+                raise InputError(
+                    f"{what} = {value:g} Pa is the stiffness of no material; expected a value from "
+                    f"{softest:g} to {stiffest:g}, or no bound",
+                    None,
+                    where=name,
+                )
     if scale == "linear" and typical == 0:
         statement = "no guess" if user_statement.guess is None else "guess = 0"
         raise InputError(

@@ -331,6 +331,7 @@ class Problem:
         nuisance_indices([each for each in self.experiments if not each.validation], 0)
         for experiment in self.experiments:
             with located(where=f"experiment '{experiment.name}'"):
+                _require_plausible_noise(experiment)
                 as_scheme(self.scheme, experiment.start_rule)
                 if self.rollout.timestep_s is not None:
                     require_steps(experiment, self.rollout.timestep_s)
@@ -343,6 +344,20 @@ class Problem:
                     f"found {name!r}; expected estimated parameters, {', '.join(scalars)}",
                     where="uncertainty.profile",
                 )
+
+
+def _require_plausible_noise(experiment: Experiment) -> None:
+    """Raise an `InputError` if the noise of the markers is larger than the body."""
+    if not experiment.markers.count_samples():
+        return
+    sigma_m = float(np.min(experiment.markers.sigma_m))
+    size_m = float(np.ptp(experiment.body.nodes_m, axis=0).max())
+    if sigma_m > size_m:
+        raise InputError(
+            f"found {sigma_m:g} m, but the body is {size_m:.3g} m long; expected the standard deviation "
+            f"of the noise of one coordinate in metres (0.5 mm are 0.0005)",
+            where="markers.sigma_m",
+        )
 
 
 def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None:

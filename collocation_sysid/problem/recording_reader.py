@@ -554,6 +554,13 @@ class RecordingReader:
         first_s, last_s = section.window_s or (-np.inf, np.inf)
         t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]
+        if len(t_s) and np.isfinite(last_s):
+            interval_s = (table.t_s[-1] - table.t_s[0]) / max(len(table.t_s) - 1, 1)
+            if last_s > table.t_s[-1] + interval_s or first_s < table.t_s[0] - interval_s:
+                self._add_notes(
+                    f"window_s = [{first_s:g}, {last_s:g}] exceeds the recording, which has samples "
+                    f"from {table.t_s[0]:g} s to {table.t_s[-1]:g} s"
+                )
         for name, sequence, interval_s in zip(pose_files, poses, grasp_intervals_s, strict=True):
             if name is not None and len(t_s) and not static:
                 require_determined_motion(

@@ -794,6 +794,24 @@ KINDS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
 GAUGE = NuisanceRow("reading", "", sigma=None, of="gauge", changes=())
 
 
+def nuisances_called(word: str) -> list[NuisanceRow]:
+    """Return the kinds of nuisance parameters with a name, key, label, or beginning of their
+    sentence in the terminal; empty for none.
+    """
+    plain = word.replace("_", " ")
+
+    def matches(form: str) -> object:
+        """Whether the word has a form, in which {which} and the like stand for any text."""
+        literals = [re.escape(each) for each in re.split(r"\{\w+\}", form.replace("_", " "))]
+        return re.search(r"\w", "".join(literals)) and re.fullmatch(".*".join(literals), plain)
+
+    return [
+        row
+        for row in KINDS
+        if any(map(matches, (row.name, row.key, row.label, row.sentence.split(":")[0])))
+    ]
+
+
 @dataclass(frozen=True, kw_only=True)
 @with_attributes({row.name: ("float or None", sentence(row.description)) for row in KINDS})
 class Nuisance:

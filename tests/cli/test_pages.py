@@ -11,14 +11,18 @@ from pathlib import Path
 import pytest
 from kit.problem_files import run_command
 
+from collocation_sysid import Problem, run
 from collocation_sysid.cli.markdown import TerminalPage
 from collocation_sysid.cli.texts import _key_table, _word_table
 from collocation_sysid.common.console import PlainConsole
-from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.display import Table, plain_text
 from collocation_sysid.common.pages import page_files, page_text, page_url
 from collocation_sysid.fem.laws.constants import KNOWN, constants_with_symbol
 from collocation_sysid.problem.key_descriptions import all_keys, find_keys
+from collocation_sysid.problem.new_problem import create_problem
+from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_sections import remedy_command, remedy_lines
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
 from collocation_sysid.statistics.budget.uncertainty_budget import source_label
 from collocation_sysid.statistics.concerns import TOPICS, Concern
@@ -66,7 +70,7 @@ def test_keys_of_the_problem_file_are_explained():
     assert "experiment.grasp.sigma_m" not in one
     outcome = run_command("explain", "resampel_hz")
     assert outcome.code == 2
-    assert "or a key of the problem file" in outcome.err
+    assert "a key of the problem file, or a word of the output" in outcome.err
     assert "did you mean 'resample_hz'?" in outcome.err
 
 
@@ -161,6 +165,32 @@ def test_labels_are_explained_by_the_command():
     assert "grip_layer_m" in shown
     assert "glue the body to a stiff plate" in shown
     assert "young_pa" in shown
+
+
+def test_every_kind_of_nuisance_parameter_is_explained():
+    for row in KINDS:
+        said = (row.label.format(which="tip", axis="x"), row.sentence.split(":")[0], row.key)
+        for word in said:
+            if word and "{" not in word and word != "tip":
+                names = [each[0] for each in _word_table(word).rows]
+                assert (row.key or row.name) in names, word
+
+
+@pytest.mark.long
+def test_every_word_that_a_solve_prints_is_explained(tmp_path):
+    create_problem(tmp_path / "strip", "specimen")
+    found = run(Problem.read(tmp_path / "strip" / "problem.toml"), seek_causes=False)
+    shown = run_summary(found.result, details=True, budget=True)
+    tables = [each for each in shown if isinstance(each, Table)]
+    assert len(tables) > 1
+    words = {cell for table in tables for cell in table.heads} - {"", "value", "% of the variance"}
+    rows = [row[0] for table in tables for row in table.rows]
+    words |= {re.sub(r" (Pa|kPa|MPa|GPa|s|1/s)$", "", row) for row in rows}
+    words |= {note.split(":")[0] for note in found.result.fit.experiments["pull"].notes}
+    words |= {label.rpartition(" [")[0] for label in found.result.nuisance["pull"]}
+    words |= {"fit", "forward simulation", "reduced χ²", found.trust.verdict}
+    unknown = [word for word in sorted(words) if run_command("explain", word).code]
+    assert unknown == []
 
 
 @pytest.mark.parametrize(

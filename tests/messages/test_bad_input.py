@@ -401,6 +401,14 @@ POSE_FILES = [
         edit=keep_lines(POSES, 5),
     ),
     bad(
+        "noise-in-millimetres", "markers.sigma_m", "0.5 m", "0.5 mm are 0.0005",
+        options=["--set", "experiment.swing.markers.sigma_m=0.5"],
+    ),
+    bad(
+        "bound-of-no-material", "parameters.mu_pa", "lower = 0.0001 Pa", "from 0.001 to 1e+13",
+        options=["--set", "parameters.mu_pa.lower=1e-4"],
+    ),
+    bad(
         "poses-that-begin-late", f"{POSES}: the poses run from 0.03 s", "window_s = [0.03, 0.08]",
         edit=cut_start(POSES, 3),
     ),

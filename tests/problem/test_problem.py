@@ -303,6 +303,13 @@ def test_lengths_of_a_marker_file_have_a_unit(tiny):
 # Time ---------------------------------------------------------------------------------------------
 
 
+def test_a_window_that_exceeds_the_recording_is_noted(tiny):
+    notes = load(tiny, "experiment.0.window_s=[0.0, 9.0]").notes
+    assert any("window_s = [0, 9] exceeds the recording" in note for note in notes)
+    notes = load(tiny, "experiment.0.window_s=[0.0, 0.06]").notes
+    assert not any("exceeds" in note for note in notes)
+
+
 def test_a_window_cuts_poses_and_markers(tiny):
     experiment = experiment_of(tiny, "experiment.0.window_s=[0.02, 0.06]")
     np.testing.assert_allclose(experiment.t_s, [0.02, 0.03, 0.04, 0.05, 0.06])
