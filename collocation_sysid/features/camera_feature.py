@@ -3,43 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
 from ..common.array_types import Array, root_mean
-from ..common.display import number
 from ..methods.solution import Solution
 from ..methods.stiffness_scan import typical_constants
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
-from ..program.depth.depth_comparison import (
-    DepthError,
-    SurfaceComparison,
-    camera_residuals,
-    depth_residuals,
-    outline_distances_px,
-    surface_residuals,
-)
-from ..program.simulation import Trajectory
-from ..program.transcription import Transcription
-from ..recording.experiment import Experiment
+from ..program.depth.depth_comparison import depth_residuals, outline_distances_px
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..statistics.concerns import Concern, concern_if
-from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
 from .camera_clock_misspecifications import MESSAGES_OF_TIMES, camera_clock_hypotheses
 from .camera_image_misspecifications import MESSAGES_OF_IMAGES, camera_image_hypotheses
 from .camera_misspecifications import MESSAGES_OF_POSES, camera_hypotheses, require_depth_units
-from .feature import Feature, SimulatedCheck, Units
-from .measurement_results import (
-    FittedExperiment,
-    InstrumentPrediction,
-    PictureKind,
-    PredictionErrors,
-    Samples,
-    during,
-)
+from .feature import Feature, SimulatedCheck
+from .measurement_results import PredictionErrors
 
 # Messages of concerns about a fit or a prediction, by code.
 MESSAGES = {
@@ -75,96 +55,6 @@ EXCLUSION_WORDS = {
 }
 # Most nodes of a body whose equilibria for many stiffnesses take seconds.
 NODES = 2000
-
-
-# Predictions --------------------------------------------------------------------------------------
-
-
-def instruments(experiment: Experiment) -> list[str]:
-    """Return the number of points of each camera."""
-    return [
-        f"{sum(map(len, depth.clouds)):,} points of '{depth.name}'" for depth in experiment.depths
-    ]
-
-
-def samples(experiment: Experiment) -> Iterator[Samples]:
-    """Yield which images of each camera during the recording have points."""
-    for depth in experiment.depths:
-        has_points = np.array([len(cloud) > 0 for cloud in depth.clouds], dtype=bool)
-        is_within = during(experiment, np.asarray(depth.t_s))
-        yield Samples(
-            f"the images of '{depth.name}'", ["points"], (has_points & is_within)[:, None]
-        )
-
-
-def predict(transcription: Transcription, trajectory: Trajectory, phi: Array) -> dict[str, Any]:
-    """Return the comparison of each camera with the simulated surface, by name."""
-    return {
-        "surfaces": {
-            reading.correspondences.camera.depth.name: SurfaceComparison.from_motion(
-                reading, trajectory.t_s, positions_m=trajectory.positions_m, phi=phi
-            )
-            for reading in camera_residuals(transcription)
-        }
-    }
-
-
-def fitted(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
-    """Return the comparison of each camera with the fitted surface, by name."""
-    return {"surfaces": fitted_surfaces(part)}
-
-
-def reason_against_copy(experiment: Experiment, _: Experiment) -> str:
-    """Return that points cannot be compared if nothing else is measured; else ""."""
-    is_compared = (
-        experiment.markers.count_samples() or experiment.sensors_by_grasp or experiment.readings
-    )
-    if is_compared:
-        return ""
-    return "points of depth cameras cannot be compared between recordings"
-
-
-def errors(_: Experiment, predicted: InstrumentPrediction) -> dict[str, Any]:
-    """Return the distances of each camera's points from the surface; None without cameras."""
-    by_camera = {name: surface.error for name, surface in predicted.surfaces.items()}
-    return {"depth": by_camera or None}
-
-
-def misfits(_: Experiment, predicted: InstrumentPrediction) -> Iterator[InstrumentMisfit]:
-    """Yield the distances of each camera with a point near the body, over its σ."""
-    for name, surface in predicted.surfaces.items():
-        error = surface.error
-        if error.rms_m is not None:
-            yield InstrumentMisfit(
-                f"the depth of {name}",
-                "its sigma_m",
-                sigmas=error.sigmas,
-                robust_sigmas=error.tame_sigmas,
-                count=error.points,
-                size=f"{1e3 * error.rms_m:.3g} mm RMS",
-            )
-
-
-def step_differences(
-    part: ExperimentIterate, trajectory: Trajectory, _: InstrumentPrediction, share: float
-) -> list[Array]:
-    """Return the changes (S, M, 3) of the residuals of each camera and outline, at the
-    correspondences of the fit.
-    """
-    if not (residuals := surface_residuals(part)):
-        return []
-    known_s = part.transcription.experiment.t_s
-    rows_s = part.transcription.dynamics.t_s
-    fitted = part.x[part.transcription.markers.observable.rows]
-    way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
-    way_rows_m = np.array([np.interp(rows_s, known_s, each) for each in way_m.T])
-    displacements_m = way_rows_m.T.reshape(len(rows_s), -1, 3, 1)
-    return [
-        reading.residual_changes(
-            observation, displacements_m[:, reading.correspondences.surface.nodes], phi=part.phi
-        )[..., 0]
-        for reading, observation in residuals
-    ]
 
 
 # Likely errors ------------------------------------------------------------------------------------
@@ -251,8 +141,13 @@ def _misses_surface(distances: Array) -> bool:
 # Concerns -----------------------------------------------------------------------------------------
 
 
-def part_concerns(part: ExperimentIterate) -> Iterator[Concern]:
+def concerns(parts: Sequence[ExperimentIterate]) -> Iterator[Concern]:
     """Yield concerns about the estimated poses of the cameras, and about outlines."""
+    for part in parts:
+        yield from _part_concerns(part)
+
+
+def _part_concerns(part: ExperimentIterate) -> Iterator[Concern]:
     experiment = part.transcription.experiment
     nuisance = part.transcription.nuisance
     for camera in range(len(experiment.depths)):
@@ -327,41 +222,6 @@ def simulation_concerns(name: str, error: PredictionErrors) -> Iterator[Concern]
             yield Concern("prediction/unseen", "doubtful", data=data)
 
 
-def live_limitations(experiment: Experiment) -> list[tuple[str, object, str]]:
-    """Return that frames of a live recording contain no images."""
-    return [
-        ("depth cameras, because frames do not contain their images", experiment.depths, "none")
-    ]
-
-
-# Results ------------------------------------------------------------------------------------------
-
-
-def fitted_surfaces(part: ExperimentIterate) -> dict[str, SurfaceComparison]:
-    """Return the points of each camera compared with the fitted surface, by name of the camera."""
-    return {
-        reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
-            reading, part.x, values=observation, phi=part.phi
-        )
-        for reading, observation in depth_residuals(part)
-    }
-
-
-def fitted_errors(part: ExperimentIterate) -> dict[str, DepthError]:
-    """Return the distances of each camera's points from the fitted surface, by name."""
-    return {name: surface.error for name, surface in fitted_surfaces(part).items()}
-
-
-def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
-    """Return the distances of each camera's points; None without cameras."""
-    return {"depth": fitted_errors(part) or None}
-
-
-def excluded_loss(part: ExperimentIterate) -> float:
-    """Return the loss of the points beyond the gate, each counted like one at the gate."""
-    return sum(reading.loss_of_distant_points for reading, _ in depth_residuals(part))
-
-
 def notes(part: ExperimentIterate) -> Iterator[str]:
     """Yield notes on the distances of points and outlines from the fitted surface, per camera;
     first on all points, then on all outlines.
@@ -396,71 +256,13 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
             )
 
 
-def fit_lines(name: str, fitted: FittedExperiment, _: bool) -> Iterator[str]:
-    """Yield the distances of each camera's points from the fitted surface."""
-    for camera, error in (fitted.depth or {}).items():
-        yield f"depth of {camera} in '{name}': {_distance_text(error)}"
-
-
-def error_texts(error: PredictionErrors, _: Units) -> Iterator[str]:
-    """Yield the distances of each camera's points from a predicted surface."""
-    for camera, distances in (error.depth or {}).items():
-        yield f"depth of {camera} {_distance_text(distances)}"
-
-
-def brief_texts(error: PredictionErrors) -> Iterator[str]:
-    """Yield the RMS distance of each camera with points near the body."""
-    for name, distances in (error.depth or {}).items():
-        if distances.rms_m is not None:
-            yield f"{name}: {number(1e3 * distances.rms_m, 3)} mm RMS"
-
-
-def _distance_text(error: DepthError) -> str:
-    """Return the distances of a depth camera's points from the surface, in words."""
-    if error.rms_m is None:
-        return "no point near the body"
-    sentence = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
-    gate = f"the limit of {1e3 * error.gate_m:.3g} mm (gate_m)"
-    if not error.share_beyond_gate:
-        return f"{sentence}, all within {gate}"
-    beyond = f"{sentence}, {error.share_beyond_gate:.0%} beyond {gate}"
-    if error.rms_within_gate_m is None:
-        return beyond
-    return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
-
-
 CAMERAS = Feature(
-    "depth",
     messages={**MESSAGES, **MESSAGES_OF_POSES, **MESSAGES_OF_IMAGES, **MESSAGES_OF_TIMES},
-    picture_kinds=[
-        PictureKind(
-            "depth",
-            "Points of a depth camera with the outline of the fitted surface, at up to four "
-            "samples, and the distance of each point behind the surface; grey points are not "
-            "compared.",
-            before="shapes",
-            is_leading=True,
-        )
-    ],
-    instruments=instruments,
     require_valid=require_depth_units,
-    samples=samples,
-    predict=predict,
-    fitted=fitted,
-    reason_against_copy=reason_against_copy,
-    errors=errors,
-    misfits=misfits,
-    step_differences=step_differences,
     hypotheses=camera_hypotheses,
     simulated_hypotheses=simulated_hypotheses,
     fit_hypotheses=fit_hypotheses,
-    part_concerns=part_concerns,
+    concerns=concerns,
     simulation_concerns=simulation_concerns,
-    live_limitations=live_limitations,
     notes=notes,
-    excluded_loss=excluded_loss,
-    fit_fields=fit_fields,
-    fit_lines=fit_lines,
-    error_texts=error_texts,
-    brief_texts=brief_texts,
 )

@@ -1,23 +1,18 @@
-"""Contact with obstacles in checks and runs: likely errors, concerns and friction."""
+"""Contact with obstacles in checks and runs: likely errors, concerns, gaps and pressures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from math import inf
 from typing import Any
 
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.display import short
-from ..methods.complementarity import with_contact_energy
 from ..methods.solution import Solution
-from ..model.contact.contact_force import contact_terms
 from ..model.contact.contact_summary import (
     ContactSummary,
     contact_summaries,
-    friction_summaries,
     surface_gaps_and_pressures,
 )
 from ..program.collocation import ExperimentIterate
@@ -27,13 +22,9 @@ from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 from ..statistics.misspecification.obstacle_misspecifications import MESSAGES, obstacle_hypotheses
 from ..statistics.misspecification.placement_causes import placement_mistakes
 from .feature import Feature
-from .measurement_results import FittedExperiment, InstrumentPrediction, PictureKind
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
-# Largest step of differences, relative to the gap over which the pressure rises: it must stay
-# within.
-STEP_PER_WIDTH = 1e-3
 AT_THE_GUESS = ", at the guess"
 TOPICS = {
     "contact": Topic(
@@ -143,11 +134,11 @@ def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> li
     ]
 
 
-def recorded(
-    experiment: Experiment, solution: Solution, _: InstrumentPrediction | None, positions_m: Array
+def contact_fields(
+    experiment: Experiment, solution: Solution, positions_m: Array
 ) -> dict[str, Any]:
-    """Return gap [m] and pressure [Pa] on the boundary triangles at the estimates, (T, F) each;
-    nothing without obstacles.
+    """Return the fields of `MotionRecord` with gap [m] and pressure [Pa] on the boundary triangles
+    at positions (T, n, 3) [m], (T, F) each; nothing without obstacles.
 
     Poses are corrected by the nuisance parameters if the experiment was fitted.
     """
@@ -162,46 +153,11 @@ def recorded(
     return {"gaps_m": gaps_m, "pressures_pa": pressures_pa}
 
 
-def largest_difference_step(experiment: Experiment) -> float:
-    """Return a small share of the narrowest gap range over which a pressure rises; infinity without
-    obstacles.
-    """
-    widths_m = (term.law_of_contact.largest_width_m for term in contact_terms(experiment))
-    return STEP_PER_WIDTH * min(widths_m, default=inf)
-
-
-def fit_fields(part: ExperimentIterate, _: Solution) -> dict[str, Any]:
-    """Return the friction with each obstacle; None without friction."""
-    friction = friction_summaries(part.transcription.experiment, part.equations.dynamics, x=part.x)
-    return {"friction": friction or None}
-
-
-def fit_lines(name: str, fitted: FittedExperiment, is_symmetric: bool) -> Iterator[str]:
-    """Yield the friction with each obstacle; its energy is that of the modelled part."""
-    unit = "J in the modelled part" if is_symmetric else "J"
-    for obstacle, friction in (fitted.friction or {}).items():
-        energy = f"{short(friction.dissipated_j)} {unit}"
-        yield (
-            f"friction of {obstacle} in '{name}': at most {friction.used:.0%} of its limit, "
-            f"slip during {friction.slipping:.0%} of the time, {energy} dissipated"
-        )
-
-
 CONTACT = Feature(
-    "contact",
-    picture_kinds=[
-        PictureKind("pressure", "Pressure of obstacles on the body.", before="tracks"),
-        PictureKind("gap", "Gap between the body's surface and obstacles.", before="tracks"),
-    ],
     topics=TOPICS,
     messages=MESSAGES,
     hypotheses=hypotheses,
     fit_hypotheses=fit_hypotheses,
     guess_concerns=guess_concerns,
     concerns=concerns,
-    for_simulation=with_contact_energy,
-    largest_difference_step=largest_difference_step,
-    recorded=recorded,
-    fit_fields=fit_fields,
-    fit_lines=fit_lines,
 )

@@ -1,23 +1,22 @@
 """Predictions of measurements and their errors, as simulations and `result.json` contain them.
 
-The fields of each class name the kinds of measurements; which functions compute them is declared by
-the features, see `feature`.
+The fields of each class name the kinds of measurements; `measurements` computes them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
+from ..common.display import short
 from ..common.serialisation import optional
 from ..model.contact.contact_summary import FrictionSummary
-from ..program.depth.depth_comparison import DepthError, SurfaceComparison
-from ..recording.experiment import Experiment
-from ..recording.sample_times import TIME_TOLERANCE_S
+from ..program.depth.depth_comparison import DepthError
+from ..recording.measured_wrench import COMPONENTS, UNITS
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,45 @@ class PredictionErrors:
     reading_rms: Mapping[str, float] | None = None
     depth: Mapping[str, DepthError] | None = None
 
+    @property
+    def main(self) -> float:
+        """RMS distance of the markers [m], without markers the RMS difference of the forces [N];
+        infinity if neither is compared.
+        """
+        return self.rms_m or self.wrench_rms_n or float("inf")
+
+    def text(self, units: Mapping[str, str] | None) -> str:
+        """Return the errors in words; "" if nothing is compared.
+
+        Errors that are None, and errors of markers and forces that are zero, are left out. `units`
+        are those of custom sensors by name.
+        """
+        texts = []
+        if self.rms_m:
+            largest = "" if self.max_m is None else f", at most {1e3 * self.max_m:.2f} mm"
+            texts.append(f"{1e3 * self.rms_m:.3f} mm RMS{largest}")
+        if forces := _forces_text(self.wrench_rms_n, self.wrench_rms_nm):
+            texts.append(f"{forces} RMS")
+        for reading, rms in (self.reading_rms or {}).items():
+            texts.append(f"{reading} {rms:.2g}{_unit_text(units, reading)} RMS")
+        for camera, distances in (self.depth or {}).items():
+            texts.append(f"depth of {camera} {distances.text}")
+        return "; ".join(texts)
+
+
+def _forces_text(*sizes: float | None) -> str:
+    """Return RMS or σ of a force [N] and a torque [N m] in words, without those that are None or
+    zero.
+    """
+    pairs = zip(sizes, ("N", "N m"), strict=True)
+    return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
+
+
+def _unit_text(units: Mapping[str, str] | None, reading: str) -> str:
+    """Return the unit of a custom sensor after a space; "" if it states none."""
+    unit = (units or {}).get(reading, "")
+    return f" {unit}" if unit else ""
+
 
 @dataclass(frozen=True)
 class CopyError:
@@ -58,28 +96,6 @@ class CopyError:
 
     copied: str
     error: PredictionErrors
-
-
-@dataclass(frozen=True)
-class InstrumentPrediction:
-    """Predictions of a recording's instruments by a simulation, or by another recording.
-
-    Attributes
-    ----------
-    markers_m : (T, M, 3)
-        Marker positions; NaN where nothing is predicted.
-    wrenches : sequence of (S, 6)
-        Force [N] and torque [N m] of each sensor, at its own times.
-    readings : mapping of name to (S, m)
-        Values of custom sensors.
-    surfaces : mapping of the name of a depth camera to SurfaceComparison
-        Points of depth cameras against the predicted surface; empty for another recording.
-    """
-
-    markers_m: Array
-    wrenches: Sequence[Array] = ()
-    readings: Mapping[str, Array] = field(default_factory=dict)
-    surfaces: Mapping[str, SurfaceComparison] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -133,6 +149,27 @@ class FittedExperiment:
     depth: Mapping[str, DepthError] | None = optional()
     air_density_kg_m3: float = 0.0
     test: str | None = optional()
+
+    def lines(self, name: str, is_symmetric: bool) -> Iterator[str]:
+        """Yield lines of a summary on the sensors and the friction of the experiment `name`; of a
+        symmetric one the energy is that of the modelled part.
+        """
+        if sizes := _forces_text(self.wrench_rms_n, self.wrench_rms_nm):
+            sigma = _forces_text(self.wrench_sigma_n, self.wrench_sigma_nm)
+            yield f"wrench of '{name}': {sizes} RMS (sigma {sigma})"
+        for reading, rms in (self.reading_rms or {}).items():
+            unit = _unit_text(self.reading_unit, reading)
+            sigma = short((self.reading_sigma or {})[reading])
+            yield f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})"
+        joules = "J in the modelled part" if is_symmetric else "J"
+        for obstacle, friction in (self.friction or {}).items():
+            yield (
+                f"friction of {obstacle} in '{name}': at most {friction.used:.0%} of its limit, "
+                f"slip during {friction.slipping:.0%} of the time, "
+                f"{short(friction.dissipated_j)} {joules} dissipated"
+            )
+        for camera, error in (self.depth or {}).items():
+            yield f"depth of {camera} in '{name}': {error.text}"
 
 
 @dataclass(frozen=True)
@@ -238,25 +275,6 @@ class ForwardResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
-    """Numbers of one measurement that are present.
-
-    Attributes
-    ----------
-    what : str
-        The measurement, for people.
-    names : sequence of K str
-        Names of its numbers.
-    is_present : (S, K) array of bool
-        Which of them are present at its S samples.
-    """
-
-    what: str
-    names: Sequence[str]
-    is_present: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
 class SensorSeries:
     """Numbers of one sensor over time: measured, fitted and simulated.
 
@@ -304,26 +322,8 @@ class SeriesKind:
         return SensorSeries(self.name, number, columns, self.number_names, units=self.units)
 
 
-@dataclass(frozen=True)
-class PictureKind:
-    """Pictures of one kind in the report of a run.
-
-    Attributes
-    ----------
-    name : str
-        Beginning of the names of their files.
-    caption : str
-        Caption.
-    before : str
-        Name of the kind before which they stand in a report.
-    is_leading : bool
-        Whether they show measurement and fit, so that one of them may lead the report.
-    """
-
-    name: str
-    caption: str
-    before: str
-    is_leading: bool = False
+# Force and torque of grasps.
+WRENCH_SERIES = SeriesKind("wrench", COMPONENTS, units=UNITS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,38 +350,14 @@ class PredictionResiduals:
 
     @classmethod
     def in_order_of_time(cls, t_s: Array, values: Array, unit: str) -> PredictionResiduals:
-        """Return the differences (S, d) of several sensors together, at times (S,) in any order; a
-        sample counts if any of its numbers is finite.
+        """Return the differences (S, K, d) of several sensors together, at times (S,) in any order;
+        a vector counts if any of its numbers is finite.
         """
         order = np.argsort(t_s, kind="stable")
-        in_order = values[order, None]
+        in_order = values[order]
         return cls(
             t_s[order],
             in_order,
             is_counted=np.asarray(np.isfinite(in_order).any(axis=2)),
             unit=unit,
         )
-
-
-def main_error(error: PredictionErrors) -> float:
-    """Return the RMS distance of the markers [m], without markers the RMS difference of the forces
-    [N]; infinity if neither is compared.
-    """
-    return error.rms_m or error.wrench_rms_n or float("inf")
-
-
-def comparison_columns(t_s: Array, measured: Array, *models: Array | None) -> Array:
-    """Return the columns time, measured values and the values of each model, as one array (S, 1 + m
-    (1 + number of models)).
-
-    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
-    NaN.
-    """
-    columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
-    return np.column_stack([t_s, measured, *columns])
-
-
-def during(experiment: Experiment, t_s: Array) -> NDArray[np.bool_]:
-    """Return the mask (S,) of the samples at times `t_s` (S,) [s] that are within a recording."""
-    first_s, last_s = experiment.t_s[[0, -1]]
-    return (t_s >= first_s - TIME_TOLERANCE_S) & (t_s <= last_s + TIME_TOLERANCE_S)

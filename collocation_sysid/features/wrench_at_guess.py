@@ -195,9 +195,9 @@ def wrench_deviations(parts: Sequence[ExperimentIterate]) -> list[WrenchDeviatio
         transcription = part.transcription
         for sensor in transcription.sensors:
             wrench = sensor.wrench
-            predicted = sensor.predict_reactions(
-                part.reactions, np.zeros(transcription.nuisance.size)
-            )
+            motion = part.motion_for(sensor.observable)
+            phi = np.zeros(transcription.nuisance.size)
+            predicted = sensor.numbers(sensor.predict_motion(motion, phi))
             simulated = np.where(wrench.is_measured, predicted, np.nan)
             measured = np.where(np.isfinite(simulated), wrench.values, np.nan)
             if np.isfinite(measured).any():

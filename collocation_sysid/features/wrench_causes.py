@@ -22,7 +22,7 @@ from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..program.collocation import Collocation, ExperimentIterate
-from ..program.observables import ReactionForces
+from ..program.observables import ObservedMotion, ReactionForces
 from ..program.transcription import Transcription
 from ..program.wrench_residual import WrenchResidual, without_grasp_sensors
 from ..recording.measured_wrench import Wrench
@@ -282,7 +282,7 @@ class _OneSensor:
         transcription = part.transcription
         self.part = part
         self.sensor = sensor
-        self.forced = forced
+        self.motion = ObservedMotion(part.x, forced)
         blind = without_grasp_sensors(transcription.experiment)
         self.scale_known = not transcription.body.mass_derivatives or blind.has_known_force()
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
@@ -352,7 +352,8 @@ class _OneSensor:
             phi = np.zeros(self.part.transcription.nuisance.size)
             tools = self.part.transcription.nuisance.indices_of_rows(*TOOL)
             phi[tools] = self.part.phi[tools]
-            self._known[at] = self.sensor.with_wrench(wrench).predict_reactions(self.forced, phi)
+            predicted = self.sensor.with_wrench(wrench).predict_motion(self.motion, phi)
+            self._known[at] = predicted.reshape(-1, 6)
         return self._known[at]
 
     def _gain(self, columns: slice) -> float:

@@ -7,11 +7,11 @@ residuals, multipliers, optimality), `Status` the reason why the solve ended.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,10 +19,12 @@ from ..common.array_types import Array, root_mean
 from ..errors import InputError, SimulationError, hint_at
 from ..fem.kernels import map_experiments
 from ..program.collocation import Collocation, ExperimentIterate, Violation
+from ..program.measured_motion import SurfaceComparison, fitted_values
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
-from ..program.wrench_residual import predict_wrenches
+from ..recording.custom_sensor import Gauge
 from ..recording.experiment import Experiment
+from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import GAUGE
 from .stiffness_scan import Scan
 
@@ -358,6 +360,20 @@ class Solution:
         return [x.reshape(len(x), -1, 3) for x in positions]
 
     @cached_property
+    def fitted_values(self) -> dict[str, tuple[Array | SurfaceComparison, ...]]:
+        """Prediction of each of `Experiment.measurements` by name of the fitted experiment: numbers
+        (S, m), NaN where a sample was not predicted; of a depth camera the comparison of its points
+        with the surface.
+        """
+        return {part.transcription.experiment.name: fitted_values(part) for part in self.parts}
+
+    def _fitted_by_kind(self, part: ExperimentIterate, kind: type) -> list[tuple[Any, Any]]:
+        """Return the measurements of one kind, each with its prediction."""
+        experiment = part.transcription.experiment
+        pairs = zip(experiment.measurements, self.fitted_values[experiment.name], strict=True)
+        return [(each, values) for each, values in pairs if isinstance(each, kind)]
+
+    @cached_property
     def readings_m(self) -> list[Array]:
         """Predicted marker positions (T, M, 3) of each fitted experiment [m], at its
         estimated nuisance parameters φ.
@@ -366,48 +382,25 @@ class Solution:
             part.transcription.markers.predict_positions(part.x, part.phi) for part in self.parts
         ]
 
-    @cached_property
+    @property
     def wrenches(self) -> dict[str, list[Array]]:
-        """Predicted values (S, 6) of the wrench sensors, by experiment name.
-
-        Each experiment with wrench sensors has a list with one array per sensor: force [N] and
-        torque [N m]. NaN means that the sensor was not predicted at that sample.
+        """Predicted force and torque (S, 6) [N, N m] of each sensor, by name of the fitted
+        experiment; NaN where not predicted. Experiments without a sensor are left out.
         """
         return {
-            part.transcription.experiment.name: predict_wrenches(
-                part.transcription.sensors, part.reactions, part.phi
-            )
+            part.transcription.experiment.name: [values for _, values in found]
             for part in self.parts
-            if part.transcription.sensors
+            if (found := self._fitted_by_kind(part, Wrench))
         }
 
-    @cached_property
-    def wrench_rms(self) -> dict[str, tuple[float | None, float | None]]:
-        """RMS residuals of force [N] and torque [N m] by experiment name, None for one that is not
-        measured, see the function `wrench_rms`.
-
-        Only experiments with wrench sensors are included.
-        """
-        rms_by_experiment = {}
-        for transcription in self.collocation.transcriptions:
-            if transcription.sensors:
-                readings = self.wrenches[transcription.experiment.name]
-                rms_by_experiment[transcription.experiment.name] = wrench_rms(
-                    transcription.experiment, readings
-                )
-        return rms_by_experiment
-
-    @cached_property
+    @property
     def readings(self) -> dict[str, dict[str, Array]]:
         """Predicted values (S, m) of custom sensors, by name of the fitted experiment and of the
         sensor; experiments without custom sensors have empty mappings.
         """
         return {
             part.transcription.experiment.name: {
-                gauge.sensor.name: gauge.without_padding(
-                    gauge.predict_motion(part.motion_for(gauge.observable), part.phi)
-                )
-                for gauge in part.transcription.custom_sensors
+                gauge.name: values for gauge, values in self._fitted_by_kind(part, Gauge)
             }
             for part in self.parts
         }
@@ -487,27 +480,6 @@ def wrench_rms(
     return force, torque
 
 
-def custom_sensor_rms(experiment: Experiment, predicted: Mapping[str, Array]) -> dict[str, float]:
-    """Return the RMS residuals of custom sensors by name, in the unit of each sensor, over all its
-    values.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment with the measured values.
-    predicted : mapping of str to (S, m) array
-        Predicted values by sensor name, for each sensor of the experiment. Samples that are NaN,
-        predicted or measured, are ignored; a sensor without any other has the value NaN.
-
-    Raises
-    ------
-    KeyError
-        If `predicted` lacks a sensor.
-    """
-    residuals = ((g.name, predicted[g.name] - g.measured_values) for g in experiment.readings)
-    return {name: float(np.sqrt(np.nanmean(each**2))) for name, each in residuals}
-
-
 def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
     """Return the RMS residuals of force [N] and torque [N m] over all fitted experiments of a
     solution.
@@ -517,8 +489,9 @@ def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
     squares = np.zeros(2)
     counts = np.zeros(2)
     for transcription in solution.collocation.transcriptions:
-        components = solution.wrench_rms.get(transcription.experiment.name, (None, None))
-        for k, value in enumerate(components):
+        experiment = transcription.experiment
+        predicted = solution.wrenches.get(experiment.name, [])
+        for k, value in enumerate(wrench_rms(experiment, predicted)):
             if value is not None:
                 squares[k] = squares[k] + value**2
                 counts[k] = counts[k] + 1

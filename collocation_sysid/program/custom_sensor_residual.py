@@ -7,9 +7,8 @@ the five grid times around a sample.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -115,15 +114,12 @@ class CustomSensorResidual(MeasurementResidual):
             is_static=static,
         )
 
-    def with_samples(
-        self, known_s: Array, t_s: Array, measurements: Array, **changes: Any
-    ) -> CustomSensorResidual:
-        """Return the model of other samples, whose observable is known at `known_s`; arguments as
-        in `MeasurementResidual.with_samples`.
-        """
-        return super().with_samples(
-            known_s, t_s, measurements=measurements, observable_s=known_s, **changes
-        )
+    def at_samples(self, t_s: Array, grid: ReactionGrid) -> CustomSensorResidual:
+        """Return the model for a motion known at other times, as `MeasurementResidual.at_samples`."""
+        other = super().at_samples(t_s, grid)
+        observable = other.observable
+        at_s = observable.t_s if isinstance(observable, ReactionResultant) else t_s
+        return replace(other, observable_s=at_s)
 
     @cached_property
     def _stencil(self) -> RowStencil:
@@ -205,14 +201,12 @@ class CustomSensorResidual(MeasurementResidual):
         """Return predictions (S, G, 3) for a motion over all times of the observable, at φ (k,);
         NaN for samples outside these times.
         """
-        predicted = self.predict(self.observable.evaluate(motion, phi), phi)
+        predicted = super().predict_motion(motion, phi)
         return np.where(_is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
 
-    def without_padding(self, predicted_m: Array) -> Array:
-        """Return the m numbers (S, m) of the sensor from predictions (S, G, 3), in the unit of the
-        sensor.
-        """
-        return predicted_m.reshape(len(predicted_m), -1)[:, : self.sensor.measured_values.shape[1]]
+    def numbers(self, predicted: Array) -> Array:
+        """Return predictions (S, G, 3) as the numbers (S, m) of the sensor, without padding."""
+        return super().numbers(predicted)[:, : self.sensor.measured_values.shape[1]]
 
 
 def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:

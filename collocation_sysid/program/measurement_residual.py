@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..common.array_types import Array, Index
 from ..model.generated_functions import GeneratedFunction
 from ..model.nuisance_map import NuisanceMap
-from .observables import ObservableDerivatives, PointPositions, SparseEntries
+from .observables import ObservableDerivatives, ObservedMotion, PointPositions, SparseEntries
 from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
 
 # Numbers of a vector [x, y, z], whose residuals share a weight of Huber's loss.
@@ -364,6 +364,11 @@ class MeasurementResidual(ABC):
         return np.ones(len(self.t_s), dtype=bool)
 
     @property
+    def excluded_loss(self) -> float:
+        """Loss of measurements that the fit excludes, as far as it is known; 0 for most kinds."""
+        return 0.0
+
+    @property
     def uncompared_count(self) -> int:
         """Number of scalar measurements that belong to the body at the present estimates but are
         not compared; 0 for most kinds.
@@ -412,14 +417,7 @@ class MeasurementResidual(ABC):
         measured[:, 0, : measurements.shape[1]] = measurements
         is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
         changes |= {"t_s": t_s, "measured": measured, "is_compared": is_compared}
-        is_resultant = isinstance(self.observable, ReactionResultant)
-        times = (
-            {"reaction_grid": ReactionGrid.from_times(known_s)}
-            if is_resultant
-            else {"rows": np.arange(len(known_s))}
-        )
-        changes["observable"] = replace(self.observable, **times)
-        other = replace(self, **changes)
+        other = replace(self.at_samples(known_s, ReactionGrid.from_times(known_s)), **changes)
         # Derivatives of the same expression are generated once.
         vars(other)["_expressions"] = self._expressions
         return other
@@ -494,6 +492,27 @@ class MeasurementResidual(ABC):
         inputs.data[own + measured :] = 1.0
         residual = inputs.functions.residual
         return self._grouped(residual.evaluate(inputs.u, inputs.data))
+
+    def at_samples(self, t_s: Array, grid: ReactionGrid) -> Self:
+        """Return the model for a motion whose positions are known at the times `t_s` (N,) [s], and
+        whose reaction forces at those of `grid`, for predictions.
+        """
+        times = (
+            {"reaction_grid": grid}
+            if isinstance(self.observable, ReactionResultant)
+            else {"rows": np.arange(len(t_s))}
+        )
+        return replace(self, observable=replace(self.observable, **times))
+
+    def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
+        """Return predictions (S, G, g) for a motion over all times of the observable, at φ (k,);
+        NaN for samples that it does not cover.
+        """
+        return self.predict(self.observable.evaluate(motion, phi), phi)
+
+    def numbers(self, predicted: Array) -> Array:
+        """Return predictions (S, G, g) as the numbers (S, m) of the `Measurement`."""
+        return predicted.reshape(len(predicted), -1)
 
     def residuals(self, values: Array, phi: Array) -> Array:
         """Return residuals (y − ŷ) / σ (s, G, g) of the samples that the values suffice for, zero

@@ -102,6 +102,11 @@ class Trajectory:
     step_error_m: float | None = None
     branch_change: BranchChange | None = None
 
+    @property
+    def observed(self) -> ObservedMotion:
+        """Motion with reaction forces, of which measurements are functions."""
+        return ObservedMotion(self.positions_m.reshape(len(self.t_s), -1), self.reactions[1])
+
 
 def require_steps(experiment: Experiment, step_s: float) -> None:
     """Raise InputError if time steps of `step_s` [s] would be more than `MOST_STEPS` per sample of
@@ -325,43 +330,28 @@ def _with_steps(
         forced = reactions_at(dynamics, grid, dofs=sensed)
     shape = (len(x), -1, 3)
     positions = x.reshape(shape)
-    markers = experiment.markers.predict_positions(positions)
     ideal = NuisanceMap.from_experiment(replace(experiment, nuisance=Nuisance.none()))
-    wrenches = tuple(
-        sensor.predict_reactions(forced, np.zeros(ideal.size))
-        for sensor in wrench_residuals(experiment, at, nuisance=ideal)
+    motion = ObservedMotion(x, forced)
+    wrenches, custom = (
+        tuple(
+            sensor.numbers(sensor.predict_motion(motion, np.zeros(ideal.size)))
+            for sensor in sensors
+        )
+        for sensors in (
+            wrench_residuals(experiment, at, nuisance=ideal),
+            custom_sensor_residuals(experiment, experiment.t_s, grid=at, nuisance=ideal),
+        )
     )
     return Trajectory(
         experiment.t_s,
         positions,
         velocities_m_s=v.reshape(shape),
-        markers_m=markers,
+        markers_m=experiment.markers.predict_positions(positions),
         reactions=(at, forced),
         wrenches=wrenches,
-        custom_sensor_values=_custom_sensor_values(
-            experiment, positions, reactions=(at, forced), ideal=ideal
-        ),
+        custom_sensor_values=custom,
         steps_per_sample=steps,
         branch_change=change,
-    )
-
-
-def _custom_sensor_values(
-    experiment: Experiment,
-    positions_m: Array,
-    reactions: tuple[ReactionGrid, ReactionForces],
-    ideal: NuisanceMap,
-) -> tuple[Array, ...]:
-    """Return the predictions (S, m) of each custom sensor for a motion (T, n, 3) [m] at the
-    samples, without nuisance parameters.
-    """
-    readings = custom_sensor_residuals(
-        experiment, experiment.t_s, grid=reactions[0], nuisance=ideal
-    )
-    motion = ObservedMotion(positions_m.reshape(len(positions_m), -1), reactions[1])
-    return tuple(
-        reading.without_padding(reading.predict_motion(motion, np.zeros(ideal.size)))
-        for reading in readings
     )
 
 

@@ -76,6 +76,12 @@ class Transcription(MotionTranscription):
         """
         return (self.markers, *self.sensors, *self.custom_sensors, *self.unlabelled)
 
+    @property
+    def measurement_models(self) -> tuple[MeasurementResidual, ...]:
+        """The measurement model of each of `Experiment.measurements`, in their order."""
+        markers = (self.markers,) * bool(self.experiment.markers.names)
+        return (*markers, *self.sensors, *self.custom_sensors, *self.reassociable)
+
     @cached_property
     def local_loss(self) -> LocalLoss:
         """Second derivatives of the loss by x and φ of those measurements that depend on few

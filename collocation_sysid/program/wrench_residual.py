@@ -10,7 +10,6 @@ motion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -29,7 +28,7 @@ from .measurement_residual import (
     lagrange_weights,
     neighbouring_times,
 )
-from .observables import ObservedMotion, ReactionForces
+from .observables import ObservedMotion
 from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionGrid, ReactionResultant
 
 
@@ -162,24 +161,15 @@ class WrenchResidual(MeasurementResidual):
             predicted[tared[: tare.numel()]] += tare
         return predicted
 
-    # Of reactions -----------------------------------------------------------------------------
-
-    def predict_reactions(self, known_reactions: ReactionForces, phi: Array) -> Array:
-        """Return the prediction (S, 6) [N, N m] at φ (k,) from reaction forces at the observable's
-        times; NaN for samples outside these times.
+    def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
+        """Return predictions (S, 2, 3) [N, N m] from the reaction forces of a motion at φ (k,);
+        NaN for samples outside their times.
         """
-        motion = ObservedMotion(np.zeros((0, 0)), known_reactions)
         values = self.observable.evaluate(motion, phi)
         if not len(values):
-            return np.full(self.wrench.values.shape, np.nan)
-        predicted = self.predict(values, phi).reshape(-1, 6)
-        return np.where(self.is_covered(len(values))[:, None], predicted, np.nan)
-
-    def on_grid(self, grid: ReactionGrid) -> WrenchResidual:
-        """Return the model with reaction forces at the times of another grid, with a quadratic loss
-        and names without suffix.
-        """
-        return WrenchResidual.from_sensor(replace(self.observable, reaction_grid=grid), self.wrench)
+            return np.full((len(self.t_s), 2, 3), np.nan)
+        predicted = self.predict(values, phi)
+        return np.where(self.is_covered(len(values))[:, None, None], predicted, np.nan)
 
     def with_wrench(self, wrench: Wrench) -> WrenchResidual:
         """Return the model of other samples, in their own frame and about their own point, with a
@@ -238,15 +228,6 @@ def wrench_residuals(
         )
         models.append(WrenchResidual.from_sensor(channel, wrench, label=label, huber=huber))
     return tuple(models)
-
-
-def predict_wrenches(
-    sensors: Sequence[WrenchResidual], reactions: ReactionForces, phi: Array
-) -> list[Array]:
-    """Return the predictions (S, 6) of sensors [N, N m] from the reaction forces of a motion at φ
-    (k,); NaN at samples for which the times of the reactions do not suffice.
-    """
-    return [sensor.predict_reactions(reactions, phi) for sensor in sensors]
 
 
 def without_grasp_sensors(experiment: Experiment) -> Experiment:

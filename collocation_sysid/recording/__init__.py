@@ -11,7 +11,7 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
 - `markers`, `placement`: tracked markers and where they sit on the body.
 - `depth_camera`: depth cameras and scanners.
 - `custom_sensor`: custom sensors.
-- `separate_sensor`: the interface of sensors with times of their own.
+- `measurement`: what all measurements have in common.
 - `nuisance`: unknowns of a single recording, with their priors.
 - `environment`: the density of the air.
 - `specimen`, `specimen_stretches`, `homogeneous_deformation`: material tests without a mesh;

@@ -19,9 +19,9 @@ from ..common.schema_tables import Vector
 from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
 from .checked_arrays import read_only_floats, unconverted, unconverted_or_none
+from .measurement import Measurement
 from .poses import Frame
 from .sample_times import first_unordered_time
-from .separate_sensor import SeparateSensor
 
 # Values of a custom sensor as its function returns them.
 SensorValues = ca.SX | ca.DM | float | Sequence[ca.SX | ca.DM | float]
@@ -74,7 +74,7 @@ def stack_values(values: SensorValues) -> ca.SX:
 
 
 @declaration
-class Gauge(SeparateSensor):
+class Gauge(Measurement):
     """A custom sensor: its reading is an expression of a few points of the body, or of a grasp.
 
     Parameters
@@ -119,6 +119,7 @@ class Gauge(SeparateSensor):
 
     description_name: ClassVar[str] = "reading"
     measurement_text: ClassVar[str] = "readings"
+    other_text: ClassVar[str] = "sensor readings"
     noise_key: ClassVar[str] = "sigma of the readings"
 
     name: str
@@ -195,6 +196,21 @@ class Gauge(SeparateSensor):
         if self.values is None:
             return np.zeros((len(self.sample_times_s), vars(self)["_value_count"]))
         return np.asarray(self.values)
+
+    @property
+    def title(self) -> str:
+        """Name of the sensor."""
+        return self.name
+
+    @property
+    def samples_text(self) -> str:
+        """Name of the sensor in quotation marks."""
+        return f"'{self.name}'"
+
+    @property
+    def value_sigmas(self) -> Array:
+        """(m,) standard deviations of the numbers, which are equal."""
+        return np.full(self.measured_values.shape[1], self.sigma)
 
     @property
     def is_measured(self) -> NDArray[np.bool_]:

@@ -20,10 +20,10 @@ from ..common.validated_types import Finite, Positive
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
 from .checked_arrays import read_only_floats, unconverted, unconverted_or_none
+from .measurement import Measurement
 from .node_selection import Nodes, selection_from_section
 from .poses import PoseSequence
 from .sample_times import first_unordered_time
-from .separate_sensor import SeparateSensor
 
 MatrixRow = tuple[Finite, Finite, Finite, Finite]
 PoseMatrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
@@ -202,7 +202,7 @@ def _unconverted_images(images_m: Sequence[ArrayLike | None]) -> tuple[Array | N
 
 
 @declaration
-class Depth(SeparateSensor):
+class Depth(Measurement):
     """Depth images, or clouds of points of a body, of one camera, one for each sample time.
 
     Parameters
@@ -248,8 +248,9 @@ class Depth(SeparateSensor):
     description_name: ClassVar[str] = "depth camera"
     measurement_text: ClassVar[str] = "points of depth cameras"
     noise_key: ClassVar[str] = "sigma_m of depth"
+    sigma_text: ClassVar[str] = "its sigma_m"
     points_name: ClassVar[str] = "depth points"
-    measures_shape: ClassVar[bool] = True
+    precedence: ClassVar[int] = 1
 
     name: str
     t_s: Array = key(converter=unconverted)
@@ -390,6 +391,26 @@ class Depth(SeparateSensor):
     def __repr__(self) -> str:
         points = sum(map(len, self.clouds))
         return f"Depth({self.name!r}: {len(self.t_s)} images of {points} points together)"
+
+    @property
+    def title(self) -> str:
+        """Depth and name of the camera."""
+        return f"the depth of {self.name}"
+
+    @property
+    def samples_text(self) -> str:
+        """Images and name of the camera."""
+        return f"the images of '{self.name}'"
+
+    @property
+    def presence(self) -> dict[str, NDArray[np.bool_]]:
+        """Mask (S,) of the samples that have points."""
+        return {"points": np.array(self.point_counts) > 0}
+
+    @property
+    def instrument_text(self) -> str:
+        """Number of points and name of the camera."""
+        return f"{sum(self.point_counts):,} points of '{self.name}'"
 
     @property
     def sample_times_s(self) -> Array:

@@ -25,11 +25,11 @@ from .homogeneous_deformation import HomogeneousDeformation
 from .loads import Force, LoadTime, PointMass, smooth_ramp
 from .markers import Markers
 from .measured_wrench import Wrench
+from .measurement import SENSORS, Measurement, sensor_fields
 from .nuisance import Nuisance
 from .obstacle import Obstacle, with_obstacle_frames
 from .pressure import Pressure
 from .sample_times import STEP_TOLERANCE, TIME_TOLERANCE_S, first_unordered_time, sample_interval_s
-from .separate_sensor import SENSORS, SeparateSensor, sensor_fields
 from .tendon import Tendon
 from .time_tables import is_within_experiment
 
@@ -205,7 +205,12 @@ class Experiment:
         return tuple(self.sensors_by_grasp.values())
 
     @property
-    def separate_sensors(self) -> list[SeparateSensor]:
+    def measurements(self) -> tuple[Measurement, ...]:
+        """All measurements: markers if there are any, wrenches, custom sensors and depth cameras."""
+        return (*(self.markers,) * bool(self.markers.names), *self.wrenches, *self.separate_sensors)
+
+    @property
+    def separate_sensors(self) -> list[Measurement]:
         """Sensors with times of their own, besides markers and those of grasps."""
         return [each for name in sensor_fields(Experiment) for each in getattr(self, name)]
 

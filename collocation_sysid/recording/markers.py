@@ -6,17 +6,18 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..common.array_types import Array, Index
+from ..common.array_types import Array, Index, root_mean
 from ..common.declarations import Key, declaration, identity, identity_or_none, key
 from ..common.time_dependence import over_time
 from ..common.validated_types import Positive
 from ..errors import InputError
 from .checked_arrays import float_converter, read_only_coordinates, read_only_floats
+from .measurement import Measurement
 from .placement import AttachmentRule, LocatedBody, Placement, place_markers
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ _PLACES = Key("places", Places, read=lambda word: word == "surface")
 
 
 @declaration
-class Markers:
+class Markers(Measurement):
     """Marker tracks and the markers' places on the body.
 
     Parameters
@@ -77,6 +78,15 @@ class Markers:
         If shapes disagree, names repeat, a sigma is not positive, or both places and placement are
         given.
     """
+
+    measurement_text: ClassVar[str] = "markers"
+    other_text: ClassVar[str] = "markers"
+    noise_key: ClassVar[str] = "sigma_m"
+    sigma_text: ClassVar[str] = "sigma_m"
+    precedence: ClassVar[int] = 0
+    unit: ClassVar[str] = "m"
+    title: ClassVar[str] = "the markers"
+    instrument_text: ClassVar[str] = ""
 
     t_s: Array = key(converter=float_converter((None,), "t_s of the markers"), metadata=over_time())
     positions_m: Array = key(converter=np.asarray, metadata=over_time())
@@ -218,6 +228,55 @@ class Markers:
         markers.
         """
         return cls(t_s, np.zeros((len(np.atleast_1d(t_s)), 0, 3)), sigma_m=1.0)
+
+    @property
+    def sample_times_s(self) -> Array:
+        """(T,) sample times [s]."""
+        return self.t_s
+
+    @property
+    def measured_values(self) -> Array:
+        """(T, 3M) measured coordinates [m], NaN where missing."""
+        return self.positions_m.reshape(len(self.t_s), -1)
+
+    @property
+    def value_sigmas(self) -> Array:
+        """(3M,) standard deviations of the coordinates [m]."""
+        return np.repeat(self.sigma_m, 3)
+
+    @property
+    def identity(self) -> frozenset[str]:
+        """Names of the markers."""
+        return frozenset(self.names)
+
+    def values_of(self, other: Markers) -> Array:
+        """Return the measured coordinates (T, 3M) [m] of markers with the same names in another
+        order.
+        """
+        order = [other.names.index(name) for name in self.names]
+        return other.positions_m[:, order].reshape(len(other.t_s), -1)
+
+    def vectors(self, values: Array) -> Array:
+        """Return coordinates (T, 3M) as vectors (T, M, 3)."""
+        return values.reshape(len(values), -1, 3)
+
+    def rms_text(self, difference: Array) -> str:
+        """Return the RMS distance for differences (T, 3M) [m]; "" if none is finite."""
+        known = self.distances_m(difference)
+        return f"{1e3 * root_mean(known**2):.3g} mm RMS" if known.size else ""
+
+    def distances_m(self, difference: Array) -> Array:
+        """Return the lengths (P,) [m] of those of differences (T, 3M) [m] that have a finite
+        coordinate, along the finite ones.
+        """
+        vectors_m = self.vectors(difference)
+        known_m = vectors_m[np.isfinite(vectors_m).any(axis=2)]
+        return np.sqrt(np.nansum(known_m**2, axis=1))
+
+    @property
+    def number_names(self) -> list[str]:
+        """Names (3M,) of the coordinates."""
+        return [f"{name} {axis}" for name in self.names for axis in "xyz"]
 
     def find_first_visible_sample(self) -> int:
         """Return the index, from 0, of the first sample in which a marker is present; 0 if none is."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .checked_arrays import float_converter, read_only_floats
 from .formats.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
+from .measurement import Measurement
 from .poses import Frame
 from .recording_writers import write_columns_csv
 from .sample_times import first_unordered_time
@@ -40,7 +42,7 @@ def _with_torques(values: ArrayLike) -> Array:
 
 
 @declaration
-class Wrench:
+class Wrench(Measurement):
     """Force and torque that a grasp exerts on the body, as measured by a sensor.
 
     Parameters
@@ -68,6 +70,14 @@ class Wrench:
     InputError
         If shapes disagree, time does not increase, nothing is measured, or a sigma is missing.
     """
+
+    measurement_text: ClassVar[str] = "measured forces"
+    other_text: ClassVar[str] = "wrenches"
+    noise_key: ClassVar[str] = "sigma_n"
+    sigma_text: ClassVar[str] = "sigma_n"
+    precedence: ClassVar[int] = 2
+    unit: ClassVar[str] = "N"
+    title: ClassVar[str] = "the wrench"
 
     t_s: Array = key(converter=float_converter((None,), "t_s of the wrench"), metadata=over_time())
     values: Array = key(converter=_with_torques, metadata=over_time())
@@ -113,6 +123,40 @@ class Wrench:
         """
         values = np.where(self.measured_components, np.zeros((len(t_s), 1)), np.nan)
         return replace(self, t_s=t_s, values=values)
+
+    @property
+    def sample_times_s(self) -> Array:
+        """(S,) sample times [s]."""
+        return self.t_s
+
+    @property
+    def measured_values(self) -> Array:
+        """(S, 6) measured components [N, N m], NaN where missing."""
+        return self.values
+
+    @property
+    def value_sigmas(self) -> Array:
+        """(6,) standard deviations of the components [N, N m]."""
+        return self.stack_sigmas()
+
+    @property
+    def number_names(self) -> tuple[str, ...]:
+        """Names (6,) of the components."""
+        return COMPONENTS
+
+    @property
+    def presence(self) -> dict[str, NDArray[np.bool_]]:
+        """Mask (S,) of the samples in which each measured component is present, by its name."""
+        masks = super().presence
+        return {name: masks[name] for name in self.list_component_names()}
+
+    def vectors(self, values: Array) -> Array:
+        """Return the forces (S, 1, 3) of the whole specimen among numbers (S, 6)."""
+        return self.symmetry * values[:, None, :3]
+
+    def rms_text(self, difference: Array) -> str:
+        """Return the RMS of the forces of the whole specimen; "" if none is finite."""
+        return super().rms_text(self.vectors(difference))
 
     @property
     def is_measured(self) -> NDArray[np.bool_]:

@@ -17,9 +17,9 @@ from ..common.array_types import Array
 from ..common.time_dependence import at_times
 from .experiment import Experiment
 from .grasp import Grasp
+from .measurement import Measurement, sensor_fields
 from .poses import PoseSequence
 from .sample_times import TIME_TOLERANCE_S
-from .separate_sensor import SeparateSensor, sensor_fields
 from .time_tables import FEWEST_SHARED_SAMPLES
 
 # Fields of an experiment whose measurements are all of sensors besides markers and grasps.
@@ -73,7 +73,7 @@ def shortened_experiment(
 
 
 def _replaced_sensors(
-    experiment: Experiment, change: Callable[[SeparateSensor], SeparateSensor | None]
+    experiment: Experiment, change: Callable[[Measurement], Measurement | None]
 ) -> dict[str, Any]:
     """Return the separate sensors of an experiment by the name of the field, each replaced by what
     `change` returns for it; None leaves the sensor out.
@@ -90,7 +90,7 @@ def without_later_measurements(experiment: Experiment, end_s: float) -> Experime
     """Return the experiment without the measurements after `end_s` [s]; its times stay.
 
     Markers and measured forces become NaN, and other sensors do as they declare, see
-    `SeparateSensor.without_later_values`. The experiment itself is not modified.
+    `Measurement.without_later_values`. The experiment itself is not modified.
     """
     markers = experiment.markers
     is_later = (experiment.t_s > end_s)[:, None, None]
@@ -108,7 +108,7 @@ def thinned_experiment(experiment: Experiment, *, many: int, most: int) -> Exper
     that have more than `many` in one; itself if there is no such sensor.
     """
 
-    def change(sensor: SeparateSensor) -> SeparateSensor:
+    def change(sensor: Measurement) -> Measurement:
         has_many = max(sensor.point_counts, default=0) > many
         return sensor.thinned(most) if has_many else sensor
 
@@ -146,18 +146,11 @@ def measured_count(experiment: Experiment) -> int:
 
 def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
     """Return the kind of measurement that dominates, as plural text, and the key that states its
-    noise: markers, else a sensor that measures the shape of the body, else force sensors, else any
-    other sensor.
+    noise: markers, else depth cameras, else force sensors, else other sensors.
     """
-    if any(each.markers.count_samples() for each in experiments):
-        return "markers", "sigma_m"
-    sensors = [sensor for each in experiments for sensor in each.separate_sensors]
-    for sensor in sensors:
-        if sensor.measures_shape:
-            return sensor.measurement_text, sensor.noise_key
-    if any(each.sensors_by_grasp for each in experiments):
-        return "measured forces", "sigma_n"
-    return sensors[0].measurement_text, sensors[0].noise_key
+    known = (m for each in experiments for m in each.measurements if m.has_samples())
+    main = min(known, key=lambda each: each.precedence)
+    return main.measurement_text, main.noise_key
 
 
 def is_load_only(experiment: Experiment) -> bool:

@@ -9,14 +9,14 @@ rows of outlines follow: time, u, v, and NaN else; a row without u and v ends ea
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..common.array_types import Array
-from ..features.camera_feature import fitted_surfaces
+from ..features.measurements import Predictions, surfaces
 from ..model.nuisance_map import NuisanceMap
 from ..program.depth.depth_camera_model import DepthCameraModel
 from ..program.depth.depth_comparison import SurfaceComparison
@@ -216,14 +216,14 @@ def visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str,
     """
     part = finished.solution.part_of(experiment.name)
     rollout = finished.rollouts[experiment.name]
-    surfaces: Mapping[str, SurfaceComparison] = {}
+    predicted: Predictions = ()
     if part is not None:
-        surfaces = fitted_surfaces(part)
+        predicted = finished.solution.fitted_values[experiment.name]
     elif isinstance(rollout, ForwardSimulation):
-        surfaces = rollout.predicted.surfaces
+        predicted = rollout.predicted
     return {
         name: surface_rows(surface, experiment.compute_upward_direction())
-        for name, surface in surfaces.items()
+        for name, surface in surfaces(experiment, predicted).items()
     }
 
 

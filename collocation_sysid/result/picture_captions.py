@@ -5,15 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..common.display import Picture, own_pictures
-from ..features.registry import FEATURES
 
 # Captions of the pictures of every run in the order of a report, by the beginning of their names.
-GENERAL_CAPTIONS = {
+PICTURE_CAPTIONS = {
     "stress": "Stress over strain: measured, fitted and simulated.",
+    "force_displacement": "Force over displacement: measured, fitted and simulated.",
+    "depth": "Points of a depth camera with the outline of the fitted surface, at up to four samples, "
+    "and the distance of each point behind the surface; grey points are not compared.",
     "shapes": "The fitted body at several times of the recording; orange: measured markers.",
     "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
     "through the body. Pale colours: the data add little to the prior.",
     "mesh": "The mesh, its grasped nodes and the estimated positions of the markers.",
+    "pressure": "Pressure of obstacles on the body.",
+    "gap": "Gap between the body's surface and obstacles.",
+    "tracks": "Measured, fitted and simulated markers, the residual below.",
+    "wrench": "Wrench of a grasp: measured, fitted and simulated.",
+    "reading": "Custom sensor: measured, fitted and simulated.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
     "confidence": "95 % regions of pairs of parameters, for the combined uncertainty if it is known.",
@@ -27,24 +34,8 @@ GENERAL_CAPTIONS = {
 }
 
 
-def _all_captions() -> dict[str, str]:
-    """Return the captions of all pictures, with those of the features at their places in a
-    report.
-    """
-    captions = [*GENERAL_CAPTIONS.items()]
-    for feature in FEATURES:
-        for kind in feature.picture_kinds:
-            names = [name for name, _ in captions]
-            captions.insert(names.index(kind.before), (kind.name, kind.caption))
-    return dict(captions)
-
-
-PICTURE_CAPTIONS = _all_captions()
 # Pictures that show measurement and fit, one of which leads the page.
-LEADING_PICTURES = (
-    "stress",
-    *(kind.name for feature in FEATURES for kind in feature.picture_kinds if kind.is_leading),
-)
+LEADING_PICTURES = ("stress", "tracks", "wrench", "force_displacement", "reading", "depth")
 
 
 def captioned_pictures(run: Path) -> list[Picture]:

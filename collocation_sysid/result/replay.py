@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from ..common.array_types import Array
 from ..common.files import RESULT_FILE, damage_refused, require_own
 from ..errors import InputError
-from ..features.measurement_results import SensorSeries
-from ..features.registry import FEATURES
+from ..features.measurement_results import WRENCH_SERIES, SensorSeries
 from ..fem.elements import EDGES
 from ..fem.laws.constants import symbol_of, without_region
 from ..recording.experiment import Experiment
@@ -31,9 +30,7 @@ from ..runs.result_content import Result
 
 ARRAYS_FILE = "trajectory.npz"
 # Kinds of sensors whose arrays are named after the kind and the number of the sensor, from 1.
-SERIES_KINDS = {
-    each.series_kind.name: each.series_kind for each in FEATURES if each.series_kind is not None
-}
+SERIES_KINDS = {WRENCH_SERIES.name: WRENCH_SERIES}
 # Prefixes of arrays of the attributes that are mappings, before the name.
 GROUP_PREFIXES = {"readings": "reading_", "fields": "field_", "visible_points": "visible_"}
 # Prefix of the unit of a custom sensor, before its name.

@@ -22,7 +22,8 @@ from ..common.array_types import Array
 from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
 from ..errors import InputError
-from ..features.registry import FEATURES, merged_fields
+from ..features.contact_feature import contact_fields
+from ..features.measurements import recorded_series
 from ..fem.body import Body
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
@@ -287,10 +288,10 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
                 simulated=rolled_out,
                 natural_hz=natural,
                 places_m=places_m,
-                recorded=merged_fields(
-                    feature.recorded(experiment, finished.solution, predicted, shown[0])
-                    for feature in FEATURES
-                ),
+                recorded=recorded_series(
+                    experiment, finished.solution.fitted_values.get(experiment.name), predicted
+                )
+                | contact_fields(experiment, finished.solution, shown[0]),
             )
             of_cells = _field_estimates(finished, experiment.body)
             of_cameras = _visible_points(finished, experiment)

@@ -33,7 +33,6 @@ from ..common.pages import explain_command, page_url
 from ..common.serialisation import content, copy_fields
 from ..errors import listed
 from ..features.measurement_results import PredictionErrors, SimulatedExperiment
-from ..features.registry import FEATURES
 from ..fem.laws.constants import symbol_of, symbol_with_unit, unit_of
 from ..recording.nuisance import in_readable_unit
 from ..runs.result_content import Elapsed, Result
@@ -437,8 +436,7 @@ def fit_section(result: Result) -> TitledParts:
     lines = [markers * marked + dynamics]
     for name, each in experiments.items():
         is_symmetric = name in (fit.symmetry or {})
-        for feature in FEATURES:
-            lines += feature.fit_lines(name, each, is_symmetric)
+        lines += each.lines(name, is_symmetric)
     for name, each in result.rollout.experiments.items():
         lines += _simulation_lines(name, each)
     for parts in sorted({*(fit.symmetry or {}).values()}):
@@ -488,7 +486,7 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
     units = simulated.reading_unit
     onsets = _deviations_text(simulated.own_onsets)
     yield (
-        f"{kind} '{name}': {errors_text(error, units) or 'no measurements to compare with'}"
+        f"{kind} '{name}': {error.text(units) or 'no measurements to compare with'}"
         + (f", with {onsets} from this recording" if onsets else "")
     )
     if simulated.fitted:
@@ -496,14 +494,14 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
     if simulated.own is not None and simulated.own_deviations:
         largest = max(simulated.own_deviations.items(), key=lambda each: abs(each[1]))
         yield (
-            f"  if nuisance parameters are fitted to it: {errors_text(simulated.own, units)}, "
+            f"  if nuisance parameters are fitted to it: {simulated.own.text(units)}, "
             f"with {_deviations_text(dict([largest]))}"
         )
     if simulated.copied is not None:
         copied = simulated.copied
         yield (
             f"  for comparison, the measurements of '{copied.copied}' as the prediction: "
-            f"{errors_text(copied.error, units)}"
+            f"{copied.error.text(units)}"
         )
     elif simulated.not_copied:
         yield f"  no comparison with measurements of another recording: {simulated.not_copied}"
@@ -514,14 +512,6 @@ def _deviations_text(deviations: Mapping[str, float] | None) -> str:
     return listed(
         f"'{name}' at {size:+.2g} standard deviations" for name, size in (deviations or {}).items()
     )
-
-
-def errors_text(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
-    """Return the errors of a prediction in words; "" if nothing is compared.
-
-    Errors that are None, and errors of markers and forces that are zero, are left out.
-    """
-    return "; ".join(text for feature in FEATURES for text in feature.error_texts(error, units))
 
 
 def millimetres_text(metres: float) -> str:

@@ -26,7 +26,6 @@ from .probe_sections import (
 )
 from .run_sections import (
     budget_table,
-    errors_text,
     estimate_row,
     estimate_sections,
     fit_section,
@@ -234,7 +233,7 @@ def _fit_errors(fitted: FittedExperiment) -> str:
         reading_rms=fitted.reading_rms,
         depth=fitted.depth,
     )
-    return errors_text(errors, fitted.reading_unit)
+    return errors.text(fitted.reading_unit)
 
 
 def _simulation_text(simulated: SimulatedExperiment) -> str:
@@ -244,8 +243,8 @@ def _simulation_text(simulated: SimulatedExperiment) -> str:
     if simulated.failed is not None:
         return f"failed: {simulated.failed}"
     own = copy_fields(PredictionErrors, simulated)
-    text = errors_text(own, simulated.reading_unit) or "no measurements to compare with"
+    text = own.text(simulated.reading_unit) or "no measurements to compare with"
     if simulated.copied is not None:
-        copied = errors_text(simulated.copied.error, simulated.reading_unit)
+        copied = simulated.copied.error.text(simulated.reading_unit)
         text += f" (measurements of '{simulated.copied.copied}' as the prediction: {copied})"
     return text

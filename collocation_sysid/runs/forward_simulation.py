@@ -11,13 +11,15 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
-from ..features.measurement_results import CopyError, InstrumentPrediction, PredictionErrors
-from ..features.registry import FEATURES, merged_fields
+from ..features.measurement_results import CopyError, PredictionErrors
+from ..features.measurements import Predictions, instrument_misfits, prediction_error, tracks_m
 from ..fem.kernels import map_experiments
+from ..methods.complementarity import with_contact_energy
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
+from ..program.measured_motion import residual_changes, simulated_values
 from ..program.simulation import Trajectory, simulate
 from ..program.transcription import Transcription
 from ..recording import Experiment
@@ -30,13 +32,7 @@ from ..statistics.budget.discretisation_error import (
 from ..statistics.estimates import Estimate
 from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.linearised import LinearisedFit, parameter_values
-from .prediction import (
-    instrument_misfits,
-    nearest_recording_error,
-    nuisance_of_fitted_recordings,
-    prediction_error,
-    unknown_onsets,
-)
+from .prediction import nearest_recording_error, nuisance_of_fitted_recordings, unknown_onsets
 
 # Least ratio of grid step and simulation step for an estimate of the step's error: half, rounded.
 LEAST_STEP_RATIO = 1.99
@@ -87,8 +83,8 @@ class ForwardSimulation:
         those of places are displacements from their start. Empty for fitted experiments.
     places_m : mapping of marker to place [x, y, z]
         Marker places on the undeformed body, likewise; empty for fitted experiments.
-    predicted : InstrumentPrediction
-        Predictions of all instruments.
+    predicted : sequence of (S, m) array or SurfaceComparison
+        Prediction of each of `Experiment.measurements`.
     error : PredictionErrors
         Their RMS and largest differences from the measurements.
     misfits : tuple of InstrumentMisfit
@@ -106,7 +102,7 @@ class ForwardSimulation:
     trajectory: Trajectory
     nuisance: Mapping[str, float]
     places_m: Mapping[str, list[float]]
-    predicted: InstrumentPrediction
+    predicted: Predictions
     error: PredictionErrors
     misfits: tuple[InstrumentMisfit, ...] = ()
     own: OwnFit | None = None
@@ -267,9 +263,7 @@ def simulate_with_parameters(
         Where the simulation fails.
     """
     integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
-    corrected = transcription.corrected_experiment(phi)
-    for feature in FEATURES:
-        corrected = feature.for_simulation(corrected)
+    corrected = with_contact_energy(transcription.corrected_experiment(phi))
     trajectory = simulate(
         corrected,
         transcription.body.theta_from_values(parameters),
@@ -278,14 +272,12 @@ def simulate_with_parameters(
         substeps=transcription.substeps,
         progress=report,
     )
-    predicted = InstrumentPrediction(
-        **merged_fields(feature.predict(transcription, trajectory, phi) for feature in FEATURES)
-    )
+    predicted = simulated_values(transcription, trajectory, phi)
     error = prediction_error(experiment, predicted)
     return ForwardSimulation(
         rms_m=error.rms_m or 0.0,
         max_m=error.max_m or 0.0,
-        trajectory=replace(trajectory, markers_m=predicted.markers_m),
+        trajectory=replace(trajectory, markers_m=tracks_m(experiment, predicted)),
         nuisance={},
         places_m={},
         predicted=predicted,
@@ -397,10 +389,7 @@ def step_error(
         share = _step_error_share(problem, part.transcription)
         if not isinstance(rollout, ForwardSimulation) or share is None:
             return None
-        for feature in FEATURES:
-            differences += feature.step_differences(
-                part, rollout.trajectory, rollout.predicted, share
-            )
+        differences += residual_changes(part, rollout.trajectory, share)
     change = change_in_observations(fit, differences)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.compute_bounds_q())
     linear = problem.parameters.list_linear_names()

@@ -1,8 +1,6 @@
-"""Differences between a simulated motion and a recording, in units and in stated standard
-deviations.
+"""References of the predictions of recordings.
 
-They are evaluated for forward simulations of fitted recordings, and for predictions of others. A
-prediction is compared with two references: the same prediction with the nuisance parameters of the
+A prediction is compared with two references: the same prediction with the nuisance parameters of the
 fitted recordings (blind), and the measurements of a fitted recording (copy).
 """
 
@@ -13,13 +11,14 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..common.array_types import Array, Index
-from ..features.measurement_results import (
-    CopyError,
-    InstrumentPrediction,
-    PredictionErrors,
-    main_error,
+from ..features.measurement_results import CopyError
+from ..features.measurements import (
+    copied,
+    copied_times_s,
+    instrument_misfits,
+    prediction_error,
+    reason_against_copy,
 )
-from ..features.registry import FEATURES, merged_fields
 from ..methods.solution import Solution
 from ..program.transcription import Transcription
 from ..recording import Experiment
@@ -28,52 +27,12 @@ from ..recording.sample_times import TIME_TOLERANCE_S
 from ..statistics.instrument_misfit import InstrumentMisfit
 
 
-def prediction_error(experiment: Experiment, predicted: InstrumentPrediction) -> PredictionErrors:
-    """Return RMS and maximum differences between a prediction and the measurements of its
-    recording, for each kind of instrument.
-
-    Values that are not measured, or not predicted (NaN), are left out; a kind without values has
-    None.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Recording with the measurements.
-    predicted : InstrumentPrediction
-        Prediction at the same samples and for the same instruments, in the same order.
-    """
-    return PredictionErrors(
-        **merged_fields(feature.errors(experiment, predicted) for feature in FEATURES)
-    )
-
-
-def instrument_misfits(
-    experiment: Experiment, predicted: InstrumentPrediction
-) -> list[InstrumentMisfit]:
-    """Return the RMS of (prediction − measurement) / σ of each instrument, with the stated σ, in
-    the order of `FEATURES`.
-
-    A kind without measurements is left out; values that are NaN, measured or predicted, do not
-    count.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Recording with the measurements.
-    predicted : InstrumentPrediction
-        Prediction at the same samples and for the same instruments, in the same order.
-    """
-    return [misfit for feature in FEATURES for misfit in feature.misfits(experiment, predicted)]
-
-
 def fit_misfits(solution: Solution) -> dict[str, list[InstrumentMisfit]]:
-    """Return the same of the fit, by name of the fitted recording."""
+    """Return the RMS of (fit − measurement) / σ of each measurement, by name of the recording."""
     return {
         part.transcription.experiment.name: instrument_misfits(
             part.transcription.experiment,
-            InstrumentPrediction(
-                **merged_fields(feature.fitted(part, solution) for feature in FEATURES)
-            ),
+            solution.fitted_values[part.transcription.experiment.name],
         )
         for part in solution.parts
     }
@@ -175,26 +134,22 @@ def nearest_recording_error(
         if reason:
             reasons[other.name] = reason
             continue
-        copy = InstrumentPrediction(
-            **merged_fields(feature.copied(experiment, other) for feature in FEATURES)
-        )
-        copies.append(CopyError(other.name, prediction_error(experiment, copy)))
+        error = prediction_error(experiment, copied(experiment, other))
+        copies.append(CopyError(other.name, error))
     if not copies:
         explanation = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         return f"no fitted recording has the same samples ({explanation})"
-    return min(copies, key=lambda each: main_error(each.error))
+    return min(copies, key=lambda each: each.error.main)
 
 
 def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     """Return why the measurements of `other` cannot be compared with those of a recording as a
     prediction, such as other markers; "" if they can.
     """
-    reasons = (feature.reason_against_copy(experiment, other) for feature in FEATURES)
-    if reason := next(filter(None, reasons), ""):
+    if reason := reason_against_copy(experiment, other):
         return reason
-    times = [pair for feature in FEATURES for pair in feature.copied_times_s(experiment, other)]
     starts_s = experiment.t_s[0], other.t_s[0]
-    for here_s, there_s in times:
+    for here_s, there_s in copied_times_s(experiment, other):
         if len(here_s) != len(there_s):
             return f"{len(there_s)} samples instead of {len(here_s)}"
         if np.abs((here_s - starts_s[0]) - (there_s - starts_s[1])).max() > TIME_TOLERANCE_S:

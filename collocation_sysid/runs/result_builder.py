@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import casadi
 import numpy as np
@@ -14,17 +15,19 @@ from ..common.display import short
 from ..common.files import SCHEMA
 from ..common.installation import package_version
 from ..common.serialisation import copy_fields
-from ..features.custom_sensor_feature import units_by_name
 from ..features.measurement_results import (
     CopyError,
     FitResult,
     FittedExperiment,
     ForwardResult,
+    PredictionErrors,
     SimulatedExperiment,
 )
-from ..features.registry import FEATURES, merged_fields
+from ..features.measurements import prediction_error, stated_sigmas, units_by_name
 from ..fem.laws.constants import GAMMA_R
+from ..methods.solution import pooled_wrench_rms
 from ..methods.stiffness_scan import ScanSummary
+from ..model.contact.contact_summary import friction_summaries
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
@@ -262,13 +265,16 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         experiment = part.transcription.experiment
         name = experiment.name
         markers = experiment.markers
+        friction = friction_summaries(experiment, part.equations.dynamics, x=part.x)
         experiments[name] = FittedExperiment(
             solution.rms_by_experiment_m[name],
             markers.count_samples(),
             int(markers.count_missing().sum()),
             experiment.is_static,
             (*_place_sentences(answer.places[name]), *_nuisance_sentences(part, answer)),
-            **merged_fields(feature.fit_fields(part, solution) for feature in FEATURES),
+            **stated_sigmas(experiment),
+            **_sensor_errors(prediction_error(experiment, solution.fitted_values[name])),
+            friction=friction or None,
             air_density_kg_m3=experiment.air_density_kg_m3,
             test=experiment.specimen and experiment.specimen.test,
         )
@@ -277,14 +283,20 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         for experiment in answer.problem.experiments
         if experiment.find_symmetry() > 1
     }
-    symmetry = parts or None
+    force_n, torque_nm = pooled_wrench_rms(solution)
     return FitResult(
         solution.rms_m,
         answer.compute_noise_rms_m(),
         experiments,
-        **merged_fields(feature.pooled_fields(solution) for feature in FEATURES),
-        symmetry=symmetry,
+        wrench_rms_n=force_n,
+        wrench_rms_nm=torque_nm,
+        symmetry=parts or None,
     )
+
+
+def _sensor_errors(error: PredictionErrors) -> dict[str, Any]:
+    """Return the errors of all measurements but the markers, by name of the field."""
+    return {key: value for key, value in vars(error).items() if key not in ("rms_m", "max_m")}
 
 
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
@@ -316,16 +328,13 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):
         return SimulatedExperiment(fitted, failed=simulated)
-    errors = {
-        key: value for key, value in vars(simulated.error).items() if key not in ("rms_m", "max_m")
-    }
     own = simulated.own
     return copy_fields(
         SimulatedExperiment,
         simulated,
         fitted=fitted,
         failed=None,
-        **errors,
+        **_sensor_errors(simulated.error),
         reading_unit=units_by_name(experiment),
         own=own.error if own else None,
         own_deviations=own.deviations if own else None,

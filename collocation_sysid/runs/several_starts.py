@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.array_types import Array
-from ..features.registry import FEATURES
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Iteration, Method, Solution, Status, Watch
 from ..methods.stiffness_scan import Scan
@@ -70,7 +69,9 @@ def robust_loss(solution: Solution) -> float:
     p, _ = collocation.unpack(solution.z)
     prior, _ = collocation.prior_residuals(p)
     excluded_loss = sum(
-        feature.excluded_loss(part) for part in solution.parts for feature in FEATURES
+        model.excluded_loss
+        for part in solution.parts
+        for model in part.transcription.measurement_models
     )
     return sum(part.loss for part in solution.parts) + float(prior @ prior) + excluded_loss
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from ..common.array_types import Array
 from ..common.step_counting import search_activity
 from ..errors import InputError
-from ..features.registry import FEATURES, lost_samples
+from ..features.measurements import lost_samples
+from ..features.registry import FEATURES
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace

@@ -111,8 +111,6 @@ def solution_concerns(
             rows=[entry.row for entry in nuisance.entries],
             scales=nuisance.scales.tolist(),
         )
-        for feature in FEATURES:
-            yield from feature.part_concerns(part)
         for k in nuisance.indices_of_rows(TIME):
             scale = float(nuisance.scales[k])
             name = part.transcription.experiment.name

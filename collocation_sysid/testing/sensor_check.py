@@ -242,9 +242,8 @@ def _check_prediction(
     p[collocation.nq :] = check.rng.standard_normal(collocation.nphi)
     (iterate,) = collocation.iterates_at(p, [x])
     (residual,) = transcription.custom_sensors
-    found = residual.without_padding(
-        residual.predict_motion(iterate.motion_for(residual.observable), iterate.phi)
-    )
+    motion = iterate.motion_for(residual.observable)
+    found = residual.numbers(residual.predict_motion(motion, iterate.phi))
     unknowns = iterate.phi * np.array([*expression.sensor.unknowns.values()], dtype=float)
     points = np.asarray(expression.sensor.points_m).T
     for t_s, numbers in zip(residual.t_s, found, strict=True):

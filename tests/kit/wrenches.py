@@ -10,7 +10,6 @@ import numpy as np
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
-from collocation_sysid.program.wrench_residual import predict_wrenches
 from collocation_sysid.recording import Experiment, Nuisance, Wrench
 from kit.problems import TRUTH, as_theta, hung_cube, measured_with
 
@@ -82,7 +81,10 @@ def sensed(
 
 def predicted_wrenches(part: ExperimentIterate) -> list[np.ndarray]:
     """What each sensor of an experiment reads by the model."""
-    return predict_wrenches(part.transcription.sensors, part.reactions, part.phi)
+    return [
+        each.numbers(each.predict_motion(part.motion_for(each.observable), part.phi))
+        for each in part.transcription.sensors
+    ]
 
 
 def wristed_cube(steps: int = 12, nuisance: Nuisance | None = None, **changes) -> Experiment:

@@ -1,4 +1,4 @@
-"""Features are listed once, declare different fields and messages, and are optional in every part."""
+"""Features are listed once, declare different messages, and are optional in every part."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 import collocation_sysid
 from collocation_sysid.features.feature import Feature
-from collocation_sysid.features.registry import FEATURES, merged_fields
+from collocation_sysid.features.registry import FEATURES
 from collocation_sysid.statistics.concerns import TOPICS, declare_messages, declare_topics
 
 PACKAGE = Path(collocation_sysid.__file__).parent
@@ -37,12 +37,6 @@ def test_only_the_registry_lists_the_features():
     assert users == {"features/registry.py"}
 
 
-def test_features_have_different_fields():
-    assert merged_fields([{"a": 1}, {}, {"b": 2}]) == {"a": 1, "b": 2}
-    with pytest.raises(ValueError, match="two features contribute the field 'a'"):
-        merged_fields([{"a": 1, "b": 2}, {"a": 3}])
-
-
 def test_no_message_is_declared_twice():
     with pytest.raises(ValueError, match="the topic 'contact' is declared"):
         declare_topics({"contact": TOPICS["contact"]})
@@ -52,14 +46,7 @@ def test_no_message_is_declared_twice():
 
 
 def test_a_feature_without_functions_contributes_nothing():
-    nothing = Feature("nothing")
+    nothing = Feature()
     assert not [*nothing.hypotheses(None)]
-    assert not [*nothing.error_texts(None, None)]
-    assert not [*nothing.simulated_series(None, None)]
-    assert not [*nothing.live_limitations(None)]
+    assert not [*nothing.concerns(None)]
     assert nothing.simulated_hypotheses(None) == ((), ())
-    assert nothing.reason_against_copy(None, None) == ""
-    assert nothing.prediction_residuals(None, None, None) is None
-    assert nothing.excluded_loss(None) == 0.0
-    experiment = object()
-    assert nothing.for_simulation(experiment) is experiment

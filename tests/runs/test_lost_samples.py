@@ -10,7 +10,7 @@ from kit.problems import GUESS, TRUTH, hung_cube, measured
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.features.registry import lost_samples
+from collocation_sysid.features.measurements import lost_samples
 from collocation_sysid.statistics.linearised import linearise_fit
 
 

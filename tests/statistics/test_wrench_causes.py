@@ -81,8 +81,9 @@ def with_tool() -> Collocation:
     tool = transcription.nuisance.indices_of_rows(TOOL_MASS, TOOL_CENTRE)
     phi[tool] = [TOOL_KG, *TOOL_M] / transcription.nuisance.scales[tool]
     iterate = ExperimentIterate(transcription, part.q, phi=phi, x=part.x)
-    added = sensor.predict_reactions(iterate.reactions, phi) - sensor.predict_reactions(
-        iterate.reactions, 0 * phi
+    motion = iterate.motion_for(sensor.observable)
+    added = sensor.numbers(
+        sensor.predict_motion(motion, phi) - sensor.predict_motion(motion, 0 * phi)
     )
     (grasp,) = given.grasps
     assert grasp.wrench is not None

@@ -22,6 +22,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
+from collocation_sysid.program.measured_motion import predict_trajectory
 from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.recording import Experiment, Nuisance
 from collocation_sysid.runs.check import check_problem
@@ -106,9 +107,8 @@ def test_tare_clock_lag_and_tool_are_found():
     true[["centre of the tool" in name for name in names]] = (0.0, 0.01, -0.005)
     phi = true / scales
     made = simulate(swung(0, wanted, 60), TRUTH, "midpoint", substeps=1)
-    grid, forced = made.reactions
     (sensor,) = transcription.sensors
-    read = sensor.on_grid(grid).predict_reactions(forced, phi)
+    read = sensor.numbers(predict_trajectory(sensor, made, phi))
     measured = with_wrenches(swung(0, wanted, 60), [read])
     collocation = Collocation([with_markers(measured, made.markers_m)], GUESS)
     solution = ReducedSpace()(collocation)

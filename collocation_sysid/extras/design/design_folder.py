@@ -16,11 +16,10 @@ import tomli_w
 from scipy.spatial.transform import RigidTransform
 
 from ...common.serialisation import as_json, content
-from ...features.registry import FEATURES
 from ...problem.gripper_transforms import gripper_transforms
 from ...problem.recording_schema import MovedSection
 from ...problem.schema import with_experiment_defaults
-from ...recording import PoseSequence, write_poses_csv
+from ...recording import PoseSequence, write_markers_csv, write_poses_csv, write_wrench_csv
 from ...result.animation import film
 from ...result.pictures.album import save_pictures
 from ...result.replay import MotionRecord
@@ -30,6 +29,8 @@ from .motion_design import Design, ErrorBars
 
 DESIGN_FILE = "design.json"
 POSES_FILE = "poses.csv"
+MARKERS_FILE = "predicted_markers.csv"
+WRENCH_FILE = "predicted_wrench.csv"
 PROBLEM_FILE = "problem.toml"
 FILM_FILE = "motion.gif"
 NAME = "designed"
@@ -39,6 +40,17 @@ SCHEMA = 1
 FRAMES_PER_SECOND = 25.0
 # Keys of a grasp that describe the file of its poses: files of a design have the package's format.
 OF_POSES = MovedSection.model_fields.keys() - {"gripper_to_body"}
+# Keys of markers and of a wrench that describe their files.
+OF_MARKERS = (
+    "names",
+    "labels",
+    "length_unit",
+    "rate_hz",
+    "template_m",
+    "template_window_s",
+    "max_template_residual_m",
+)
+OF_WRENCH = ("columns", "axis", "sign", "area_m2", "symmetry")
 # Keys whose texts are names of files, in any table.
 OF_FILES = ("mesh", "surface", "file", "poses", "displacement", "tension", "pressure")
 # Keys of an experiment that select samples, or exclude it from the fit.
@@ -55,7 +67,7 @@ def write_design(
 ) -> Path:
     """Write the folder of a design atomically, and return its path.
 
-    It contains the poses (poses.csv), the predicted measurements of each feature, pictures,
+    It contains the poses (poses.csv), the predicted markers and wrench, pictures,
     design.json, with `with_film` motion.gif, and, if the problem was read from a file, problem.toml
     for the recording.
 
@@ -80,8 +92,14 @@ def write_design(
         write_poses_csv(place / POSES_FILE, _gripper_poses(design))
         experiment = design.experiment
         markers = experiment.markers
-        for feature in FEATURES:
-            feature.write_predicted(experiment, design.predicted, place)
+        write_markers_csv(
+            place / MARKERS_FILE,
+            markers.t_s,
+            names=markers.names,
+            positions_m=design.predicted.markers_m,
+        )
+        for sensor, wrench in zip(experiment.wrenches, design.predicted.wrenches, strict=True):
+            write_wrench_csv(place / WRENCH_FILE, sensor.t_s, values=wrench)
         if design.recording.problem.origin is not None:
             text = HEAD + tomli_w.dumps(_problem_content(design, target.resolve()))
             (place / PROBLEM_FILE).write_text(text, encoding="utf-8")
@@ -207,8 +225,10 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
     from the files of the design beside the problem file.
 
     Keys that select samples are removed (`OF_TIME`), and so are keys that describe the original
-    file of poses in the table of the first grasp (`OF_POSES`). Each feature changes what it reads,
-    see `Feature.read_predicted`.
+    file of poses in the table of the first grasp (`OF_POSES`). Tables of markers and of the
+    wrench of that grasp lose the keys that describe their files (`OF_MARKERS`, `OF_WRENCH`); the
+    wrench is in newtons and for the modelled part of the body, so that its sigmas are divided by
+    "symmetry".
     """
     for key in OF_TIME:
         table.pop(key, None)
@@ -216,8 +236,16 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
     for key in OF_POSES:
         grasp.pop(key, None)
     grasp["poses"] = POSES_FILE
-    for feature in FEATURES:
-        feature.read_predicted(table)
+    if "markers" in table:
+        for key in OF_MARKERS:
+            table["markers"].pop(key, None)
+        table["markers"]["file"] = MARKERS_FILE
+    if "wrench" in grasp:
+        wrench = grasp["wrench"]
+        parts = wrench.get("symmetry", 1)
+        sigmas = {key: wrench[key] / parts for key in ("sigma_n", "sigma_nm") if key in wrench}
+        remaining = {key: value for key, value in wrench.items() if key not in OF_WRENCH}
+        grasp["wrench"] = remaining | sigmas | {"file": WRENCH_FILE}
     return table
 
 

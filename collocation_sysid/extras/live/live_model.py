@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import InputError
-from ...features.registry import FEATURES
 from ...methods.stiffness_scan import typical_parameters
 from ...model.point_forces import law_function
 from ...problem import Problem
@@ -85,8 +84,7 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
         experiment.actuators,
         "none",
     )
-    for feature in FEATURES:
-        yield from feature.live_limitations(experiment)
+    yield ("depth cameras, because frames do not contain their images", experiment.depths, "none")
     delayed = experiment.obstacles and nuisance.obstacle_time_s
     yield ("an obstacle whose delay is estimated", delayed, "one whose clock is known")
     filtered = nuisance.sensor_lag_s and experiment.sensors_by_grasp

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import SimulationError
-from ...features.registry import FEATURES, merged_fields, prediction_residuals
+from ...features.measurements import fit_rms, judged_residuals
 from ...fem.laws.constants import symbol_of, unit_of
 from ...methods.solution import Solution
 from ...pipeline import run as solve_and_check
@@ -623,7 +623,7 @@ def _solution_record(solution: Solution) -> dict[str, Any]:
     return {
         "status": solution.status.value,
         "converged": solution.status.converged,
-        "rms": merged_fields(each.fit_rms(solution) for each in FEATURES),
+        "rms": fit_rms(solution),
         "parameters": parameter_values(solution.collocation, solution.q),
         "at_bound": _names_at_bounds(solution),
         "free": [item.name for item in solution.collocation.parameters.free],
@@ -680,10 +680,9 @@ def _prediction_error(
     """Return RMS, number of samples and sums of squares by block, of held-out measurements against
     a simulation.
 
-    The measurements are those of the first feature that is measured, see
-    `Feature.prediction_residuals`; "unit" says which. Missing ones (NaN) do not count.
+    The measurements are those of `judged_residuals`; "unit" says which. Missing ones (NaN) do not count.
     """
-    residuals = prediction_residuals(experiment, rollout.trajectory, rollout.predicted)
+    residuals = judged_residuals(experiment, rollout.predicted)
     is_test_sample = residuals.t_s > start_s
     squares = np.where(residuals.is_counted, np.nansum(residuals.values**2, axis=2), 0.0)[
         is_test_sample

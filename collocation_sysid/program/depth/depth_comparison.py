@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from ...common.array_types import Array, root_mean
 from ..experiment_iterate import ExperimentIterate
+from ..simulation import Trajectory
 from ..transcription import Transcription
 from .depth_residual import HUBER, DepthResidual
 from .outline_residual import OutlineResidual
@@ -64,6 +65,20 @@ class DepthError:
     rms_within_gate_m: float | None
     sigmas: float
     tame_sigmas: float
+
+    @property
+    def text(self) -> str:
+        """Distances in words."""
+        if self.rms_m is None:
+            return "no point near the body"
+        sentence = f"{1e3 * self.rms_m:.3g} mm RMS of {self.points} points"
+        gate = f"the limit of {1e3 * self.gate_m:.3g} mm (gate_m)"
+        if not self.share_beyond_gate:
+            return f"{sentence}, all within {gate}"
+        beyond = f"{sentence}, {self.share_beyond_gate:.0%} beyond {gate}"
+        if self.rms_within_gate_m is None:
+            return beyond
+        return f"{beyond}, the others {1e3 * self.rms_within_gate_m:.3g} mm RMS"
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +132,7 @@ class SurfaceComparison:
 
     @classmethod
     def from_motion(
-        cls, residual: DepthResidual, t_s: Array, positions_m: Array, phi: Array
+        cls, residual: DepthResidual, trajectory: Trajectory, phi: Array
     ) -> SurfaceComparison:
         """Associate the points with a motion and compare them; images after its end are compared
         with its last positions.
@@ -126,16 +141,12 @@ class SurfaceComparison:
         ----------
         residual : DepthResidual
             Measurement model of the camera; its correspondences are not used.
-        t_s : (T,) array
-            Times of the motion [s].
-        positions_m : (T, n, 3) array
-            Positions of all nodes [m].
+        trajectory : Trajectory
+            Simulated motion.
         phi : (k,) array
             Nuisance parameters.
         """
-        shapes_m = residual.surface_shapes(
-            _positions_at_observable(residual, t_s, positions_m=positions_m), phi
-        )
+        shapes_m = residual.surface_shapes(_positions_at_observable(residual, trajectory), phi)
         view = residual.correspondences.camera
         body = residual.correspondences.body
         widest_m = max(initial_gate_m(body.nodes_m), view.depth.gate_m)
@@ -174,12 +185,13 @@ class SurfaceComparison:
         )
 
 
-def _positions_at_observable(residual: DepthResidual, t_s: Array, positions_m: Array) -> Array:
-    """Return positions (R, 3n) at the times of a measurement's observable, interpolated from
-    positions `positions_m` (T, …) at times `t_s` (T,) by a cubic spline, or by lines between fewer
-    than `FEWEST_FOR_SPLINE`; outside these times the end positions.
+def _positions_at_observable(residual: DepthResidual, trajectory: Trajectory) -> Array:
+    """Return positions (R, 3n) at the times of a measurement's observable, interpolated from those
+    of a motion by a cubic spline, or by lines between fewer than `FEWEST_FOR_SPLINE`; outside its
+    times the end positions.
     """
-    position_rows = positions_m.reshape(len(t_s), -1)
+    t_s = trajectory.t_s
+    position_rows = trajectory.observed.x
     at_s = np.clip(residual.observable_s, t_s[0], t_s[-1])
     if len(t_s) >= FEWEST_FOR_SPLINE:
         return np.asarray(CubicSpline(t_s, position_rows)(at_s))
@@ -190,11 +202,7 @@ def camera_residuals(transcription: Transcription) -> list[DepthResidual]:
     """Return the measurement models of the points of the depth cameras, in their order, without
     those of outlines.
     """
-    return [
-        each
-        for each in transcription.residuals
-        if isinstance(each, DepthResidual) and not isinstance(each, OutlineResidual)
-    ]
+    return [each for each in transcription.reassociable if isinstance(each, DepthResidual)]
 
 
 def depth_residuals(iterate: ExperimentIterate) -> list[tuple[DepthResidual, Array]]:

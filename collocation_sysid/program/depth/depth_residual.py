@@ -305,7 +305,7 @@ class DepthResidual(CorrespondenceResidual):
         return self.correspondences.excluded_counts["crease"]
 
     @property
-    def loss_of_distant_points(self) -> float:
+    def excluded_loss(self) -> float:
         """Loss of the points beyond the gate of the present correspondences, each counted as if its
         distance were the stated gate.
         """

@@ -207,13 +207,6 @@ class MarkerResidual(MeasurementResidual):
 
     # Of positions -----------------------------------------------------------------------------
 
-    def predict_samples(self, positions_m: Array, phi: Array) -> Array:
-        """Return predictions (T, M, 3) [m] at φ (k,) from the body's positions (T, n, 3) [m] at the
-        samples.
-        """
-        plain = replace(self, observable=replace(self.observable, rows=np.arange(len(positions_m))))
-        return plain.predict_positions(positions_m.reshape(len(positions_m), -1), phi)
-
     def predict_positions(self, x: Array, phi: Array) -> Array:
         """Return predictions (t, M, 3) [m] at φ (k,) from the first grid positions x (rows, 3n)
         [m], for the t samples that they suffice for.

@@ -17,7 +17,8 @@ from typing import Any, ClassVar, NamedTuple
 from ...common.array_types import Array
 from ...common.serialisation import content
 from ...features.feature import SimulatedCheck
-from ...features.registry import FEATURES, lost_samples
+from ...features.measurements import lost_samples
+from ...features.registry import FEATURES
 from ...methods.initial_trajectories import initial_variables
 from ...methods.reduced_space import ReducedSpace
 from ...methods.stiffness_scan import SOFT_PA, start_problem, typical_constants, typical_parameters

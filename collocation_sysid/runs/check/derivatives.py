@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from ...common.array_types import Array
-from ...features.registry import FEATURES
+from ...model.contact.contact_force import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
 from ...program.lifted.lifted_collocation import lifted_nonzeros, with_lifted_variables
@@ -23,6 +23,9 @@ SAMPLES = 12
 STATIC_SAMPLES = 3
 # Step of the differences, which balances truncation and rounding of fourth-order differences.
 STEP = 1e-5
+# Largest step of differences, relative to the gap over which the pressure of an obstacle rises: it
+# must stay within.
+STEP_PER_WIDTH = 1e-3
 # Huber threshold of the check [σ]: differences must not cross the kink of the second derivative.
 LARGE_HUBER = 1e9
 # Most nonzeros of lifted variables for which the whole program is laid out and checked.
@@ -107,19 +110,15 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
 
 
 def _difference_step(collocation: Collocation) -> float:
-    """Return the step of the differences in the scaled variables z: `STEP`, or less where a feature
-    of a fitted experiment needs smaller ones.
+    """Return the step of the differences in the scaled variables z: `STEP`, or a small share of the
+    narrowest gap over which the pressure of an obstacle rises.
     """
-    return min(
-        (
-            STEP,
-            *(
-                feature.largest_difference_step(transcription.experiment)
-                for transcription in collocation.transcriptions
-                for feature in FEATURES
-            ),
-        )
-    )
+    widths_m = [
+        term.law_of_contact.largest_width_m
+        for transcription in collocation.transcriptions
+        for term in contact_terms(transcription.experiment)
+    ]
+    return min([STEP, *(STEP_PER_WIDTH * width_m for width_m in widths_m)])
 
 
 def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: float) -> float:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array
-from ...features.registry import FEATURES
 from ...recording.experiment import Experiment
 from ...statistics.concerns import Concern, concern_if
 from .body_check import BodyCheck
@@ -138,7 +137,9 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
         samples=markers.count_samples(),
         missing=int(missing.sum()),
         markers=tuple(findings),
-        instruments=tuple(text for feature in FEATURES for text in feature.instruments(experiment)),
+        instruments=tuple(
+            dict.fromkeys(filter(None, (each.instrument_text for each in experiment.measurements)))
+        ),
         air_density_kg_m3=experiment.air_density_kg_m3,
         test="" if experiment.specimen is None else f"{experiment.specimen.test} specimen",
         unplaced=int((~markers.located).sum()),

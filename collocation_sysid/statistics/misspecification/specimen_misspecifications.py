@@ -253,9 +253,8 @@ def _residuals(part: ExperimentIterate) -> list[Array]:
     """
     rows: list[Array] = []
     for sensor in part.transcription.custom_sensors:
-        predicted = sensor.without_padding(
-            sensor.predict_motion(part.motion_for(sensor.observable), part.phi)
-        )
+        motion = part.motion_for(sensor.observable)
+        predicted = sensor.numbers(sensor.predict_motion(motion, part.phi))
         residuals = (predicted - sensor.sensor.measured_values) / sensor.sensor.sigma
         rows += [row[np.isfinite(row)] for row in residuals.T]
     return rows

@@ -1,0 +1,307 @@
+"""Comparison of predictions with the measurements of a recording, for all kinds of measurements.
+
+Predictions are tuples in the order of `Experiment.measurements`, see `program.measured_motion`; None
+stands for a measurement that is not predicted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..common.array_types import Array, root_mean
+from ..errors import InputError
+from ..methods.solution import Solution, pooled_wrench_rms, wrench_rms
+from ..program.depth.depth_comparison import SurfaceComparison
+from ..program.measured_motion import Predicted
+from ..recording.custom_sensor import Gauge
+from ..recording.experiment import Experiment
+from ..recording.markers import Markers
+from ..recording.measured_wrench import Wrench
+from ..recording.measurement import Measurement
+from ..recording.sample_times import TIME_TOLERANCE_S
+from ..statistics.instrument_misfit import InstrumentMisfit, misfit
+from .measurement_results import WRENCH_SERIES, PredictionErrors, PredictionResiduals
+
+# Share of the samples below which a note says what is missing, and most names in it.
+LEAST_SHARE = 0.5
+MOST_SHOWN = 3
+
+Predictions = Sequence[Predicted | None]
+
+
+def _predicted_numbers(
+    experiment: Experiment, predicted: Predictions, kind: type = Measurement
+) -> list[tuple[Any, Array]]:
+    """Return the measurements of one kind whose numbers are predicted, each with these (S, m)."""
+    pairs = zip(experiment.measurements, predicted, strict=True)
+    return [
+        (each, values)
+        for each, values in pairs
+        if isinstance(each, kind) and isinstance(values, np.ndarray)
+    ]
+
+
+def surfaces(experiment: Experiment, predicted: Predictions) -> dict[str, SurfaceComparison]:
+    """Return the comparisons of depth cameras with a predicted surface, by name of the camera."""
+    views = (each for each in predicted if isinstance(each, SurfaceComparison))
+    return dict(zip(experiment.camera_names, views, strict=False))
+
+
+def tracks_m(experiment: Experiment, predicted: Predictions) -> Array:
+    """Return the predicted positions (T, M, 3) of the markers [m]."""
+    for markers, values in _predicted_numbers(experiment, predicted, Markers):
+        return markers.vectors(values)
+    return np.zeros((len(experiment.t_s), 0, 3))
+
+
+def titles(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the title of each measurement, numbered where several have the same one."""
+    counts = Counter(each.title for each in measurements)
+    numbers: Counter[str] = Counter()
+    for each in measurements:
+        numbers[each.title] += 1
+        is_alone = counts[each.title] == 1
+        number = numbers[each.title]
+        yield each.title if is_alone else f"{each.title.removeprefix('the ')} {number}"
+
+
+def lost_samples(experiment: Experiment) -> list[str]:
+    """Return a note for each measurement of which less than half is present.
+
+    Raises
+    ------
+    InputError
+        If nothing of a measurement is present within the recording.
+    """
+    notes = []
+    first_s, last_s = experiment.t_s[[0, -1]]
+    measurements = experiment.measurements
+    for title, measurement in zip(titles(measurements), measurements, strict=True):
+        what = measurement.samples_text or title
+        t_s = measurement.sample_times_s
+        is_within = (t_s >= first_s - TIME_TOLERANCE_S) & (t_s <= last_s + TIME_TOLERANCE_S)
+        shares = {name: np.mean(mask & is_within) for name, mask in measurement.presence.items()}
+        if not any(shares.values()):
+            raise InputError(
+                f"nothing of {what} of '{experiment.name}' is measured between "
+                f"{first_s:.6g} s and {last_s:.6g} s; expected at least one "
+                "sample: check columns, labels and times, or leave it out",
+                where="experiment",
+            )
+        few = [name for name, share in shares.items() if share < LEAST_SHARE]
+        if few:
+            shown = ", ".join(f"{name} ({shares[name]:.0%})" for name in few[:MOST_SHOWN])
+            more = ", …" if len(few) > MOST_SHOWN else ""
+            notes.append(
+                f"experiment '{experiment.name}': of {what}, {len(few)} of {len(shares)} "
+                f"columns are present in less than half of the samples: {shown}{more}; what is "
+                "present is used"
+            )
+    return notes
+
+
+# Differences --------------------------------------------------------------------------------------
+
+
+def prediction_error(experiment: Experiment, predicted: Predictions) -> PredictionErrors:
+    """Return RMS and maximum differences between a prediction and the measurements of its
+    recording, for each kind of measurement.
+
+    Values that are not measured, or not predicted (NaN), are left out; a kind without values has
+    None.
+    """
+    distances_m = np.zeros(0)
+    for markers, values in _predicted_numbers(experiment, predicted, Markers):
+        distances_m = markers.distances_m(values - markers.measured_values)
+    wrenches = [values for _, values in _predicted_numbers(experiment, predicted, Wrench)]
+    force_n, torque_nm = wrench_rms(experiment, wrenches) if wrenches else (None, None)
+    readings = {
+        gauge.name: float(np.sqrt(np.nanmean((values - gauge.measured_values) ** 2)))
+        for gauge, values in _predicted_numbers(experiment, predicted, Gauge)
+    }
+    depth = {name: surface.error for name, surface in surfaces(experiment, predicted).items()}
+    return PredictionErrors(
+        rms_m=root_mean(distances_m**2) if distances_m.size else None,
+        max_m=float(distances_m.max()) if distances_m.size else None,
+        wrench_rms_n=force_n,
+        wrench_rms_nm=torque_nm,
+        reading_rms=readings or None,
+        depth=depth or None,
+    )
+
+
+def instrument_misfits(experiment: Experiment, predicted: Predictions) -> list[InstrumentMisfit]:
+    """Return the RMS of (prediction − measurement) / σ of each measurement with its stated σ.
+
+    Measurements without samples are left out; values that are NaN, measured or predicted, do not
+    count.
+    """
+    misfits = []
+    measurements = experiment.measurements
+    named = zip(titles(measurements), measurements, predicted, strict=True)
+    for title, measurement, values in named:
+        if isinstance(values, SurfaceComparison):
+            error = values.error
+            if error.rms_m is not None:
+                misfits.append(
+                    InstrumentMisfit(
+                        title,
+                        measurement.sigma_text,
+                        sigmas=error.sigmas,
+                        robust_sigmas=error.tame_sigmas,
+                        count=error.points,
+                        size=f"{1e3 * error.rms_m:.3g} mm RMS",
+                    )
+                )
+        elif values is not None and measurement.has_samples():
+            difference = values - measurement.measured_values
+            ratio = difference / measurement.value_sigmas
+            size = measurement.rms_text(difference)
+            misfits.append(misfit(title, measurement.sigma_text, ratio=ratio, size=size))
+    return misfits
+
+
+def judged_residuals(experiment: Experiment, predicted: Predictions) -> PredictionResiduals:
+    """Return the differences by which a prediction of an experiment is judged: those of the
+    markers, without these of the forces on the complete specimen, else of the custom sensors like
+    the first one.
+
+    Raises
+    ------
+    ValueError
+        If nothing is measured by which it could be judged.
+    """
+    numbers = [pair for pair in _predicted_numbers(experiment, predicted) if pair[0].has_samples()]
+    if not numbers:
+        raise ValueError(f"nothing is measured in '{experiment.name}'")
+
+    def sort(of: Measurement) -> Any:
+        return type(of), of.unit, of.measured_values.shape[1]
+
+    first = numbers[0][0]
+    same = [(each, values) for each, values in numbers if sort(each) == sort(first)]
+    return PredictionResiduals.in_order_of_time(
+        np.concatenate([each.sample_times_s for each, _ in same]),
+        np.concatenate([each.vectors(values - each.measured_values) for each, values in same]),
+        unit=first.unit,
+    )
+
+
+def fit_rms(solution: Solution) -> dict[str, float | None]:
+    """Return the RMS residuals of all fitted experiments by unit: distances of markers, forces, and
+    custom sensors; None where nothing is measured.
+    """
+    differences: dict[str, list[Array]] = {}
+    for part in solution.parts:
+        experiment = part.transcription.experiment
+        fitted = solution.fitted_values[experiment.name]
+        for gauge, values in _predicted_numbers(experiment, fitted, Gauge):
+            here = values - gauge.measured_values
+            differences.setdefault(gauge.unit, []).append(here.ravel())
+    readings = {
+        unit: float(np.sqrt(np.nanmean(np.concatenate(each) ** 2)))
+        for unit, each in differences.items()
+    }
+    return readings | {"m": solution.rms_m, "N": pooled_wrench_rms(solution)[0]}
+
+
+# Copies of other recordings -----------------------------------------------------------------------
+
+
+def reason_against_copy(experiment: Experiment, other: Experiment) -> str:
+    """Return why the measurements of another recording cannot be compared with those of a recording
+    as a prediction, such as other markers; "" if they can.
+    """
+    both = [[m for m in each.measurements if m.value_sigmas.size] for each in (experiment, other)]
+    for kind in dict.fromkeys(type(each) for each in (*both[0], *both[1])):
+        own, theirs = ([m.identity for m in each if type(m) is kind] for each in both)
+        if own != theirs:
+            return f"other {kind.other_text}"
+    if not any(np.isfinite(each.measured_values).any() for each in both[0]):
+        what = experiment.measurements[-1].measurement_text
+        return f"{what} cannot be compared between recordings"
+    return ""
+
+
+def copied(experiment: Experiment, other: Experiment) -> Predictions:
+    """Return the measurements of another recording as predictions; unlabelled points predict
+    nothing. `reason_against_copy` must be empty.
+    """
+    theirs = iter([each for each in other.measurements if each.value_sigmas.size])
+    return [
+        each.values_of(next(theirs)) if each.value_sigmas.size else None
+        for each in experiment.measurements
+    ]
+
+
+def copied_times_s(experiment: Experiment, other: Experiment) -> Iterator[tuple[Array, Array]]:
+    """Yield the sample times of each measurement in both recordings, which must agree for a copy."""
+    both = ([m for m in each.measurements if m.value_sigmas.size] for each in (experiment, other))
+    for own, theirs in zip(*both, strict=True):
+        if own.has_samples():
+            yield own.sample_times_s, theirs.sample_times_s
+
+
+# Results of a fit ---------------------------------------------------------------------------------
+
+
+def units_by_name(experiment: Experiment) -> dict[str, str] | None:
+    """Return the units of the custom sensors that state one, by name; None if none does."""
+    return {gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit} or None
+
+
+def stated_sigmas(experiment: Experiment) -> dict[str, Any]:
+    """Return the fields of `FittedExperiment` with the stated noise of the measurements: of force
+    and torque on the whole specimen, and of custom sensors with their units.
+    """
+    squares = [
+        np.where(wrench.measured_components, (wrench.symmetry * wrench.value_sigmas) ** 2, np.nan)
+        for wrench in experiment.wrenches
+    ]
+    of_force, of_torque = (
+        root_mean(each[np.isfinite(each)]) or None
+        for each in np.array(squares).reshape(-1, 2, 3).swapaxes(0, 1)
+    )
+    return {
+        "wrench_sigma_n": of_force,
+        "wrench_sigma_nm": of_torque,
+        "reading_sigma": {gauge.name: gauge.sigma for gauge in experiment.readings} or None,
+        "reading_unit": units_by_name(experiment),
+    }
+
+
+def recorded_series(
+    experiment: Experiment, fitted: Predictions | None, simulated: Predictions | None
+) -> dict[str, Any]:
+    """Return the fields of `MotionRecord` with the numbers of sensors over time.
+
+    Each array (S, 1 + 3m) has the time [s], and the m numbers as measured, fitted and simulated, of
+    the whole specimen also where symmetry reduces the model to a part of it; NaN where the
+    experiment was not fitted or not simulated.
+    """
+    models = [
+        [None] * len(experiment.measurements) if each is None else each
+        for each in (fitted, simulated)
+    ]
+    wrenches = []
+    readings = {}
+    for measurement, *predicted in zip(experiment.measurements, *models, strict=True):
+        if isinstance(measurement, Wrench):
+            wrenches.append(_columns(measurement, predicted))
+        elif isinstance(measurement, Gauge):
+            readings[measurement.name] = _columns(measurement, predicted)
+    return {"sensor_columns": {WRENCH_SERIES.name: wrenches}, "readings": readings}
+
+
+def _columns(measurement: Measurement, models: Iterable[Any]) -> Array:
+    """Return time, measured values and the values of each model, as one array."""
+    measured = measurement.measured_values
+    unknown = np.full_like(measured, np.nan)
+    numbers = [measured, *(unknown if each is None else each for each in models)]
+    return np.column_stack(
+        [measurement.sample_times_s, *(measurement.symmetry * each for each in numbers)]
+    )

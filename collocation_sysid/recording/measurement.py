@@ -1,0 +1,153 @@
+"""What a recording measures: the base class of markers, wrenches, custom sensors and depth cameras.
+
+Comparisons with a motion, copies of other recordings, series over time and texts follow from the
+attributes of `Measurement`, so that they are the same for every kind. Fields of `Experiment` that
+contain measurements with times of their own have the metadata `SENSORS`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from functools import cache
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.array_types import Array, root_mean
+
+# Key of the mark in the metadata of a field.
+MARK = "measurements"
+# Metadata of a field that is a tuple of measurements with times of their own.
+SENSORS: Mapping[str, bool] = {MARK: True}
+
+
+@cache
+def sensor_fields(kind: type) -> tuple[str, ...]:
+    """Return the names of the fields of a dataclass that are marked by `SENSORS`, in their order."""
+    return tuple(each.name for each in fields(kind) if MARK in each.metadata)
+
+
+class Measurement:
+    """Measurement of one instrument of a recording.
+
+    Attributes
+    ----------
+    measurement_text, other_text : str
+        Plural text of what it measures, and of those of another recording.
+    noise_key, sigma_text : str
+        Key that states its noise, as in messages on all recordings and on this measurement.
+    unit : str
+        Unit of its numbers; "" if it is not stated.
+    symmetry : int
+        Ratio of the reported values to those of the modelled part of the specimen.
+    points_name : str
+        Plural of its unlabelled points; not used without any.
+    precedence : int
+        Of several kinds, the one with the smallest number is the main measurement.
+    """
+
+    measurement_text: ClassVar[str]
+    other_text: ClassVar[str]
+    noise_key: ClassVar[str]
+    sigma_text: ClassVar[str] = "its sigma"
+    unit: str = ""
+    symmetry: int = 1
+    points_name: ClassVar[str] = "points"
+    precedence: ClassVar[int] = 3
+
+    @property
+    @abstractmethod
+    def title(self) -> str:
+        """Instrument in messages; measurements with the same title are numbered."""
+
+    @property
+    def samples_text(self) -> str:
+        """Its samples in messages; "" if that is the title."""
+        return ""
+
+    @property
+    def instrument_text(self) -> str:
+        """What it measures, for the list of instruments of a recording; "" if listed apart."""
+        return self.title
+
+    @property
+    @abstractmethod
+    def sample_times_s(self) -> Array:
+        """Times (S,) of its samples [s]."""
+
+    @property
+    def measured_values(self) -> Array:
+        """Measured numbers (S, m), NaN where missing; here none, m = 0, for unlabelled points."""
+        return np.zeros((len(self.sample_times_s), 0))
+
+    @property
+    def value_sigmas(self) -> Array:
+        """Standard deviations (m,) of the noise of its numbers."""
+        return np.zeros(0)
+
+    @property
+    def identity(self) -> Any:
+        """What two recordings must have in common so that one's measurement predicts the other's."""
+        return self.title
+
+    def values_of(self, other: Any) -> Array:
+        """Return the values (S, m) of a measurement with the same `identity` as a prediction."""
+        return other.measured_values
+
+    def vectors(self, values: Array) -> Array:
+        """Return numbers (S, m) as K vectors or numbers (S, K, d) by which a prediction is judged."""
+        return values[:, None]
+
+    def rms_text(self, difference: Array) -> str:
+        """Return the RMS of differences (S, m) from the measured numbers, with its unit; "" if none
+        is finite.
+        """
+        known = difference[np.isfinite(difference)]
+        return f"{root_mean(known**2):.3g} {self.unit}".rstrip() + " RMS" if known.size else ""
+
+    @property
+    def number_names(self) -> Sequence[str]:
+        """Names (m,) of its numbers."""
+        return [f"{self.title} {k + 1}" for k in range(self.measured_values.shape[1])]
+
+    @property
+    def presence(self) -> dict[str, NDArray[np.bool_]]:
+        """Mask (S,) of the samples in which each number is present, by its name."""
+        masks = np.isfinite(self.measured_values).T
+        return dict(zip(self.number_names, masks, strict=True))
+
+    def has_samples(self) -> bool:
+        """Return whether a number or a point is measured."""
+        return bool(np.isfinite(self.measured_values).any() or any(self.point_counts))
+
+    # A part of the measurements ---------------------------------------------------------------
+
+    @property
+    def point_counts(self) -> Sequence[int]:
+        """Numbers of unlabelled points of each sample; empty if the sensor measures none."""
+        return ()
+
+    def thinned(self, most: int) -> Self:
+        """Return a sensor with at most `most` unlabelled points in each sample; here self."""
+        return self
+
+    def needed_until_s(self, fewest: int) -> float:
+        """Return the time [s] that the beginning of a recording must include so that the sensor is
+        useful in it, if possible with the number `fewest` of samples; here any time, −∞.
+        """
+        return -np.inf
+
+    def until_time(self, end_s: float) -> Self | None:
+        """Return the sensor for a recording that ends at `end_s` [s], this time included; None if
+        it has no measurement then. Here self: later samples are ignored.
+        """
+        return self
+
+    def without_later_values(self, end_s: float) -> Self | None:
+        """Return the sensor without measurements after `end_s` [s] in a recording that continues;
+        None to leave the sensor out. Here the same as `until_time`.
+        """
+        return self.until_time(end_s)
