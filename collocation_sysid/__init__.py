@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from .recording import (
         Capsule,
         Cuboid,
+        CustomSensor,
         Cylinder,
         Depth,
         DepthCamera,
@@ -89,6 +90,7 @@ __all__ = [
     "Constant",
     "Continuation",
     "Cuboid",
+    "CustomSensor",
     "Cylinder",
     "DampingLaw",
     "Depth",

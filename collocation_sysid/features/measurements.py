@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..methods.solution import Solution, pooled_wrench_rms, wrench_rms
 from ..program.depth.depth_comparison import SurfaceComparison
 from ..program.measured_motion import Predicted
-from ..recording.custom_sensor import Gauge
+from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.markers import Markers
 from ..recording.measured_wrench import Wrench
@@ -121,7 +121,7 @@ def prediction_error(experiment: Experiment, predicted: Predictions) -> Predicti
     force_n, torque_nm = wrench_rms(experiment, wrenches) if wrenches else (None, None)
     readings = {
         gauge.name: float(np.sqrt(np.nanmean((values - gauge.measured_values) ** 2)))
-        for gauge, values in _predicted_numbers(experiment, predicted, Gauge)
+        for gauge, values in _predicted_numbers(experiment, predicted, CustomSensor)
     }
     depth = {name: surface.error for name, surface in surfaces(experiment, predicted).items()}
     return PredictionErrors(
@@ -199,7 +199,7 @@ def fit_rms(solution: Solution) -> dict[str, float | None]:
     for part in solution.parts:
         experiment = part.transcription.experiment
         fitted = solution.fitted_values[experiment.name]
-        for gauge, values in _predicted_numbers(experiment, fitted, Gauge):
+        for gauge, values in _predicted_numbers(experiment, fitted, CustomSensor):
             here = values - gauge.measured_values
             differences.setdefault(gauge.unit, []).append(here.ravel())
     readings = {
@@ -292,7 +292,7 @@ def recorded_series(
     for measurement, *predicted in zip(experiment.measurements, *models, strict=True):
         if isinstance(measurement, Wrench):
             wrenches.append(_columns(measurement, predicted))
-        elif isinstance(measurement, Gauge):
+        elif isinstance(measurement, CustomSensor):
             readings[measurement.name] = _columns(measurement, predicted)
     return {"sensor_columns": {WRENCH_SERIES.name: wrenches}, "readings": readings}
 

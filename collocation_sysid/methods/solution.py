@@ -22,7 +22,7 @@ from ..program.collocation import Collocation, ExperimentIterate, Violation
 from ..program.measured_motion import SurfaceComparison, fitted_values
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
-from ..recording.custom_sensor import Gauge
+from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import GAUGE
@@ -400,7 +400,7 @@ class Solution:
         """
         return {
             part.transcription.experiment.name: {
-                gauge.name: values for gauge, values in self._fitted_by_kind(part, Gauge)
+                gauge.name: values for gauge, values in self._fitted_by_kind(part, CustomSensor)
             }
             for part in self.parts
         }

@@ -1,21 +1,33 @@
 """Tables with a name, and tables of sensors that read their own files.
 
 A sensor that is not described by its table and a file of columns alone has a `MeasurementSection`,
-a table with a function that reads it. `recording_schema.ExperimentSection` lists these tables.
+a table with a function that reads it. `recording_schema.ExperimentSection` lists these tables; those
+of other packages are the entry points `ENTRY_POINTS`.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator
+import numpy as np
+from pydantic import AfterValidator, create_model
 
 from ..common.array_types import Array
 from ..common.schema_tables import Section
+from ..errors import InputError, located
+from ..recording.formats.logs import stored_files
+from ..recording.time_tables import is_within_experiment, read_custom_sensor
+from .named_files import existing_file
+
+# Group of the entry points of other packages: the key of a list of tables within
+# [[experiment]], and the class of the tables, a `MeasurementSection`.
+ENTRY_POINTS = "collocation_sysid.measurements"
 
 
 def require_file_name(name: str) -> str:
@@ -50,13 +62,57 @@ class RecordingFolder:
         Folder that contains the files.
     is_static : bool
         Whether the samples are equilibria.
+    is_simulation : bool
+        Whether measurements are simulated, so that their files need not exist.
     add_note : callable
         Called with a sentence about what was read or assumed.
     """
 
     path: Path
     is_static: bool
+    is_simulation: bool
     add_note: Callable[[str], None]
+
+    def must_read(self, name: str | None) -> bool:
+        """Return whether a file must be read: in a solve always, also without a name (None); in a
+        simulation if it is named and exists.
+        """
+        return not self.is_simulation or bool(name and stored_files(self.path / name))
+
+    def require_existing(self, name: str | None, key: str, what: str = "a file") -> Path:
+        """Return the path of a file; raise `InputError` at `key` if none is named (None) or it does
+        not exist. `what` is the expected kind of file, for the message.
+        """
+        if name is None:
+            raise InputError(f"missing; expected {what}", where=key)
+        return existing_file(self.path, name, key=key)
+
+    def read_samples(
+        self, name: str | None, where: str, t_s: Array, columns: Sequence[str] = ()
+    ) -> tuple[Array, Array | None, list[str]]:
+        """Return times (S,) [s], numbers (S, m) and the names of their columns of the samples of a
+        custom sensor within the times t_s [s], and note how many are used.
+
+        Parameters
+        ----------
+        name : str or None
+            Table with a column t_s and one for each number. A simulation does without; then the
+            values are None, and the times are t_s.
+        where : str
+            Location of the sensor's table, whose key "file" is the name.
+        t_s : (T,) array
+            Times of the experiment [s].
+        columns : sequence of str
+            Columns of the numbers; all but t_s by default.
+        """
+        if not self.must_read(name):
+            return t_s, None, [*columns]
+        file = self.require_existing(name, f"{where}.file")
+        with located(where=where):
+            at_s, values, names = read_custom_sensor(file, columns)
+            is_used = is_within_experiment(at_s, t_s, name=str(name), is_static=self.is_static)
+        self.add_note(f"{name}: {is_used.sum()} of {len(at_s)} samples are used")
+        return at_s[is_used], values[is_used], names
 
 
 class MeasurementSection(NamedSection):
@@ -82,8 +138,16 @@ class MeasurementSection(NamedSection):
             If a file is missing or unusable, or nothing is within the times.
         """
 
-    @abstractmethod
     def read_times_s(self, folder: RecordingFolder, where: str) -> Array:
-        """Return the times of all measurements of the sensor [s]; arguments and errors as for
-        `read`.
+        """Return the times of those measurements of the sensor that determine the samples of
+        equilibria, if nothing else does [s]; here none. Arguments and errors as for `read`.
         """
+        return np.zeros(0)
+
+
+@cache
+def registered_tables() -> type[Section] | None:
+    """Return a table of the lists of tables of other packages, by their keys; None without any."""
+    kinds = {each.name: each.load() for each in entry_points(group=ENTRY_POINTS)}
+    lists: dict[str, Any] = {key: (list[kind], []) for key, kind in kinds.items()}
+    return create_model("RegisteredTables", __base__=Section, **lists) if lists else None

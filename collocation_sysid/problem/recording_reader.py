@@ -41,7 +41,7 @@ from ..recording.formats.logs import stored_files
 from ..recording.gap_interpolation import interpolation_error
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
-from ..recording.time_tables import is_within_experiment, read_custom_sensor
+from ..recording.time_tables import is_within_experiment
 from ..statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader
@@ -153,9 +153,6 @@ class RecordingReader:
             body=self.body,
             t_s=t_s,
             grasps=grasps,
-            readings=[
-                self._custom_sensor(k, each, t_s=t_s) for k, each in enumerate(section.reading)
-            ],
             **self._measurements(t_s),
             markers=self._markers(t_s, aligned.table),
             nuisance=nuisance_from_section(section.nuisance, self.code.nuisance_row),
@@ -189,26 +186,12 @@ class RecordingReader:
 
     # Files ----------------------------------------------------------------------------------------
 
-    def _must_read(self, name: str | None) -> bool:
-        """Whether a file must be read: in a solve always, also without a name (None); in a
-        simulation if it is named and exists.
-        """
-        return not self.simulation or bool(name and stored_files(self.folder / name))
-
-    def _require_existing(self, name: str | None, key: str, what: str = "a file") -> Path:
-        """Return the path of a file; raise `InputError` at `key` if none is named (None) or it does
-        not exist. `what` is the expected kind of file, for the message.
-        """
-        if name is None:
-            raise InputError(f"missing; expected {what}", where=key)
-        return existing_file(self.folder, name, key=key)
-
     def _table_file(self, table: TableSection, key: str) -> Path:
         """Return the path of the existing file of a displacement or a wrench: its own, else that of
         the experiment.
         """
         key = "file" if table.file is None and self.section.file else key
-        return self._require_existing(
+        return self._recording_folder.require_existing(
             self.section.file_of(table), key, what="a file here, or a file of the experiment"
         )
 
@@ -335,7 +318,7 @@ class RecordingReader:
         for sigma in {"sigma_n", "sigma_nm"} & arguments.keys():
             arguments[sigma] /= section.symmetry
         with located(where=key):
-            if not self._must_read(name):
+            if not self._recording_folder.must_read(name):
                 return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **arguments})
             at_s, values = self._read_wrench(section, key)
             mounting = self._frames.sensor_mounting(section, key, k=k)
@@ -368,32 +351,38 @@ class RecordingReader:
             message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
             raise InputError(message, where=f"{key}.grasp")
         with located(where=key):
-            if not self._must_read(section.file):
-                return Gauge(t_s=t_s, values=None, **arguments)
-            file = self._require_existing(section.file, f"{key}.file")
-            at_s, values, arguments["columns"] = read_custom_sensor(file, section.columns)
-            is_used = is_within_experiment(
-                at_s, t_s, name=str(section.file), is_static=self._is_static
+            at_s, values, columns = self._recording_folder.read_samples(
+                section.file, key, t_s=t_s, columns=section.columns
             )
-            self._add_notes(f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used")
-            return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
+            arguments["columns"] = columns
+            return Gauge(t_s=at_s, values=values, **arguments)
 
     @property
     def _recording_folder(self) -> RecordingFolder:
         """Folder of the files, for tables that read themselves."""
-        return RecordingFolder(self.folder, is_static=self._is_static, add_note=self._add_notes)
+        return RecordingFolder(
+            self.folder,
+            is_static=self._is_static,
+            is_simulation=self.simulation,
+            add_note=self._add_notes,
+        )
 
     def _measurements(self, t_s: Array) -> dict[str, list[Any]]:
-        """Return the measurements of all tables that read themselves within the times t_s (T,) of
-        the experiment [s], by the name of the field of `Experiment`.
+        """Return the measurements of all tables of sensors within the times t_s (T,) of the
+        experiment [s], by the name of the field of `Experiment`.
         """
-        return {
-            MEASUREMENT_TABLES[key]: [
+        section = self.section
+        fields: dict[str, list[Any]] = {
+            "readings": [
+                self._custom_sensor(k, each, t_s=t_s) for k, each in enumerate(section.reading)
+            ]
+        }
+        for key, tables in section.measurement_tables.items():
+            fields.setdefault(MEASUREMENT_TABLES.get(key, "readings"), []).extend(
                 table.read(self._recording_folder, f"{key}.{k}", t_s=t_s)
                 for k, table in enumerate(tables)
-            ]
-            for key, tables in self.section.measurement_tables.items()
-        }
+            )
+        return fields
 
     def _from_table(self, list_key: str, k: int) -> Any:
         """Return the object of a table in a list, such as a tendon or a pressure, on the body.
@@ -422,9 +411,11 @@ class RecordingReader:
         reads the file and adds notes.
         """
         markers = self.section.markers
-        if not self.section.has_markers or not self._must_read(markers.file):
+        if not self.section.has_markers or not self._recording_folder.must_read(markers.file):
             return None
-        file = self._require_existing(markers.file, "markers.file", what="a file of marker tracks")
+        file = self._recording_folder.require_existing(
+            markers.file, "markers.file", what="a file of marker tracks"
+        )
         table = read_marker_tracks(self.section, file)
         self._add_notes(*(f"{markers.file}: {note}" for note in table.notes))
         _require_known_markers(markers.template_m or (), table.names, key="markers.template_m")

@@ -26,7 +26,7 @@ from ..recording import (
 )
 from ..recording.markers import Places
 from .camera_section import DepthSection
-from .measurement_section import MeasurementSection, NamedSection
+from .measurement_section import MeasurementSection, NamedSection, registered_tables
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
 # Fields of `Experiment` by the key of the tables that read themselves.
@@ -500,7 +500,11 @@ class ExperimentSection(NamedSection, of=Experiment):
         names = [
             self.markers.file,
             *(each.file for each in self.reading),
-            *(each.file for key in MEASUREMENT_TABLES for each in getattr(self, key)),
+            *(
+                getattr(each, "file", None)
+                for tables in self.measurement_tables.values()
+                for each in tables
+            ),
         ]
         for grasp in self.moved_sections:
             names += [grasp.poses or self.file_of(grasp.displacement), self.file_of(grasp.sensor)]
@@ -510,7 +514,24 @@ class ExperimentSection(NamedSection, of=Experiment):
     def measurement_tables(self) -> dict[str, list[MeasurementSection]]:
         """Tables that read themselves by their key, of those keys that have any."""
         tables = {key: getattr(self, key) for key in MEASUREMENT_TABLES}
+        if self._registered is not None:
+            tables |= dict(self._registered)
         return {key: listed for key, listed in tables.items() if listed}
+
+    # Tables of other packages.
+    _registered: Section | None = None
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _with_registered_tables(cls, table: Any, validated: Any) -> Any:
+        """Return the section with the tables of other packages, validated by their own classes."""
+        registered = registered_tables()
+        if registered is None or not isinstance(table, dict):
+            return validated(table)
+        of_others = {key: table[key] for key in registered.model_fields.keys() & table.keys()}
+        section = validated({k: each for k, each in table.items() if k not in of_others})
+        section._registered = registered.model_validate(of_others)
+        return section
 
     @property
     def grasp_list(self) -> list[GraspSection]:

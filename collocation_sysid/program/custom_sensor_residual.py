@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array
 from ..model.nuisance_map import NuisanceMap
-from ..recording.custom_sensor import Gauge
+from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE
 from ..recording.placement import place_markers
@@ -45,7 +45,7 @@ class CustomSensorResidual(MeasurementResidual):
 
     Attributes
     ----------
-    sensor : Gauge
+    sensor : CustomSensor
         The user's sensor with its samples.
     observable_s : (n,) array
         Times of the observable [s].
@@ -54,7 +54,7 @@ class CustomSensorResidual(MeasurementResidual):
         used.
     """
 
-    sensor: Gauge
+    sensor: CustomSensor
     observable_s: Array
     is_static: bool
 
@@ -64,7 +64,7 @@ class CustomSensorResidual(MeasurementResidual):
     @classmethod
     def from_sensor(
         cls,
-        sensor: Gauge,
+        sensor: CustomSensor,
         number: int,
         observable: Observable,
         at_s: Array,
@@ -78,7 +78,7 @@ class CustomSensorResidual(MeasurementResidual):
 
         Parameters
         ----------
-        sensor : Gauge
+        sensor : CustomSensor
             The user's sensor with its samples.
         number : int
             Index of the sensor in the experiment, from 0.
@@ -266,7 +266,7 @@ def custom_sensor_residuals(
     return tuple(models)
 
 
-def observed_points(experiment: Experiment, sensor: Gauge, rows: int) -> PointPositions:
+def observed_points(experiment: Experiment, sensor: CustomSensor, rows: int) -> PointPositions:
     """Return the points of a custom sensor as an observable at the first `rows` grid times; their
     places are exact, without estimated coordinates.
 

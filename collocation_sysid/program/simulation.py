@@ -389,7 +389,8 @@ def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experi
             f"for each sensor: {names or 'none'}"
         )
     pairs = zip(experiment.readings, values, strict=True)
-    return replace(experiment, readings=[replace(g, values=v) for g, v in pairs])
+    readings = [gauge.with_samples(gauge.sample_times_s, each) for gauge, each in pairs]
+    return replace(experiment, readings=readings)
 
 
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:

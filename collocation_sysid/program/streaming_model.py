@@ -467,7 +467,7 @@ def _still_experiment(experiment: Experiment, collocation: Collocation) -> Exper
     first, _ = markers.first_samples
     tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
     gauges = [
-        replace(g, t_s=t_s, values=np.zeros((count, g.measured_values.shape[1])))
+        g.with_samples(t_s, np.zeros((count, g.measured_values.shape[1])))
         for g in experiment.readings
     ]
     return replace(

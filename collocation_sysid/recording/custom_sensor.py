@@ -6,7 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, cast
+from types import MappingProxyType
+from typing import Any, ClassVar, Self, cast
 
 import casadi as ca
 import numpy as np
@@ -73,8 +74,200 @@ def stack_values(values: SensorValues) -> ca.SX:
     return ca.vec(ca.SX(cast(ca.SX, stacked)))
 
 
+class CustomSensor(Measurement):
+    """Sensor of a few points of the body, or of a grasp: base class of `Gauge` and of sensors of
+    other packages.
+
+    A subclass is a frozen dataclass with keyword arguments, compared by identity, with the
+    attributes below as fields or class attributes.
+
+    Attributes
+    ----------
+    name, t_s, values, sigma, points_m, unknowns, grasp, frame, columns, unit
+        See `Gauge`; all but the first four have a default.
+    predict : callable
+        ``predict(at, **unknowns) -> numbers``, the `expression` of `Gauge` as a method.
+    """
+
+    description_name: ClassVar[str] = "reading"
+    measurement_text: ClassVar[str] = "readings"
+    other_text: ClassVar[str] = "sensor readings"
+    noise_key: ClassVar[str] = "sigma of the readings"
+
+    name: str
+    t_s: Array
+    values: Array | None
+    sigma: float
+    points_m: ArrayLike = ()
+    unknowns: Mapping[str, float] = MappingProxyType({})
+    grasp: int | None = None
+    frame: Frame = "grasp"
+    columns: Sequence[str] = ()
+    predict: Callable[..., SensorValues]
+
+    def __post_init__(self) -> None:
+        """Check the sensor and complete it in place: `values` become (S, m) unless they are None,
+        and `columns` the name of the sensor, with _1, _2, … if m > 1, where none are given.
+        """
+        where = f"the reading '{self.name}'"
+        vars(self)["unknowns"] = self.unknowns or {}
+        times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
+        points = read_only_floats(
+            self.points_m if np.size(self.points_m) else np.zeros((0, 3)),
+            (None, 3),
+            name=f"points_m of {where}",
+        )
+        vars(self).update(t_s=times, points_m=points)
+        if fault := first_unordered_time(times):
+            raise InputError(f"{fault[1]} in t_s of {where}", where=f"row {fault[0] + 1}")
+        if (self.grasp is None) == (not len(points)):
+            both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
+            raise InputError(
+                f"{where} has {both}; expected exactly one of them, as the measured quantity"
+            )
+        count = self._count_of_values()
+        names = [f"{self.name}_{k + 1}" for k in range(count)] if count > 1 else [self.name]
+        vars(self).update(
+            values=None if self.values is None else self._checked_values(self.values, count),
+            columns=tuple(self.columns or names),
+            _value_count=count,
+        )
+
+    def _checked_values(self, measured: ArrayLike, count: int) -> Array:
+        """Return the measured values as a read-only array (S, m), NaN where missing."""
+        where = f"the reading '{self.name}'"
+        samples = len(self.sample_times_s)
+        columns = np.array(measured, dtype=float)
+        columns = columns[:, None] if columns.ndim == 1 else columns
+        values = read_only_floats(columns, (samples, None), name=f"values of {where}", finite=False)
+        if np.isinf(values).any():
+            raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
+        if not np.isfinite(values).any():
+            raise InputError(f"all values of {where} are missing; remove it, or check its file")
+        if values.shape[1] != count:
+            raise InputError(
+                f"the expression of {where} gives {count} numbers; expected {values.shape[1]}, as "
+                "many as its values have columns"
+            )
+        return values
+
+    def __repr__(self) -> str:
+        samples = len(self.sample_times_s)
+        count = self.measured_values.shape[1]
+        return f"{type(self).__name__}({self.name!r}: {samples} samples of {count})"
+
+    @property
+    def sample_times_s(self) -> Array:
+        """(S,) sample times of the sensor [s]."""
+        return np.asarray(self.t_s)
+
+    @property
+    def measured_values(self) -> Array:
+        """(S, m) measured values, NaN where missing; zeros if none were given."""
+        if self.values is None:
+            return np.zeros((len(self.sample_times_s), vars(self)["_value_count"]))
+        return np.asarray(self.values)
+
+    @property
+    def title(self) -> str:
+        """Name of the sensor."""
+        return self.name
+
+    @property
+    def samples_text(self) -> str:
+        """Name of the sensor in quotation marks."""
+        return f"'{self.name}'"
+
+    @property
+    def value_sigmas(self) -> Array:
+        """(m,) standard deviations of the numbers, which are equal."""
+        return np.full(self.measured_values.shape[1], self.sigma)
+
+    @property
+    def is_measured(self) -> NDArray[np.bool_]:
+        """(S, m) whether each value is measured."""
+        return np.isfinite(self.measured_values)
+
+    def without_later_values(self, end_s: float) -> Self:
+        """Return a copy with measurements after `end_s` [s] replaced by NaN; self if none would
+        remain.
+        """
+        values = np.where((self.sample_times_s > end_s)[:, None], np.nan, self.measured_values)
+        measured = np.isfinite(values).any()
+        return self.with_samples(self.sample_times_s, values) if measured else self
+
+    def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
+        """Return a copy with other samples (S, m) at the times `t_s` (S,) [s]."""
+        return replace(cast(Any, self), t_s=t_s, values=values)
+
+    # The expression ---------------------------------------------------------------------------
+
+    @property
+    def quantities(self) -> type[PointQuantities | GraspQuantities]:
+        """Class of the quantities of which the expression is a function."""
+        return PointQuantities if self.grasp is None else GraspQuantities
+
+    def read(self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
+        """Evaluate the expression of the sensor.
+
+        Parameters
+        ----------
+        t_s : SX
+            Time of the sample.
+        inputs : sequence of SX
+            Position, velocity and acceleration (3, P) of its points, or force and torque (3,) of
+            its grasp.
+        unknowns : sequence of SX
+            Values of the sensor's unknowns, in the order of `unknowns`.
+
+        Returns
+        -------
+        (m,) SX
+            Predicted numbers.
+        """
+        named = dict(zip(self.unknowns, unknowns, strict=True))
+        read = self.predict(self.quantities(t_s, *inputs), **named)
+        if read is None:
+            raise TypeError("the function returns None")
+        return stack_values(read)
+
+    def _count_of_values(self) -> int:
+        """Evaluate the expression and its Jacobian at rest, and return the number m of its values.
+
+        Rest means the undeformed places of the points without velocity and acceleration, or force
+        and torque with all components one; unknowns are zero, and the time is that of the first
+        sample.
+        """
+        points = np.asarray(self.points_m).T
+        zero_rates = np.zeros_like(points)
+        of_points = [points, zero_rates, zero_rates]
+        rest = of_points if self.grasp is None else [np.ones(3), np.ones(3)]
+        observables = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
+        t_s = ca.SX.sym("t_s")
+        own = ca.SX.sym("own", len(self.unknowns))
+        names = [each.name for each in fields(self.quantities)]
+        try:
+            read = self.read(t_s, observables, unknowns=ca.vertsplit(own) if self.unknowns else [])
+        except (Exception, SystemExit) as error:
+            raise InputError(
+                f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
+                f"function of an argument `at` with the attributes {', '.join(names)}, and "
+                f"of its unknowns {', '.join(self.unknowns) or '(none)'}, in CasADi operations, such "
+                "as ca.if_else in place of if"
+            ) from error
+        u = ca.veccat(*observables, own)
+        slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
+        at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
+        if not all(np.isfinite(e.full()).all() for e in slopes(self.sample_times_s[0], at_rest)):
+            raise InputError(
+                f"the reading '{self.name}' or its derivative is not finite for the body at rest; "
+                "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"
+            )
+        return read.numel()
+
+
 @declaration
-class Gauge(Measurement):
+class Gauge(CustomSensor):
     """A custom sensor: its reading is an expression of a few points of the body, or of a grasp.
 
     Parameters
@@ -117,11 +310,6 @@ class Gauge(Measurement):
         above zero, or the expression cannot be evaluated or is not smooth at rest.
     """
 
-    description_name: ClassVar[str] = "reading"
-    measurement_text: ClassVar[str] = "readings"
-    other_text: ClassVar[str] = "sensor readings"
-    noise_key: ClassVar[str] = "sigma of the readings"
-
     name: str
     expression: Callable[..., SensorValues]
     t_s: Array = key(converter=unconverted)
@@ -134,158 +322,8 @@ class Gauge(Measurement):
     columns: Sequence[str] = key(list[Text], converter=identity, default=())
     unit: str = key(str, default="")
 
-    def __post_init__(self) -> None:
-        """Check the sensor and complete it in place: `values` become (S, m) unless they are None,
-        and `columns` the name of the sensor, with _1, _2, … if m > 1, where none are given.
-        """
-        where = f"the reading '{self.name}'"
-        vars(self)["unknowns"] = self.unknowns or {}
-        times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
-        points = read_only_floats(
-            self.points_m if len(self.points_m) else np.zeros((0, 3)),
-            (None, 3),
-            name=f"points_m of {where}",
-        )
-        vars(self).update(t_s=times, points_m=points)
-        if fault := first_unordered_time(times):
-            raise InputError(f"{fault[1]} in t_s of {where}", where=f"row {fault[0] + 1}")
-        if (self.grasp is None) == (not len(points)):
-            both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
-            raise InputError(
-                f"{where} has {both}; expected exactly one of them, as the measured quantity"
-            )
-        count = self._count_of_values()
-        names = [f"{self.name}_{k + 1}" for k in range(count)] if count > 1 else [self.name]
-        vars(self).update(
-            values=None if self.values is None else self._checked_values(self.values, count),
-            columns=tuple(self.columns or names),
-            _value_count=count,
-        )
-
-    def _checked_values(self, measured: ArrayLike, count: int) -> Array:
-        """Return the measured values as a read-only array (S, m), NaN where missing."""
-        where = f"the reading '{self.name}'"
-        samples = len(self.sample_times_s)
-        columns = np.array(measured, dtype=float)
-        columns = columns[:, None] if columns.ndim == 1 else columns
-        values = read_only_floats(columns, (samples, None), name=f"values of {where}", finite=False)
-        if np.isinf(values).any():
-            raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
-        if not np.isfinite(values).any():
-            raise InputError(f"all values of {where} are missing; remove it, or check its file")
-        if values.shape[1] != count:
-            raise InputError(
-                f"the expression of {where} gives {count} numbers; expected {values.shape[1]}, as "
-                "many as its values have columns"
-            )
-        return values
-
-    def __repr__(self) -> str:
-        samples = len(self.sample_times_s)
-        count = self.measured_values.shape[1]
-        return f"Gauge({self.name!r}: {samples} samples of {count})"
-
-    @property
-    def sample_times_s(self) -> Array:
-        """(S,) sample times of the sensor [s]."""
-        return np.asarray(self.t_s)
-
-    @property
-    def measured_values(self) -> Array:
-        """(S, m) measured values, NaN where missing; zeros if none were given."""
-        if self.values is None:
-            return np.zeros((len(self.sample_times_s), vars(self)["_value_count"]))
-        return np.asarray(self.values)
-
-    @property
-    def title(self) -> str:
-        """Name of the sensor."""
-        return self.name
-
-    @property
-    def samples_text(self) -> str:
-        """Name of the sensor in quotation marks."""
-        return f"'{self.name}'"
-
-    @property
-    def value_sigmas(self) -> Array:
-        """(m,) standard deviations of the numbers, which are equal."""
-        return np.full(self.measured_values.shape[1], self.sigma)
-
-    @property
-    def is_measured(self) -> NDArray[np.bool_]:
-        """(S, m) whether each value is measured."""
-        return np.isfinite(self.measured_values)
-
-    def without_later_values(self, end_s: float) -> Gauge:
-        """Return a copy with measurements after `end_s` [s] replaced by NaN; self if none would
-        remain.
-        """
-        values = np.where((self.sample_times_s > end_s)[:, None], np.nan, self.measured_values)
-        return replace(self, values=values) if np.isfinite(values).any() else self
-
-    # The expression ---------------------------------------------------------------------------
-
-    @property
-    def quantities(self) -> type[PointQuantities | GraspQuantities]:
-        """Class of the quantities of which the expression is a function."""
-        return PointQuantities if self.grasp is None else GraspQuantities
-
-    def read(self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
-        """Evaluate the expression of the sensor.
-
-        Parameters
-        ----------
-        t_s : SX
-            Time of the sample.
-        inputs : sequence of SX
-            Position, velocity and acceleration (3, P) of its points, or force and torque (3,) of
-            its grasp.
-        unknowns : sequence of SX
-            Values of the sensor's unknowns, in the order of `unknowns`.
-
-        Returns
-        -------
-        (m,) SX
-            Predicted numbers.
-        """
-        read = self.expression(
-            self.quantities(t_s, *inputs), **dict(zip(self.unknowns, unknowns, strict=True))
-        )
-        if read is None:
-            raise TypeError("the function returns None")
-        return stack_values(read)
-
-    def _count_of_values(self) -> int:
-        """Evaluate the expression and its Jacobian at rest, and return the number m of its values.
-
-        Rest means the undeformed places of the points without velocity and acceleration, or force
-        and torque with all components one; unknowns are zero, and the time is that of the first
-        sample.
-        """
-        points = np.asarray(self.points_m).T
-        zero_rates = np.zeros_like(points)
-        of_points = [points, zero_rates, zero_rates]
-        rest = of_points if self.grasp is None else [np.ones(3), np.ones(3)]
-        observables = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
-        t_s = ca.SX.sym("t_s")
-        own = ca.SX.sym("own", len(self.unknowns))
-        names = [each.name for each in fields(self.quantities)]
-        try:
-            read = self.read(t_s, observables, unknowns=ca.vertsplit(own) if self.unknowns else [])
-        except (Exception, SystemExit) as error:
-            raise InputError(
-                f"the reading '{self.name}' cannot be evaluated ({reason(error)}); expected a "
-                f"function of an argument `at` with the attributes {', '.join(names)}, and "
-                f"of its unknowns {', '.join(self.unknowns) or '(none)'}, in CasADi operations, such "
-                "as ca.if_else in place of if"
-            ) from error
-        u = ca.veccat(*observables, own)
-        slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
-        at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
-        if not all(np.isfinite(e.full()).all() for e in slopes(self.sample_times_s[0], at_rest)):
-            raise InputError(
-                f"the reading '{self.name}' or its derivative is not finite for the body at rest; "
-                "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"
-            )
-        return read.numel()
+    def predict(
+        self, at: PointQuantities | GraspQuantities, **unknowns: ca.SX | float
+    ) -> SensorValues:
+        """Return the value of the function."""
+        return self.expression(at, **unknowns)

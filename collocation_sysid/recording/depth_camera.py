@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import ClassVar, Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array
 from ..common.declarations import declaration, identity, key

@@ -17,7 +17,7 @@ from ..common.validated_types import Flag, NotNegative
 from ..errors import InputError
 from .actuator import Actuator
 from .checked_arrays import float_converter, read_only_floats
-from .custom_sensor import Gauge
+from .custom_sensor import CustomSensor
 from .depth_camera import Depth
 from .environment import air_density, usual_air_density
 from .grasp import Grasp, free_rigid_motions, prescribed_dofs
@@ -100,8 +100,8 @@ class Experiment:
         Tendons in the body.
     pressures : sequence of Pressure
         Pressures in cavities, or on patches whose rim is held.
-    readings : sequence of Gauge
-        Custom sensors.
+    readings : sequence of CustomSensor
+        Custom sensors, such as `Gauge`.
     depths : sequence of Depth
         Depth cameras and scanners.
     air_density_kg_m3 : float or "none"
@@ -141,7 +141,9 @@ class Experiment:
     forces: tuple[Force, ...] = key(converter=tuple, default=())
     tendons: tuple[Tendon, ...] = key(converter=tuple, default=())
     pressures: tuple[Pressure, ...] = key(converter=tuple, default=())
-    readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=(), metadata=SENSORS)
+    readings: tuple[CustomSensor, ...] = key(
+        converter=tuple[CustomSensor, ...], default=(), metadata=SENSORS
+    )
     depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=(), metadata=SENSORS)
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)

@@ -11,7 +11,7 @@ from ...methods.reduced_space import ReducedSpace
 from ...pipeline import Run, run
 from ...problem import Problem
 from ...program.streaming import LoggedRow, StreamingModel
-from ...recording.custom_sensor import Gauge
+from ...recording.custom_sensor import CustomSensor
 from ...recording.experiment import Experiment
 from ...recording.poses import PoseSequence
 from ...recording.sample_times import STEP_TOLERANCE
@@ -72,12 +72,12 @@ def recording_from_log(
         values = np.array([samples[when] for when in inside])
         if len(inside) < FEWEST or not np.isfinite(values).any():
             continue
-        series = {"t_s": t_s[0] + model.experiment.timestep_s * np.array(inside), "values": values}
-        if isinstance(gauge, Gauge):
-            readings.append(replace(gauge, **series))
+        at_s = t_s[0] + model.experiment.timestep_s * np.array(inside)
+        if isinstance(gauge, CustomSensor):
+            readings.append(gauge.with_samples(at_s, values))
         else:
             sampled_grasps.add(gauge - 1)
-            grasps[gauge - 1] = grasps[gauge - 1].with_loads(**series)
+            grasps[gauge - 1] = grasps[gauge - 1].with_loads(at_s, values)
     grasps = [
         grasp if k in sampled_grasps else grasp.without_sensor() for k, grasp in enumerate(grasps)
     ]
