@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import Any, ClassVar, Self, cast
+from typing import ClassVar, Self, cast
 
 import casadi as ca
 import numpy as np
@@ -198,7 +198,7 @@ class CustomSensor(Measurement):
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with other samples (S, m) at the times `t_s` (S,) [s]."""
-        return replace(cast(Any, self), t_s=t_s, values=values)
+        return replace(self, t_s=t_s, values=values)
 
     # The expression ---------------------------------------------------------------------------
 

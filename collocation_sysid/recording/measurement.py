@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import Field, fields
 from functools import cache
 from typing import Any, ClassVar, Self
 
@@ -49,6 +49,7 @@ class Measurement:
         Of several kinds, the one with the smallest number is the main measurement.
     """
 
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # subclasses are dataclasses
     measurement_text: ClassVar[str]
     other_text: ClassVar[str]
     noise_key: ClassVar[str]
