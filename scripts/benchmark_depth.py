@@ -1,12 +1,11 @@
 """Time of the search with one depth image of 18,900 points, compared with that with ten markers.
 
 A bar of 875 nodes hangs from one end. Its Young's modulus has no guess, and the pose, bias and
-scale of the camera are estimated. An earlier revision and this one solve both in turn, in separate
-processes on one thread, so that other work on the machine slows all. The output has the smallest
-processor times of `solve`, without imports and the reading of data, their ratio for both revisions,
-and the relative difference of the estimates.
+scale of the camera are estimated. Both are solved in turn, in separate processes on one thread, so
+that other work on the machine slows both. The output has the smallest processor times of `solve`,
+without imports and the reading of data, and their ratio.
 
-    python scripts/benchmark_depth.py [--baseline bbaeea20] [--rounds 3]
+    python scripts/benchmark_depth.py [--rounds 3]
 """
 
 from __future__ import annotations
@@ -16,13 +15,10 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from benchmark_static_friction import ROOT, checkout
 
 import collocation_sysid as cs
 
@@ -45,43 +41,30 @@ KINDS = ("markers", "depth")
 def main() -> None:
     """Measure and print, or solve once with --solve."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--baseline", default="bbaeea20", metavar="REVISION")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--solve", choices=KINDS)
     arguments = parser.parse_args()
     if arguments.solve:
         print(json.dumps(solve_once(arguments.solve)))
         return
-    with tempfile.TemporaryDirectory() as folder:
-        baseline_tree = checkout(arguments.baseline, Path(folder) / "before")
-        trees = {arguments.baseline: baseline_tree, "now": ROOT}
-        runs = {(name, kind): [] for name in trees for kind in KINDS}
-        for _ in range(arguments.rounds):
-            for (name, kind), results in runs.items():
-                results.append(solve_in_own_process(trees[name], kind))
-    for name in trees:
-        best_s = {kind: min(each["spent_s"] for each in runs[name, kind]) for kind in KINDS}
-        print(
-            f"{name}: markers {best_s['markers']:.2f} s, "
-            f"{runs[name, 'depth'][0]['points']} points {best_s['depth']:.2f} s, "
-            f"the latter over the former {best_s['depth'] / best_s['markers']:.2f}"
-        )
-    for kind in KINDS:
-        baseline_pa, current_pa = (runs[name, kind][0]["young_pa"] for name in trees)
-        print(f"{kind}: E differs by {abs(current_pa / baseline_pa - 1):.1e}")
+    runs = {kind: [] for kind in KINDS}
+    for _ in range(arguments.rounds):
+        for kind, results in runs.items():
+            results.append(solve_in_own_process(kind))
+    best_s = {kind: min(each["spent_s"] for each in results) for kind, results in runs.items()}
+    print(
+        f"markers {best_s['markers']:.2f} s, {runs['depth'][0]['points']} points "
+        f"{best_s['depth']:.2f} s, the latter over the former "
+        f"{best_s['depth'] / best_s['markers']:.2f}"
+    )
 
 
-def solve_in_own_process(tree: Path, kind: str) -> dict:
-    """Return the result of `solve_once` in a process with the package of a tree."""
-    environment = os.environ | {
-        "PYTHONPATH": f"{tree}{os.pathsep}{Path(__file__).parent}",
-        "COLLOCATION_SYSID_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-    }
+def solve_in_own_process(kind: str) -> dict:
+    """Return the result of `solve_once` in a separate process on one thread."""
+    environment = os.environ | {"COLLOCATION_SYSID_THREADS": "1", "OMP_NUM_THREADS": "1"}
     process = subprocess.run(
         [sys.executable, __file__, "--solve", kind],
         env=environment,
-        cwd=tree,
         check=True,
         stdout=subprocess.PIPE,
         text=True,
