@@ -31,7 +31,7 @@ test-long: $(DEV) ## run whole runs, the notebook and the gallery
 	@$(PYTEST) -m "long and not slow"
 
 test-dependencies: ## run the tests with the lowest dependencies, and with the newest
-	@mkdir -p build && $(PYTHON) scripts/lowest_dependencies.py > build/lowest.txt && : > build/newest.txt
+	@mkdir -p build && $(PYTHON) scripts lowest_dependencies > build/lowest.txt && : > build/newest.txt
 	@for which in lowest newest; do \
 	  echo "With the $$which dependencies" && rm -rf build/$$which && $(PYTHON) -m venv build/$$which && \
 	  build/$$which/bin/python -m pip install --quiet --disable-pip-version-check --upgrade \
@@ -45,7 +45,7 @@ check: $(DEV) ## lint, formatting and types
 	@$(BIN)/pyright --pythonpath $(BIN)/python
 
 bench: $(CORE) ## time the constraint Jacobian
-	@$(BIN)/python scripts/benchmark_jacobian.py
+	@$(BIN)/python scripts benchmark_jacobian
 
 docs: $(CORE) ## build the documentation's pages
 	@$(PIP) -e '.[docs]'

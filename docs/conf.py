@@ -9,7 +9,7 @@ from latex2mathml.converter import convert
 from sphinx.ext.napoleon import NumpyDocstring
 
 sys.path.insert(0, str(Path(__file__).parent))
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts" / "tools"))
 from badges import badges, repository_url
 from reference import PUBLISHED, write_pages
 

@@ -114,7 +114,7 @@ def _list_bodies(options: BenchmarkCommand) -> None:
             each["body"],
             "measured" if each["is_measured"] else "simulated",
             "held out" if each["is_held_out"] else "fitted",
-            "yes" if each["is_available"] else f"scripts/{each['script']}",
+            "yes" if each["is_available"] else f"scripts {each['script']}",
             each["licence"],
             each["specimen"],
         )
@@ -151,7 +151,7 @@ def _write_bodies(options: BenchmarkCommand, folder: Path) -> None:
         return
     for body in left_out:
         error_console.print(
-            f"{body.name} is left out: its data are not on this computer; scripts/{body.script} "
+            f"{body.name} is left out: its data are not on this computer; python scripts {body.script} "
             "fetches them",
             soft_wrap=True,
         )

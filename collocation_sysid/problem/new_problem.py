@@ -10,7 +10,7 @@ from ..common.files import replaced_file, require_possible, write_text_file
 from ..errors import InputError
 from .editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
 
-# A folder for each kind, see scripts/make_templates.py.
+# A folder for each kind, see scripts/data/make_templates.py.
 TEMPLATES = Path(__file__).parent / "templates"
 # Comment on settings of a template that are right for its simulated recording only.
 SIMULATED_MARK = "for your own recordings"

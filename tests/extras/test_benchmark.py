@@ -282,7 +282,7 @@ def test_a_body_without_data_names_the_script(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(benchmark_bodies, "CHECKOUT", tmp_path)
     outcome = run_command("benchmark", tmp_path / "new", "--write", "--body", "silicone_beam")
     assert outcome.code == 2
-    assert "scripts/get_srl_beam.py" in outcome.err
+    assert "scripts get_srl_beam" in outcome.err
     assert not (tmp_path / "new").exists()
 
 

@@ -258,7 +258,7 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
 
 @pytest.mark.slow
 def test_intervals_contain_the_truth_at_their_nominal_rate():
-    """Of twins with noise alike over three pixels and a bias; see scripts/study_depth.py."""
+    """Of twins with noise alike over three pixels and a bias; see scripts/studies/study_depth.py."""
     from study_depth import holds
 
     assert 0.9 <= np.mean([holds(seed) for seed in range(40)]) <= 1.0

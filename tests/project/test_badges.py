@@ -25,7 +25,7 @@ def test_pages_have_the_badges_of_the_stated_repository():
     for name in badges.PAGES:
         page = (ROOT / name).read_text(encoding="utf-8")
         expected = badges.with_badges(page, badges.badges(stated))
-        assert page == expected, "run scripts/badges.py"
+        assert page == expected, "run scripts/tools/badges.py"
 
 
 @pytest.mark.parametrize("suffix", ["", "/", ".git"])

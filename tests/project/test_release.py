@@ -63,7 +63,7 @@ def test_the_package_is_typed():
 
 
 def test_every_dependency_states_the_lowest_version():
-    script = runpy.run_path(str(ROOT / "scripts" / "lowest_dependencies.py"))
+    script = runpy.run_path(str(ROOT / "scripts" / "tools" / "lowest_dependencies.py"))
     lowest, pins = script["lowest_pins"], script["project_pins"]()
     assert len(lowest(PROJECT["dependencies"])) == len(PROJECT["dependencies"])
     assert all(re.fullmatch(r"[\w-]+==[\d.]+", pin) for pin in pins)
@@ -103,7 +103,7 @@ def test_no_package_host_is_named():
 
 def test_the_conda_recipe_has_the_same_dependencies():
     """Under the names that conda has for them."""
-    recipe = (ROOT / "scripts" / "conda" / "meta.yaml").read_text()
+    recipe = (ROOT / "scripts" / "tools" / "conda" / "meta.yaml").read_text()
     listed = re.findall(r"^    - ([\w-]+) >=([\d.]+)$", recipe.partition("  run:")[2], re.MULTILINE)
     renamed = {"matplotlib": "matplotlib-base"}
     wanted = [re.fullmatch(r"([\w-]+)>=([\d.]+)", each) for each in PROJECT["dependencies"]]
@@ -124,6 +124,6 @@ def test_every_dependency_states_its_licence():
 
 def test_all_data_of_others_state_their_licence():
     page = (ROOT / "docs" / "licences.md").read_text()
-    scripts = [file.stem.removeprefix("get_") for file in (ROOT / "scripts").glob("get_*.py")]
+    scripts = [file.stem.removeprefix("get_") for file in (ROOT / "scripts").rglob("get_*.py")]
     assert len(scripts) >= 4
     assert [name for name in scripts if f"`problems/{name}`" not in page] == []

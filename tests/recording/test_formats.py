@@ -14,7 +14,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.recording import align_to_template, read_markers
 
 ROOT = Path(__file__).parents[2]
-# A folder with the C3D files of scripts/get_srl_beam.py, and what they become in the world's frame.
+# A folder with the C3D files of scripts/data/get_srl_beam.py, and what they become in the world's frame.
 MEASURED = Path(os.environ.get("SRL_BEAM_DATA", ROOT / "problems" / "srl_beam"))
 
 # Metres, frame by frame; "Tip 1" is lost in the second frame, and base in the third.

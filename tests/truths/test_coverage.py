@@ -1,4 +1,4 @@
-"""Coverage of intervals in complete identifications, a short version of scripts/study_coverage.py."""
+"""Coverage of intervals in complete identifications, a short version of scripts/studies/study_coverage.py."""
 
 from __future__ import annotations
 

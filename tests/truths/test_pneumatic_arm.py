@@ -26,7 +26,7 @@ def measured_problem() -> Problem:
 def require_recordings() -> None:
     """Skip the test if the recordings have not been fetched."""
     if not (arm.FOLDER / "100mbar.csv").is_file():
-        pytest.skip("needs the measured data: python scripts/get_pneumatic_arm.py")
+        pytest.skip("needs the measured data: python scripts get_pneumatic_arm")
 
 
 def test_the_shipped_mesh_and_fibres_are_those_of_the_script():

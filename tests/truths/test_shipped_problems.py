@@ -23,7 +23,7 @@ from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_at
 
 PROBLEMS = Path(__file__).parents[2] / "problems"
-# A folder with the C3D files of scripts/get_srl_beam.py.
+# A folder with the C3D files of scripts/data/get_srl_beam.py.
 RECORDINGS = Path(os.environ.get("SRL_BEAM_DATA", PROBLEMS / "srl_beam")).resolve()
 FOAM = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_r_s": 0.006, "gamma_m_1_s": 1.5}
 TABLE1 = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -125,7 +125,7 @@ def measured_beam(file: str) -> Problem:
     for table in tomllib.loads(path.read_text())["experiment"]:
         files[table["name"]] = RECORDINGS / table["markers"]["file"]
     if not all(recording.is_file() for recording in files.values()):
-        pytest.skip("needs the measured data: python scripts/get_srl_beam.py")
+        pytest.skip("needs the measured data: python scripts get_srl_beam")
     return Problem.read(
         path, [f"experiment.{name}.markers.file={file}" for name, file in files.items()]
     )
@@ -185,7 +185,7 @@ def measured(
     path = PROBLEMS / name / file
     text, folder = (path.read_text(), Path(os.environ.get(variable, path.parent)).resolve())
     if not all((folder / each).is_file() for each in re.findall(r'"(\w+\.csv)"', text)):
-        pytest.skip(f"needs the measured data: python scripts/get_{name}.py")
+        pytest.skip(f"needs the measured data: python scripts get_{name}")
     mesh = tomllib.loads(text)["object"].get("mesh")
     beside = [f"object.mesh={path.parent / mesh}"] if mesh else []
     return Problem.read(path, [*beside, *changes], folder=folder)

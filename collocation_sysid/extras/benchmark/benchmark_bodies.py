@@ -37,7 +37,7 @@ class BenchmarkBody:
     data_files : tuple of str
         Files in the folder that a script fetches; empty if all data are part of the repository.
     script : str
-        The script that fetches the data; empty if there is none.
+        Name of the script that fetches the data; empty if there is none.
     licence_path : str
         Text of the licence in the repository, for recordings of others; empty if there is none.
     note : str
@@ -87,7 +87,7 @@ class BenchmarkBody:
         folder = self.find_data_folder()
         if folder is None:
             remedy = (
-                f"run python scripts/{self.script} in a clone of the repository"
+                f"run python scripts {self.script} in a clone of the repository"
                 if self.script
                 else "install the package again"
             )
@@ -129,7 +129,7 @@ BODIES = {
             recordings=("A2", "A4"),
             are_held_out=True,
             data_files=tuple(f"EF30_0T_A{run}.csv" for run in range(1, 6)),
-            script="get_phantom_compression.py",
+            script="get_phantom_compression",
             note="σ is the deviation of five equal tests from their mean. The zero of the "
             "displacement is uncertain by 0.2 mm (standard deviation), and whether the platens "
             "stick is an assumption. E of the catalogue entry for lubricated platens is 43 % "
@@ -145,7 +145,7 @@ BODIES = {
             # The constants were identified on this mesh.
             overrides=("object.mesh=beam.vtu",),
             data_files=("beam_gravity_V2_a.c3d",),
-            script="get_srl_beam.py",
+            script="get_srl_beam",
             # The recordings of the arm are from the same repository.
             licence_path="problems/pneumatic_arm/LICENSE",
             note="The positions of the markers on the beam are known to 3 mm: compare the error "

@@ -4,7 +4,7 @@ A measured silicone beam
 
 A beam of Dragon Skin 10, clamped, let go without a load and with 52 and 102 g at its tip (Soft
 Robotics Lab, ETH Zurich). One material with a branch of memory fits the three recordings. The data
-are fetched by ``python scripts/get_srl_beam.py``.
+are fetched by ``python scripts get_srl_beam``.
 """
 
 # sphinx_gallery_thumbnail_path = 'pictures/measured_beam.png'

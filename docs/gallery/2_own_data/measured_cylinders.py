@@ -4,7 +4,7 @@ Measured silicone between platens
 
 Cylinders of Ecoflex 00-30, pressed in a testing machine that tells crosshead and load (Dawood et
 al. 2026). No camera: the load alone tells the material. The data are fetched by
-``python scripts/get_phantom_compression.py``.
+``python scripts get_phantom_compression``.
 """
 
 # sphinx_gallery_thumbnail_path = 'pictures/measured_cylinders.png'

@@ -4,7 +4,7 @@ A measured soft tentacle
 
 A silicone tentacle, 360 mm long, that one tendon at a time bends (TU Delft): eight equilibria, four
 markers in each. Tension and weight, both known, tell stiffness and density. The data are fetched by
-``python scripts/get_soft_tentacle.py``; it takes some minutes.
+``python scripts get_soft_tentacle``; it takes some minutes.
 """
 
 # sphinx_gallery_thumbnail_path = 'pictures/measured_tentacle.png'

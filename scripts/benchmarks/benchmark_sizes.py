@@ -1,0 +1,138 @@
+"""Time and memory of a simulation and a sweep of bodies with 500 to 20,000 nodes.
+
+The body is the swung cylinder of `benchmark_methods.py`, with the default damping law or with
+Rayleigh's. Each line is measured in a separate process, so that the peak memory is that of the
+line. On one thread, times are processor times, which other work on the machine changes little; on
+more threads they are wall times. A sweep consists of a feasibility step and the sensitivities to
+four parameters; a few time steps are enough to measure the cost of one.
+
+    python scripts benchmark_sizes                              # all sizes, one and two threads
+    python scripts benchmark_sizes --size 5000 --steps 200      # peak memory of 200 steps
+    python scripts benchmark_sizes --size 2000 --factorisation band sparse supernodal
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import time
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung_cylinder
+
+from collocation_sysid import Body, Collocation
+from collocation_sysid.program.forward.newton_solver import NewtonOptions
+from collocation_sysid.program.forward.scheme_simulation import continue_simulation
+from collocation_sysid.program.linear_algebra.factorisation import Choice
+from collocation_sysid.program.stopwatch import Stopwatch
+from collocation_sysid.program.sweep import Sweep
+
+# Rings x layers of the cylinder, element, and a sufficient number of time steps, by number of
+# nodes.
+SIZES = {
+    "500": ("3x12", "tet4", 40),
+    "2000": ("4x32", "tet4", 20),
+    "2000-tet10": ("2x16", "tet10", 20),
+    "5000": ("6x38", "tet4", 10),
+    "20000": ("10x60", "tet4", 3),
+}
+
+
+@dataclass(frozen=True)
+class PartCost:
+    """Total time of one part [s], and the stopwatch with its shares."""
+
+    total_s: float
+    stopwatch: Stopwatch
+
+    def as_text(self, steps: int) -> str:
+        """Return the time per step and the shares of evaluation and linear algebra, as text."""
+        stopwatch = self.stopwatch
+        shares = (stopwatch.evaluations / self.total_s, stopwatch.linear_algebra / self.total_s)
+        return (
+            f"{1e3 * self.total_s / steps:8.1f} ms per step (elements {shares[0]:4.0%}, "
+            f"linear algebra {shares[1]:4.0%})"
+        )
+
+
+def main() -> None:
+    """Run the benchmark with the options of the command line, and print its table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", nargs="+", choices=[*SIZES], default=[*SIZES])
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--factorisation", nargs="+", choices=get_args(Choice), default=["auto"])
+    parser.add_argument("--damping", default="kelvin-voigt")
+    parser.add_argument("--steps", type=int)
+    arguments = parser.parse_args()
+    for size in arguments.size:
+        for choice in arguments.factorisation:
+            for threads in arguments.threads:
+                case = size, arguments.steps, threads, choice, arguments.damping
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    print(pool.apply(measure_size, case), flush=True)
+
+
+def measure_size(size: str, steps: int | None, threads: int, choice: Choice, damping: str) -> str:
+    """Measure simulation and sweep of one body, and return a line of the table.
+
+    `size` is a key of `SIZES`; if `steps` is None, the number of steps there is used.
+    """
+    mesh, element, default_steps = SIZES[size]
+    steps = steps or default_steps
+    body = Body(
+        cylinder(mesh), density_kg_m3=20.0, damping=damping, element=element, threads=threads
+    )
+    collocation = Collocation([swung_cylinder(body, steps + 1)], PARAMETERS)
+    (transcription,) = collocation.transcriptions
+    equations = transcription.equations_at(
+        np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0)
+    )
+    before_mb = peak_mb()
+    clock = time.perf_counter if threads > 1 else time.process_time
+    began = clock()
+    stopwatch = Stopwatch(clock)
+    x, failure = continue_simulation(
+        transcription.experiment,
+        equations.dynamics,
+        options=NewtonOptions(tolerance=1e-6),
+        stopwatch=stopwatch,
+    )
+    if failure:
+        raise failure
+    simulation_cost = PartCost(clock() - began, stopwatch)
+    stopwatch = Stopwatch(clock)
+    solver = Sweep(transcription, stopwatch=stopwatch, factorisation=choice)
+    # The symbolic factorisation is computed once for all sweeps; accessing this computes it.
+    chunk_bytes = solver.estimate_chunk_bytes()
+    began = clock()
+    solver.forward(x, equations)
+    sweep_cost = PartCost(clock() - began, stopwatch)
+    return (
+        f"{len(body.nodes_m):6d} nodes {element:5s} {steps:4d} steps {threads} threads "
+        f"{factorisation_name(solver):10s} simulation {simulation_cost.as_text(steps)}  "
+        f"sweep {sweep_cost.as_text(steps)}  "
+        f"chunks of {solver.choose_chunk_rows()} steps, {chunk_bytes / 1e6:.0f} MB; "
+        f"peak memory {peak_mb():.0f} MB, before {before_mb:.0f} MB"
+    )
+
+
+def factorisation_name(solver: Sweep) -> str:
+    """Return the name of the factorisation that a sweep uses."""
+    factoriser = solver.factoriser
+    if factoriser.skyline:
+        return "skyline"
+    return (
+        "band" if factoriser.is_banded else "supernodal" if factoriser.is_supernodal else "sparse"
+    )
+
+
+def peak_mb() -> float:
+    """Return the largest memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()

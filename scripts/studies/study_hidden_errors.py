@@ -1,0 +1,372 @@
+"""Errors of the description that the residuals do not show: bias of E, intervals and verdicts.
+
+A block of foam is moved at random, as in `twins`. Its tracks are simulated with an effect that the
+described body does not have, or with another body, and are fitted with all options at their
+default. The estimated parameters absorb such errors, so that the residuals look like noise. The
+table has the smallest and the largest estimated E over the true one, how many combined intervals
+contain the true E, the verdicts, and the codes of the first reasons.
+
+    python scripts study_hidden_errors [--twins 5] [--only markers memory]
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from assumed_twins import anisotropic_law
+from scipy.signal import butter, sosfiltfilt
+from script_arguments import make_parser
+from twins import random_poses
+
+import collocation_sysid as cs
+from collocation_sysid.statistics.budget.systematic_effects import KnownEffect
+
+TRUTH = {"young_pa": 5e3, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
+UNKNOWN = {name: cs.Unknown() for name in TRUTH}
+# Edges of the block [m], numbers of elements along them, and density.
+SIZE_M = (0.05, 0.05, 0.1)
+DIVISIONS = (2, 2, 5)
+DENSITY_KG_M3 = 100.0
+# Number of samples, the time between them [s], and the number of markers with their noise [m].
+SAMPLES = 80
+STEP_S = 0.01
+MARKERS = 8
+NOISE_M = 5e-4
+# Sizes of the errors: mass of a marker [kg], share and relaxation time [s] of a branch of memory,
+# lengths that the gripper holds or the mesh lacks [m], and relative difference of the stiffness at
+# the ends of the body from that in its middle.
+MARKER_MASS_KG = 5e-4
+MEMORY = {"prony_1.share": 0.3, "prony_1.tau_s": 0.1}
+HELD_M = 1e-3
+LACKING_M = 1e-2
+GRADIENT = 0.1
+# Bent bar: edges and bend at its end [m], elements and density. Errors of its description: relative
+# width, frequency of a low-pass filter [Hz].
+BAR_M = (0.04, 0.04, 0.12)
+BEND_M = (0.03, 0.012, 0.0)
+BAR_DIVISIONS = (2, 2, 6)
+BAR_DENSITY_KG_M3 = 100.0
+WIDE = 0.04
+LOW_PASS_HZ = 6.0
+SCAN_GRAVITY_M_S2 = (0.0, -9.81, 0.0)
+# Stiffness along the bar, by fibres, over that across it, less one.
+FIBRES = 0.3
+
+
+@dataclass(frozen=True)
+class HiddenError:
+    """Real recording and its description.
+
+    Attributes
+    ----------
+    actual : Experiment
+        Simulated experiment.
+    described : Experiment
+        Experiment that is fitted, with the markers at the same places.
+    more_constants : mapping
+        Constants of the simulated body beside `TRUTH`.
+    assumptions : Assumptions
+        Assumptions of the budget.
+    recorded : function of an array (T, M, 3)
+        Returns the recorded tracks from those with noise [m].
+    """
+
+    actual: cs.Experiment
+    described: cs.Experiment
+    more_constants: Mapping[str, float] = field(default_factory=dict)
+    assumptions: cs.Assumptions = field(default_factory=cs.Assumptions)
+    recorded: Callable[[np.ndarray], np.ndarray] = field(default=lambda tracks_m: tracks_m)
+
+
+def block(height_m: float = SIZE_M[2], **options) -> cs.Body:
+    """Return the block, or one of another height; options are those of `Body`."""
+    mesh = cs.box_mesh((*SIZE_M[:2], height_m), DIVISIONS)
+    return cs.Body(mesh, density_kg_m3=DENSITY_KG_M3, **options)
+
+
+def recording(body: cs.Body, seed: int) -> cs.Experiment:
+    """Return the block, held at its lower face and moved at random, with markers on the upper part
+    that every body of the study has.
+    """
+    rng = np.random.default_rng(seed)
+    t_s = STEP_S * np.arange(SAMPLES)
+    nodes_m = block().nodes_m
+    high = np.flatnonzero(
+        (nodes_m[:, 2] > 0.3 * SIZE_M[2]) & (nodes_m[:, 2] < SIZE_M[2] - LACKING_M)
+    )
+    places_m = nodes_m[rng.choice(high, MARKERS, replace=False)]
+    markers = cs.Markers(t_s, np.zeros((SAMPLES, MARKERS, 3)), NOISE_M, places_m=places_m)
+    held = np.flatnonzero(body.nodes_m[:, 2] < body.nodes_m[:, 2].min() + 1e-9)
+    return cs.Experiment(body, t_s, [cs.Grasp(held, random_poses(t_s, rng))], markers, name="swing")
+
+
+def no_error(seed: int) -> HiddenError:
+    """Return a correct description."""
+    experiment = recording(block(), seed)
+    return HiddenError(experiment, experiment)
+
+
+def with_heavy_markers(seed: int) -> HiddenError:
+    """Return a body with markers whose mass is not stated."""
+    described = recording(block(), seed)
+    nodes_m = described.body.nodes_m
+    places_m = described.markers.predict_positions(nodes_m)
+    masses = [
+        cs.PointMass([int(np.linalg.norm(nodes_m - place_m, axis=1).argmin())], MARKER_MASS_KG)
+        for place_m in places_m
+    ]
+    return HiddenError(replace(described, masses=masses), described)
+
+
+def with_stated_markers(seed: int) -> HiddenError:
+    """Return the same body with the mass of the markers stated in the budget."""
+    stated = KnownEffect(mean=MARKER_MASS_KG, deviation=0.1 * MARKER_MASS_KG)
+    return replace(with_heavy_markers(seed), assumptions=cs.Assumptions(marker_mass_kg=stated))
+
+
+def with_memory(seed: int) -> HiddenError:
+    """Return a body whose material has a branch of memory; the true E is the long-term modulus."""
+    actual = recording(block(prony=["prony_1"]), seed)
+    return HiddenError(actual, recording(block(), seed), MEMORY)
+
+
+def held_higher(seed: int) -> HiddenError:
+    """Return a body that the gripper holds up to a greater height than described."""
+    described = recording(block(), seed)
+    mesh = cs.box_mesh((*SIZE_M[:2], SIZE_M[2] - HELD_M), DIVISIONS)
+    shorter = cs.TetMesh(mesh.points_m + np.array([0, 0, HELD_M]), mesh.tetrahedra)
+    body = cs.Body(shorter, density_kg_m3=DENSITY_KG_M3)
+    return HiddenError(recording(body, seed), described)
+
+
+def with_lacking_end(seed: int) -> HiddenError:
+    """Return a body whose free end is missing in the mesh."""
+    lower = block(SIZE_M[2] - LACKING_M)
+    return HiddenError(recording(block(), seed), recording(lower, seed))
+
+
+def with_gradient(seed: int) -> HiddenError:
+    """Return a body whose stiffness grows linearly from its lower to its upper end."""
+    body = block()
+    centres_m = body.nodes_m[body.cells, 2].mean(axis=1)
+    shares = GRADIENT * (2 * centres_m / SIZE_M[2] - 1)
+    actual = recording(body.with_stiffness_factors(1 + shares), seed)
+    return HiddenError(actual, recording(body, seed))
+
+
+def bent_bar(shape: np.ndarray | None = None, **options) -> cs.Body:
+    """Return a bar that is bent along x and y, so that it differs from its mirror images; a diagonal
+    `shape` (3,) multiplies its coordinates.
+    """
+    mesh = cs.box_mesh(BAR_M, BAR_DIVISIONS)
+    bend = (mesh.points_m[:, 2] / BAR_M[2]) ** 2
+    points_m = mesh.points_m + np.outer(bend, BEND_M)
+    points_m[:, :2] -= np.array(BAR_M[:2]) / 2
+    points_m = points_m * (np.ones(3) if shape is None else shape)
+    cells = (
+        mesh.tetrahedra if shape is None or np.prod(shape) > 0 else mesh.tetrahedra[:, [0, 2, 1, 3]]
+    )
+    return cs.Body(cs.TetMesh(points_m, cells), density_kg_m3=BAR_DENSITY_KG_M3, **options)
+
+
+def bar_recording(seed: int, body: cs.Body | None = None) -> cs.Experiment:
+    """Return the bent bar, held at its lower face and moved at random, with markers on the same
+    nodes whose places are estimated.
+    """
+    rng = np.random.default_rng(seed)
+    body = bent_bar(rest_shape="stress_free") if body is None else body
+    t_s = STEP_S * np.arange(SAMPLES)
+    high = np.flatnonzero(body.nodes_m[:, 2] > 0.3 * BAR_M[2])
+    places_m = body.nodes_m[rng.choice(high, MARKERS, replace=False)]
+    markers = cs.Markers(t_s, np.zeros((SAMPLES, MARKERS, 3)), NOISE_M, places_m=places_m)
+    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    poses = random_poses(t_s, rng)
+    return cs.Experiment(body, t_s, [cs.Grasp(held, poses)], markers, name="swing")
+
+
+def without_places(experiment: cs.Experiment) -> cs.Experiment:
+    """Return the experiment with markers at unknown places."""
+    return replace(experiment, markers=unplaced(experiment.markers))
+
+
+def unplaced(markers: cs.Markers) -> cs.Markers:
+    """Return the markers at unknown places."""
+    return replace(markers, placement=None, located=None, places_m=None)
+
+
+def bar_without_error(seed: int) -> HiddenError:
+    """Return a correct description of the bent bar."""
+    actual = bar_recording(seed)
+    return HiddenError(actual, without_places(actual))
+
+
+def mirrored(seed: int) -> HiddenError:
+    """Return the bent bar, with the mirror image of its mesh in the description."""
+    return scaled(np.array([-1.0, 1.0, 1.0]), seed)
+
+
+def wide(seed: int) -> HiddenError:
+    """Return the bent bar, with a mesh in the description that is too wide along x."""
+    return scaled(np.array([1 + WIDE, 1.0, 1.0]), seed)
+
+
+def scaled(shape: np.ndarray, seed: int) -> HiddenError:
+    """Return the bent bar, with its mesh multiplied by factors (3,) in the description."""
+    described = bar_recording(seed, bent_bar(shape, rest_shape="stress_free"))
+    return HiddenError(bar_recording(seed), without_places(described))
+
+
+def scanned_while_hanging(seed: int) -> HiddenError:
+    """Return the bent bar, whose mesh is the shape that it has under its weight."""
+    held = np.flatnonzero(bent_bar().nodes_m[:, 2] < 1e-9)
+    scanned = bent_bar(rest_shape=cs.UnderGravity(held, gravity_m_s2=SCAN_GRAVITY_M_S2))
+    return HiddenError(bar_recording(seed, scanned), without_places(bar_recording(seed)))
+
+
+def filtered(seed: int) -> HiddenError:
+    """Return the bent bar, whose tracks were low-passed by the software of the cameras."""
+    actual = bar_recording(seed)
+    sections = butter(2, LOW_PASS_HZ, output="sos", fs=1 / STEP_S)
+    return HiddenError(
+        actual, without_places(actual), recorded=lambda x: sosfiltfilt(sections, x, axis=0)
+    )
+
+
+def twice(seed: int) -> HiddenError:
+    """Return the bent bar, with one track in place of that of another marker."""
+    actual = bar_recording(seed)
+
+    def doubled(tracks_m: np.ndarray) -> np.ndarray:
+        noise = np.random.default_rng((seed, 2)).normal(
+            scale=NOISE_M / 5, size=tracks_m[:, 0].shape
+        )
+        return np.concatenate([(tracks_m[:, 1] + noise)[:, None], tracks_m[:, 1:]], axis=1)
+
+    return HiddenError(actual, actual, recorded=doubled)
+
+
+def with_other_law(seed: int) -> HiddenError:
+    """Return the bent bar of another material and damping law."""
+    body = bent_bar(rest_shape="stress_free", material="st-venant-kirchhoff", damping="material")
+    actual = bar_recording(seed, body)
+    return HiddenError(actual, without_places(bar_recording(seed)))
+
+
+def with_fibres(seed: int) -> HiddenError:
+    """Return the bent bar with fibres along it; the true E is that across them."""
+    law = anisotropic_law([0.0, 0.0, FIBRES])
+    body = bent_bar(rest_shape="stress_free", material=law, evaluator="casadi")
+    return HiddenError(bar_recording(seed, body), without_places(bar_recording(seed)))
+
+
+def with_coarse_mesh(seed: int) -> HiddenError:
+    """Return the bent bar of quadratic elements, with linear ones on the same mesh in the
+    description.
+    """
+    actual = bar_recording(seed, bent_bar(rest_shape="stress_free", element="tet10"))
+    body = bent_bar(rest_shape="stress_free")
+    held = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    grasp = cs.Grasp(held, actual.grasps[0].poses)
+    markers = unplaced(actual.markers)
+    return HiddenError(actual, replace(actual, body=body, grasps=[grasp], markers=markers))
+
+
+ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
+    "none": ("none", no_error),
+    "markers": ("8 markers of 0.5 g on the body of 25 g", with_heavy_markers),
+    "stated-markers": ("the same, with `marker_mass_kg` stated", with_stated_markers),
+    "memory": ("memory: share 0.3, 0.1 s", with_memory),
+    "grasp": ("the gripper holds 1 mm more", held_higher),
+    "mesh": ("the mesh lacks 10 mm at the free end", with_lacking_end),
+    "bar": ("none, a bent bar of foam", bar_without_error),
+    "mirrored": ("the same, mesh mirrored", mirrored),
+    "wide": ("the same, mesh 4 % too wide along x", wide),
+    "hanging": (
+        "the same, mesh scanned under its weight and declared stress-free",
+        scanned_while_hanging,
+    ),
+    "filtered": ("the same, tracks low-passed at 6 Hz", filtered),
+    "twice": ("the same, one track in place of another", twice),
+    "law": ("the same, another material and damping law", with_other_law),
+    "coarse": (
+        "the same, linear elements where the body is that of quadratic ones",
+        with_coarse_mesh,
+    ),
+    "fibres": ("the same, fibres along the bar: E along it 30 % larger", with_fibres),
+    "gradient": ("stiffness ± 10 % at the ends", with_gradient),
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Fit of one twin.
+
+    Attributes
+    ----------
+    young_ratio : float
+        Estimated over true Young's modulus.
+    contains_truth : bool
+        Whether the combined interval contains the true modulus.
+    verdict : str
+    cause : str
+        Beginning of the first reason.
+    """
+
+    young_ratio: float
+    contains_truth: bool
+    verdict: str
+    cause: str
+
+
+def twin(name: str, seed: int, parameters: Mapping[str, cs.Unknown] = UNKNOWN) -> cs.Problem:
+    """Simulate a twin with an error, a key of `ERRORS`, and return its wrong problem."""
+    error = ERRORS[name][1](seed)
+    tracks_m = cs.simulate(error.actual, TRUTH | dict(error.more_constants), "newmark").markers_m
+    noise_m = np.random.default_rng((seed, 1)).normal(scale=NOISE_M, size=tracks_m.shape)
+    return cs.Problem(
+        [cs.with_markers(error.described, error.recorded(tracks_m + noise_m))],
+        dict(parameters),
+        uncertainty=cs.UncertaintyOptions(assumptions=error.assumptions),
+    )
+
+
+def fit(name: str, seed: int) -> Outcome:
+    """Simulate a twin with an error, and identify it."""
+    problem = twin(name, seed)
+    run = cs.run(problem)
+    low_pa, high_pa = run.interval("young_pa")
+    return Outcome(
+        run.estimates["young_pa"].value / TRUTH["young_pa"],
+        contains_truth=low_pa <= TRUTH["young_pa"] <= high_pa,
+        verdict=run.trust.verdict,
+        cause=run.trust.concerns[0].code if run.trust.concerns else "",
+    )
+
+
+def main() -> None:
+    """Run the study with the options of the command line, and print its table."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--twins", type=int, default=5, help="of each error")
+    parser.add_argument("--only", nargs="+", choices=tuple(ERRORS), default=tuple(ERRORS))
+    options = parser.parse_args()
+    print("| error | E over the true E | intervals that contain it | verdicts | first reasons |")
+    print("|---|---|---|---|---|")
+    for name in options.only:
+        outcomes = [fit(name, seed) for seed in range(options.twins)]
+        ratios = np.array([each.young_ratio for each in outcomes])
+        verdicts = Counter(each.verdict for each in outcomes)
+        counted = ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items())
+        causes = Counter(each.cause for each in outcomes)
+        reasons = ", ".join(f"{n} {cause}" for cause, n in causes.items() if cause)
+        print(
+            f"| {ERRORS[name][0]} | {ratios.min():.2f} to {ratios.max():.2f} "
+            f"| {sum(each.contains_truth for each in outcomes)} of {len(outcomes)} | {counted} | {reasons} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

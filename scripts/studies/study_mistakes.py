@@ -1,0 +1,317 @@
+"""Mistakes in descriptions and data: table of the reports of `check` and `solve`.
+
+Every mistake is made in a correct problem: in twins of a soft bar with markers (`twins`), also with
+a force sensor, in twins with depth images (`depth_twins`), and in twins with an obstacle
+(`contact_twins`). Correct problems of several seeds stand first: a report there is a false alarm.
+
+    python scripts study_mistakes [--groups tracks wrench depth obstacle] [--only NAME]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import contact_twins
+import depth_twins
+import numpy as np
+from twins import BODIES, SOFT, sensing_twin, twin
+from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
+from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
+from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
+
+from collocation_sysid.errors import InputError, SimulationError
+from collocation_sysid.features.camera_feature import depth_image_hypotheses, may_be_images
+from collocation_sysid.features.wrench_causes import wrench_mistakes
+from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.pipeline import run
+from collocation_sysid.problem import Problem
+from collocation_sysid.runs.check import misspecification_hypotheses
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+    rank,
+)
+
+# Seed of the random choices of a mistake, such as which markers are exchanged.
+FAULT_SEED = 3
+# Seed of the correct problem in which mistakes are made.
+PROBLEM_SEED = 1
+# Number of causes that a cell shows.
+SHOWN_CAUSES = 2
+
+
+@dataclass(frozen=True)
+class ProblemFamily:
+    """Correct problems of one kind, and the mistakes that are made in them.
+
+    Attributes
+    ----------
+    group, name : str
+        The group that `--groups` selects, and the name of the kind.
+    make : callable
+        Returns the correct problem of a seed.
+    faults : mapping of name to Fault
+    parameter : str
+        Estimated parameter that is compared with the truth.
+    truth : float
+        Its true value.
+    """
+
+    group: str
+    name: str
+    make: Callable[[int], Problem]
+    faults: Mapping[str, Fault]
+    parameter: str
+    truth: float
+
+
+@dataclass(frozen=True)
+class MistakeRow:
+    """One row of the table.
+
+    Attributes
+    ----------
+    name : str
+    checked, solved : str
+        Reports of `check` and of `solve`; the second is empty if the problem was not solved.
+    is_right : bool
+        Whether the problem has no mistake.
+    is_reported : bool
+        Whether `check` names a cause, or refuses the problem.
+    is_good : bool
+        Whether `solve` rates the answer "good".
+    """
+
+    name: str
+    checked: str
+    solved: str
+    is_correct: bool
+    is_reported: bool
+    is_good: bool
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """Verdict of `solve` and its reasons as text, and whether the verdict is "good"."""
+
+    text: str
+    is_good: bool
+
+
+def main() -> None:
+    options = _options()
+    began_s = time.perf_counter()
+    print(_line(["mistake", "`check`", "`solve`"]), _line(["---"] * 3), sep="\n")
+    rows = []
+    for row in table_rows(
+        families(options.body, options.samples),
+        groups=options.groups,
+        seeds=options.seeds,
+        only=options.only,
+        is_solved=not options.check_only,
+    ):
+        print(_line([row.name, row.checked, row.solved]), flush=True)
+        rows.append(row)
+    print(f"\n{summary(rows)}; {time.perf_counter() - began_s:.0f} s")
+
+
+def _options() -> argparse.Namespace:
+    """Return the options of the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    groups = ["tracks", "wrench", "depth", "obstacle"]
+    parser.add_argument("--groups", nargs="+", choices=groups, default=groups)
+    parser.add_argument("--body", choices=list(BODIES), default="bar")
+    parser.add_argument("--samples", type=int, default=40)
+    parser.add_argument(
+        "--seeds", type=int, default=5, help="number of correct problems of each kind"
+    )
+    parser.add_argument("--only", default="", help="rows whose name contains this")
+    parser.add_argument("--check-only", action="store_true", help="do not solve")
+    return parser.parse_args()
+
+
+def families(body: str, samples: int) -> list[ProblemFamily]:
+    """Return all kinds of problems; the arguments are the body and the number of samples of those
+    with markers.
+    """
+    shear_pa = SOFT["mu_pa"]
+    bar_pa = depth_twins.TRUTH["young_pa"]
+    block_pa = contact_twins.TRUTH["young_pa"]
+    return [
+        ProblemFamily(
+            "tracks",
+            "markers",
+            lambda seed: twin(body, SOFT, seed, samples),
+            {**FAULTS, **TRACK_FAULTS},
+            "mu_pa",
+            shear_pa,
+        ),
+        ProblemFamily(
+            "wrench",
+            "markers and sensor",
+            lambda seed: sensing_twin(body, SOFT, seed, samples),
+            WRENCH_FAULTS,
+            "mu_pa",
+            shear_pa,
+        ),
+        ProblemFamily(
+            "depth", "one depth image", depth_twins.hanging_twin, DEPTH_FAULTS, "young_pa", bar_pa
+        ),
+        ProblemFamily(
+            "depth",
+            "depth images of a motion",
+            depth_twins.swinging_twin,
+            MOVING_FAULTS,
+            "young_pa",
+            bar_pa,
+        ),
+        ProblemFamily(
+            "obstacle", "indentation", contact_twins.poked_twin, POKING_FAULTS, "young_pa", block_pa
+        ),
+        ProblemFamily(
+            "obstacle",
+            "block on a plate",
+            contact_twins.sheared_twin,
+            PLATE_FAULTS,
+            "young_pa",
+            block_pa,
+        ),
+    ]
+
+
+def table_rows(
+    kinds: Sequence[ProblemFamily], *, groups: Sequence[str], seeds: int, only: str, is_solved: bool
+) -> Iterator[MistakeRow]:
+    """Yield the rows of all correct problems, then those of all mistakes.
+
+    Parameters
+    ----------
+    kinds : sequence of Family
+    groups : sequence of str
+        Groups of the families that are included.
+    seeds : int
+        Number of correct problems of each kind.
+    only : str
+        Text that the names of the rows contain.
+    is_solved : bool
+        Whether the problems are solved.
+    """
+    chosen = [family for family in kinds if family.group in groups]
+    for family in chosen:
+        for seed in range(1, seeds + 1):
+            name = f"none: {family.name}, seed {seed}"
+            if only in name:
+                yield table_row(name, family, None, seed, is_solved=is_solved)
+    for family in chosen:
+        for name, fault in family.faults.items():
+            if only in name:
+                yield table_row(name, family, fault, PROBLEM_SEED, is_solved=is_solved)
+
+
+def table_row(
+    name: str, family: ProblemFamily, fault: Fault | None, seed: int, *, is_solved: bool
+) -> MistakeRow:
+    """Return the row of a problem with a mistake, or without one (None).
+
+    Parameters
+    ----------
+    name : str
+        Name of the row.
+    family : Family
+    fault : Fault or None
+    seed : int
+        Of the correct problem.
+    is_solved : bool
+        Whether the problem is solved.
+    """
+    described: Problem | None = None
+    causes: tuple[Hypothesis, ...] = ()
+    refusal = ""
+    try:
+        correct = family.make(seed)
+        described = correct if fault is None else fault(correct, np.random.default_rng(FAULT_SEED))
+        causes = checked_causes(described)
+    except (InputError, SimulationError) as error:
+        refusal = f"refused: {error}"
+    report = SolveReport("", False)
+    if is_solved:
+        # A description that cannot be built is refused by a solve too.
+        report = (
+            SolveReport(refusal, False) if described is None else solve_report(described, family)
+        )
+    return MistakeRow(
+        name,
+        refusal or causes_text(causes),
+        solved=report.text,
+        is_correct=fault is None,
+        is_reported=bool(causes) or bool(refusal),
+        is_good=report.is_good,
+    )
+
+
+def checked_causes(problem: Problem) -> tuple[Hypothesis, ...]:
+    """Return the causes that `check` lists."""
+    causes = misspecification_hypotheses(problem)
+    has_images = any(e.depths for e in problem.experiments)
+    if causes and not (has_images and may_be_images(causes)):
+        return causes
+    collocation = problem.collocation()
+    if has_images:
+        variables, _ = initial_variables(collocation)
+        mistakes = depth_image_hypotheses(problem, collocation.iterates(variables))
+        causes = rank((*causes, *mistakes))
+    return causes or rank(wrench_mistakes(collocation).hypotheses)
+
+
+def solve_report(problem: Problem, family: ProblemFamily) -> SolveReport:
+    """Return the verdict of `solve` with the likely causes that it names, or with the status of
+    the search; a "good" one also with the estimate over the truth.
+    """
+    try:
+        answer = run(problem)
+    except (InputError, SimulationError) as error:
+        return SolveReport(f"refused: {error}", False)
+    status = answer.solution.status.value
+    reason = causes_text(answer.causes) if answer.causes else status
+    verdict = answer.trust.verdict
+    if verdict != "good":
+        return SolveReport(f"{verdict}: {reason}", False)
+    ratio = answer.estimates[family.parameter].value / family.truth
+    return SolveReport(f"{verdict}: {reason}, {family.parameter} {ratio:.3g} of the truth", True)
+
+
+def causes_text(causes: Sequence[Hypothesis]) -> str:
+    """Return the likeliest causes with the factors by which the misfit falls without them."""
+    shown = (f"{each.code} ({each.strength:.2g})" for each in causes[:SHOWN_CAUSES])
+    return ", ".join(shown) or "nothing"
+
+
+def summary(rows: Sequence[MistakeRow]) -> str:
+    """Return the numbers of mistakes that are reported or rated good, and of false alarms."""
+    counts = Counter(
+        (row.is_correct, key)
+        for row in rows
+        for key, counted in (("all", True), ("reported", row.is_reported), ("good", row.is_good))
+        if counted
+    )
+    return (
+        f"{counts[False, 'reported']} of {counts[False, 'all']} mistakes reported by check, "
+        f"{counts[False, 'good']} rated good by solve; {counts[True, 'reported']} false alarms in "
+        f"{counts[True, 'all']} correct problems, {counts[True, 'good']} rated good"
+    )
+
+
+def _line(cells: Sequence[str]) -> str:
+    """Return one row of a Markdown table."""
+    plain = (" ".join(cell.split()).replace("|", "/") for cell in cells)
+    return f"| {' | '.join(plain)} |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

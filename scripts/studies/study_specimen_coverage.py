@@ -1,0 +1,158 @@
+"""Coverage of the 95 % intervals of homogeneous specimens, over simulated twins.
+
+Each twin draws noise, a zero of the strain for each test and an error of the area for each test
+from their stated distributions. Intervals are statistical ones: the simulated material is neither
+anisotropic nor drifting, so that the combined intervals would be too wide.
+
+    python scripts study_specimen_coverage
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from studies import markdown
+
+import collocation_sysid as cs
+from collocation_sysid.program.simulation import with_readings
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
+
+UNDAMPED = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+# Number of samples per test, and standard deviations of stress [Pa] and lateral stretch.
+SAMPLES = 20
+SIGMA_PA = 2e3
+LATERAL_SIGMA = 2e-3
+# Initial guess over the true value.
+GUESS_SHARE = 0.8
+
+
+@dataclass(frozen=True)
+class SpecimenCase:
+    """Tests of one material.
+
+    Attributes
+    ----------
+    name : str
+        Name in the table.
+    material : str
+        Name of the material law.
+    truth : mapping
+        True constants.
+    free : tuple of str
+        Names of the constants that are estimated.
+    tests : tuple of str
+        Kinds of deformation.
+    strains : tuple of float
+        First and last strain of each test.
+    has_lateral : bool
+        Whether the lateral stretch is measured.
+    """
+
+    name: str
+    material: str
+    truth: Mapping[str, float]
+    free: tuple[str, ...]
+    tests: tuple[str, ...]
+    strains: tuple[float, float]
+    has_lateral: bool = False
+
+
+CASES = (
+    SpecimenCase(
+        "rubber: uniaxial, planar, equibiaxial",
+        "mooney-rivlin",
+        {"c10_pa": 1e5, "c01_pa": 2e4, "kappa_pa": 1e9},
+        ("c10_pa", "c01_pa"),
+        ("uniaxial", "planar", "equibiaxial"),
+        (0.05, 1.5),
+    ),
+    SpecimenCase(
+        "foam: compression with lateral stretch",
+        "neo-hookean",
+        {"young_pa": 5e4, "poisson": 0.25},
+        ("young_pa", "poisson"),
+        ("uniaxial",),
+        (-0.02, -0.4),
+        has_lateral=True,
+    ),
+    SpecimenCase(
+        "rubber: simple shear and confined compression",
+        "neo-hookean",
+        {"young_pa": 2e5, "poisson": 0.45},
+        ("young_pa", "poisson"),
+        ("simple-shear", "confined"),
+        (-0.01, -0.2),
+    ),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--twins", type=int, default=200)
+    parser.add_argument("--case", type=int, choices=range(len(CASES)), help="one of the cases")
+    options = parser.parse_args()
+    rows = []
+    for case in CASES if options.case is None else CASES[options.case : options.case + 1]:
+        start = time.perf_counter()
+        outcomes = [intervals_with_truth(case, seed) for seed in range(options.twins)]
+        elapsed = time.perf_counter() - start
+        for name in case.free:
+            contains_truth = np.array([outcome[name] for outcome in outcomes])
+            share = f"{contains_truth.sum()} of {len(contains_truth)}, {contains_truth.mean():.1%}"
+            rows.append((case.name, name, share, f"{elapsed / len(contains_truth):.2g}"))
+    heads = ("twins", "constant", "intervals that contain the truth", "time per twin [s]")
+    print(markdown(heads, rows))
+
+
+def intervals_with_truth(case: SpecimenCase, seed: int) -> dict[str, bool]:
+    """Return for each estimated constant whether its statistical 95 % interval contains the truth."""
+    rng = np.random.default_rng(seed)
+    experiments = [twin(case, test, rng) for test in case.tests]
+    free = {name: cs.Unknown(guess=GUESS_SHARE * case.truth[name]) for name in case.free}
+    problem = cs.Problem(experiments, {**case.truth, **UNDAMPED, **free})
+    solution = cs.solve(problem)
+    assert solution.status.converged, seed
+    fit = linearise_fit(solution.collocation, solution.z)
+    parameters = solution.collocation.parameters
+    uncertainty = uncertainty_from_fit(fit, parameters, solution.q, problem.uncertainty)
+    contains_truth = {}
+    for name in case.free:
+        interval = uncertainty.estimates[name].statistical95
+        assert interval is not None, (name, seed)
+        contains_truth[name] = interval[0] <= case.truth[name] <= interval[1]
+    return contains_truth
+
+
+def twin(case: SpecimenCase, test: str, rng: np.random.Generator) -> cs.Experiment:
+    """Return a test with noise, a random zero of the strain and a random error of the area."""
+    strain = np.linspace(*case.strains, SAMPLES)
+    zeros = np.zeros(SAMPLES)
+    lateral: Any = 1 + zeros if case.has_lateral else None
+    described = cs.Specimen(
+        test, strain, zeros, SIGMA_PA, lateral_stretch=lateral, lateral_sigma=LATERAL_SIGMA
+    )
+    true_strain = strain + described.strain_zero * rng.normal()
+    true_specimen = cs.Specimen(test, true_strain, zeros, SIGMA_PA, lateral_stretch=lateral)
+    trajectory = cs.simulate(
+        true_specimen.experiment(case.material, test), {**case.truth, **UNDAMPED}
+    )
+    area_factor = 1 + described.area_error * rng.normal()
+    experiment = described.experiment(case.material, test)
+    values = [
+        (area_factor if gauge.unit == "Pa" else 1.0) * reading
+        + gauge.sigma * rng.normal(size=reading.shape)
+        for gauge, reading in zip(experiment.readings, trajectory.custom_sensor_values, strict=True)
+    ]
+    return with_readings(experiment, values)
+
+
+if __name__ == "__main__":
+    main()

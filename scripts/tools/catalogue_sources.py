@@ -1,0 +1,207 @@
+"""Problems of the catalogue of identified materials, with source and licence of the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class CatalogueSource:
+    """One problem of the catalogue.
+
+    Attributes
+    ----------
+    name : str
+        Name of the entry, unique.
+    problem : str
+        Problem file, relative to the repository.
+    specimen : str
+        The recorded body and its test, in words.
+    source : str
+        Who recorded or simulated the data, and where they are published.
+    licence : str
+        Licence of the recordings.
+    twin_script : str
+        Module of `scripts/data` that simulated the recordings and has their constants as `TRUTH`;
+        empty for measured data.
+    static_times_are_recorded : bool
+        Whether the samples of a static recording have the times of the test, so that a strain rate
+        follows from them.
+    is_long : bool
+        Whether the solve takes longer than ten minutes, so that it is left out by default.
+    """
+
+    name: str
+    problem: str
+    specimen: str
+    source: str
+    licence: str
+    twin_script: str = ""
+    static_times_are_recorded: bool = False
+    is_long: bool = False
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the recordings are measurements."""
+        return not self.twin_script
+
+    @property
+    def problem_file(self) -> Path:
+        """Absolute path of the problem file."""
+        return ROOT / self.problem
+
+
+BEAM = (
+    "Dubied et al. 2022, Soft Robotics Lab, ETH Zürich, arXiv 2201.12560; "
+    "repository srl-ethz/diffPD_sim2real"
+)
+PHANTOMS = "Dawood et al. 2026; repository abubakardawood/tissue-phantom-material-database"
+BARS = "Arnavaz et al. 2023, Computer Graphics Forum 42(1); repository diku-dk/DiffCal"
+TENTACLE = "SoRoMoX contributors, TU Delft; repository tud-phi/soromox"
+RUBBER = "numbers from Hyperelastics.jl (TRACER Lab at Liberty University)"
+GPL = "GPL-3.0"
+CC_BY = "CC BY 4.0"
+MIT = "MIT"
+OWN = "this project"
+
+SOURCES = (
+    CatalogueSource(
+        "ecoflex_00_30_sticking",
+        "problems/phantom_compression/problem.toml",
+        "Ecoflex 00-30, cylinder compressed between sticking platens",
+        PHANTOMS,
+        CC_BY,
+        static_times_are_recorded=True,
+    ),
+    CatalogueSource(
+        "ecoflex_00_30_lubricated",
+        "problems/phantom_compression/sliding.toml",
+        "Ecoflex 00-30, the same loads, platens assumed to be lubricated",
+        PHANTOMS,
+        CC_BY,
+        static_times_are_recorded=True,
+    ),
+    CatalogueSource(
+        "ecoflex_00_30_whole_stroke",
+        "problems/phantom_compression/whole_stroke.toml",
+        "Ecoflex 00-30, cylinder compressed to a third of its height, with contact",
+        PHANTOMS,
+        CC_BY,
+        static_times_are_recorded=True,
+        is_long=True,
+    ),
+    CatalogueSource(
+        "ecoflex_00_50_bar",
+        "problems/silicone_depth/ecoflex.toml",
+        "Ecoflex 00-50, hanging bar in one depth image",
+        BARS,
+        GPL,
+    ),
+    CatalogueSource(
+        "mold_star_15_bar",
+        "problems/silicone_depth/mold_star.toml",
+        "Mold Star 15, hanging bar in one depth image",
+        BARS,
+        GPL,
+    ),
+    CatalogueSource(
+        "ecoflex_mold_star_bar",
+        "problems/silicone_depth/halves_hanging.toml",
+        "bar of Ecoflex 00-50 and Mold Star 15, hanging, in one depth image",
+        BARS,
+        GPL,
+    ),
+    CatalogueSource(
+        "dragon_skin_10_beam",
+        "problems/srl_beam/problem.toml",
+        "Dragon Skin 10, clamped beam released at its tip, motion capture",
+        BEAM,
+        MIT,
+    ),
+    CatalogueSource(
+        "dragon_skin_10_beam_memory",
+        "problems/srl_beam/memory.toml",
+        "Dragon Skin 10, the same recordings with one branch of memory",
+        BEAM,
+        MIT,
+    ),
+    CatalogueSource(
+        "silicone_tentacle",
+        "problems/soft_tentacle/problem.toml",
+        "silicone tentacle bent by tendons, motion capture of equilibria",
+        TENTACLE,
+        MIT,
+    ),
+    CatalogueSource(
+        "isoprene_rubber",
+        "collocation_sysid/datasets/kawabata_1981/problem.toml",
+        "isoprene rubber vulcanisate, uniaxial, equibiaxial and planar tension",
+        f"Kawabata et al. 1981, Macromolecules 14(1); {RUBBER}",
+        MIT,
+    ),
+    CatalogueSource(
+        "vulcanised_rubber",
+        "collocation_sysid/datasets/treloar_1944/problem.toml",
+        "vulcanised rubber (8 % S), uniaxial tension at 20 °C",
+        f"Treloar 1944, Rubber Chemistry and Technology 17(4); {RUBBER}",
+        MIT,
+    ),
+    CatalogueSource(
+        "calendered_rubber",
+        "collocation_sysid/datasets/diani/problem.toml",
+        "calendered rubber, uniaxial tension along calendering",
+        f"Diani and co-workers; {RUBBER}",
+        MIT,
+    ),
+    CatalogueSource(
+        "twin_foam_cylinder",
+        "problems/foam_cylinder/recording.toml",
+        "foam cylinder swung by a robot, marker positions unknown",
+        OWN,
+        MIT,
+        "make_foam_cylinder",
+    ),
+    CatalogueSource(
+        "twin_noisy_cylinder",
+        "problems/noisy_cylinder/problem.toml",
+        "foam cylinder with lost, exchanged and misplaced markers",
+        OWN,
+        MIT,
+        "make_noisy_cylinder",
+    ),
+    CatalogueSource(
+        "twin_table1",
+        "problems/table1/problem.toml",
+        "cylinder of Table I of the paper, data without noise",
+        OWN,
+        MIT,
+        "make_table1",
+    ),
+    CatalogueSource(
+        "twin_wrist_sensor",
+        "problems/wrist_sensor/problem.toml",
+        "foam block of unknown density, hand with a force sensor",
+        OWN,
+        MIT,
+        "make_wrist_sensor",
+    ),
+    CatalogueSource(
+        "twin_laid_block",
+        "problems/laid_block/problem.toml",
+        "foam block that a gripper places on a plate",
+        OWN,
+        MIT,
+        "make_laid_block",
+    ),
+    CatalogueSource(
+        "twin_poked_block",
+        "problems/poked_block/problem.toml",
+        "gel block poked by a ball at twelve places, force only",
+        OWN,
+        MIT,
+        "make_poked_block",
+    ),
+)
