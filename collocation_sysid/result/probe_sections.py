@@ -174,8 +174,9 @@ def _conclusions(result: Result) -> Iterator[str]:
         error = short(first.size_error or 0.0)
         yield (
             f"the data determine {source_label(first.name)}: with {size} ± {error}, χ² decreases "
-            f"by {first.chi_squared:.3g} and the estimates change by {listed(moved)}; measure it, "
-            "or estimate it"
+            f"by {first.chi_squared:.3g}"
+            + (f" and the estimates change by {listed(moved)}" if moved else "")
+            + "; measure it, or estimate it"
         )
         if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
             yield f"alternative explanations with similar effects: {listed(others)}"

@@ -261,7 +261,8 @@ def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
-    """Return one concern, as a list, if markers are much noisier than the others; else empty.
+    """Return one concern, as a list, if markers or other sensors are much noisier than the others;
+    else empty.
 
     Noisy are markers whose residuals exceed `MARKER_MISFIT` times the median of all markers, and
     `MARKER_MISFIT` times σ. Nothing is reported unless the test for unequal variances is
@@ -274,9 +275,10 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
     if not noisy:
         return []
     worst = max(noisy, key=level.factors.__getitem__)
-    code = "noise/marker" if len(noisy) == 1 else "noise/markers"
-    data = {"marker": worst, "factor": level.factors[worst], "count": len(noisy)}
-    return [Concern(code, data=data)]
+    stated = level.sigma_keys.get(worst, "sigma_m")
+    kind = "marker" if stated == "sigma_m" else "sensor"
+    data = {"marker": worst, "factor": level.factors[worst], "count": len(noisy), "stated": stated}
+    return [Concern(f"noise/{kind}{'s' * (len(noisy) > 1)}", data=data)]
 
 
 def parameter_concerns(

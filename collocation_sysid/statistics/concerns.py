@@ -199,6 +199,11 @@ TOPICS: dict[str, Topic] = {
             "its reference_m and reflections in its track",
             "markers": "the residuals of {count} markers are larger than sigma_m, most of all "
             "those of {marker} ({factor:.2g} times): check their labels, reference_m and sigma_m",
+            "sensor": "the residuals of {marker} are {factor:.2g} times {stated}: check {stated}, and "
+            "the unit, the axes and signs, and the zero of this sensor",
+            "sensors": "the residuals of {count} sensors and markers are larger than expected, most of "
+            "all those of {marker} ({factor:.2g} times {stated}): check {stated}, and the unit, the "
+            "axes and signs, and the zero of this sensor",
             "allowance": "sigma_m = {sigma_mm:.3g} mm is {share:.2g} of the body's size, more "
             "than the error of cameras: if it is an allowance for model errors, the error bars "
             "are too short, because they assume independent errors; state the noise of the "
@@ -330,6 +335,9 @@ TOPICS: dict[str, Topic] = {
             "law {laws} may be too simple for {range}. First compare laws with "
             "collocation-sysid compare-models FILE --materials {others}; then check sigma_pa, the "
             "units of the columns and the kind of test",
+            "outlier": "sample {number} deviates by {deviations:.2g} sigma and contributes "
+            "{percent:.0f} % of the sum of squared residuals: correct or remove this row, or set "
+            "solver.huber",
             "stress": "the residuals of {marker} are {factor:.2g} times sigma_pa: check sigma_pa, "
             "the unit of the column and the kind of test, and compare laws with compare-models "
             "--materials",
@@ -381,7 +389,7 @@ TOPICS: dict[str, Topic] = {
             "branch": "the equilibria of '{experiment}' from {time_s:.4g} s on are not those that "
             "its loads lead to from the samples before, and depend on mesh and rounding: {why}",
             "material": "the material {material}{where} is unstable at strains of '{experiment}' "
-            "(Drucker): at {time_s:.3g} s and the principal stretches {stretches} a further strain "
+            "(Drucker): at {when}the principal stretches {stretches} a further strain "
             "lowers its stress; use a law with fewer terms, or bound its constants",
             "rest": "the material {material} of {where} is unstable without any strain: its shear "
             "modulus is {mu_pa:.3g} Pa and its bulk modulus {kappa_pa:.3g} Pa; both must be "

@@ -9,8 +9,8 @@ end with the remedy.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -227,8 +227,16 @@ def relative_derivatives(parameters: Parameters, q: Array) -> Array:
     return np.fromiter(slopes, dtype=float, count=len(q)) / sizes
 
 
+# Share of a modulus, or Poisson's ratio over ½, that is rounding.
+ROUNDED = 1e-9
+
+
 def derived_estimates(
-    derived: DerivedModuli, covariance_q: Array, at_bound: Mask, quantiles: Array
+    derived: DerivedModuli,
+    covariance_q: Array,
+    at_bound: Mask,
+    quantiles: Array,
+    reasons: Sequence[str | None] = (),
 ) -> dict[str, Estimate]:
     """Return the estimates of the moduli that follow from the parameters, by the delta method.
 
@@ -241,27 +249,47 @@ def derived_estimates(
         Parameters at a bound; a modulus that depends on one has no interval.
     quantiles : (nq,) array
         Half widths of intervals in standard deviations.
+    reasons : sequence of nq str or None, optional
+        Why each parameter has no standard error; a modulus that depends on one parameter alone has
+        none either.
 
     Notes
     -----
-    A modulus that does not depend on q, or is not positive, has its value alone; others are taken
-    as log-normal, with the largest quantile of the parameters that they depend on.
+    A modulus that does not depend on q has its value alone; others are taken as log-normal, or as
+    normal if they are not positive, with the largest quantile of the parameters that they depend
+    on.
     """
     estimates = {}
     for name, value in derived.values.items():
         gradient = derived.derivatives[name]
-        used = np.flatnonzero(gradient)
+        rounding = ROUNDED * (0.5 if without_region(name) == "poisson" else abs(value))
+        used = np.flatnonzero(np.abs(gradient) > rounding)
+        if abs(value) <= rounding:
+            value = 0.0
         if at_bound[used].any():
             estimates[name] = _estimate_at_bound(value)
-        elif not len(used) or not value > 0:
+        elif not len(used):
             estimates[name] = Estimate(value)
         else:
             variance = gradient[used] @ covariance_q[np.ix_(used, used)] @ gradient[used]
-            deviation = float(np.sqrt(variance)) / value
-            estimates[name] = _logarithmic_estimate(
-                name, value, deviation=deviation, quantile=float(quantiles[used].max())
+            estimate = _derived_estimate(
+                name, value, float(np.sqrt(variance)), quantile=float(quantiles[used].max())
             )
+            reason = reasons[used[0]] if len(used) == 1 and len(reasons) else None
+            if reason and estimate.statistical_std_error is not None:
+                estimate = replace(estimate, statistical_std_error=None, reason=reason)
+            estimates[name] = estimate
     return estimates
+
+
+def _derived_estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
+    """Return the estimate of a modulus from its standard deviation."""
+    if value > 0:
+        return _logarithmic_estimate(name, value, deviation=deviation / value, quantile=quantile)
+    if not np.isfinite(deviation):
+        return Estimate(value, reason="the data do not determine it")
+    ends = (value - quantile * deviation, value + quantile * deviation)
+    return Estimate(value, deviation, statistical95=ends)
 
 
 def _parameter_estimate(

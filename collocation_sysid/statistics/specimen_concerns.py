@@ -19,9 +19,10 @@ from .concerns import Concern
 # Code of the concern about a specimen by that of the general concern with the same data.
 SPECIMEN_CODES: Mapping[str, str] = {
     "noise/larger": "specimen/law",
-    "noise/marker": "specimen/stress",
-    "noise/markers": "specimen/stresses",
+    "noise/sensor": "specimen/stress",
+    "noise/sensors": "specimen/stresses",
     "residuals/persist": "specimen/persist",
+    "residuals/outlier": "specimen/outlier",
     "information/none": "specimen/none",
 }
 # Laws of rubber to compare, in the order of their number of constants.

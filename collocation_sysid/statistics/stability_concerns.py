@@ -72,6 +72,7 @@ def strain_stability_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator
                 stretches=stretches,
                 experiment=experiment.name,
                 t_s=experiment.t_s[samples],
+                has_times=experiment.specimen is None,
             )
 
 
@@ -96,7 +97,7 @@ def branch_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator[Concern]:
 
 
 def _part_concerns(
-    body: Body, theta: Array, stretches: Array, experiment: str, t_s: Array
+    body: Body, theta: Array, stretches: Array, experiment: str, t_s: Array, *, has_times: bool
 ) -> Iterator[Concern]:
     """Yield a concern for each part with an unstable point, about the point of least margin.
 
@@ -127,6 +128,8 @@ def _part_concerns(
                 "where": f" of region '{part.name}'" if part.name else "",
                 "experiment": experiment,
                 "time_s": float(times[worst]),
+                # The times of a table of a material test may be numbers of rows.
+                "when": f"{times[worst]:.3g} s and " if has_times else "",
                 "stretches": ", ".join(f"{each:.3g}" for each in points[worst][::-1]),
             },
         )

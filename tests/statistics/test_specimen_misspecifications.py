@@ -180,8 +180,8 @@ def test_concerns_of_specimens_name_no_markers():
     data = {"marker": "planar/second stress", "factor": 4.0, "count": 2}
     general = [
         Concern("information/none", data={"names": ["c10_pa"]}),
-        Concern("noise/marker", data=data),
-        Concern("noise/markers", data=data),
+        Concern("noise/sensor", data=data),
+        Concern("noise/sensors", data=data),
         Concern("noise/larger", data={"factor": 2.0, "stated": "sigma"}),
         Concern("noise/smaller", data={"factor": 2.0, "stated": "sigma"}),
         Concern("residuals/persist", data={"autocorrelation": 0.9}),

@@ -177,7 +177,8 @@ def bending_concerns(body: Body, shape: Slenderness) -> list[Concern]:
         slender and shape.cells_across < needed - ROUNDING,
         False,
         code="mesh/few",
-        cells=shape.cells_across,
+        # Rounded down, so that it is below the number that is needed.
+        cells=np.floor(10 * shape.cells_across) / 10,
         element=name,
         thickness_mm=1e3 * shape.thickness_m,
         off=off,

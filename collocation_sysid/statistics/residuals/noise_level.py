@@ -13,7 +13,7 @@ test whether all of them are one. Other known errors are given by samples, such 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -64,6 +64,8 @@ class NoiseLevel:
         Covariance of the score due to other known errors.
     sigma_key : str
         Key of σ in the problem.
+    sigma_keys : mapping of str to str
+        Key of σ of each series, by its name.
     """
 
     names: tuple[str, ...]
@@ -77,6 +79,7 @@ class NoiseLevel:
     shares: Array = field(repr=False)
     known_score_covariance: Array = field(repr=False)
     sigma_key: str = "sigma_m"
+    sigma_keys: Mapping[str, str] = field(default_factory=dict)
 
     def is_unequal(self) -> bool:
         """Return whether markers differ more than by chance: `unequal_p` below `UNEQUAL`."""
@@ -189,9 +192,18 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
         prior=information.prior + prior_score,
         of_score=of_score + prior_score,
     )
-    sigma_keys = [b.sigma_key for b in fit.blocks if b.is_present.any() and not b.has_noise_floor]
+    sigma_keys = {
+        f"{block.name}/{name}": block.sigma_key
+        for block in fit.blocks
+        if not block.has_noise_floor
+        for name, is_used in zip(
+            block.marker_names, block.is_present.any(axis=0).tolist(), strict=True
+        )
+        if is_used
+    }
     # That of places stands for all.
-    return replace(level, sigma_key=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"))
+    stated = min(sigma_keys.values(), key="sigma_m".__ne__, default="sigma_m")
+    return replace(level, sigma_key=stated, sigma_keys=sigma_keys)
 
 
 def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:

@@ -351,7 +351,12 @@ class Outlier:
         start, else "residuals/outlier".
         """
         code = "residuals/first" if self.is_relaxed_start else "residuals/outlier"
-        data = {"t_s": self.t_s, "deviations": self.deviations, "percent": 100 * self.share}
+        data = {
+            "t_s": self.t_s,
+            "number": self.sample + 1,
+            "deviations": self.deviations,
+            "percent": 100 * self.share,
+        }
         return Concern(code, data={"of": self.series, **data})
 
 
