@@ -361,7 +361,8 @@ def test_a_significant_routine_probe_recommends_the_comparison_of_laws():
     (concern,) = probe_concerns([other], {})
     assert "compare-models" not in concern.message
     remedy = TOPICS["assumption"].remedy
-    assert "compare-models --damping" in remedy
+    assert "compare-models" in remedy
+    assert "--damping" in remedy
 
 
 def test_the_advice_names_the_command_and_the_argument():
