@@ -6,20 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kit.problems import hung_cube
+from kit.problems import GUESS, hung_cube, measured
 from scipy.signal import butter, sosfiltfilt
 from study_hidden_errors import TRUTH, twin
 
-from collocation_sysid import Unknown
+from collocation_sysid import Problem, Unknown
+from collocation_sysid.fem.laws.materials import DAMPINGS
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.misspecification.fit_misspecifications import (
     _named_alone_or_together,
+    _Refitter,
 )
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
 from collocation_sysid.statistics.misspecification.model_misspecifications import (
     mirror_images,
+    with_body,
+    with_laws,
     with_shape,
 )
 from collocation_sysid.statistics.misspecification.track_misspecifications import (
@@ -98,6 +102,17 @@ def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():
     assert np.isclose(wider.body.mass_kg, hung.body.mass_kg)
 
 
+def test_a_refit_begins_at_an_answer_that_rounding_puts_beyond_a_bound():
+    described = measured(hung_cube(8))
+    solution = solve(Problem([described], GUESS, substeps=1), "reduced-space")
+    (experiment,) = (each.experiment for each in solution.collocation.transcriptions)
+    changed = with_body(experiment, with_laws(experiment.body, None, DAMPINGS["rayleigh"]))
+    refits = _Refitter(solution, experiment, sweeps=20)
+    refits.answer["gamma_m_1_s"] = solution.collocation.parameters.free[-1].lower * (1 - 1e-14)
+    refits.near_answer.add(changed)
+    assert refits.fit(changed) is not None
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "cause"),
@@ -108,6 +123,7 @@ def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():
         ("filtered", "tracks-filtered"),
         ("twice", "markers-same"),
         ("law", "law"),
+        ("coarse", "mesh-coarse"),
     ],
 )
 def test_hidden_errors_of_a_bent_bar_are_named(error: str, cause: str):

@@ -362,7 +362,7 @@ class _Refitter:
         try:
             changed = replace(self.collocation, experiments=(experiment,))
             if experiment in self.near_answer:
-                changed = changed.with_parameters(changed.parameters.with_guess(self.answer))
+                changed = changed.with_parameters(changed.parameters.with_estimates(self.answer))
             solution = method(associated_at_guess(changed))
         except (InputError, SimulationError):
             return None
