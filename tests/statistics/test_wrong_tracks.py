@@ -21,6 +21,7 @@ from collocation_sysid.statistics.misspecification.fit_misspecifications import 
 )
 from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
 from collocation_sysid.statistics.misspecification.model_misspecifications import (
+    LinearCorrection,
     mirror_images,
     with_body,
     with_laws,
@@ -90,6 +91,26 @@ def test_a_cause_is_named_alone_only_if_it_suffices_and_no_other_does():
     (partial,) = _named_alone_or_together([lag], losses.__getitem__)
     assert partial.code == "insufficient"
     assert _named_alone_or_together([law, other], {2: 100.0, 3: 150.0}.__getitem__) == [law]
+
+
+def test_of_laws_that_fit_equally_well_the_smaller_change_is_named():
+    both = Hypothesis("law/both", "'a'", corrected=1, strength=3.1, remaining=0.9)
+    material = Hypothesis("law", "'a'", corrected=2, strength=3.0, remaining=0.9)
+    assert _named_alone_or_together([both, material], {1: 100.0, 2: 103.0}.get) == [material]
+    assert _named_alone_or_together([both, material], {1: 100.0, 2: 150.0}.get) == [both]
+
+
+def test_a_coarse_mesh_is_named_if_its_error_to_first_order_explains_most():
+    data = {"sigmas": 3.0, "remedy": "refine the mesh"}
+
+    def mesh(strength: float) -> Hypothesis:
+        corrected = LinearCorrection(strength**-2)
+        return Hypothesis("mesh-coarse", "", data, corrected, strength=strength, remaining=3.0)
+
+    (named,) = _named_alone_or_together([mesh(2.5)], lambda _: 100.0)
+    assert named.code == "mesh-coarse"
+    (partial,) = _named_alone_or_together([mesh(1.6)], lambda _: 100.0)
+    assert partial.code == "insufficient"
 
 
 def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():

@@ -196,7 +196,8 @@ def _named_alone_or_together(
 ) -> list[Hypothesis]:
     """Return the hypothesis that brings the residuals to the noise, or that does so as far as a
     linear correction can (`LINEAR`); as one of several if others do so with a loss that is larger by
-    at most `INDISTINGUISHABLE`; if none does, those that reduce them most, as one hypothesis.
+    at most `INDISTINGUISHABLE`, of one cause the one that changes less; if none does, those that
+    reduce them most, as one hypothesis.
     """
     sufficient = [
         each
@@ -214,6 +215,10 @@ def _named_alone_or_together(
         for each, loss in zip(sufficient, losses, strict=True)
         if loss <= min(losses) + INDISTINGUISHABLE
     ]
+    simplest: dict[str, Hypothesis] = {}
+    for each in sorted(likely, key=lambda each: each.code.endswith("/both")):
+        simplest.setdefault(each.cause, each)
+    likely = [*simplest.values()]
     return likely if len(likely) == 1 else _together("several", likely)
 
 
