@@ -144,7 +144,7 @@ def _scale(problem: Problem) -> ScaleReference | None:
 
 def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
     """Yield up to three sentences on what the values refer to: the damping law of γ_r if a body that
-    moves has it, the axis along which E is measured, and how moduli are scaled if no force is
+    moves has it, how moduli are scaled if no force is measured, and the axis along which E is
     measured.
     """
     problem = answer.problem
@@ -155,10 +155,10 @@ def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
     ]
     if law_names:
         yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
-    if sentence := answer.modulus_axis_sentence():
-        yield sentence
     if (scale := _scale(problem)) is not None:
         yield scale.sentence
+    if sentence := answer.modulus_axis_sentence():
+        yield sentence
 
 
 def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:

@@ -454,8 +454,8 @@ class Result:
     parameters, derived : mapping of name to ReportedEstimate
         All parameters, coefficients of fields included, and moduli that follow from them.
     basis : tuple of str
-        Sentences on what the values refer to: the damping law, the axis of E, and what sets the
-        scale.
+        Sentences on what the values refer to: the damping law, what sets the scale, and the
+        axis of E.
     budget : mapping of name to mapping of source to float
         Share of each source in the variance of each estimate, largest first; empty without error
         bars.
