@@ -15,7 +15,7 @@ from pydantic_core.core_schema import no_info_plain_validator_function
 from ..common.schema_tables import Among, Section
 from ..common.validated_types import Positive
 from ..errors import InputError
-from ..methods import METHODS, method_options_schema
+from ..methods import METHODS, method_options_schema, method_summary
 from ..methods.comparison.casadi_nlp import Sleqp, SqpMethod, refusal_reason
 from ..methods.comparison.penalty import AugmentedLagrangian, Penalty
 from ..methods.comparison.shooting import Shooting
@@ -68,10 +68,10 @@ class OptionTable:
 
 
 def _method_key(kind: type[MethodOptions]) -> Any:
-    """Return the pydantic field of a method's table: its name in the file as alias, and the method
-    with default options as default.
+    """Return the pydantic field of a method's table: its name in the file as alias, the summary of
+    the class, and the method with default options as default.
     """
-    return Field(default_factory=kind, alias=kind.name)
+    return Field(default_factory=kind, alias=kind.name, description=method_summary(kind.name))
 
 
 class SolverSection(Section):
@@ -84,22 +84,6 @@ class SolverSection(Section):
     huber : float, optional
         Threshold in standard deviations beyond which residuals count linearly, not squared (Huber's
         loss).
-    interior_point : InteriorPoint
-        Interior-point method (IPOPT) for parameters and trajectories together.
-    reduced_space : ReducedSpace
-        Gauss–Newton method for the parameters; the equations of motion give the trajectories.
-    penalty : Penalty
-        Penalty method: violations of the equations of motion are penalised, as in the paper.
-    augmented_lagrangian : AugmentedLagrangian
-        Augmented Lagrangian: a penalty with multipliers, so that ρ need not become large.
-    shooting : Shooting
-        Single shooting: simulate with trial parameters, and improve them.
-    casadi_sqpmethod : SqpMethod
-        Sequential quadratic programming (SQP) with convex quadratic programs.
-    casadi_sleqp : Sleqp
-        SLP-EQP in a trust region: steps of QPs with the active constraints of linear programs.
-    continuation : Continuation
-        Continuation over the horizon: another method on growing parts of every recording.
     """
 
     method: MethodName = DEFAULT
