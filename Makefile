@@ -49,7 +49,8 @@ bench: $(CORE) ## time the constraint Jacobian
 
 docs: $(CORE) ## build the documentation's pages
 	@$(PIP) -e '.[docs]'
-	@$(BIN)/sphinx-build -q -b html docs docs/_build/html
+	@echo "Building the pages: some minutes, because the scripts of the gallery are executed"
+	@$(BIN)/sphinx-build -b html docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
 
 dist: $(CORE) ## build wheel and sdist, install each afresh, and solve a problem with it

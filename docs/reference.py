@@ -1,9 +1,13 @@
-"""Pages made when the documentation is built: the problem file's keys, and the command line."""
+"""Pages made when the documentation is built: the problem file's keys, the command line, and the
+notebooks of the tutorial.
+"""
 
 from __future__ import annotations
 
 import inspect
+import json
 import re
+from base64 import b64decode
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +22,7 @@ from collocation_sysid.problem.schema import ProblemFile
 Schema = Mapping[str, Any]
 # Folder of files that are published beside the pages.
 PUBLISHED = "published"
+NOTEBOOKS = Path(__file__).parents[1] / "scripts" / "notebooks"
 KINDS = {
     "string": "text",
     "integer": "whole number",
@@ -28,12 +33,47 @@ KINDS = {
 
 
 def write_pages(folder: Path) -> None:
-    """Write both pages, and the schema of the problem file, into a folder."""
+    """Write all pages, and the schema of the problem file, into a folder."""
     published = folder / PUBLISHED
     published.mkdir(parents=True, exist_ok=True)
     (published / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")
     (folder / "problem_file.md").write_text(problem_file(), encoding="utf-8")
     (folder / "command_line.md").write_text(command_line(), encoding="utf-8")
+    for notebook in sorted(NOTEBOOKS.glob("*.ipynb")):
+        write_notebook(notebook, folder / "tutorial")
+
+
+# The tutorial -------------------------------------------------------------------------------------
+
+
+def write_notebook(notebook: Path, folder: Path) -> None:
+    """Write a notebook with its stored outputs as a page, and its pictures beside it."""
+    folder.mkdir(exist_ok=True)
+    parts = []
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    for number, cell in enumerate(cells):
+        text = "".join(cell["source"]).strip()
+        if cell["cell_type"] == "markdown":
+            text = text.replace(".ipynb)", ".md)").replace(
+                "](../../docs/howto)", "](../../index.md)"
+            )
+            parts.append(text.replace("](../../docs/", "](../../"))
+            continue
+        if not text.startswith("%"):  # a command of the notebook
+            parts.append(_fenced(text, "python"))
+        for place, output in enumerate(cell["outputs"]):
+            data = output.get("data", {})
+            if "image/png" in data:
+                name = f"{notebook.stem}_{number}_{place}.png"
+                (folder / name).write_bytes(b64decode(data["image/png"]))
+                parts.append(f"![]({name})")
+            elif said := "".join(output.get("text", data.get("text/plain", ""))).strip("\n"):
+                parts.append(_fenced(said, "text"))
+    (folder / f"{notebook.stem}.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _fenced(text: str, language: str) -> str:
+    return f"````{language}\n{text}\n````"
 
 
 # The problem file ---------------------------------------------------------------------------------

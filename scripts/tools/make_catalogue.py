@@ -7,6 +7,7 @@ fail or that exceed the time limit are listed as omitted.
     python scripts make_catalogue                    # solves all
     python scripts make_catalogue --reuse            # solves what has no run folder yet
     python scripts make_catalogue --reuse --long     # also those of more than ten minutes
+    python scripts make_catalogue --only isoprene_rubber   # solves this one, and keeps the others
     python scripts make_catalogue --page-only        # writes the page from the JSON file
 """
 
@@ -57,6 +58,7 @@ def main() -> None:
     parser.add_argument("--reuse", action="store_true", help="use the run folders that exist")
     parser.add_argument("--page-only", action="store_true", help="write the page from the JSON")
     parser.add_argument("--long", action="store_true", help="solve long problems too")
+    parser.add_argument("--only", nargs="+", default=(), help="names; other entries are kept")
     parser.add_argument("--time-limit-s", type=float, default=TIME_LIMIT_S)
     options = parser.parse_args()
     if options.page_only:
@@ -64,7 +66,13 @@ def main() -> None:
         return
     entries = []
     omitted = []
+    kept = read_catalogue() if options.only else Catalogue(cs.__version__, (), ())
+    earlier = {each.name: each for each in (*kept.entries, *kept.omitted)}
     for source in SOURCES:
+        if options.only and source.name not in options.only:
+            outcome = earlier[source.name]
+            (omitted if isinstance(outcome, Omission) else entries).append(outcome)
+            continue
         outcome = make_entry(
             source, reuse=options.reuse, time_limit_s=options.time_limit_s, with_long=options.long
         )

@@ -152,6 +152,15 @@ def test_links_to_a_section_lead_to_its_heading():
     assert broken == []
 
 
+def test_the_problem_file_in_the_readme_is_complete():
+    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    file = ROOT / "problems" / "foam_cylinder" / "recording.toml"
+    stated = tomllib.loads(file.read_text())
+    del stated["title"]
+    (shown,) = [block for block in map(tomllib.loads, blocks) if "swing_markers.csv" in str(block)]
+    assert {key: each for key, each in shown.items() if key != "title"} == stated
+
+
 def test_the_glossary_is_in_order_and_its_words_stand_on_the_pages_they_lead_to():
     glossary = ROOT / "docs" / "glossary.md"
     rows = re.findall(
