@@ -2,7 +2,8 @@
 
 At each stiffness the free moduli have values that are typical in relation to each other, and other
 parameters without a guess have typical values. The first part of every recording is simulated and
-compared with all measurements. A stiff body can always be simulated and moves rigidly with the
+compared with all measurements; if that part is alike at every stiffness, as in free fall, a longer
+one is. A stiff body can always be simulated and moves rigidly with the
 grasp; a softer one sags more, follows later and needs less force, until it fits, and finally the
 simulation fails. So the best start is found by cheap simulations, and the search begins on the side
 where simulations succeed.
@@ -118,11 +119,14 @@ class Scan(ScanSummary):
     others : tuple of int
         Indices of other moduli that may lead to a better solution where there are local minima:
         those next to the best, and other minima of the misfit, in ascending order of the misfit.
+    share : float
+        Share of the samples that were compared.
     """
 
     parameters: Parameters
     starts: Mapping[int, Parameters] = field(default_factory=dict)
     others: tuple[int, ...] = ()
+    share: float = SHARES[0]
 
 
 def start_problem(
@@ -177,9 +181,14 @@ def start_problem(
     result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
         return collocation, None, ""  # the method reports what it needs
+    if result.share != trial.share and failure is None:
+        misfit, failure = TrialSimulation(collocation, result.share).evaluate_guess(is_complete)
+        if failure is not None:
+            reason = f"the body cannot be simulated at the guess ({failure})"
     best = float(result.misfit[result.best])
     if failure is None and misfit <= CLEARLY_BETTER * best:
         return collocation, None, ""
+    result = replace(result, reason=reason)
     if failure is None:
         result = replace(
             result,
@@ -234,16 +243,12 @@ def scan_stiffness(
         from the best one on.
     """
     began = time.perf_counter()
-    trial = TrialSimulation(collocation.with_parameters(_with_units(collocation.parameters, 1.0)))
-    trials = ScanState(trial)
-    step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
-    with counted_phase(StepUnit.STIFFNESS, STEPS):
-        trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
-    if trials.is_best_at_end(softest=True):
-        trials.extend_range(min(trials.misfits), step)
-    if trials.is_best_at_end(softest=False):
-        trials.last_trajectories = None
-        trials.extend_range(max(trials.misfits), 1 / step)
+    sized = collocation.with_parameters(_with_units(collocation.parameters, 1.0))
+    for share in SHARES:
+        trial = TrialSimulation(sized, share)
+        trials = _tried(trial)
+        if trials.depends_on_stiffness:
+            break
     young_pa = np.array(sorted(trials.misfits))
     misfit = np.array([trials.misfits[young] for young in young_pa])
     candidates = [
@@ -273,7 +278,24 @@ def scan_stiffness(
         time_s=time.perf_counter() - began,
         starts=starts,
         others=others,
+        share=trial.share,
     )
+
+
+def _tried(trial: TrialSimulation) -> ScanState:
+    """Return the misfits from stiff to soft, continued beyond an end that fits best."""
+    trials = ScanState(trial)
+    step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
+    with counted_phase(StepUnit.STIFFNESS, STEPS):
+        trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
+    if not trials.depends_on_stiffness:
+        return trials
+    if trials.is_best_at_end(softest=True):
+        trials.extend_range(min(trials.misfits), step)
+    if trials.is_best_at_end(softest=False):
+        trials.last_trajectories = None
+        trials.extend_range(max(trials.misfits), 1 / step)
+    return trials
 
 
 def other_starts(misfit: Array, best: int) -> tuple[int, ...]:
@@ -426,9 +448,9 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     )
 
 
-def _compared_samples(transcription: Transcription) -> int:
-    """Return the number of first samples of an experiment that are compared: the first of `SHARES`,
-    and at least one sample of each measurement; at most all.
+def _compared_samples(transcription: Transcription, share: float) -> int:
+    """Return the number of first samples of an experiment that are compared: a share of them, and
+    at least one sample of each measurement; at most all.
     """
     t_s = transcription.experiment.t_s
     first_samples = [transcription.experiment.markers.find_first_visible_sample()]
@@ -436,7 +458,7 @@ def _compared_samples(transcription: Transcription) -> int:
         first_samples.append(
             int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
         )
-    return min(len(t_s), max(samples_in_share(len(t_s), SHARES[0]), max(first_samples) + 1))
+    return min(len(t_s), max(samples_in_share(len(t_s), share), max(first_samples) + 1))
 
 
 class TrialSimulation:
@@ -446,6 +468,8 @@ class TrialSimulation:
     ----------
     collocation : Collocation
         Problem with units of all parameters.
+    share : float
+        Share of the samples that are compared; also an attribute.
 
     Attributes
     ----------
@@ -459,13 +483,14 @@ class TrialSimulation:
         Last failure of `evaluate_at` or `is_simulable`; None before the first.
     """
 
-    def __init__(self, collocation: Collocation) -> None:
+    def __init__(self, collocation: Collocation, share: float = SHARES[0]) -> None:
         self.collocation = collocation
+        self.share = share
         self.samples = []
         self.rows = []
         self.all_rows = []
         for transcription in collocation.transcriptions:
-            self.samples.append(_compared_samples(transcription))
+            self.samples.append(_compared_samples(transcription, share))
             self.rows.append((self.samples[-1] - 1) * transcription.substeps + 1)
             self.all_rows.append(transcription.grid_times)
         self.failure: SimulationError | None = None
@@ -618,6 +643,15 @@ class ScanState:
                 return
             best = misfit
             beyond = beyond * factor
+
+    @property
+    def depends_on_stiffness(self) -> bool:
+        """Whether the misfits differ by more than the share `BETTER` of the largest, and of a
+        standard deviation; a body that falls freely, for example, moves alike at every stiffness
+        until it is touched.
+        """
+        finite = [misfit for misfit in self.misfits.values() if np.isfinite(misfit)]
+        return not finite or max(finite) - min(finite) > BETTER * max(*finite, 1.0)
 
     def is_best_at_end(self, softest: bool) -> bool:
         """Return whether the best modulus is the softest (or else the stiffest) that was tried.

@@ -247,6 +247,8 @@ class SweepColumns:
         Whether the first column is the feasibility step.
     prescribed : PrescribedColumns or None
         Prescribed changes of grasped dofs; None if their displacements are fixed.
+    start_m : (3n, c) array or None
+        Changes of given start positions [m]; None if they are fixed.
     """
 
     equations: EquationsAtParameters
@@ -254,6 +256,7 @@ class SweepColumns:
     has_parameters: bool = True
     has_step: bool = False
     prescribed: PrescribedColumns | None = None
+    start_m: Array | None = None
 
     @classmethod
     def by_parameters(
@@ -892,11 +895,11 @@ class ForwardSubstitution:
         for t in range(done, first):  # the start is given
             for each in self.internal_states:
                 each.advance(partial(np.zeros, self.shape), partial(np.zeros, self.shape))
-            start = np.zeros(self.shape)
+            start = np.zeros(self.shape) if columns.start_m is None else columns.start_m.copy()
             if columns.prescribed is not None:
                 columns.prescribed.write_into(t, start)
             self.past.appendleft(start)
-            yield np.zeros(self.shape)
+            yield np.zeros(self.shape) if columns.start_m is None else start
         for chunk in solver.chunks(
             x, setting, first=done, histories=histories, accuracy=self.accuracy
         ):

@@ -7,14 +7,25 @@ from functools import cache
 
 import numpy as np
 import pytest
-from kit.problems import GUESS, TRUTH, hung_cube, measured, point_markers, relative_errors
+from kit.problems import (
+    GUESS,
+    TRUTH,
+    hung_cube,
+    measured,
+    measured_with,
+    point_markers,
+    relative_errors,
+)
 from kit.static import block
 from kit.wrenches import sensed, sensing, with_wrenches, wristed_cube
 
 from collocation_sysid import (
     Body,
+    Experiment,
     InputError,
     Nuisance,
+    Obstacle,
+    Plane,
     Problem,
     ReducedSpace,
     Region,
@@ -326,6 +337,7 @@ def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
     assert start_problem(collocation)[0] is collocation
 
 
+@pytest.mark.long
 def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
     """As where a tare, which is not estimated in a scan, makes most of the misfit."""
     monkeypatch.setattr(
@@ -340,9 +352,8 @@ def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
         + np.random.default_rng(1).normal(scale=0.3, size=markers.positions_m.shape),
     )
     blurred = replace(problem, experiments=[replace(experiment, markers=moved)]).collocation()
-    trial = TrialSimulation(blurred)
-    misfit, failure = trial.evaluate_guess(False)
     result = scan_stiffness(without_guesses(blurred))
+    misfit, failure = TrialSimulation(blurred, result.share).evaluate_guess(False)
     assert failure is None
     # The scan is better, but hardly.
     assert 1.0 < misfit / result.misfit[result.best] < CLEARLY_BETTER
@@ -414,3 +425,33 @@ def test_a_linear_constant_without_a_guess_gets_an_error_bar():
     assert estimate.value == pytest.approx(300.0, rel=1e-6)
     assert estimate.statistical_std_error is not None
     assert 0 < estimate.statistical_std_error < 10.0
+
+
+def falling_block() -> Experiment:
+    """A block that falls freely for more than half of its recording, then lands on a plane."""
+    body = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), density_kg_m3=1000.0)
+    t_s = np.arange(25) / 120
+    floor = Obstacle(shape=Plane((0.0, 0.0, 1.0), (0.0, 0.0, -0.08)), friction=0.0)
+    markers = point_markers(body, body.nodes_m, t_s)
+    falling = Experiment(
+        body,
+        t_s,
+        [floor],
+        markers,
+        start="undeformed",
+        air_density_kg_m3="none",
+        nuisance=Nuisance.none(),
+    )
+    return measured_with(falling, FALLEN, "bdf2")
+
+
+FALLEN = {"young_pa": 1e5, "poisson": 0.3, "gamma_r_s": 4e-3, "gamma_m_1_s": 0.1}
+
+
+def test_the_scan_looks_beyond_the_free_fall_of_a_body():
+    given = FALLEN | {"young_pa": Unknown(), "gamma_r_s": Unknown()}
+    problem = Problem([falling_block()], given, scheme="bdf2", substeps=1)
+    scan = scan_stiffness(problem.collocation())
+    best_pa = scan.young_pa[scan.best]
+    assert FALLEN["young_pa"] / 3 < best_pa < FALLEN["young_pa"] * 3
+    assert scan.samples > 13

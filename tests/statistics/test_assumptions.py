@@ -21,6 +21,8 @@ from collocation_sysid import (
     Markers,
     NodeForce,
     Nuisance,
+    Obstacle,
+    Plane,
     PointMass,
     PoseSequence,
     Problem,
@@ -332,3 +334,26 @@ def test_a_tension_test_of_rubber_determines_its_stiffness_at_a_stated_poisson_r
     low, high = answer.interval("young_pa")
     assert low < 6e5 < high
     assert high < 1.5 * low
+
+
+def test_a_larger_body_that_falls_is_released_without_strain():
+    """Compressed to its old size it would swing; it only is larger, and falls alike."""
+    body = Body(box().mesh, density_kg_m3=60.0)
+    t_s = 0.01 * np.arange(13)
+    floor = Obstacle(shape=Plane((0.0, 0.0, 1.0), (0.0, 0.0, -0.5)), friction=0.0)
+    markers = Markers(t_s, np.zeros((13, len(body.nodes_m), 3)), 1e-3, places_m=body.nodes_m)
+    falling = Experiment(
+        body,
+        t_s,
+        [floor],
+        markers,
+        start="undeformed",
+        air_density_kg_m3="none",
+        nuisance=Nuisance.none(),
+    )
+    change_m = changed(falling, "body_scale", "bdf2")
+    # About a point of the lowest face, which touches the floor first.
+    point_m = body.nodes_m[0] - change_m[0, 0]
+    assert point_m[2] == pytest.approx(0.0, abs=1e-9)
+    expected_m = np.broadcast_to(body.nodes_m - point_m, change_m.shape)
+    np.testing.assert_allclose(change_m, expected_m, atol=1e-6 * EDGE_M)

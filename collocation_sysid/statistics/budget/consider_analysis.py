@@ -237,6 +237,7 @@ def _changes_by_effects(
     forces = np.zeros((*x.shape, count))
     rows = np.zeros((*x.shape, count))
     displacements_m = np.zeros((*prescribed.positions_m.shape, count))
+    start_m = np.zeros((x.shape[1], count))
     for k, (effect, sigma) in enumerate(effects):
         if effect is None:
             continue
@@ -251,6 +252,8 @@ def _changes_by_effects(
             displacements_m[..., k] = sigma * np.where(
                 np.isnan(prescribed.positions_m), 0.0, effect.displacement_m
             )
+        if effect.start_m is not None:
+            start_m[:, k] = sigma * effect.start_m
     forces[: fitted.dynamics.first_row] = rows[: fitted.dynamics.first_row] = 0.0
     solver = Sweep(transcription)
     columns = _EffectColumns(
@@ -258,6 +261,7 @@ def _changes_by_effects(
         count,
         has_parameters=False,
         prescribed=PrescribedColumns.from_columns(solver, prescribed.dofs, columns=displacements_m),
+        start_m=start_m,
         forces_n=forces,
         rows_n=rows,
     )

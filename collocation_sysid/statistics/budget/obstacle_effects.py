@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ...model.contact.contact_force import Contact, contact_terms
@@ -34,14 +35,16 @@ class FirstContact:
     ----------
     row : int
         Index of the row in the grid, from 0.
-    place_m : (3,) array
-        Mean of the points in contact, weighted by their pressure, in the row before [m].
+    place_m, start_place_m : (3,) arrays
+        Mean of the points in contact, weighted by their pressure, in the row before and at the
+        start [m].
     normal : (3,) array
         Normal of the obstacle there, in the world.
     """
 
     row: int
     place_m: Array
+    start_place_m: Array
     normal: Array
 
     @classmethod
@@ -74,10 +77,13 @@ class FirstContact:
         weights = weights / weights.sum()
         normal = slopes[:3, 0] @ weights
         # The row before has the surface as it is without contact.
-        before = max(row - 1, 0)
-        origin_m = x[before].reshape(-1, 3)[law.obstacle.nodes[0]]
-        place_m = origin_m + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
-        return cls(row, place_m, normal=normal / max(float(np.linalg.norm(normal)), 1e-9))
+        place_m, start_place_m = (
+            x[k].reshape(-1, 3)[law.obstacle.nodes[0]]
+            + contact.points.vectors(x[k : k + 1])[:3, 0] @ weights
+            for k in (max(row - 1, 0), 0)
+        )
+        unit = normal / max(float(np.linalg.norm(normal)), 1e-9)
+        return cls(row, place_m, start_place_m, normal=unit)
 
 
 def contact_changes_by_size_n(dynamics: Dynamics, x: Array) -> Iterator[Array]:
@@ -151,26 +157,60 @@ def obstacle_shifts_m(iterate: ExperimentIterate) -> Iterator[tuple[Obstacle, Ar
     moves with the rotation of the obstacle, and is in world axes at the N grid times.
     """
     experiment = iterate.transcription.experiment
-    forces = iterate.equations.dynamics.forces
     t_s = iterate.equations.dynamics.t_s[: len(iterate.x)]
-    contacts = [term for term in forces.external_terms if isinstance(term, Contact)]
-    if not contacts:
+    contacts, first_contacts, support = _first_contacts(iterate)
+    if support is None:
         return
-    first_contacts = [FirstContact.from_motion(contact, iterate.x) for contact in contacts]
-    travels_m = [
-        np.ptp(iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0).max()
-        for c in contacts
-    ]
-    support = min(
-        zip((each.row for each in first_contacts), travels_m, range(len(contacts)), strict=True)
-    )
-    prescribed_axes = set("".join(grasp.axes for grasp in experiment.body_grasps))
-    free = np.array([axis not in prescribed_axes for axis in "xyz"])
+    free = _free_axes(experiment)
     for contact, each in zip(contacts, first_contacts, strict=True):
         obstacle = contact.law_of_contact.obstacle
         turn, shift = (values[0] for values in experiment.rigid_motion(t_s[each.row]))
         pivot_m = turn @ iterate.transcription.nuisance.grasp_pivot_m + shift
-        pivot_m = np.where(free, first_contacts[support[-1]].place_m, pivot_m)
+        pivot_m = np.where(free, support.place_m, pivot_m)
         way_m = each.normal * (each.normal @ (each.place_m - pivot_m))
         rotations, _ = obstacle.poses.at(t_s)
         yield obstacle, rotations @ (rotations[each.row].T @ way_m)
+
+
+def scaled_start_m(iterate: ExperimentIterate) -> Array | None:
+    """Return the change (3n,) of given start positions per relative size of the body [m], about the
+    same point as in `obstacle_shifts_m`; None for a start from equilibrium.
+
+    Without it, a larger body would be released compressed to its old size, and swing.
+    """
+    experiment = iterate.transcription.experiment
+    if not iterate.equations.dynamics.first_row:
+        return None
+    turn, shift = (values[0] for values in experiment.rigid_motion(experiment.t_s[0]))
+    pivot_m = turn @ iterate.transcription.nuisance.grasp_pivot_m + shift
+    x_m = iterate.x[0].reshape(-1, 3)
+    _, _, support = _first_contacts(iterate)
+    middle_m = x_m.mean(axis=0) if support is None else support.start_place_m
+    pivot_m = np.where(_free_axes(experiment), middle_m, pivot_m)
+    arms_m = x_m - pivot_m
+    for obstacle in experiment.obstacles:
+        arms_m[obstacle.nodes] = 0.0
+    return arms_m.ravel()
+
+
+def _free_axes(experiment: Experiment) -> NDArray[np.bool_]:
+    """Return for each axis whether no grasp of the body prescribes it."""
+    prescribed = set("".join(grasp.axes for grasp in experiment.body_grasps))
+    return np.array([axis not in prescribed for axis in "xyz"])
+
+
+def _first_contacts(
+    iterate: ExperimentIterate,
+) -> tuple[list[Contact], list[FirstContact], FirstContact | None]:
+    """Return the contacts, the first contact of each, and the one that supports the body: of those
+    that touch first, that of the obstacle that moves least; None without obstacles.
+    """
+    forces = iterate.equations.dynamics.forces
+    contacts = [term for term in forces.external_terms if isinstance(term, Contact)]
+    firsts = [FirstContact.from_motion(contact, iterate.x) for contact in contacts]
+    travels_m = [
+        np.ptp(iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0).max()
+        for c in contacts
+    ]
+    order = sorted(range(len(contacts)), key=lambda k: (firsts[k].row, travels_m[k]))
+    return contacts, firsts, firsts[order[0]] if order else None

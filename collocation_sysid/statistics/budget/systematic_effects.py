@@ -48,7 +48,12 @@ from .memory_effect import (
     memory_forces_n,
     supports_memory,
 )
-from .obstacle_effects import contact_changes_by_size_n, obstacle_shifts_m, rigid_contact_change_n
+from .obstacle_effects import (
+    contact_changes_by_size_n,
+    obstacle_shifts_m,
+    rigid_contact_change_n,
+    scaled_start_m,
+)
 from .platen_slip import slip_displacements_m
 from .shape_error import (
     CORRELATION,
@@ -95,12 +100,15 @@ class Effect:
         Relative change of the times in the inertia.
     displacement_m : (N, g) array or None
         Change of the prescribed positions of the grasped dofs [m]; None means no change.
+    start_m : (3n,) array or None
+        Change of given start positions [m]; None means no change. Equilibria follow the forces.
     """
 
     force_n: Array | None = None
     mass_kg: Array | None = None
     time_stretch: float = 0.0
     displacement_m: Array | None = None
+    start_m: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,7 +444,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
 
     From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
     about the middle of the grasps; obstacles keep their size and are moved so that they first touch
-    the body as before, see `obstacle_effects`.
+    the body as before, and given start positions scale with the body, see `obstacle_effects`.
 
     Buoyancy and the mass of moved air grow by s³, and drag by s². The own mass grows by s³ unless
     the mass of the body is declared, when it stays. For a mesh made under gravity, the weight
@@ -468,6 +476,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
         force + heavier + at.weight_and_drag(mass) + air,
         mass + 3.0 * at.dynamics.mass.added_kg,
         displacement_m=displacement_m,
+        start_m=scaled_start_m(at.iterate),
     )
 
 
