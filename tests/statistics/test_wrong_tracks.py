@@ -109,8 +109,11 @@ def test_a_coarse_mesh_is_named_if_its_error_to_first_order_explains_most():
 
     (named,) = _named_alone_or_together([mesh(2.5)], lambda _: 100.0)
     assert named.code == "mesh-coarse"
-    (partial,) = _named_alone_or_together([mesh(1.6)], lambda _: 100.0)
+    lag = Hypothesis("gripper-frame", "'a'", corrected=1, strength=1.8, remaining=1.4)
+    (partial,) = _named_alone_or_together([lag, mesh(1.6)], lambda _: 100.0)
     assert partial.code == "insufficient"
+    assert "the mesh is too coarse" in partial.message
+    assert "gripper" not in partial.message
 
 
 def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():

@@ -74,6 +74,8 @@ MIRRORED = 2.0
 # Factor by which a correction that is known to first order must decrease the misfit to be the cause:
 # what remains is of second order.
 LINEAR = 2.0
+# The same to be mentioned, and before corrections that do not suffice either.
+PARTLY = 1.2
 # Difference of losses (χ²) below which two corrections explain the data equally well.
 INDISTINGUISHABLE = 10.0
 # Strength over the largest one from which on a correction that does not suffice is mentioned.
@@ -182,11 +184,11 @@ def _refit_hypotheses(
                 *_slip_hypotheses(first, fitted_m, of=of),
                 *turned,
                 *bodies,
-                *coarse_mesh_hypotheses(solution, of),
                 *mirrored,
                 *_grasp_layer_hypotheses(first, of),
             ]
-        )
+        ),
+        *replace(trial, required_factor=PARTLY).accepted(coarse_mesh_hypotheses(solution, of)),
     ]
     return _named_alone_or_together(tested, alone.loss_after_refit)
 
@@ -197,7 +199,8 @@ def _named_alone_or_together(
     """Return the hypothesis that brings the residuals to the noise, or that does so as far as a
     linear correction can (`LINEAR`); as one of several if others do so with a loss that is larger by
     at most `INDISTINGUISHABLE`, of one cause the one that changes less; if none does, those that
-    reduce them most, as one hypothesis.
+    reduce them most, as one hypothesis, or only a linear one: beside an error that is known, what
+    others explain says little.
     """
     sufficient = [
         each
@@ -206,7 +209,8 @@ def _named_alone_or_together(
         or (isinstance(each.corrected, LinearCorrection) and each.strength >= LINEAR)
     ]
     if not sufficient:
-        partial = sorted(tested, key=lambda each: -each.strength)
+        linear = [each for each in tested if isinstance(each.corrected, LinearCorrection)]
+        partial = sorted(linear or tested, key=lambda each: -each.strength)
         partial = [each for each in partial if each.strength > PARTIAL * partial[0].strength]
         return _together("insufficient", partial)
     losses = [loss_of(each.corrected) for each in sufficient]

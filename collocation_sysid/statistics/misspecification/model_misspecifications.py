@@ -47,6 +47,9 @@ SAME_SHAPE = 0.02
 # Smallest and largest error of a mesh over the change to half the edge lengths: with the order of
 # convergence n it is 2ⁿ / (2ⁿ − 1), 1.3 to 3.4 for the lowest orders, to first order.
 MESH_AMPLITUDES = (0.5, 3.5)
+# Root mean square of an error of the mesh that the constants do not absorb, in σ, up to which it is no
+# cause: smaller than noise.
+LEAST_SIGMAS = 1.0
 # Share of the weight in a scan that is taken as the whole weight.
 WHOLE_WEIGHT = (0.4, 2.0)
 
@@ -242,8 +245,8 @@ def screened_bodies(solution: Solution, experiment: Experiment) -> Iterator[Hypo
 
 def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
     """Yield the hypothesis, about the subject `of`, that a finer mesh explains the residuals, with a
-    `LinearCorrection`; nothing if it hardly decreases χ², for large bodies, or if its effect cannot
-    be computed.
+    `LinearCorrection`; nothing if it is smaller than noise or hardly decreases χ², for large bodies,
+    or if its effect cannot be computed.
     """
     collocation = solution.collocation
     bodies = [each.body for each in collocation.transcriptions if each.experiment.specimen is None]
@@ -260,11 +263,11 @@ def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
         return
     amplitude = min(amplitude, MESH_AMPLITUDES[1])
     decrease = -2 * amplitude * gram[1, 0] - amplitude**2 * gram[1, 1]
-    if decrease > LEAST_DECREASE:
-        count = collocation.count_measurements()
+    sigmas = float(amplitude * np.sqrt(gram[1, 1] / collocation.count_measurements()))
+    if decrease > LEAST_DECREASE and sigmas > LEAST_SIGMAS:
         linear = any(body.element.name == "tet4" for body in bodies)
         data = {
-            "sigmas": float(amplitude * np.sqrt(gram[1, 1] / count)),
+            "sigmas": sigmas,
             "remedy": 'set object.element = "tet10", or refine the mesh'
             if linear
             else "refine the mesh",
