@@ -25,7 +25,7 @@ from .formats.text import (
     times_in_column,
 )
 from .formats.topics import POSE
-from .formats.units import METRES_PER_UNIT, require_length_unit, si_factor
+from .formats.units import METRES_PER_UNIT, expected_units, require_length_unit, si_factor
 from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
 POSE_COLUMNS = ("t_s", *POSE)
@@ -139,7 +139,13 @@ def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[in
     axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
     units = [parts[k][1] for k in axes]
     metres = [si_factor(unit or length_unit or "m", "length") for unit in units]
-    if len(axes) != 3 or None in metres or len(set(metres)) > 1:
+    if len(axes) == 3 and None in metres:
+        wrong = metres.index(None)
+        raise grid.error_at(
+            f"column {grid.columns[axes[wrong]]} has the unit {units[wrong]}; expected "
+            f"{expected_units(str(units[wrong]), 'length')}"
+        )
+    if len(axes) != 3 or len(set(metres)) > 1:
         raise _column_error(grid)
     named = ", ".join(grid.columns[k] for k in axes)
     if length_unit is None and None in units:

@@ -111,6 +111,36 @@ def test_missing_coordinates_become_nan(file):
     )
 
 
+@pytest.mark.parametrize(
+    "header", ["t_s,tip_x (mm),tip_y (mm),tip_z (mm)", "time [s],tip_x[mm],tip_y[mm],tip_z[mm]"]
+)
+def test_markers_may_have_their_unit_in_brackets(file, header):
+    table = read_markers(file(f"{header}\n0.0,1,2,3\n0.1,2,2,3\n"))
+    assert table.names == ("tip",)
+    np.testing.assert_allclose(table.positions_m[0, 0], [1e-3, 2e-3, 3e-3])
+    with pytest.raises(InputError, match="length_unit is 'm'"):
+        read_markers(file(f"{header}\n0.0,1,2,3\n0.1,2,2,3\n"), length_unit="m")
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("t_s,tip_x (in.),tip_y (in.),tip_z (in.)", "the unit in.; expected one of m, cm, mm, in"),
+        ("t (ms),tip_x,tip_y,tip_z", "column t (ms) has the unit ms; expected one of s"),
+        ("t_s,tip_x (mm),tip_y (m),tip_z (m)", "have different units"),
+        ("t_s,tip_x (mm),tip_y,tip_z", "have different units"),
+    ],
+)
+def test_units_of_markers_that_are_not_known_are_refused(file, header, words):
+    assert words in refusal(read_markers, file(f"{header}\n0.0,1,2,3\n0.1,2,2,3\n"))
+
+
+def test_units_of_poses_that_are_not_known_are_refused_with_those_that_are(file):
+    text = POSES.replace("x_m,y_m,z_m", "x (ft),y (ft),z (ft)")
+    message = refusal(read_poses, file(text))
+    assert "column x (ft) has the unit ft; expected one of m, cm, mm" in message
+
+
 def test_markers_asked_for_come_in_the_order_asked(file):
     table = read_markers(file(MARKERS), names=["base", "tip"])
     assert table.names == ("base", "tip")

@@ -2,20 +2,25 @@
 
 Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres. Long: t_s, marker, and x_m,
 y_m, z_m (or _cm, _mm, _in; or x, y, z and a given unit); a marker without a row at a time is
-missing there. In both, a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place.
+missing there. In both, the unit may stand in brackets behind the names, as in "tip_x (mm)", a blank
+cell or NaN is a missing sample, and (0, 0, 0) is a measured place.
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, listed
 from ..sample_times import first_unordered_time
 from .raw_tracks import LabelChooser, RawTracks, tracks_of_table
 from .text import TextTable, numeric_cells, read_table
-from .units import METRES_PER_UNIT
+from .units import METRES_PER_UNIT, length_unit_of_spelling
+
+_BRACKETED = re.compile(r"(?P<name>.*?)\s*[(\[](?P<unit>[^()\[\]]+)[)\]]")
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
@@ -28,8 +33,37 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         If columns are missing or unknown, a cell is neither blank nor a number, or time does not
         increase.
     """
-    table = read_table(text)
-    return (_read_long if "marker" in table.columns else _read_wide)(table, choose)
+    table, unit = _without_bracketed_units(read_table(text))
+    tracks = (_read_long if "marker" in table.columns else _read_wide)(table, choose)
+    return tracks if unit is None else replace(tracks, unit=unit, unit_key="the columns' names")
+
+
+def _without_bracketed_units(table: TextTable) -> tuple[TextTable, str | None]:
+    """Return the table without units in brackets behind the names of its columns, and the unit of
+    the coordinates; None if there is none.
+    """
+    columns = []
+    units: dict[str | None, str] = {}
+    for column in table.columns:
+        parts = _BRACKETED.fullmatch(column)
+        name, stated = (column, "") if parts is None else (parts["name"], parts["unit"].strip())
+        is_time = name.lower() in ("t", "time", "t_s")
+        is_place = name in ("x", "y", "z") or name[-2:] in ("_x", "_y", "_z")
+        known = ("s", "sec") if is_time else METRES_PER_UNIT
+        unit = stated if is_time else length_unit_of_spelling(stated)
+        if stated and (is_time or is_place) and unit not in known:
+            raise table.error_at(
+                f"column {column} has the unit {stated}; expected one of {', '.join(known)}: convert "
+                "its values"
+            )
+        if is_place:
+            units[unit] = column
+        columns.append(name if is_place else "t_s" if is_time and stated else column)
+    if len(units) > 1:
+        raise table.error_at(
+            f"the columns {listed(units.values())} have different units; expected the same of all"
+        )
+    return TextTable(columns, table.rows), next(iter(units), None)
 
 
 def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:

@@ -61,6 +61,11 @@ def expected_units(unit: str, dimension: str) -> str:
     return f"{'a unit of force, ' if mass else ''}one of {', '.join(UNITS[dimension])}"
 
 
+def length_unit_of_spelling(text: str) -> str | None:
+    """Return the key of `METRES_PER_UNIT` that a unit such as "Millimeter" means; None if none."""
+    return _SPELLINGS.get(text.strip().lower())
+
+
 def length_unit_of_text(text: str, where: str) -> str | None:
     """Return the unit of length ("m", "cm", "mm", "in") that a file's text names; None if it is
     blank.
