@@ -78,6 +78,9 @@ class SpecimenReader:
                 "incompressible, because the file has no lateral stretch; a lateral stretch would be "
                 "used instead"
             )
+        if table.unread:
+            which = "this column is" if len(table.unread) == 1 else "these columns are"
+            self._add_note(f"{section.file}: {which} not read: {', '.join(table.unread)}")
         specimen = self._specimen(table)
         deformation = replace(specimen.find_deformation(), columns=table.columns)
         with located(file):

@@ -144,6 +144,8 @@ class SpecimenTable:
         Whether true stresses were converted as those of an incompressible specimen.
     columns : tuple of str
         Quantities that the table has, such as "stretch" and "lateral_strain".
+    unread : tuple of str
+        Columns with a unit that are not read.
     """
 
     t_s: Array = field(metadata=over_time())
@@ -154,6 +156,7 @@ class SpecimenTable:
     lateral_stretch: Array | None = field(metadata=over_time())
     is_incompressible: bool
     columns: tuple[str, ...]
+    unread: tuple[str, ...]
 
     @property
     def is_displacement(self) -> bool:
@@ -216,6 +219,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         and lateral is None
         and layout.test in ("uniaxial", "equibiaxial", "planar", "biaxial"),
         columns=tuple(table.values),
+        unread=table.unread,
     )
 
 
@@ -328,6 +332,13 @@ def _one_of(
     if len(there) != 1:
         present = " and ".join(quantity.key for quantity in there)
         expected = ", ".join(quantity.column for quantity in quantities)
+        if STRESS in quantities and TRUE_STRESS not in quantities and not there:
+            true = fitting_column_names(table.grid, TRUE_STRESS)
+            if true and "true" in true[0].lower():
+                raise table.grid.error_at(
+                    f"column {true[0]} holds a true stress, force over deformed area; expected an "
+                    'engineering stress, or stress = "true"'
+                )
         raise table.grid.error_at(
             f"the columns are {', '.join(table.grid.columns)}; found "
             f"{present or 'no column'} of the {what}, "

@@ -125,7 +125,7 @@ SLIPS = {
         ("tension.csv", "t_s,tension\n0,1\n1,1\n"),
         "column tension names no unit; .*for example tension \\(n\\)",
     ),
-    "other unit": (("tension.csv", "t_s,tension_kg\n0,1\n1,1\n"), "a unit of force, one of n, mn"),
+    "other unit": (("tension.csv", "t_s,tension_kg\n0,1\n1,1\n"), "a unit of force, one of N, mN"),
     "pushes": (("tension.csv", "t_s,tension_n\n0,1\n1,-2\n"), "line 3.*a tendon only pulls"),
     "raw": (("tension.csv", "t_s,tension_n\n0,1\n1,9e7\n"), "too large for a soft body"),
     "back in time": (("tension.csv", "t_s,tension_n\n1,1\n0,1\n"), "line 3.*must increase"),

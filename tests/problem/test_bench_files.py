@@ -150,7 +150,7 @@ def test_pressures_have_any_unit(written):
 
 BAD = {
     "no unit": ("Time (s),Force\n0,1\n1,2\n", {}, "line 1: column Force names no unit"),
-    "a mass": ("Time (s),Load (kg)\n0,1\n1,2\n", {}, "a unit of force, one of n, mn"),
+    "a mass": ("Time (s),Load (kg)\n0,1\n1,2\n", {}, "a unit of force, one of N, mN"),
     "two": (
         "Time (s),Load (N),Force (N)\n0,1,1\n1,2,2\n",
         {},

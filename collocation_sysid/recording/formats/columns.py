@@ -138,11 +138,14 @@ class QuantityTable:
     t_s : (T,) array
     values : dict
         (T,) array by the key of each quantity that the table has, NaN where missing.
+    unread : tuple of str
+        Columns with a unit that hold none of the quantities; empty if the user named the columns.
     """
 
     grid: TextTable
     t_s: Array
     values: Mapping[str, Array]
+    unread: tuple[str, ...] = ()
 
 
 @names_file_in_errors
@@ -187,14 +190,21 @@ def read_columns(
     places = _find_columns(grid, quantities, mapped=column_names or {}, column_advice=column_advice)
     t = places.pop(TIME.key, None)
     if len(places) < (len(quantities) if requires_all else 1) or (requires_times and t is None):
-        raise _columns_error(grid, quantities, all_of=requires_all)
+        advice = "" if column_advice is None or places else f". State {column_advice(grid)}"
+        raise _columns_error(grid, quantities, all_of=requires_all, advice=advice)
     values = {}
     for key, (place, factor) in places.items():
         values[key] = factor * numeric_cells(grid, [place], blank_allowed=blank_allowed)[:, 0]
         if np.isnan(values[key]).all():
             raise InputError(f"column {grid.columns[place]} has no values; remove it")
     t_s = np.arange(float(len(grid.rows))) if t is None else times_in_column(grid, *t)
-    return QuantityTable(grid, t_s, values=values)
+    used = [place for place, _ in (*places.values(), *([] if t is None else [t]))]
+    unread = [
+        column
+        for place, column in enumerate(grid.columns)
+        if place not in used and name_and_unit(column)[1] is not None
+    ]
+    return QuantityTable(grid, t_s, values=values, unread=() if column_names else tuple(unread))
 
 
 # Choice of columns --------------------------------------------------------------------------------
@@ -434,7 +444,7 @@ def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_
 
 
 def _columns_error(
-    grid: TextTable, quantities: Sequence[Quantity], all_of: bool, why: str = ""
+    grid: TextTable, quantities: Sequence[Quantity], all_of: bool, why: str = "", advice: str = ""
 ) -> InputError:
     """Return the error for a table without the wanted columns."""
     expected = ", ".join(quantity.column for quantity in quantities)
@@ -447,7 +457,7 @@ def _columns_error(
     return grid.error_at(
         f"the columns are {', '.join(grid.columns)}; expected {TIME.column} and "
         f"{'all' if all_of else 'any'} of {expected}, each once, in these or other units"
-        f"{why}{''.join(needed)}{other_columns_text(grid)}"
+        f"{why}{''.join(needed)}{other_columns_text(grid)}{advice}"
     )
 
 

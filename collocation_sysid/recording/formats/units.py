@@ -25,6 +25,15 @@ UNITS: dict[str, dict[str, float]] = {
     },
     "ratio": {"-": 1.0, "1": 1.0, "mm/mm": 1.0, "m/m": 1.0, "%": 1e-2},
 }
+# Units as they are written, by their spelling in lower case; others are written as in `UNITS`.
+_WRITTEN = {
+    **{"n": "N", "mn": "mN", "kn": "kN", "µn": "µN", "nn": "nN", "nm": "nm", "pa": "Pa"},
+    **{"hpa": "hPa", "kpa": "kPa", "mpa": "MPa", "gpa": "GPa", "n/m²": "N/m²", "n/cm²": "N/cm²"},
+    **{"n/mm²": "N/mm²", "kn/m²": "kN/m²", "mn/m²": "mN/m²", "mmhg": "mmHg", "cmh₂o": "cmH₂O"},
+}
+_TORQUES = {"nm": "N m", "nmm": "N mm", "mnm": "mN m"}
+# Second spellings, which messages leave out.
+_UNWRITTEN = ("um", "un", "cmh2o")
 # What people write where a force is meant.
 _MASSES = ("g", "kg", "lb", "lbs")
 
@@ -58,7 +67,9 @@ def expected_units(unit: str, dimension: str) -> str:
     force is meant and `unit` is one of mass, the text says so.
     """
     mass = dimension == "force" and unit.lower() in _MASSES
-    return f"{'a unit of force, ' if mass else ''}one of {', '.join(UNITS[dimension])}"
+    written = _TORQUES if dimension == "torque" else _WRITTEN
+    units = [written.get(each, each) for each in UNITS[dimension] if each not in _UNWRITTEN]
+    return f"{'a unit of force, ' if mass else ''}one of {', '.join(units)}"
 
 
 def length_unit_of_spelling(text: str) -> str | None:
