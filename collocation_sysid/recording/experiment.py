@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, replace
 from functools import cached_property
@@ -212,7 +213,7 @@ class Experiment:
         return (*(self.markers,) * bool(self.markers.names), *self.wrenches, *self.separate_sensors)
 
     @property
-    def separate_sensors(self) -> list[Measurement]:
+    def separate_sensors(self) -> list[CustomSensor | Depth]:
         """Sensors with times of their own, besides markers and those of grasps."""
         return [each for name in sensor_fields(Experiment) for each in getattr(self, name)]
 
@@ -557,8 +558,7 @@ class Experiment:
         if self.markers.count_samples() == 0:
             self._require_measurements()
         self._check_grasp_times()
-        self._check_custom_sensors()
-        self._check_depth_cameras()
+        self._check_separate_sensors()
 
     def _check_grasp_times(self) -> None:
         """Raise an `InputError` if poses do not cover the samples at which their grasp is active,
@@ -574,44 +574,32 @@ class Experiment:
                     is_static=self.is_static,
                 )
 
-    def _check_custom_sensors(self) -> None:
-        """Raise an `InputError` if two custom sensors have the same name, one has too few samples
-        within the experiment, or one refers to no grasp.
+    def _check_separate_sensors(self) -> None:
+        """Raise an `InputError` if two sensors of one kind have the same name, one has too few
+        samples within the experiment or refers to no grasp, or a camera of a static experiment has
+        an image between the samples.
         """
-        for gauge in self.readings:
-            what = f"the reading '{gauge.name}'"
-            if [other.name for other in self.readings].count(gauge.name) > 1:
-                raise InputError(
-                    f"two readings are called {gauge.name!r}; expected different names"
-                )
-            is_within_experiment(
-                gauge.sample_times_s, self.t_s, name=what, is_static=self.is_static
-            )
-            if gauge.grasp is not None and not 1 <= gauge.grasp <= len(self.grasps):
-                raise InputError(
-                    f"{what} refers to grasp {gauge.grasp}; expected the number of a grasp, 1 to "
-                    f"{len(self.grasps)}"
-                )
-
-    def _check_depth_cameras(self) -> None:
-        """Raise an `InputError` if two depth cameras have the same name, one has too few images
-        within the experiment, or one of a static experiment has an image between the samples.
-        """
-        for depth in self.depths:
-            what = f"the depth camera '{depth.name}'"
-            if [other.name for other in self.depths].count(depth.name) > 1:
-                raise InputError(
-                    f"two depth cameras are called {depth.name!r}; expected different names"
-                )
-            is_within_experiment(
-                depth.sample_times_s, self.t_s, name=what, is_static=self.is_static
-            )
-            distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(axis=1)
-            if self.is_static and distance_s.max() > TIME_TOLERANCE_S:
-                raise InputError(
-                    f"{what} has an image at {depth.sample_times_s[distance_s.argmax()]:g} s, but "
-                    "the static experiment has no sample then; expected times of its samples"
-                )
+        named = Counter((each.description_name, each.name) for each in self.separate_sensors)
+        for sensor in self.separate_sensors:
+            kind, name = sensor.description_name, sensor.name
+            what = f"the {kind} '{name}'"
+            if named[kind, name] > 1:
+                raise InputError(f"two {kind}s are called {name!r}; expected different names")
+            at_s = sensor.sample_times_s
+            is_within_experiment(at_s, self.t_s, name=what, is_static=self.is_static)
+            if isinstance(sensor, CustomSensor):
+                if sensor.grasp is not None and not 1 <= sensor.grasp <= len(self.grasps):
+                    raise InputError(
+                        f"{what} refers to grasp {sensor.grasp}; expected the number of a grasp, 1 "
+                        f"to {len(self.grasps)}"
+                    )
+            elif self.is_static:
+                distance_s = np.abs(at_s[:, None] - self.t_s).min(axis=1)
+                if distance_s.max() > TIME_TOLERANCE_S:
+                    raise InputError(
+                        f"{what} has an image at {at_s[distance_s.argmax()]:g} s, but the static "
+                        "experiment has no sample then; expected times of its samples"
+                    )
 
     def _require_measurements(self) -> None:
         """Raise an `InputError` if, besides markers, nothing is measured either: by no sensor of
