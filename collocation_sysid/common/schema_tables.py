@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import MISSING, dataclass, is_dataclass
-from typing import Annotated, Any, ClassVar, Literal, Self, Union, get_args, get_origin
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Self,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import pydantic
 from pydantic import (
@@ -68,10 +78,10 @@ class Section(BaseModel):
     """Base class of the tables of a problem file.
 
     The class docstring and its Attributes become the descriptions in the schema and in messages.
-    ``class GraspSection(Section, of=Grasp)`` is the table of a class that is decorated with
-    `declaration`: it has the keys of that class (`keys_of`) with their forms, defaults and
-    descriptions, and its summary unless the table has a docstring. Its body states only the keys of
-    the file itself, and those that differ; they follow the keys that the body does not mention.
+    ``class GraspSection(Section, of=Grasp)`` is the table of a dataclass: it has the keys of that
+    class (`keys_of`) with their forms, defaults and descriptions, and its summary unless the table
+    has a docstring. Its body states only the keys of the file itself, and those that differ; they
+    follow the keys that the body does not mention.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
@@ -85,20 +95,20 @@ class Section(BaseModel):
         cls.of = of
         stated = dict(inspect.get_annotations(cls))
         declared: dict[str, Any] = {}
+        texts = {name: text for name, (_, text) in attributes(of).items()}
         for name, key in _keys_by_name(cls).items():
             if stated.get(key.name, "Declared") == "Declared":
                 (stated if key.name in stated else declared)[key.name] = key.form
-                setattr(cls, key.name, pydantic.Field(_default(cls.of, name, key)))
+                text = texts.get(name) if key.name == name else key.description
+                field = pydantic.Field(_default(of, name, key), description=text)
+                setattr(cls, key.name, field)
         cls.__annotations__ = declared | stated
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
-        declared = {key.name: key.description for key in _keys_by_name(cls).values()}
-        described = {name: text for name, (_, text) in attributes(cls.of).items()}
-        own = {name: text for name, (_, text) in attributes(cls).items()}
-        for name, field in cls.model_fields.items():
-            text = own.get(name) or declared.get(name) or (name in declared and described.get(name))
-            field.description = text or field.description
+        for name, (_, text) in attributes(cls).items():
+            if name in cls.model_fields:
+                cls.model_fields[name].description = text
         text = inspect.cleandoc(cls.__doc__ or cls.of.__doc__ or "")
         text = text.partition("\n\nAttributes\n")[0]
         summary, gap, details = text.partition("\n\n")
@@ -117,8 +127,16 @@ class Section(BaseModel):
 
 
 def _keys_by_name(section: type[Section]) -> dict[str, Key]:
-    """Return the keys of the class of which a section is the table, by the name of the field."""
-    return dict(keys_of(section.of)) if is_dataclass(section.of) else {}
+    """Return the keys of the class of which a section is the table, by the name of the field.
+
+    The forms of a class without `declarations.key` are the annotations of its fields.
+    """
+    if not is_dataclass(section.of):
+        return {}
+    if keys := dict(keys_of(section.of)):
+        return keys
+    forms = get_type_hints(section.of, include_extras=True)
+    return {each.name: Key(each.name, forms[each.name]) for each in fields(section.of)}
 
 
 def _default(kind: type, name: str, key: Key) -> Any:
@@ -152,13 +170,13 @@ def declared_in(section: Section, where: str) -> dict[str, Any]:
     InputError
         For an invalid value; the message names its key.
     """
-    fields: dict[str, Any] = {}
+    stated: dict[str, Any] = {}
     for name, key in _keys_by_name(type(section)).items():
         value = getattr(section, key.name)
         if value is not None and key.constant is None:
             with located(where=f"{where}.{key.name}"):
-                fields[name] = key.read(value) if key.read else value
-    return fields
+                stated[name] = key.read(value) if key.read else value
+    return stated
 
 
 def used_keys(section: Section, *names: str) -> list[str]:

@@ -7,14 +7,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from ..common.schema_tables import Among, ByForm, Section, Unit, Vector, require_one, used_keys
+from ..common.schema_tables import (
+    Among,
+    ByForm,
+    Declared,
+    Section,
+    Unit,
+    Vector,
+    require_one,
+    used_keys,
+)
 from ..common.validated_types import Count, Finite, Flag, NotNegative, Positive, Text
 from ..errors import InputError
 from ..fem.body import Made, MeshOrigin
 from ..fem.elements import ELEMENTS
-from ..fem.laws.constants import Scale
 from ..fem.laws.materials import DAMPINGS, MATERIALS
 from ..fem.spatial_field import Field as SpatialField
+from ..model.parameters import Unknown
 from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.environment import usual_air_density
 from ..recording.node_selection import Nodes
@@ -300,21 +309,11 @@ class PriorSection(Section):
         return self
 
 
-class ParameterSection(Section):
+class ParameterSection(Section, of=Unknown):
     """One parameter: estimated within bounds, fixed, or tied to another; {} is estimated.
 
     Attributes
     ----------
-    guess : float, optional
-        Value at which the search starts; found by a scan of the stiffness by default.
-    lower, upper : float, optional
-        Lower and upper bound of the estimate; by default the bounds of the constant.
-    scale : {"log", "linear"}, optional
-        "log": the logarithm of a positive parameter is estimated. "linear": the value itself is
-        estimated, which may have any sign.
-    typical : float, optional
-        Typical change of a linear parameter in one step of the solver; by default that of its
-        constant, or else the guess.
     fixed : float, optional
         Value that is not estimated.
     tied_to : str, optional
@@ -323,12 +322,12 @@ class ParameterSection(Section):
         Ratio of this parameter to the parameter in `tied_to`, 1 by default.
     """
 
-    guess: Finite | None = None
-    lower: Finite | None = None
-    upper: Finite | None = None
+    guess: Declared
+    lower: Declared
+    upper: Declared
     prior: PriorSection | None = None
-    scale: Scale | None = None
-    typical: Positive | None = None
+    scale: Declared
+    typical: Declared
     fixed: Finite | None = None
     tied_to: Text | None = None
     ratio: Finite | None = None
@@ -421,19 +420,24 @@ class EnvironmentSection(Section):
     air_density_kg_m3: AirDensity = Field(default_factory=usual_air_density)
 
 
-# Pyright does not read `model_config`, and takes a section for a class that is not frozen.
-class RolloutSection(Section, RolloutOptions):  # pyright: ignore[reportGeneralTypeIssues]
-    """The forward simulation that checks the answer."""
+class RolloutSection(Section, of=RolloutOptions): ...
 
 
-class AssumptionsSection(Section, Assumptions):  # pyright: ignore[reportGeneralTypeIssues]
-    """Standard deviations of systematic effects; "none" for an effect that is exactly zero."""
+class AssumptionsSection(Section, of=Assumptions): ...
 
 
-class UncertaintySection(Section, UncertaintyOptions):  # pyright: ignore[reportGeneralTypeIssues]
-    """Intervals of the estimates."""
+class UncertaintySection(Section, of=UncertaintyOptions):
+    """Intervals of the estimates.
+
+    Attributes
+    ----------
+    assumptions : Assumptions
+        Standard deviations of systematic effects, by name; "none" if all are exact, as for a
+        simulated recording.
+    """
 
     assumptions: Annotated[AssumptionsSection, ExactIfNone()] = AssumptionsSection()
+    surface_correlation: Declared
 
 
 def _kind_tag(value: Any) -> str:
@@ -481,7 +485,7 @@ class ProblemFile(Section):
     transcription: TranscriptionSection = TranscriptionSection()
     solver: SolverSection = Field(default_factory=SolverSection)
     rollout: RolloutSection = RolloutSection()
-    uncertainty: UncertaintySection = UncertaintySection()
+    uncertainty: UncertaintySection = UncertaintySection.model_construct()
 
     @model_validator(mode="before")
     @classmethod
