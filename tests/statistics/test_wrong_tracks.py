@@ -23,6 +23,8 @@ from collocation_sysid.statistics.misspecification.misspecification_hypothesis i
 from collocation_sysid.statistics.misspecification.model_misspecifications import (
     LinearCorrection,
     mirror_images,
+    other_materials,
+    screened_bodies,
     with_body,
     with_laws,
     with_shape,
@@ -135,6 +137,15 @@ def test_a_refit_begins_at_an_answer_that_rounding_puts_beyond_a_bound():
     refits.answer["gamma_m_1_s"] = solution.collocation.parameters.free[-1].lower * (1 - 1e-14)
     refits.near_answer.add(changed)
     assert refits.fit(changed) is not None
+
+
+def test_far_from_the_stated_pose_materials_are_tested_whatever_a_linear_step_says():
+    solution = solve(Problem([measured(hung_cube(8))], GUESS, substeps=1), "reduced-space")
+    (experiment,) = (each.experiment for each in solution.collocation.transcriptions)
+    assert not [*screened_bodies(solution, experiment)]
+    tested = [*screened_bodies(solution, experiment, is_far=True)]
+    assert {each.code for each in tested} == {"law"}
+    assert {each.data["material"] for each in tested} <= {*other_materials(experiment.body)}
 
 
 @pytest.mark.slow

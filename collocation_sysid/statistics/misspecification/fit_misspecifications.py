@@ -24,6 +24,7 @@ from ...methods.continuation import first_samples
 from ...methods.initial_trajectories import associated_at_guess
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution, Status
+from ...program.collocation import ExperimentIterate
 from ...program.modes.modal_prediction import DeclaredMotion
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
@@ -84,6 +85,9 @@ PARTIAL = 0.7
 RARE = 1e-4
 # Nuisance parameters of the body in its grasp, which turn and shift it to hide other mistakes.
 BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
+# Error of gravity or of the pose in the grasp, in standard deviations, from which on a linear step
+# from the answer does not tell which law is right (31 in a twin of another law).
+FAR = 10.0
 # Fewest samples before and after a slip.
 SHORTEST = 4
 
@@ -141,12 +145,16 @@ def _discrepancy(solution: Solution, number: int = 0) -> float:
     part = solution.parts[number]
     if not part.transcription.experiment.markers.count_samples():
         return 0.0
-    nuisance = part.transcription.nuisance
-    rows = nuisance.indices_of_rows(*BODY_ROWS)
     limit = float(normal_isf(RARE / 2 / max(1, len(part.phi))))
-    largest = float(np.abs(part.phi[rows]).max(initial=0.0)) / limit
+    largest = _pose_deviation(part) / limit
     misfit = _misfit(part.transcription.experiment, solution.readings_m[number])
     return max(misfit / NOISE, largest)
+
+
+def _pose_deviation(part: ExperimentIterate) -> float:
+    """Return the largest error of gravity or of the pose in the grasp, in standard deviations."""
+    rows = part.transcription.nuisance.indices_of_rows(*BODY_ROWS)
+    return float(np.abs(part.phi[rows]).max(initial=0.0))
 
 
 def _refit_hypotheses(
@@ -175,7 +183,8 @@ def _refit_hypotheses(
     comparison = ModalComparison.from_experiment(first, solution.parameters)
     turned = [] if comparison is None else _gravity_hypotheses(first, comparison)
     mirrored = mirror_images(first) if discrepancy > MIRRORED else ()
-    bodies = [*screened_bodies(solution, first)]
+    is_far = max(map(_pose_deviation, solution.parts)) > FAR
+    bodies = [*screened_bodies(solution, first, is_far=is_far)]
     alone.near_answer.update(each.corrected for each in bodies)
     tested = [
         *trial.accepted(

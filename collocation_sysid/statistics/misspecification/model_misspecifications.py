@@ -202,7 +202,9 @@ def _law_code(material: str, damping: str) -> str:
     return "law" if material else "law/damping"
 
 
-def screened_bodies(solution: Solution, experiment: Experiment) -> Iterator[Hypothesis]:
+def screened_bodies(
+    solution: Solution, experiment: Experiment, *, is_far: bool = False
+) -> Iterator[Hypothesis]:
     """Yield hypotheses of other bodies, those first that decrease χ² most by one linear step, with
     the experiment with the other body as `corrected`.
 
@@ -212,6 +214,9 @@ def screened_bodies(solution: Solution, experiment: Experiment) -> Iterator[Hypo
         The fit.
     experiment : Experiment
         The experiment that is changed.
+    is_far : bool
+        Whether the fit moved the body so far from its stated pose that a linear step from there says
+        little: other materials come first then, whatever it says.
 
     Notes
     -----
@@ -231,6 +236,8 @@ def screened_bodies(solution: Solution, experiment: Experiment) -> Iterator[Hypo
     found: list[tuple[float, Hypothesis]] = []
     for change in changes:
         decrease, amplitudes = _gain(gram, change)
+        if is_far and change.kind == "law":
+            decrease = np.inf
         corrected = _changed_experiment(experiment, change, amplitudes)
         if decrease < LEAST_DECREASE or corrected is None:
             continue
