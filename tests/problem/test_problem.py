@@ -270,7 +270,8 @@ def test_some_markers_may_have_a_reference_and_others_not(tiny):
 
 def test_a_marker_that_is_late_is_placed_where_it_was_first_seen(tiny):
     replace_text(f"reference_m = {REFERENCES}", "")(tiny)
-    replace_cell(MARKERS, 2, 1, "")(tiny)
+    for column in (1, 2, 3):
+        replace_cell(MARKERS, 2, column, "")(tiny)
     experiment = experiment_of(tiny)
     markers = experiment.markers
     assert markers.count_missing().tolist() == [1, 0, 0]
