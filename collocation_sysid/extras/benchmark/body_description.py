@@ -10,6 +10,7 @@ LAWS = {
     "neo-hookean": "ψ = ½ λ (ln J)² − μ ln J + ½ μ (tr C − 3)",
     "mooney-rivlin": "ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + ½ κ (J − 1)²",
     "yeoh": "ψ = C₁₀ (Ī₁ − 3) + C₂₀ (Ī₁ − 3)² + C₃₀ (Ī₁ − 3)³ + ½ κ (J − 1)²",
+    "ogden-3": "ψ = Σ μₚ/αₚ (λ̄₁^αₚ + λ̄₂^αₚ + λ̄₃^αₚ − 3) + ½ κ (J − 1)², p = 1, 2, 3",
 }
 DAMPING_LAWS = {
     "rayleigh": "force −γ_r K v − γ_m M v, with the tangent stiffness K and the lumped mass M",
@@ -18,7 +19,7 @@ DAMPING_LAWS = {
 }
 NOTATION = (
     "F: deformation gradient; J = det F; C = FᵀF; Green strain E = ½ (C − I); Ī₁ = J^(−2/3) tr C; "
-    "Ī₂ = J^(−4/3) ½ ((tr C)² − tr C²)."
+    "Ī₂ = J^(−4/3) ½ ((tr C)² − tr C²); λ̄ᵢ = J^(−1/3) λᵢ with the principal stretches λᵢ."
 )
 # Addresses of licences that require a link.
 LICENCE_LINKS = {"CC BY 4.0": "https://creativecommons.org/licenses/by/4.0/"}
