@@ -231,7 +231,12 @@ class FieldResult:
             )
         shapes = f"{self.identified} of the {self.shapes.modes} shapes of its field"
         share = f"halve the prior uncertainty in {self.determined_share:.0%} of the volume"
-        details = [f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm"]
+        details = [
+            f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm",
+            f"values and intervals are those of a field smoothed over "
+            f"{short(1e3 * self.shapes.length_m)} mm, and a small inclusion with a sharp boundary "
+            "differs more",
+        ]
         if len(self.likelier) > 1:
             each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
             details.append(

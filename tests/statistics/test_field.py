@@ -17,11 +17,12 @@ import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.constants import MU
 from collocation_sysid.fem.meshes.refinement import refine_body
-from collocation_sysid.fem.spatial_field import FieldModes, Laplacian
+from collocation_sysid.fem.spatial_field import FieldModes, FieldResolution, Laplacian
 from collocation_sysid.result.pictures.field_intervals import field_picture
 from collocation_sysid.result.replay import ARRAY_LAYOUT, GROUP_PREFIXES, read_run
 from collocation_sysid.runs.check.body_check import check_body
 from collocation_sysid.runs.forward_simulation import simulate_experiment
+from collocation_sysid.runs.result_content import FieldResult
 from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
 from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
 from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
@@ -551,3 +552,10 @@ def test_check_reports_the_fields_that_the_shapes_can_determine(length_m: float,
     assert [each.code for each in seen.concerns if each.topic == "field"] == codes
     assert seen.fields["young_pa"].modes == 10
     assert "field_1" not in seen.guess
+
+
+def test_the_line_about_a_field_says_that_it_is_smoothed():
+    shapes = FieldResolution(modes=40, length_m=0.04, amplitude=0.5, share=0.95, detail_m=0.021)
+    line = FieldResult(shapes, (2e4, 7e4), 1.0, 28, {}).sentence("young_pa")
+    assert "above 21 mm; values and intervals are those of a field smoothed over 40 mm" in line
+    assert "a small inclusion with a sharp boundary differs more" in line
