@@ -634,7 +634,7 @@ def test_a_comparison_in_python_has_the_estimates_of_a_solve():
     assert compared.tables[-1].title.startswith("95 % intervals")
     (prediction, young, *_) = compared.plot().axes
     assert prediction.get_title(loc="left") + prediction.get_title()
-    assert young.get_xlabel().endswith("[Pa]")
+    assert young.get_xlabel().endswith("[kPa]")
     with pytest.raises(cs.InputError, match="two or more"):
         cs.compare_models({"yeoh": problems["yeoh"]})
 

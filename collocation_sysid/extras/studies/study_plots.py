@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
+from ...common.display import readable_stress
 from ...common.serialisation import read
 from ...fem.laws.constants import unit_of
 from ...result.figure_style import (
@@ -118,11 +119,14 @@ def model_plots(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Figure]:
     places = np.arange(len(rows))
     axes_of_panels = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, panel in zip(axes_of_panels, panels, strict=True):
+        factor, unit = 1.0, unit_of(panel)
+        if unit == "Pa":
+            factor, unit = readable_stress(row["parameters"].get(panel) or 0.0 for row in rows)
         for place, row in zip(places, rows, strict=True):
             ends = _model_ends(row, panel)
             if ends is None:
                 continue
-            low, value, high = ends
+            low, value, high = (factor * end for end in ends)
             colour = VERMILION if row["chosen"] else BLUE
             bar = [[value - low], [high - value]]
             axes.errorbar(
@@ -131,8 +135,10 @@ def model_plots(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Figure]:
         if panel == "prediction":
             style_axes(axes, "Held-out data", xlabel="error relative to the best", ylabel="")
         else:
-            label = f"{symbol_as_mathtext(panel)} [{unit_of(panel)}]".removesuffix(" []")
+            label = f"{symbol_as_mathtext(panel)} [{unit}]".removesuffix(" []")
             style_axes(axes, "95 % interval", xlabel=label, ylabel="")
+        axes.xaxis.set_major_locator(MaxNLocator(3))
+        axes.ticklabel_format(axis="x", useOffset=False)
     axes_of_panels[0].set_yticks(places, [row["model"] for row in rows])
     axes_of_panels[0].set_ylim(len(rows) - 0.5, -0.5)
     return {"models": figure}
