@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .common.array_types import Array
+from .common.checked_calls import checked
 from .common.display import plain_text
 from .common.step_counting import StepUnit, counted_phase
 from .errors import InputError, SimulationError
@@ -141,8 +142,9 @@ class Run(SolvedProblem):
         return write_run(self, folder, frames=frames, pictures=pictures)
 
 
+@checked
 def run(
-    problem: Problem,
+    problem: Problem | str | Path,
     method: str | Method | None = None,
     watch: Watch | None = None,
     log: Log | None = None,
@@ -158,8 +160,7 @@ def run(
 
     Parameters
     ----------
-    problem : Problem
-    method, watch, start, scheduler
+    problem, method, watch, start, scheduler
         See `solve`.
     log : callable, optional
         Called with a text at the beginning of each step after the solve.
@@ -180,6 +181,8 @@ def run(
     """
     say = log or (lambda _: None)
     began_s = time.perf_counter()
+    if not isinstance(problem, Problem):
+        problem = Problem.read(problem)
     solution = solve(problem, method, watch=watch, start=start, scheduler=scheduler)
     searched_s = time.perf_counter()
 

@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args
 
+import numpy as np
 from pydantic import PlainValidator, ValidatorFunctionWrapHandler, WrapValidator
 
 from ..errors import InputError
+from .checked_calls import form_of
 from .validated_classes import validate_arguments
-from .validated_types import expected, faulty_entry
+from .validated_types import Finite, expected, faulty_entry
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -115,29 +118,43 @@ def declaration(kind: type[T]) -> type[T]:
         for name, stated in inspect.get_annotations(base).items()
         if name in made.__init__.__annotations__
     }
+    names = vars(sys.modules[kind.__module__])
     for each in fields(made):
-        each.type = _accepted_type(each)
+        if isinstance(each.type, str):  # a field of a base class has its accepted type already
+            each.type = _accepted_type(each, names)
     validate_arguments(made, _refusal)
     return made
 
 
-def _accepted_type(field: Field[Any]) -> Any:
+def _accepted_type(field: Field[Any], names: Mapping[str, Any]) -> Any:
     """Return the annotation from which pydantic makes the validator of a field, see `key`.
 
-    None and the default value are accepted, although a problem file cannot state them.
+    The default value is accepted, although a problem file may not state it, and so is None for a
+    field whose annotation or default is None. A field without form and converter has the form of its
+    annotation, see `checked_calls.form_of`, in which `names` of the module may occur; numbers are
+    then finite, unless the default is not.
     """
+    is_optional = field.default is None or str(field.type).endswith("| None")
     if (converter := field.metadata.get("converter")) is not None:
         return Annotated[
-            Any, PlainValidator(lambda value: value if value is None else converter(value))
+            Any,
+            PlainValidator(
+                lambda value: value if value is None and is_optional else converter(value)
+            ),
         ]
     form = field.metadata.get("form")
+    if form is None or isinstance(form, Key):
+        form = form_of(field.type, names)
+        is_number = field.type in ("float", "float | None") and field.default is not MISSING
+        if is_number and np.isfinite(field.default or 0.0):
+            form = Finite
     if form is None:
         return Any
 
     def unless_default(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
-        """Return None and the default value unchanged, other values validated."""
-        is_default = isinstance(value, type(field.default))
-        if value is None or (is_default and value == field.default):
+        """Return a possible None and the default value unchanged, other values validated."""
+        is_default = type(value) is type(field.default)
+        if (value is None and is_optional) or (is_default and value == field.default):
             return value
         return validated(value)
 
@@ -152,7 +169,7 @@ def _refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
     if not field or field.metadata.get("converter") is not None:
         error = fault["ctx"]["error"]
     else:
-        error = _form_refusal(instance, fault, form=field.metadata["form"])
+        error = _form_refusal(instance, fault, form=field.metadata.get("form"))
     where = getattr(instance, "description", None)
     if where is None or not isinstance(error, InputError):
         return error

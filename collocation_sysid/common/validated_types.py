@@ -6,10 +6,12 @@ values, so that "30" or true in place of a number is a mistake.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field
 
 # Smallest magnitude of meaningful input; its square is still a nonzero floating-point number.
 SMALLEST = 1e-100
@@ -25,18 +27,34 @@ def _of_usual_size(value: float) -> float:
     return value
 
 
+def _python_scalar(value: Any) -> Any:
+    """Return a scalar of NumPy as one of Python; other values unchanged."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _no_nan(value: float) -> float:
+    """Return an infinite value, or one that is zero or of usual size."""
+    if math.isnan(value):
+        raise ValueError("found nan; expected a number")
+    return value if math.isinf(value) else _of_usual_size(value)
+
+
 _Usual = AfterValidator(_of_usual_size)
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), _Usual]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual]
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual]
-AboveOne = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual]
-OneOrMore = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual]
-Boundless = Annotated[float, Field(strict=True)]
-StrictInteger = Annotated[int, Field(strict=True)]
-Count = Annotated[int, Field(strict=True, ge=0)]
-AtLeastOne = Annotated[int, Field(strict=True, ge=1)]
-Flag = Annotated[bool, Field(strict=True)]
-Text = Annotated[str, Field(min_length=1)]
+_Scalar = BeforeValidator(_python_scalar)
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), _Usual, _Scalar]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual, _Scalar]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual, _Scalar]
+AboveOne = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual, _Scalar]
+OneOrMore = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual, _Scalar]
+Boundless = Annotated[float, Field(strict=True), _Scalar]
+Number = Annotated[float, Field(strict=True), AfterValidator(_no_nan), _Scalar]
+StrictInteger = Annotated[int, Field(strict=True), _Scalar]
+Count = Annotated[int, Field(strict=True, ge=0), _Scalar]
+AtLeastOne = Annotated[int, Field(strict=True, ge=1), _Scalar]
+# More steps between two samples than any motion needs.
+Substeps = Annotated[int, Field(strict=True, ge=1, le=1000), _Scalar]
+Flag = Annotated[bool, Field(strict=True), _Scalar]
+Text = Annotated[str, Field(strict=True, min_length=1)]
 
 _EXPECTED = {
     "float_type": "a number",
@@ -48,6 +66,9 @@ _EXPECTED = {
     "finite_number": "a finite number",
     "greater_than": "a number above {gt:g}",
     "greater_than_equal": "a number of at least {ge:g}",
+    "less_than_equal": "a number of at most {le:g}",
+    "is_instance_of": "a {class}",
+    "callable_type": "a function",
     "dict_type": "a table",
     "mapping_type": "a table",
     "tuple_type": "a list",
@@ -67,7 +88,7 @@ def expected(fault: Mapping[str, Any]) -> str:
         return str(fault["ctx"]["error"]).partition("expected ")[2]
     if fault["type"] in _EXPECTED:
         return _EXPECTED[fault["type"]].format(**fault.get("ctx", {}))
-    message = fault["msg"].removeprefix("Input should be ")
+    message = fault["msg"].partition("Input should be ")[2] or fault["msg"]
     # As in problem files.
     return message.replace("False", "false").replace("True", "true")
 

@@ -28,6 +28,8 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
+from ..common.checked_calls import checked
+from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .air import placed_unit_drag
 from .discretisation import Discretisation
@@ -200,14 +202,15 @@ class Body(Discretisation):
         cannot evaluate, or `UnderGravity` with a memory or a field.
     """
 
+    @checked
     def __init__(
         self,
         mesh: TetMesh,
         material: str | Energy | Material = "neo-hookean",
-        density_kg_m3: float | None = None,
+        density_kg_m3: Positive | None = None,
         element: str = "tet4",
         *,
-        mass_kg: float | None = None,
+        mass_kg: Positive | None = None,
         damping: str | DampingLaw = "kelvin-voigt",
         regions: Sequence[Region] = (),
         prony: Sequence[str | Prony] = (),
@@ -217,7 +220,7 @@ class Body(Discretisation):
         made: Made | None = None,
         mesh_from: MeshOrigin | None = None,
         evaluator: str = "auto",
-        threads: int | None = None,
+        threads: AtLeastOne | None = None,
     ) -> None:
         parts = parts_from_regions(
             mesh,
@@ -237,7 +240,8 @@ class Body(Discretisation):
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
             generated if rest_shape is None else rest_shape
         )
-        if rest_shape not in (None, "stress_free") and not isinstance(rest_shape, UnderGravity):
+        is_known = rest_shape is None or isinstance(rest_shape, str | UnderGravity)
+        if not is_known or (isinstance(rest_shape, str) and rest_shape != "stress_free"):
             raise InputError(
                 f"found {rest_shape!r}; expected 'stress_free', or for a mesh that was scanned under "
                 "its own weight cs.UnderGravity(nodes, gravity_m_s2)",

@@ -12,14 +12,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from ..common.array_types import Array, Index
+from ..common.checked_calls import checked
 from ..common.files import reason
+from ..common.validated_types import Count, Text
 from ..errors import InputError, hint_at
 from .force_points import ForcePoints
 from .laws.constants import Constant, constant_named
@@ -79,6 +82,7 @@ CONTEXT_SIZE = CONTEXT_OFFSETS[-1]
 TRIANGLE_M = (0.1, 0.2, 0.3, 0.2, 0.2, 0.3, 0.1, 0.3, 0.3)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class NodeForce:
     """Force on every node of a body, on every face of its surface, or on some of them.
@@ -105,12 +109,12 @@ class NodeForce:
         worthwhile for laws that are evaluated in every step of most problems.
     """
 
-    name: str
+    name: Text
     law: Law
     constants: tuple[Constant, ...]
     nodes: Selection | Index | None = None
     on: On = "nodes"
-    internal_variable_count: int = 0
+    internal_variable_count: Annotated[Count, Field(le=100)] = 0
     is_compiled: bool = False
 
     @classmethod

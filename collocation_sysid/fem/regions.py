@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
+from ..common.checked_calls import checked
+from ..common.validated_types import Positive, Text
 from ..errors import InputError, hint_at
 from .laws.constants import CONTRAST, DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, Constant
 from .laws.damping_admissibility import require_admissible_damping
@@ -36,6 +38,7 @@ from .spatial_field import TWO_PHASE, Field, FieldModes
 from .two_phase import TwoPhaseModes
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Region:
     """Part of a body with properties that differ from the rest.
@@ -59,10 +62,10 @@ class Region:
         If the name is empty or has other characters.
     """
 
-    name: str
+    name: Text
     cells: Selection | ArrayLike
     material: str | Energy | Material | None = None
-    density_kg_m3: float | None = None
+    density_kg_m3: Positive | None = None
     damping: str | DampingLaw | None = None
     prony: Sequence[str | Prony] | None = None
     field: Field | None = None
@@ -263,13 +266,6 @@ def _densities(
             f"found {'neither' if mass_kg is None else 'both'} of density_kg_m3 and mass_kg; "
             "expected exactly one of them"
         )
-    for region in regions:
-        if region.density_kg_m3 is not None and not region.density_kg_m3 > 0:
-            raise InputError(
-                f"density_kg_m3 is {region.density_kg_m3:g}; expected a positive number",
-                None,
-                where=f"region '{region.name}'",
-            )
     if density_kg_m3 is None:
         volumes = [float(mesh.volumes_m3[cells].sum()) for cells in claimed]
         known = [(r.density_kg_m3, v) for r, v in zip(regions, volumes, strict=True)]

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse.linalg import splu
 
 from ..common.array_types import Array, Index
+from ..common.checked_arrays import float_array
 from ..errors import InputError, SimulationError
 from .laws.materials import Material
 from .meshes.mesh import ElementNodes
@@ -120,8 +121,8 @@ class UnderGravity:
 
     def __post_init__(self) -> None:
         try:
-            gravity = np.array(self.gravity_m_s2, dtype=float)
-        except (TypeError, ValueError):
+            gravity = float_array(self.gravity_m_s2, "gravity_m_s2", (3,))
+        except InputError:
             gravity = np.zeros(0)
         valid = gravity.shape == (3,) and bool(np.isfinite(gravity).all())
         if not valid or not 0 < np.linalg.norm(gravity) <= LARGEST_GRAVITY_M_S2:

@@ -16,12 +16,15 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.validated_types import Finite, Positive
+from ..common.checked_arrays import float_array
+from ..common.checked_calls import checked, validate_as
+from ..common.validated_types import Finite, Positive, Text
 from ..errors import InputError, hint_at
 from ..fem.body import Body
 from ..fem.laws.constants import (
@@ -40,6 +43,7 @@ from ..fem.laws.moduli import ENGINEERING, engineering_constants
 from .generated_functions import GeneratedFunction
 
 
+@checked
 @dataclass(frozen=True)
 class Unknown:
     """Parameter to estimate, as stated by the user; omitted values follow from its constant.
@@ -64,7 +68,7 @@ class Unknown:
     guess: Finite | None = None
     lower: Finite | None = None
     upper: Finite | None = None
-    prior: tuple[float, float] | None = None
+    prior: tuple[Finite, Positive] | None = None
     scale: Scale | None = None
     typical: Positive | None = None
 
@@ -73,6 +77,7 @@ class Unknown:
 PARAMETER_KEYS = (*(field.name for field in fields(Unknown)), "fixed", "tied_to", "ratio")
 
 
+@checked
 @dataclass(frozen=True)
 class Tied:
     """Parameter that is a fixed multiple of another parameter.
@@ -85,10 +90,11 @@ class Tied:
         Value of this parameter divided by that of the other.
     """
 
-    to: str
-    ratio: float = 1.0
+    to: Text
+    ratio: Finite = 1.0
 
 
+@checked
 @dataclass(frozen=True)
 class Parameter:
     """Complete definition of a scalar parameter of a problem, or of one component of a vector.
@@ -122,7 +128,7 @@ class Parameter:
         prior.
     """
 
-    name: str
+    name: Text
     guess: float | None
     lower: float = 0.0
     upper: float = np.inf
@@ -389,6 +395,7 @@ class FieldCoefficients:
     components: tuple[Parameter, ...]
 
 
+@checked
 @dataclass(frozen=True)
 class Parameters:
     """All parameters of a problem.
@@ -465,6 +472,8 @@ class Parameters:
         InputError
             See `complete_parameter` and `Parameters`.
         """
+        for name, value in statements.items():
+            validate_as(Unknown | Tied | float, value, f"the parameter {name!r}")
         known = definitions or {}
         # A parameter without the name of a region applies to all regions that have the constant.
         shared = {without_region(name): known[name] for name in known}
@@ -973,12 +982,15 @@ def resolve_theta(
     """
     if isinstance(values, Parameters):
         return body.theta_from_values(values.guesses)
+    if hasattr(values, "to_dict"):  # a row of a table of pandas
+        values = cast(Any, values).to_dict()
     if isinstance(values, Mapping):
         Parameters.from_mapping(values, definitions=body.constants).require_constants_of([body])
         return body.theta_from_values(values)
-    if len(values) != len(body.constants):
+    theta = float_array(values, "the parameters", (None,))
+    if len(theta) != len(body.constants):
         raise InputError(
-            f"{len(values)} parameters given, expected {len(body.constants)}: "
+            f"{len(theta)} parameters given, expected {len(body.constants)}: "
             f"{', '.join(body.constants)}"
         )
-    return np.array(values, dtype=float)
+    return theta

@@ -155,6 +155,8 @@ def as_scheme(scheme_or_name: str | Scheme, start_rule: str = "standard") -> Sch
     if isinstance(scheme_or_name, str) and scheme_or_name not in SCHEMES:
         raise InputError(f"no scheme {scheme_or_name!r}; available: {', '.join(SCHEMES)}")
     scheme = SCHEMES[scheme_or_name] if isinstance(scheme_or_name, str) else scheme_or_name
+    if not isinstance(scheme, Scheme):
+        raise InputError(f"scheme is {scheme!r}; expected one of {', '.join(SCHEMES)}, or a Scheme")
     if start_rule == "standard":
         return scheme
     if start_rule != "paper":

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..common.declarations import declaration, key
+from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.laws.constants import with_undamped
@@ -44,6 +45,12 @@ def _as_parameters(
     """
     if isinstance(parameters, Parameters):
         return parameters
+    if not isinstance(parameters, Mapping):
+        kind = type(parameters).__name__
+        raise InputError(
+            f"parameters of the problem are a {kind}; expected a table of names with a number (a "
+            "known value) or Unknown(), such as {'mu_pa': Unknown()}"
+        )
     definitions = {
         name: constant for each in experiments for name, constant in each.body.constants.items()
     }
@@ -98,19 +105,19 @@ class Problem:
         implausible size or density.
     """
 
-    experiments: tuple[Experiment, ...] = key(converter=tuple[Experiment, ...])
+    experiments: tuple[Experiment, ...]
     parameters: Parameters = key(converter=_unconverted)
     _: KW_ONLY
     scheme: str | Scheme = "midpoint"
-    substeps: int | Literal["auto"] = "auto"
+    substeps: int | Literal["auto"] = key(Substeps | Literal["auto"], default="auto")
     explicit_grasps: bool = False
-    huber: float | None = None
+    huber: float | None = key(Positive | None, default=None)
     method: str | Method = "reduced-space"
     methods: Mapping[str, Method] = key(converter=dict[str, Method], default_factory=dict)
     rollout: RolloutOptions = field(default_factory=RolloutOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
     title: str = ""
-    notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
+    notes: tuple[str, ...] = ()
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
@@ -296,6 +303,10 @@ class Problem:
         elif isinstance(chosen, str):
             require_method(chosen, "method")
             chosen = METHODS[chosen]()
+        if not callable(chosen):
+            raise InputError(
+                f"method is {chosen!r}; expected one of {', '.join(METHODS)}, or a method"
+            )
         if isinstance(chosen, InteriorPoint):
             # Validation recordings are only simulated forward, by the energies of obstacles.
             chosen.require(each for each in self.experiments if not each.validation)
@@ -314,11 +325,6 @@ class Problem:
             raise InputError("there is no experiment; expected at least one")
         if repeated := sorted({name for name in names if names.count(name) > 1}):
             raise InputError(f"two experiments are named {repeated[0]!r}; expected different names")
-        if isinstance(self.substeps, str) and self.substeps != "auto":
-            raise InputError(
-                f"found {self.substeps!r}; expected a whole number or 'auto'",
-                where="transcription.substeps",
-            )
         if self.choose_first_substeps() != 1 and all(each.is_static for each in self.experiments):
             raise InputError(
                 f"found {self.substeps}, but every experiment is static, and there are no time steps "

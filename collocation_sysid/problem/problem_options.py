@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ..common.validated_classes import validated
-from ..common.validated_types import Positive, Text
+from ..common.validated_types import Flag, Positive, Text
 from ..fem.body import Body
 from ..model.parameters import Parameters
 from ..statistics.budget.shape_error import CORRELATION
@@ -58,7 +58,7 @@ class UncertaintyOptions(ErrorModel):
     """
 
     profile: tuple[Text, ...] = ()
-    numerical: bool = False
+    numerical: Flag = False
     assumptions: Annotated[Assumptions, ExactIfNone()] = field(default_factory=Assumptions)
     surface_correlation: Positive = CORRELATION
 

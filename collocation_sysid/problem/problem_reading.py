@@ -12,7 +12,7 @@ from typing import Any
 import tomli_w
 from pydantic import ValidationError
 
-from ..common.files import require_regular
+from ..common.files import require_regular, require_size
 from ..errors import InputError, excerpt, located
 from .schema import ProblemFile
 from .validation_messages import explain_validation_error
@@ -110,6 +110,10 @@ def _beyond_limits(error: Exception) -> str:
     return "an integer has too many digits; expected fewer than 4,300"
 
 
+# Largest file that is written by hand [bytes].
+LARGEST_BYTES = 10_000_000
+
+
 def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
     """Return the text of a file (UTF-8), without a byte order mark.
 
@@ -126,6 +130,7 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
         If the file does not exist or is not a text file.
     """
     require_regular(path)
+    require_size(path, LARGEST_BYTES)
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:

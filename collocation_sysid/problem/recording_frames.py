@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
+from ..common.checked_arrays import point_text
 from ..errors import InputError, hint_at, located
-from ..recording.checked_arrays import point_text
 from ..recording.experiment import EARTH_M_S2
 from ..recording.formats.log_frames import LogFrames, TopicFrames, topic_frames
 from ..recording.formats.logs import TopicAddress

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.checked_arrays import point_text
 from ..common.declarations import keys_of
 from ..common.schema_tables import declared_in
 from ..errors import InputError, hint_at, located
@@ -36,7 +37,6 @@ from ..recording import (
     read_wrench,
 )
 from ..recording.alignment import AlignedRecording
-from ..recording.checked_arrays import point_text
 from ..recording.formats.logs import stored_files
 from ..recording.gap_interpolation import interpolation_error
 from ..recording.poses import require_determined_motion

@@ -40,9 +40,11 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..common.array_types import Array, Index
+from ..common.checked_calls import checked
+from ..common.validated_types import Positive, Substeps
 from ..errors import InputError
 from ..model.parameters import Parameters
-from ..model.schemes import Scheme
+from ..model.schemes import Scheme, as_scheme
 from ..recording.experiment import Experiment
 from .association import Association
 from .experiment_iterate import ExperimentIterate
@@ -109,6 +111,7 @@ class Violation:
         )
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Collocation:
     """Values and derivatives of the collocation program of one or several experiments.
@@ -142,9 +145,9 @@ class Collocation:
     experiments: Sequence[Experiment]
     parameters: Parameters
     scheme: str | Scheme = "midpoint"
-    substeps: int = 1
+    substeps: Substeps = 1
     has_grasp_constraints: bool = False
-    huber: float | None = None
+    huber: Positive | None = None
     associations: Mapping[str, Association] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -153,12 +156,7 @@ class Collocation:
                 "every experiment is for validation, so that none is left for the fit; expected at "
                 "least one without validation = true"
             )
-        if self.substeps < 1:
-            raise InputError(f"substeps = {self.substeps}, expected at least 1")
-        if self.huber is not None and not self.huber > 0:
-            raise InputError(
-                f"huber = {self.huber:g}, expected a positive number", None, where="solver"
-            )
+        as_scheme(self.scheme)  # refuses an unknown one
         # Building the transcriptions checks what experiments share.
         self.parameters.require_constants_of(
             {id(s.body): s.body for s in self.transcriptions}.values()

@@ -17,6 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
+from ..common.checked_arrays import float_array
+from ..common.checked_calls import checked
+from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, SimulationError
 from ..fem.laws.constants import with_undamped
 from ..model.dynamics import Dynamics
@@ -119,12 +122,13 @@ def require_steps(experiment: Experiment, step_s: float) -> None:
         )
 
 
+@checked
 def simulate(
     experiment: Experiment,
     parameters: Parameters | Mapping[str, float] | Sequence[float] | Array,
     integrator: str | Scheme = NEWMARK,
-    timestep_s: float | None = None,
-    substeps: int | Literal["auto"] = "auto",
+    timestep_s: Positive | None = None,
+    substeps: Substeps | Literal["auto"] = "auto",
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
 ) -> Trajectory:
@@ -202,12 +206,6 @@ def _steps_per_sample(
     substeps: int | Literal["auto"],
 ) -> int | Literal["auto"]:
     """Return the time steps between samples, 1 in a static experiment; arguments as in `simulate`."""
-    if timestep_s is not None and not timestep_s > 0:
-        raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
-    if isinstance(substeps, str) and substeps != "auto":
-        raise InputError(f"substeps = {substeps!r}, expected a whole number or 'auto'")
-    if isinstance(substeps, int) and substeps < 1:
-        raise InputError(f"substeps = {substeps}, expected at least 1")
     if experiment.is_static:
         return 1
     if integrator != NEWMARK or timestep_s is None:
@@ -393,15 +391,12 @@ def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experi
     return replace(experiment, readings=readings)
 
 
+@checked
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
     """Return the experiment with other marker tracks (T, M, 3) [m] at its samples; raise InputError
     for another shape.
     """
-    tracks = np.asarray(positions_m, dtype=float)
-    if tracks.shape != experiment.markers.positions_m.shape:
-        raise InputError(
-            f"marker tracks have shape {tracks.shape}, "
-            f"expected {experiment.markers.positions_m.shape}"
-        )
+    shape = experiment.markers.positions_m.shape
+    tracks = float_array(positions_m, "marker tracks", shape, finite=False)
     markers = experiment.markers
     return replace(experiment, markers=markers.with_samples(markers.t_s, tracks))

@@ -25,8 +25,7 @@ one time grid, sample times, samples of lost or jittered frames, interpolation b
 samples, rigid fits. `experiment_refinement` and
 `experiment_coarsening` move an experiment to a finer or coarser mesh by `experiment_on_body`,
 `grasp_rotation` finds the fastest rotation of its grasps, `measurement_selection` copies it with a
-part of its measurements, and `checked_arrays` and `node_selection` check arrays and node
-selections.
+part of its measurements, and `node_selection` checks selections of nodes.
 """
 
 from .alignment import align as align

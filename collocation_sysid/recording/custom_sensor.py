@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array
+from ..common.checked_arrays import float_array, read_only_floats, unconverted, unconverted_or_none
 from ..common.declarations import declaration, identity, key
 from ..common.files import reason
 from ..common.schema_tables import Vector
 from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
-from .checked_arrays import read_only_floats, unconverted, unconverted_or_none
 from .measurement import Measurement
 from .poses import Frame
 from .sample_times import first_unordered_time
@@ -137,7 +137,9 @@ class CustomSensor(Measurement):
         """Return the measured values as a read-only array (S, m), NaN where missing."""
         where = f"the reading '{self.name}'"
         samples = len(self.sample_times_s)
-        columns = np.array(measured, dtype=float)
+        columns = float_array(
+            measured, f"values of {where}", ((samples,), (samples, None)), finite=False
+        )
         columns = columns[:, None] if columns.ndim == 1 else columns
         values = read_only_floats(columns, (samples, None), name=f"values of {where}", finite=False)
         if np.isinf(values).any():

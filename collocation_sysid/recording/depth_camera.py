@@ -6,20 +6,22 @@ converted to points when they are read; clouds are points already.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal, cast
+from typing import Annotated, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from ..common.array_types import Array
-from ..common.declarations import declaration, identity, key
+from ..common.checked_arrays import float_array, read_only_floats, unconverted, unconverted_or_none
+from ..common.checked_calls import checked
+from ..common.declarations import declaration, key
 from ..common.schema_tables import Vector
-from ..common.validated_types import Finite, Positive
+from ..common.validated_types import AtLeastOne, Finite, Positive
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
-from .checked_arrays import read_only_floats, unconverted, unconverted_or_none
 from .measurement import Measurement
 from .node_selection import Nodes, selection_from_section
 from .poses import PoseSequence
@@ -31,6 +33,8 @@ PoseMatrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
 LARGEST_RELATIVE_JUMP = 0.02
 # Fixed-point iterations that invert the distortion; each gains two digits for usual lenses.
 UNDISTORTION_ITERATIONS = 12
+# Error of an inverted distortion above which the iteration counts as not converged [pixels].
+LARGEST_DISTORTION_ERROR_PX = 1.0
 # Largest number of images of a recording whose outlines are compared: they are stored in memory,
 # and one of 640 x 480 pixels takes 1.2 MB.
 MOST_OUTLINE_IMAGES = 40
@@ -138,8 +142,13 @@ class DepthCamera:
         """Return the points (P, 3) at depth z = 1 in the camera's frame that appear at the pixels
         (P, 2), u and v.
 
-        Distortion is inverted by `UNDISTORTION_ITERATIONS` steps of a fixed-point iteration,
-        without a check of convergence. The camera must have a matrix.
+        Distortion is inverted by `UNDISTORTION_ITERATIONS` steps of a fixed-point iteration. The
+        camera must have a matrix.
+
+        Raises
+        ------
+        InputError
+            If the iteration does not converge for a pixel.
         """
         rows = np.column_stack([pixels, np.ones(len(pixels))])
         distorted = np.asarray(np.linalg.solve(self.require_matrix(), rows.T).T, dtype=np.float64)
@@ -152,7 +161,14 @@ class DepthCamera:
             across = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
             down = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
             undistorted = (distorted[:, :2] - np.column_stack([across, down])) / radial[:, None]
-        return np.column_stack([undistorted, np.ones(len(undistorted))])
+        points = np.column_stack([undistorted, np.ones(len(undistorted))])
+        off_px = np.abs(self.distorted_pixels(points) - pixels) if len(self.distortion) else 0.0
+        if not np.all(off_px <= LARGEST_DISTORTION_ERROR_PX):
+            raise InputError(
+                f"distortion of a camera is {self.distortion.tolist()}, which cannot be inverted "
+                "within the image; expected k1, k2, p1, p2, k3 of a calibration, in this order"
+            )
+        return points
 
     def distorted_pixels(self, points_m: Array) -> Array:
         """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, with
@@ -192,7 +208,9 @@ def _require_selection(faces: Selection | None) -> Selection | None:
 
 
 def _unconverted_clouds(clouds: Sequence[ArrayLike]) -> tuple[Array, ...]:
-    """Return the clouds unchanged, which `Depth` thins."""
+    """Return the clouds, which `Depth` checks and thins."""
+    if isinstance(clouds, str) or not isinstance(clouds, Iterable):
+        raise InputError(f"found {clouds!r}; expected a list of clouds (P, 3) of a depth camera")
     return cast(tuple[Array, ...], clouds)
 
 
@@ -256,7 +274,7 @@ class Depth(Measurement):
     t_s: Array = key(converter=unconverted)
     clouds: tuple[Array, ...] = key(converter=_unconverted_clouds)
     sigma_m: float = key(Positive)
-    camera: DepthCamera = key(converter=identity, default=DepthCamera())
+    camera: DepthCamera = key(default=DepthCamera())
     spacing_m: float = key(Positive, default=SPACING_M)
     gate_m: float = key(Positive, default=GATE_M)
     faces: Selection | None = key(
@@ -277,7 +295,11 @@ class Depth(Measurement):
                 f"{where} has {len(times)} times and {len(self.clouds)} images or clouds; expected one "
                 "image or cloud for each time"
             )
-        clouds = tuple(self._thin_cloud(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
+        shapes = ((None, 3), (None, 6))
+        clouds = tuple(
+            self._thin_cloud(float_array(cloud, f"a cloud of {where}", shapes, finite=False))
+            for cloud in self.clouds
+        )
         if not any(len(cloud) for cloud in clouds):
             raise InputError(f"{where} has no points; check its file and the unit of its depth")
         vars(self).update(t_s=times, clouds=clouds, images_m=self._check_images(len(times)))
@@ -300,11 +322,8 @@ class Depth(Measurement):
             if image is None:
                 images.append(None)
                 continue
-            depth = np.array(image, dtype=np.float32)
-            if depth.ndim != 2:
-                raise InputError(
-                    f"an image of {where} has the shape {depth.shape}; expected (rows, columns)"
-                )
+            what = f"an image (rows, columns) of {where}"
+            depth = float_array(image, what, (None, None), finite=False).astype(np.float32)
             depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
             images.append(depth)
         return tuple(images)
@@ -349,7 +368,9 @@ class Depth(Measurement):
         InputError
             If the camera has no matrix, or as `Depth` does.
         """
-        images = np.asarray(images_m, dtype=float)
+        what = f"images_m of the depth camera '{name}'"
+        shapes = ((None, None), (None, None, None))
+        images = float_array(images_m, what, shapes, finite=False)
         images = images[None] if images.ndim == 2 else images
         clouds = [points_from_image(image, camera) for image in images]
         outlined = samples_with_outlines(len(images))
@@ -505,7 +526,14 @@ def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
     return camera.points_at_unit_depth(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
 
 
-def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array) -> Array:
+# Rows and columns of an image.
+_ImageSize = Annotated[AtLeastOne, Field(le=20_000)]
+
+
+@checked
+def depth_image(
+    camera: DepthCamera, shape: tuple[_ImageSize, _ImageSize], triangles_m: Array
+) -> Array:
     """Render a depth image [m] of opaque triangles, both sides of which are visible.
 
     Parameters
@@ -523,6 +551,7 @@ def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array)
         Depth z of the nearest triangle at the centre of each pixel, which has whole coordinates;
         NaN where there is none.
     """
+    triangles_m = float_array(triangles_m, "triangles_m", (None, 3, 3))
     image = np.full(shape, np.inf)
     for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:
         pixels = camera.undistorted_pixels(corners)

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
-from ..common.declarations import declaration, identity_or_none, key
+from ..common.checked_arrays import float_converter, read_only_floats
+from ..common.declarations import declaration, key
 from ..common.schema_tables import Vector
 from ..common.validated_types import Flag, NotNegative
 from ..errors import InputError
 from .actuator import Actuator
-from .checked_arrays import float_converter, read_only_floats
 from .custom_sensor import CustomSensor
 from .depth_camera import Depth
 from .environment import air_density, usual_air_density
@@ -29,6 +29,7 @@ from .measured_wrench import Wrench
 from .measurement import SENSORS, Measurement, sensor_fields
 from .nuisance import Nuisance
 from .obstacle import Obstacle, with_obstacle_frames
+from .placement import require_body
 from .pressure import Pressure
 from .sample_times import STEP_TOLERANCE, TIME_TOLERANCE_S, first_unordered_time, sample_interval_s
 from .tendon import Tendon
@@ -121,10 +122,10 @@ class Experiment:
         If any of this does not hold, naming the experiment.
     """
 
-    body: Body
+    body: Body = key(converter=require_body)
     t_s: Array = key(converter=float_converter((None,), "t_s"))
-    grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
-    markers: Markers = key(converter=identity_or_none, default=None)
+    grasps: tuple[Grasp, ...]
+    markers: Markers = key(default=None)
     gravity_m_s2: Array = key(
         Vector, converter=float_converter((3,), "gravity_m_s2"), default=EARTH_M_S2
     )
@@ -138,14 +139,12 @@ class Experiment:
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
     frames_fault: str = ""
-    masses: tuple[PointMass, ...] = key(converter=tuple, default=())
-    forces: tuple[Force, ...] = key(converter=tuple, default=())
-    tendons: tuple[Tendon, ...] = key(converter=tuple, default=())
-    pressures: tuple[Pressure, ...] = key(converter=tuple, default=())
-    readings: tuple[CustomSensor, ...] = key(
-        converter=tuple[CustomSensor, ...], default=(), metadata=SENSORS
-    )
-    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=(), metadata=SENSORS)
+    masses: tuple[PointMass, ...] = ()
+    forces: tuple[Force, ...] = ()
+    tendons: tuple[Tendon, ...] = ()
+    pressures: tuple[Pressure, ...] = ()
+    readings: tuple[CustomSensor, ...] = key(default=(), metadata=SENSORS)
+    depths: tuple[Depth, ...] = key(default=(), metadata=SENSORS)
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
     specimen: HomogeneousDeformation | None = None

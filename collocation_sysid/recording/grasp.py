@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
+from ..common.checked_arrays import float_array
 from ..common.declarations import declaration, key
 from ..common.time_dependence import at_times
 from ..common.validated_types import Finite, NotNegative
@@ -32,8 +33,13 @@ Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
 
 def _unconverted_poses(poses: PoseSequence | ArrayLike) -> PoseSequence:
-    """Return the poses unchanged; matrices (T, 4, 4) are converted when their times are known."""
-    return cast(PoseSequence, poses)
+    """Return poses unchanged, and matrices (T, 4, 4) as an array: they are converted when their
+    times are known.
+    """
+    if isinstance(poses, PoseSequence):
+        return poses
+    matrices = float_array(poses, "poses of a grasp", (None, 4, 4), finite=False)
+    return cast(PoseSequence, matrices)
 
 
 @declaration

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
+from ..common.checked_arrays import as_array, float_array, read_only_floats
 from ..common.declarations import Key, declaration, key
 from ..common.schema_tables import Vector
 from ..common.validated_types import Finite, Positive, Text
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
-from .checked_arrays import read_only_floats
 from .node_selection import Nodes, node_converter, select_on_body, selection_from_section
 from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 from .time_tables import read_forces
@@ -54,8 +54,8 @@ class TimeSeries:
     def __init__(
         self, values: ArrayLike, t_s: ArrayLike | None, what: str, shape: tuple[int, ...] = ()
     ) -> None:
-        rows = np.reshape(values, (-1, *shape)) if np.ndim(values) <= len(shape) else values
-        rows = read_only_floats(rows, (None, *shape), name=what)
+        rows = float_array(values, what, (shape, (None, *shape)))
+        rows = read_only_floats(rows.reshape(-1, *shape), (None, *shape), name=what)
         if t_s is None and len(rows) != 1:
             raise InputError(f"{len(rows)} rows of {what} without times; expected t_s")
         if t_s is not None:
@@ -197,6 +197,11 @@ _TABLE = Key(
 )
 
 
+def _as_rows(values: ArrayLike) -> Array:
+    """Return a force (3,), or forces (T, 3), as rows."""
+    return np.atleast_2d(as_array(values))
+
+
 @declaration
 class Force(Load):
     """A force on nodes besides gravity.
@@ -223,8 +228,8 @@ class Force(Load):
     """
 
     nodes: Index = key(Nodes, converter=node_converter("the force"), read=selection_from_section)
-    force_n: Array = key(Vector | None, converter=np.atleast_2d)
-    t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
+    force_n: Array = key(Vector | None, converter=_as_rows)
+    t_s: Array | None = key(_TABLE, converter=as_array, default=None)
     selection: Selection | None = None
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)

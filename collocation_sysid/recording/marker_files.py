@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.checked_arrays import float_converter, read_only_coordinates
 from ..common.declarations import declaration, key
 from ..common.time_dependence import over_time
 from ..errors import InputError, hint_at, listed
-from .checked_arrays import float_converter, read_only_coordinates
 from .formats import c3d, motive, plain_csv, qualisys, trc
 from .formats.raw_tracks import LabelChooser, RawTracks
 from .formats.text import decode, names_file_in_errors, read_bytes

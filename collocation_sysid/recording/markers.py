@@ -12,11 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index, root_mean
-from ..common.declarations import Key, declaration, identity, identity_or_none, key
+from ..common.checked_arrays import (
+    as_array,
+    float_array,
+    float_converter,
+    read_only_coordinates,
+    read_only_floats,
+)
+from ..common.declarations import Key, declaration, identity_or_none, key
 from ..common.time_dependence import over_time
 from ..common.validated_types import Positive
 from ..errors import InputError
-from .checked_arrays import float_converter, read_only_coordinates, read_only_floats
 from .measurement import Measurement
 from .placement import AttachmentRule, LocatedBody, Placement, place_markers
 
@@ -33,6 +39,9 @@ UndeformedPlaces = Callable[[Array, Array], Array]
 
 Places = Literal["free", "surface"]
 _PLACES = Key("places", Places, read=lambda word: word == "surface")
+
+# Smallest standard deviation of a measured position [m]: a misspelt exponent is smaller.
+SMALLEST_SIGMA_M = 1e-12
 
 
 @declaration
@@ -89,17 +98,17 @@ class Markers(Measurement):
     instrument_text: ClassVar[str] = ""
 
     t_s: Array = key(converter=float_converter((None,), "t_s of the markers"), metadata=over_time())
-    positions_m: Array = key(converter=np.asarray, metadata=over_time())
-    sigma_m: Array = key(converter=np.asarray)
-    names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
-    places_m: Array | None = key(converter=np.asarray, default=None)
+    positions_m: Array = key(converter=as_array, metadata=over_time())
+    sigma_m: Array = key(converter=as_array)
+    names: tuple[str, ...] = key(default=None)
+    places_m: Array | None = key(converter=as_array, default=None)
     placement: Placement = key(converter=identity_or_none, default=None)
-    places_sigma_m: Array | None = key(converter=np.asarray, default=None)
-    on_surface: bool = key(_PLACES, converter=bool, default=False)
-    located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
+    places_sigma_m: Array | None = key(converter=as_array, default=None)
+    on_surface: bool = key(_PLACES, default=False)
+    located: NDArray[np.bool_] = key(converter=as_array, default=None)
     attach: AttachmentRule = key(AttachmentRule, default="auto")
-    max_distance_m: float | None = key(Positive | None, converter=identity, default=None)
-    offsets_s: Array | None = key(converter=np.asarray, default=None, metadata=over_time())
+    max_distance_m: float | None = key(Positive | None, default=None)
+    offsets_s: Array | None = key(converter=as_array, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
         """Check the markers and complete the fields, in place: names m1, m2, … by default, and
@@ -117,11 +126,14 @@ class Markers(Measurement):
             raise InputError(
                 f"the marker name '{repeated[0]}' is given more than once; expected different names"
             )
-        each = np.broadcast_to(self.sigma_m, m) if self.sigma_m.ndim == 0 else self.sigma_m
-        sigma_m = read_only_floats(each, (m,), name="sigma_m")
+        sigma_m = float_array(self.sigma_m, "sigma_m", ((), (m,)))
+        sigma_m = read_only_floats(np.broadcast_to(sigma_m, m), (m,), name="sigma_m")
         for name, sigma in zip(self.names, sigma_m, strict=True):
-            if not sigma > 0:
-                raise InputError(f"sigma_m of marker '{name}' is {sigma:g}; expected > 0")
+            if not sigma >= SMALLEST_SIGMA_M:
+                raise InputError(
+                    f"sigma_m of marker '{name}' is {sigma:g} m; expected > 0, and at least "
+                    f"{SMALLEST_SIGMA_M:g} m"
+                )
         vars(self).update(positions_m=tracks, sigma_m=sigma_m)
         if self.offsets_s is not None:
             offsets_s = read_only_floats(self.offsets_s, (len(self.t_s),), name="offsets_s")

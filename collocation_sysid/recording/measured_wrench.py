@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array
+from ..common.checked_arrays import float_array, float_converter, read_only_floats
 from ..common.declarations import declaration, key
 from ..common.schema_tables import Vector
 from ..common.time_dependence import over_time
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
-from .checked_arrays import float_converter, read_only_floats
 from .formats.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
 from .measurement import Measurement
 from .poses import Frame
@@ -36,7 +36,7 @@ def _with_torques(values: ArrayLike) -> Array:
     """Return values (S, 3) of forces with three more columns of NaN for torques; others
     unchanged.
     """
-    rows = np.array(values, dtype=float)
+    rows = float_array(values, "values of the wrench", ((None, 3), (None, 6)), finite=False)
     forces_alone = rows.ndim == 2 and rows.shape[1] == 3
     return np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows
 

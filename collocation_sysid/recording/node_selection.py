@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from pydantic import model_validator
 
 from ..common.array_types import Index
+from ..common.checked_arrays import read_only_nodes
 from ..common.schema_tables import ByForm, Corner, Section, Vector, require_one
 from ..common.validated_types import Positive, StrictInteger, Text
 from ..errors import InputError
 from ..fem.meshes.selection import Ball, Box, Face, FaceName, Indices, Named, Selection
-from .checked_arrays import read_only_nodes
 
 if TYPE_CHECKING:
     from ..fem.body import Body

@@ -15,7 +15,9 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.checked_calls import validate_as
 from ..common.field_descriptions import sentence, with_attributes
+from ..common.validated_types import Finite
 from ..errors import InputError, listed
 
 DEGREE = float(np.pi / 180)
@@ -876,6 +878,8 @@ class Nuisance:
                 )
         for row in self.list_kinds():
             value = self.sigma(row)
+            if value is not None:
+                value = validate_as(Finite, value, f"the standard deviation of {row.name!r}")
             if value is not None and not value > 0:
                 raise InputError(
                     f"the standard deviation of the nuisance parameter {row.name!r} is {value:g}; "

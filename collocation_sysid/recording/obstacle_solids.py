@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
+from ..common.checked_arrays import float_converter, point_text
 from ..common.declarations import declaration, key
 from ..common.schema_tables import Vector
 from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
-from .checked_arrays import float_converter, point_text
 
 # Added to squared distances [m²]: the square root has no derivative at zero.
 SMALLEST_SQUARE_M2 = 1e-24

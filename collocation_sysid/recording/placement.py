@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
+from ..common.checked_arrays import point_text, read_only_floats, read_only_nodes
+from ..common.checked_calls import checked
 from ..errors import InputError
-from .checked_arrays import point_text, read_only_floats, read_only_nodes
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -69,6 +70,14 @@ class Placement:
         vars(self).update(nodes=nodes, weights=weights, distance_m=distance)
 
 
+def require_body(body: Body) -> Body:
+    """Return a body, or what has nodes like one; raise an `InputError` for anything else."""
+    if not hasattr(body, "nodes_m"):
+        raise InputError(f"the body is a {type(body).__name__}; expected a Body")
+    return body
+
+
+@checked
 def place_markers(
     points_m: ArrayLike,
     node_positions_m: ArrayLike,
@@ -115,17 +124,13 @@ def place_markers(
             f"found {len(labels)} marker names for {len(points)} marker positions; expected one "
             "name for each position"
         )
-    if attach not in get_args(AttachmentRule):
-        raise InputError(
-            f"attach is {attach!r}; expected one of {', '.join(get_args(AttachmentRule))}"
-        )
     unplaced = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if unplaced.size:
         raise InputError(
             f"marker '{labels[unplaced[0]]}' has no sample from which its position on the body "
             "could be determined; give its reference_m"
         )
-    shape = LocatedBody(nodes_m, body)
+    shape = LocatedBody(nodes_m, require_body(body))
     snap_m = {"auto": VERTEX_SNAP_EDGES * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[
         attach
     ]

@@ -18,9 +18,9 @@ from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array, Index
+from ..common.checked_arrays import as_array, float_converter, read_only_floats
 from ..common.declarations import declaration, key
 from ..errors import InputError
-from .checked_arrays import float_converter, read_only_floats
 from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 
 Interpolation = Literal["smooth", "linear", "hold"]
@@ -77,8 +77,8 @@ class PoseSequence:
     """
 
     t_s: Array = key(converter=float_converter((None,), "t_s of the poses", finite=False))
-    positions_m: Array = key(converter=np.asarray)
-    quaternions_xyzw: Array = key(converter=np.asarray)
+    positions_m: Array = key(converter=as_array)
+    quaternions_xyzw: Array = key(converter=as_array)
     interpolation: Interpolation = key(Interpolation, default="smooth")
     first_motion: Array = key(
         converter=float_converter((4, 4), "first_motion of the poses"),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
+from ..common.checked_arrays import as_array
 from ..common.declarations import Key, declaration, key
 from ..common.validated_types import Finite, NotNegative, Text
 from ..errors import InputError
@@ -80,8 +81,8 @@ class Pressure(Actuator[EnclosedVolume]):
     """
 
     faces: Selection | Index = key(Nodes, converter=_checked_faces, read=selection_from_section)
-    pressure_pa: Array = key(Finite | None, converter=np.asarray)
-    t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
+    pressure_pa: Array = key(Finite | None, converter=as_array)
+    t_s: Array | None = key(_TABLE, converter=as_array, default=None)
     name: str = key(Text | None, default="pressure")
     _: KW_ONLY
     lag_s: float = key(NotNegative, default=0.0)

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
+from ..common.checked_arrays import read_only_floats, read_only_tracks
 from ..errors import InputError
-from .checked_arrays import read_only_floats, read_only_tracks
 from .marker_files import MarkerTable
 from .poses import PoseSequence
 from .sample_times import STEP_TOLERANCE

@@ -13,12 +13,12 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.checked_arrays import float_converter
 from ..common.declarations import declaration, key
 from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
 from ..fem.body import Body, Made
 from ..fem.laws.materials import DampingLaw, Energy, Material, Prony
-from .checked_arrays import float_converter
 from .custom_sensor import Gauge, GraspQuantities, PointQuantities
 from .experiment import Experiment
 from .grasp import Grasp

@@ -9,13 +9,13 @@ import numpy as np
 from pydantic import Field
 
 from ..common.array_types import Array
+from ..common.checked_arrays import as_array, float_converter, point_text
 from ..common.declarations import Key, declaration, key
 from ..common.schema_tables import Vector
 from ..common.validated_types import NotNegative, Text
 from ..errors import InputError
 from ..fem.shape import PolylineLength
 from .actuator import Actuator, BodyMeasure
-from .checked_arrays import float_converter, point_text
 from .loads import TimeSeries
 from .placement import LocatedBody
 from .time_tables import read_tension
@@ -62,8 +62,8 @@ class Tendon(Actuator[PolylineLength]):
         Annotated[list[Vector], Field(min_length=2)],
         converter=float_converter((None, 3), "points_m of the tendon"),
     )
-    tension_n: Array = key(NotNegative | None, converter=np.asarray)
-    t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
+    tension_n: Array = key(NotNegative | None, converter=as_array)
+    t_s: Array | None = key(_TABLE, converter=as_array, default=None)
     name: str = key(Text | None, default="tendon")
     _: KW_ONLY
     factor: float = 1.0

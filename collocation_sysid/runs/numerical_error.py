@@ -6,7 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
+from ..common.checked_calls import checked
 from ..common.step_counting import search_activity
+from ..common.validated_types import AtLeastOne
 from ..errors import InputError
 from ..fem.meshes.refinement import refine_body
 from ..methods.reduced_space import ReducedSpace
@@ -60,9 +62,10 @@ def finer_mesh(problem: Problem) -> Problem:
 REFINEMENTS = {"step": finer_step, "mesh": finer_mesh}
 
 
+@checked
 def refine(
     run: A,
-    levels: int = 2,
+    levels: AtLeastOne = 2,
     report_progress: Callable[[str], None] | None = None,
     watch: Watch | None = None,
 ) -> A:

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from ..common.array_types import Array
+from ..common.checked_calls import checked
 from ..common.step_counting import search_activity
 from ..errors import InputError
 from ..features.measurements import lost_samples
@@ -69,8 +70,9 @@ COARSE_TOLERANCE = 1e-4
 MOST_REREADINGS = 5
 
 
+@checked
 def solve(
-    problem: Problem,
+    problem: Problem | str | Path,
     method: str | Method | None = None,
     watch: Watch | None = None,
     start: str | Path | WarmStart | None = None,
@@ -89,8 +91,8 @@ def solve(
 
     Parameters
     ----------
-    problem : Problem
-        Problem to solve; not modified.
+    problem : Problem or path
+        Problem to solve, which is not modified, or its file.
     method : str or Method, optional
         A name, or a callable that solves a `Collocation`, such as a method with other options; the
         problem's own by default.
@@ -119,6 +121,8 @@ def solve(
         If the equations of motion are singular at a solution with a field whose correlation
         length or phases are searched.
     """
+    if not isinstance(problem, Problem):
+        problem = Problem.read(problem)
     for experiment in problem.experiments:
         experiment.require_measured_values()
     solver = problem.solver(method)

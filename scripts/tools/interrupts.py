@@ -1,9 +1,10 @@
 """Signals at random moments of `solve`: what is left, and with which exit code it ends.
 
-A small problem is solved once to measure its time. Then the command is started again and again, as a
-fork of this process so that its imports take no time, and gets SIGINT or SIGTERM in turn after a
-random part of that time. Right is the exit code 130 or 143 (0 if the command had ended before the
-signal), no traceback, and a run folder that is complete or absent, with nothing beside it.
+A small problem is solved once to measure its processor time. Then the command is started again and
+again, as a fork of this process so that its imports take no time, and gets SIGINT or SIGTERM in
+turn after a random part of that time, whatever else the machine does (on Linux). Right is the exit
+code 130 or 143 (0 if the command had ended before the signal), no traceback, and a run folder that
+is complete or absent, with nothing beside it.
 
     python scripts interrupts --problem problem.toml --count 60
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import resource
 import signal
 import sys
 import tempfile
@@ -33,14 +35,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     draw = random.Random(options.seed)
+    # A shell ignores SIGINT in what it runs in the background, and so would the forks.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(scratch)
         with contextlib.suppress(SystemExit):  # imports all, and compiles the kernels
             solve(options.problem, place / "first")
-        start = time.monotonic()
         wait_for(start_solve(options.problem, place / "timed"))
-        duration_s = time.monotonic() - start
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        duration_s = usage.ru_utime + usage.ru_stime
         print(f"one solve takes {duration_s:.1f} s")
         for k in range(options.count):
             folder = place / str(k)
@@ -48,8 +52,7 @@ def main() -> None:
             process = start_solve(options.problem, folder)
             number = (signal.SIGINT, signal.SIGTERM)[k % 2]
             moment_s = draw.uniform(0.0, duration_s)
-            time.sleep(moment_s)
-            ended = os.waitid(os.P_PID, process, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+            ended = wait_until(moment_s, process)
             os.kill(process, number)
             code = wait_for(process)
             outcome = describe(code, folder, ended=ended)
@@ -89,6 +92,16 @@ def start_solve(problem: Path, folder: Path) -> int:
                 stream.flush()
             os._exit(code)
     return process
+
+
+def wait_until(moment_s: float, process: int) -> bool:
+    """Wait until a process has used a processor time, or has ended; return whether it has ended."""
+    while os.waitid(os.P_PID, process, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        if int(words[11]) + int(words[12]) >= moment_s * os.sysconf("SC_CLK_TCK"):
+            return False
+        time.sleep(0.01)
+    return True
 
 
 def wait_for(process: int) -> int:

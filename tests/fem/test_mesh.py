@@ -127,7 +127,7 @@ def test_unconnected_parts_are_noted_with_coincident_nodes():
 @pytest.mark.parametrize(
     ("points", "tets", "message"),
     [
-        (CORNERS[:, :2], [[0, 1, 2, 3]], r"shape \(n, 3\), not \(4, 2\)"),
+        (CORNERS[:, :2], [[0, 1, 2, 3]], r"shape \(4, 2\); expected \(any, 3\)"),
         (CORNERS, [[0, 1, 2]], r"shape \(E, 4\) with E > 0, not \(1, 3\)"),
         (CORNERS, np.empty((0, 4), int), r"E > 0"),
         (CORNERS, [[0.0, 1.0, 2.0, 3.0]], "integer node indices from 0, not float64"),

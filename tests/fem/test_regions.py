@@ -362,7 +362,9 @@ def test_regions_that_overlap_are_refused_with_a_cell(slab):
 def test_names_that_cannot_be_distinguished_are_refused(slab):
     with pytest.raises(InputError, match="two regions are named 'core'"):
         Body(slab, density_kg_m3=1.0, regions=[Region("core", [0]), Region("core", [1])])
-    for name in ("", "a.b", "a b"):
+    with pytest.raises(InputError, match="name is ''; expected a text that is not empty"):
+        Region("", [0])
+    for name in ("a.b", "a b"):
         with pytest.raises(InputError, match=r"the region's name is .*expected letters, digits"):
             Region(name, [0])
 
@@ -374,7 +376,7 @@ def test_names_that_cannot_be_distinguished_are_refused(slab):
             {"mass_kg": 1e-3},
             r"mass_kg is 0\.001; expected more than 0\.1 kg, the mass of the regions",
         ),
-        ({"density_kg_m3": 0.0}, "density_kg_m3 is 0; expected a positive"),
+        ({"density_kg_m3": 0.0}, "density_kg_m3 is 0; expected a number above 0"),
         ({}, "of density_kg_m3 and mass_kg; expected exactly one"),
     ],
 )
@@ -392,7 +394,7 @@ def test_a_mass_without_information_is_refused(slab):
 
 def test_a_regions_density_must_be_positive(slab):
     with pytest.raises(
-        InputError, match=r"region 'core'.*density_kg_m3 is -3; expected a positive number"
+        InputError, match=r"Region 'core': density_kg_m3 is -3; expected a number above 0"
     ):
         Body(slab, density_kg_m3=1.0, regions=[Region("core", [0], density_kg_m3=-3.0)])
 

@@ -434,7 +434,7 @@ def test_with_fixed_fixes_the_named_parameters():
     ("changes", "message"),
     [
         ({"guess": 5.0}, r"mu_pa: guess = 5, expected a value within \[10, 1000\]"),
-        ({"guess": np.nan}, "mu_pa: guess = nan"),
+        ({"guess": np.nan}, "Parameter 'mu_pa': guess is nan; expected a number"),
         ({"lower": 0.0}, "mu_pa: lower = 0, upper = 1000, expected 0 < lower < upper"),
         ({"lower": 1000.0, "guess": 1000.0}, "expected 0 < lower < upper"),
         (

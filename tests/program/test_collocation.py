@@ -215,7 +215,7 @@ def test_validation_experiments_are_left_out():
 def test_nothing_to_fit_is_refused():
     with pytest.raises(InputError, match="none is left for the fit"):
         Collocation([replace(swung(), validation=True)], GUESS)
-    with pytest.raises(InputError, match="substeps = 0, expected at least 1"):
+    with pytest.raises(InputError, match="substeps is 0; expected a number of at least 1"):
         Collocation([swung()], GUESS, substeps=0)
 
 

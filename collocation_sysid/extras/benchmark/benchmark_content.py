@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ...common.checked_arrays import require_shape
 from ...common.files import damage_refused, read_json, require_size
-from ...common.plain_arrays import require_shape
 from ...common.written_files import is_written_here
 from ...errors import InputError
 from .signals import RecordingSignals, Signal

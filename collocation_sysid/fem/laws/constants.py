@@ -10,8 +10,10 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar, get_args
+from typing import Literal, TypeVar
 
+from ...common.checked_calls import checked
+from ...common.validated_types import Finite, Positive, Text
 from ...errors import InputError
 
 Scale = Literal["log", "linear"]
@@ -29,6 +31,7 @@ _UNITS = {
 }
 
 
+@checked
 @dataclass(frozen=True)
 class Constant:
     """Definition of one constant of the model.
@@ -67,24 +70,19 @@ class Constant:
         a logarithmic constant is not positive.
     """
 
-    name: str
+    name: Text
     symbol: str = ""
     meaning: str = ""
     bounds: tuple[float, float] = (1e-6, 1e9)
     scale: Scale = "log"
-    typical: float | None = None
-    usual: float | None = None
+    typical: Positive | None = None
+    usual: Finite | None = None
     below: float = float("inf")
     at_least: float = -float("inf")
-    prior: tuple[float, float] | None = None
+    prior: tuple[Finite, Positive] | None = None
     widest: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.scale not in get_args(Scale):
-            raise InputError(
-                f"scale of the constant {self.name!r} is {self.scale!r}; expected one of "
-                f"{', '.join(get_args(Scale))}"
-            )
         lower, upper = self.bounds
         if not lower < upper or (self.scale == "log" and lower <= 0):
             zero = "0 < " if self.scale == "log" else ""

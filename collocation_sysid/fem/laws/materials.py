@@ -30,7 +30,9 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
+from ...common.checked_calls import checked
 from ...common.files import reason
+from ...common.validated_types import Text
 from ...errors import InputError, hint_at
 from ..chain_rule import ChainRule
 from ..kernel import from_lower_triangle
@@ -45,6 +47,7 @@ Energy = Callable[..., ca.SX]
 REST_TOLERANCE = 1e-9
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Material:
     """Strain-energy density with its constants.
@@ -58,7 +61,7 @@ class Material:
         Constants in the order of θ.
     """
 
-    name: str
+    name: Text
     energy: Energy = field(repr=False)
     constants: tuple[Constant, ...]
 
@@ -335,6 +338,11 @@ def as_material(material: str | Energy | Material) -> Material:
     """
     if isinstance(material, Material):
         return material
+    if not isinstance(material, str) and not callable(material):
+        raise InputError(
+            f"material is {material!r}; expected one of {', '.join(MATERIALS)}, a Material, or an "
+            "energy function"
+        )
     return (
         _look_up("material", material, table=MATERIALS)
         if isinstance(material, str)
@@ -344,8 +352,9 @@ def as_material(material: str | Energy | Material) -> Material:
 
 def _look_up(kind: str, name: str, table: Mapping[str, T]) -> T:
     """Return the entry of a table by name, or raise an `InputError` that lists the known names."""
-    if name not in table:
-        raise InputError(f"no {kind} {name!r}; available: {', '.join(table)}{hint_at(name, table)}")
+    if not isinstance(name, str) or name not in table:
+        hint = hint_at(str(name), table)
+        raise InputError(f"no {kind} {name!r}; available: {', '.join(table)}{hint}")
     return table[name]
 
 
@@ -355,6 +364,7 @@ Stress = Callable[..., tuple[ca.SX, ca.SX]]
 TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class DampingLaw:
     """Damping law: a potential, or a stress.
@@ -386,7 +396,7 @@ class DampingLaw:
     `damping_admissibility`.
     """
 
-    name: str
+    name: Text
     constants: tuple[Constant, ...]
     potential: Potential | None = field(default=None, repr=False)
     stress: Stress | None = field(default=None, repr=False)
@@ -490,11 +500,12 @@ def as_damping(damping: str | DampingLaw) -> DampingLaw:
     InputError
         If there is no damping law of that name.
     """
-    return (
-        damping if isinstance(damping, DampingLaw) else _look_up("damping", damping, table=DAMPINGS)
-    )
+    if isinstance(damping, DampingLaw):
+        return damping
+    return _look_up("damping", damping, table=DAMPINGS)
 
 
+@checked
 @dataclass(frozen=True)
 class Prony:
     """Branch of the memory: a spring of `share` times the stiffness in series with a dashpot.
@@ -505,7 +516,7 @@ class Prony:
         Prefix of the names of its constants: ``prony_1.share``, ``prony_1.tau_s``.
     """
 
-    name: str
+    name: Text
 
     def __post_init__(self) -> None:
         if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():

@@ -107,6 +107,10 @@ class TetMesh:
     ) -> None:
         raw_points = checked_points(points_m)
         elements = checked_tetrahedra(tetrahedra, len(raw_points))
+        for arrays_by_name in (point_arrays, cell_arrays, face_sets):
+            if not isinstance(arrays_by_name, Mapping | None):
+                kind = type(arrays_by_name).__name__
+                raise InputError(f"arrays of a mesh are a {kind}; expected a mapping of names")
         arrays = checked_arrays(point_arrays or {}, len(raw_points), kind="point", of="nodes")
         element_arrays = checked_arrays(
             cell_arrays or {}, len(elements), kind="cell", of="elements"

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ...common.checked_arrays import float_array
 from ...errors import InputError
 from ..elements import EDGES
 
@@ -38,15 +39,7 @@ def checked_points(points_m: ArrayLike) -> np.ndarray:
     InputError
         If the values are not numbers, of another shape, or beyond `LARGEST_M`.
     """
-    try:
-        points = np.array(points_m, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(
-            "points_m cannot be converted to numbers; expected an (n, 3) array of coordinates in "
-            "metres"
-        ) from None
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points_m must have shape (n, 3), not {points.shape}")
+    points = float_array(points_m, "points_m", (None, 3), finite=False)
     if (np.abs(points) > LARGEST_M).any():
         raise InputError(
             f"a node lies {np.nanmax(np.abs(points)):.3g} m away from the origin; expected at most "

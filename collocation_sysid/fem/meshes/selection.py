@@ -13,6 +13,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from ...common.checked_calls import checked
+from ...common.validated_types import Positive, Text
 from ...errors import InputError, hint_at, require_among
 from .mesh import ElementNodes, TetMesh
 
@@ -113,6 +115,7 @@ class Box(_PositionSelection):
         return f"the box from ({low}) to ({high}) m"
 
 
+@checked
 @dataclass(frozen=True)
 class Ball(_PositionSelection):
     """Selection of a ball, including its surface.
@@ -131,12 +134,12 @@ class Ball(_PositionSelection):
     """
 
     center_m: Sequence[float]
-    radius_m: float
+    radius_m: Positive
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center_m", _vector(self.center_m, "ball: center_m"))
-        if not _is_number(self.radius_m) or not self.radius_m > 0:
-            raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
+        if not np.isfinite(self.center_m).all():
+            raise InputError(f"ball: center_m is {self.center_m}; expected finite numbers")
 
     def _nearest_hint(self, points_m: np.ndarray) -> str:
         """Return the distance of the nearest node as a hint."""
@@ -156,6 +159,7 @@ class Ball(_PositionSelection):
         return f"the ball of radius {self.radius_m:g} m about ({center}) m"
 
 
+@checked
 @dataclass(frozen=True)
 class Face(_PositionSelection):
     """Selection of the nodes on an end or a plane side of the body, without stating a length.
@@ -306,6 +310,7 @@ class Indices:
         return _select_faces(chosen, mesh, what="the list of indices")
 
 
+@checked
 @dataclass(frozen=True)
 class Named:
     """Selection by a point array of the mesh, or for cells a cell array, of booleans or 0 and 1.
@@ -320,7 +325,7 @@ class Named:
         Name of the array or group.
     """
 
-    name: str
+    name: Text
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`; a mid node is
@@ -451,8 +456,9 @@ def _tolerance_m(points_m: np.ndarray) -> float:
 
 
 def _is_number(value: object) -> bool:
-    """Return whether a value is a number and not a boolean."""
-    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    """Return whether a value is a real number and not a boolean."""
+    is_real = isinstance(value, (int, float, np.integer, np.floating))
+    return is_real and not isinstance(value, bool)
 
 
 def _vector(values: Iterable[float], what: str) -> tuple[float, float, float]:

@@ -7,10 +7,15 @@ given numbers of elements.
 from __future__ import annotations
 
 from math import pi, sin, sqrt
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
+from ...common.checked_arrays import float_array
+from ...common.checked_calls import checked
+from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError
 from .mesh import TetMesh
 from .mesh_checks import orient_elements
@@ -19,6 +24,8 @@ from .mesh_checks import orient_elements
 _SECTORS = 8
 # Largest number of elements that are made: more follow from a wrong unit of the edge length.
 _MOST_ELEMENTS = 1_000_000
+# Number of parts along one direction.
+_Part = Annotated[AtLeastOne, Field(le=1_000)]
 
 
 def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
@@ -30,7 +37,7 @@ def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
     InputError
         For sizes or an edge length that are not positive, or more than a million elements.
     """
-    divisions = _divisions(np.asarray(size_m, dtype=float), edge_length_m)
+    divisions = _divisions(float_array(size_m, "size_m", (3,)), edge_length_m)
     _require_element_limit(6 * float(np.prod(divisions)))
     return box_mesh(size_m, divisions.astype(int))
 
@@ -155,15 +162,15 @@ def box_mesh(
     InputError
         For lengths or divisions that are not positive.
     """
-    size = np.asarray(size_m, dtype=float)
-    origin = np.asarray(origin_m, dtype=float)
-    cells = np.asarray(divisions)
-    if size.shape != (3,) or origin.shape != (3,) or not (size > 0).all():
+    size = float_array(size_m, "size_m", (3,))
+    origin = float_array(origin_m, "origin_m", (3,))
+    cells = float_array(divisions, "divisions", (3,)).astype(int)
+    if not (size > 0).all():
         raise InputError(
             f"found size_m = {size_m!r} and origin_m = {origin_m!r}; expected three positive "
             "lengths and three coordinates in metres"
         )
-    if cells.shape != (3,) or cells.dtype.kind not in "iu" or not (cells > 0).all():
+    if np.asarray(divisions).dtype.kind not in "iu" or not (cells > 0).all():
         raise InputError(f"a box needs three positive whole divisions, not {divisions!r}")
     ticks = [np.linspace(0, 1, n + 1) for n in cells]
     points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3) * size + origin
@@ -177,8 +184,9 @@ def box_mesh(
     return TetMesh(points, orient_elements(points, tetrahedra)[0], is_generated=True)
 
 
+@checked
 def cylinder_mesh(
-    radius_m: float, height_m: float, rings: int, layers: int, sectors: int = 6
+    radius_m: Positive, height_m: Positive, rings: _Part, layers: _Part, sectors: _Part = 6
 ) -> TetMesh:
     """Mesh an upright cylinder: axis z, base at z = 0.
 
@@ -204,14 +212,8 @@ def cylinder_mesh(
     Raises
     ------
     InputError
-        For lengths, rings or layers that are not positive.
+        For lengths, rings or layers that are not positive, or more than 1,000 of these.
     """
-    for name, value in (("radius_m", radius_m), ("height_m", height_m)):
-        if not 0 < value < np.inf:
-            raise InputError(f"a cylinder needs a positive {name}, not {value!r}")
-    for name, value in (("rings", rings), ("layers", layers)):
-        if not isinstance(value, (int, np.integer)) or value < 1:
-            raise InputError(f"a cylinder needs a whole number of {name}, 1 or more, not {value!r}")
     disc, triangles = _disc(rings, sectors)
     points = np.concatenate(
         [

@@ -17,8 +17,8 @@ import numpy as np
 
 from ...common.array_files import load_array, load_arrays
 from ...common.array_types import Array
+from ...common.checked_arrays import float_array
 from ...common.files import reason, require_regular, require_size
-from ...common.plain_arrays import float_array
 from ...errors import InputError, located
 from . import ply
 from .camera_messages import (
