@@ -123,7 +123,12 @@ def validate_as(annotation: Any, value: Any, name: str) -> Any:
     """Return a value as validated against an annotation that has a form, see `form_of`; raise an
     `InputError` about `name` if it is refused.
     """
-    return _converted(value, TypeAdapter(form_of(annotation, {})), name)
+    return _converted(value, _validator(annotation), name)
+
+
+@cache
+def _validator(annotation: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(form_of(annotation, {}))
 
 
 def _converted(value: Any, validator: TypeAdapter[Any], name: str) -> Any:

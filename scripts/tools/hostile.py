@@ -2,11 +2,13 @@
 
     nice -n 19 python scripts hostile [--count 100] [--seed 0] [--only toml urdf] [--keep FOLDER]
 
-A case is a small problem of the tests with one damaged file, and a command that reads this file.
-The damage is drawn at random from the seed, the kind and the number of the case: files are
-truncated, some of their bytes are replaced, repeated or exchanged, and values with a special
-meaning in the format are inserted. Each case is run in a separate process with limits of time and
-memory. Its outcome is
+A case is a small problem with one damaged file, and a command that reads this file. The damage is
+drawn at random from the seed, the kind and the number of the case: files are truncated, some of
+their bytes are replaced, repeated or exchanged, and values with a special meaning in the format are
+inserted. In files that are "changed", the format stays valid: keys, values, cells, columns, shapes
+and types of arrays are exchanged, for each kind of problem. `--quick` leaves out the simulations of
+`check`, which then only reads and describes the problem. Each case is run in a separate process
+with limits of time and memory. Its outcome is
 
     refused     exit code 2, one message of one line, and nothing written
     accepted    exit code 0 or 1
@@ -25,10 +27,12 @@ Only interrupted solves and those on a full disk draw pictures, which take most 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import ctypes
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -54,14 +58,17 @@ from kit import logs, problem_files
 from studies import markdown
 
 from collocation_sysid import cli
+from collocation_sysid.cli import problem_commands
+from collocation_sysid.errors import InputError
 from collocation_sysid.extras.export import TARGETS
 from collocation_sysid.fem.kernels import jit
 from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.formats import topics  # noqa: F401
-from collocation_sysid.result import run_record
+from collocation_sysid.result import check_sections, run_record, solve_progress  # noqa: F401
 from collocation_sysid.result.pictures import all_pictures  # noqa: F401
-from collocation_sysid.runs import check  # noqa: F401
+from collocation_sysid.runs.check import quick_check
 
 Rng = np.random.Generator
 OUTCOMES = ("refused", "accepted", "traceback", "unclear", "hang", "crash")
@@ -311,6 +318,146 @@ def _with_word(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
 DAMAGES = (_truncated, _replaced, _with_gap, _repeated, _zeros, _largest, _with_word, _with_word)
 
 
+# Changes within the format ------------------------------------------------------------------------
+
+# Values in place of those of a TOML file, cells in place of those of a table, and JSON values.
+TOML_VALUES = (
+    "true",
+    "-1",
+    "0",
+    "1e300",
+    "1e-300",
+    "nan",
+    "inf",
+    "-0.5",
+    "3.7",
+    "10",
+    "1000000000",
+)
+TOML_VALUES += ('""', '"x"', '"none"', '"../x.csv"', '"\\u0000"', "[]", "[1]", "[nan, 0, 0]", "{}")
+TOML_VALUES += ("[[1, 2], [3]]", "{ a = 1 }", '["a", 1]', "2024-01-01", "99999999999999999999")
+CELLS = (
+    "",
+    "x",
+    "nan",
+    "inf",
+    "-inf",
+    "1e300",
+    "-1",
+    "0",
+    "1e-300",
+    "1,5",
+    '"',
+    "0x10",
+    "1 2",
+    "é",
+)
+JSON_VALUES: tuple[Any, ...] = (None, True, -1, 0, 1e308, float("nan"), "", "x", [], {}, [[[]]])
+JSON_VALUES += ({"a": 1}, [1, "a"], 10**30, "../x", [0.0] * 1000)
+_TOKEN = re.compile(
+    r'"[^"\n]*"|\[[^\[\]\n]*\]|(?<![\w.])[-+]?\d[\w.+-]*|\btrue\b|\bfalse\b|[\w-]+(?=\s*=)'
+)
+
+
+def changed_toml(rng: Rng, content: bytes) -> bytes:
+    """Replace values and keys, and remove, repeat or exchange lines."""
+    lines = content.decode().splitlines()
+    for _ in range(rng.integers(1, 3)):
+        stated = [k for k, line in enumerate(lines) if line.strip() and line.strip()[0] != "#"]
+        k = int(rng.choice(stated or [0]))
+        tokens = [*_TOKEN.finditer(lines[k])]
+        action = rng.random()
+        if action < 0.8 and tokens:
+            token = tokens[int(rng.integers(len(tokens)))]
+            new = str(rng.choice(TOML_VALUES))
+            if token[0][0].isalpha() and token[0] not in ("true", "false"):
+                new = str(rng.choice(["x", token[0] + "s", token[0][:-1] or "y", "name", "file"]))
+            lines[k] = lines[k][: token.start()] + new + lines[k][token.end() :]
+        elif action < 0.9:
+            del lines[k]
+        elif action < 0.95:
+            lines.insert(k, lines[k])
+        else:
+            other = int(rng.choice(stated))
+            lines[k], lines[other] = lines[other], lines[k]
+    return "\n".join(lines).encode()
+
+
+def changed_table(rng: Rng, content: bytes) -> bytes:
+    """Replace cells, columns and rows of a table of text."""
+    rows = [line.split(",") for line in content.decode().splitlines()]
+    k, column = int(rng.integers(len(rows))), int(rng.integers(len(rows[-1])))
+    kind = rng.integers(9)
+    if kind < 3:
+        for row in rows[k : k + int(rng.integers(1, 4))]:
+            row[min(column, len(row) - 1)] = str(rng.choice(CELLS))
+    elif kind == 3:
+        rows = [[cell for c, cell in enumerate(row) if c != column] for row in rows]
+    elif kind == 4:
+        rows = rows[:k] + rows[k + int(rng.integers(1, 20)) :]
+    elif kind == 5:
+        rows[k:k] = rows[k : k + int(rng.integers(1, 20))]
+    elif kind == 6:
+        rows[k:] = rows[k:][::-1]
+    elif kind == 7:
+        names = ("t_s", "x", "x_m", "tip_x_m", "t_ms", "qw", "force_n", "", "9", rows[-1][column])
+        rows[0][min(column, len(rows[0]) - 1)] = str(rng.choice(names))
+    else:
+        factor = float(rng.choice([0.0, -1.0, 1e3, 1e-3, 1e6, 1e20, np.nan]))
+        for row in rows[1:]:
+            with contextlib.suppress(ValueError, IndexError):
+                row[column] = repr(factor * float(row[column]))
+    return "\n".join(",".join(row) for row in rows).encode()
+
+
+def changed_arrays(rng: Rng, content: bytes) -> bytes:
+    """Change the shape, the type or the values of an array of an .npz, or its name."""
+    with np.load(io.BytesIO(content)) as archive:
+        arrays: dict[str, Any] = dict(archive)
+    name = str(rng.choice(sorted(arrays)))
+    array = arrays[name]
+    kinds = [np.complex128, np.str_, bool, np.int8, np.float16, "datetime64[s]", "V8"]
+    actions: list[Callable[[], Any]] = [
+        lambda: array.reshape(-1),
+        lambda: array[None],
+        lambda: array[..., None],
+        lambda: array.T,
+        lambda: array.ravel()[:1].reshape(()),
+        lambda: array[:0],
+        lambda: array[: int(rng.integers(len(array) + 1))],
+        lambda: array[::-1],
+        lambda: array * float(rng.choice([0.0, -1.0, 1e3, 1e30, np.nan, np.inf])),
+        lambda: array.astype(float).astype(int).astype(kinds[int(rng.integers(len(kinds)))]),
+        lambda: np.zeros(rng.integers(0, 4, size=int(rng.integers(0, 5)))),
+    ]
+    action = int(rng.integers(len(actions) + 1))
+    if action == len(actions):
+        arrays[str(rng.choice(["x", "t_s", "points_m", "depth_m"]))] = arrays.pop(name)
+    else:
+        with np.errstate(all="ignore"):
+            arrays[name] = actions[action]()
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def changed_json(rng: Rng, content: bytes) -> bytes:
+    """Replace or remove a value of a JSON file, at any depth."""
+    root = json.loads(content)
+    node: Any = root
+    while True:
+        keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+        key = keys[int(rng.integers(len(keys)))]
+        if not isinstance(node[key], dict | list) or not node[key] or rng.random() < 0.15:
+            break
+        node = node[key]
+    if rng.random() < 0.2:
+        del node[key]
+    else:
+        node[key] = JSON_VALUES[int(rng.integers(len(JSON_VALUES)))]
+    return json.dumps(root).encode()
+
+
 # Damaged files ------------------------------------------------------------------------------------
 
 
@@ -325,13 +472,15 @@ class FileKind:
     make : callable
         Function that adds the files to the folder of a problem.
     file : str
-        Pattern of the file that is damaged.
+        Pattern of the file that is damaged; one is drawn if there are several.
     commands : tuple of command lines
         One of them is drawn for each case.
     words : tuple of bytes
         Words with a special meaning in the format.
-    whole : tuple of bytes
+    replacements : tuple of bytes
         Contents that replace the complete file in 20 % of the cases.
+    change : callable, optional
+        Change within the format, in place of damaged bytes.
     """
 
     name: str
@@ -340,6 +489,7 @@ class FileKind:
     commands: tuple[tuple[str, ...], ...] = (("check", "problem.toml"),)
     words: tuple[bytes, ...] = ()
     replacements: tuple[bytes, ...] = ()
+    change: Callable[[Rng, bytes], bytes] | None = None
 
     def run(self, cases: CaseSettings) -> Counter[str]:
         """Run all cases and count the outcomes; no case if the package that reads the format is
@@ -359,10 +509,13 @@ class FileKind:
                 if "No module named" in ended.err or "not installed" in ended.err:
                     return counts
                 raise RuntimeError(f"{self.name} is refused before it is damaged: {ended.err}")
-        (file,) = base.glob(self.file)
-        replacements = file.read_bytes()
+        with contextlib.suppress(InputError):  # validators are made here, not in each fork
+            quick_check(Problem.read(base / "problem.toml"))
+        files = sorted(base.glob(self.file))
         for number in range(cases.count):
             rng = cases.rng(self.name, number)
+            file = files[rng.integers(len(files))] if len(files) > 1 else files[0]
+            valid = file.read_bytes()
             folder = cases.folder / "case"
             shutil.copytree(base, folder)
             is_replaced = self.replacements and rng.random() < 0.2
@@ -370,7 +523,9 @@ class FileKind:
                 self.replacements[rng.integers(len(self.replacements))] if is_replaced else None
             )
             target = folder / file.relative_to(base)
-            target.write_bytes(content or damaged(rng, replacements, self.words))
+            if content is None and self.change is not None:
+                content = self.change(rng, valid)
+            target.write_bytes(damaged(rng, valid, self.words) if content is None else content)
             before = problem_files.contents(folder)
             words = self.commands[rng.integers(len(self.commands))]
             ended = run(words, folder, cases.limit_s)
@@ -379,6 +534,25 @@ class FileKind:
             cases.keep(self.name, number, folder, outcome, ended)
             shutil.rmtree(folder)
         return counts
+
+
+def _shipped(place: Path) -> Callable[[Path], object]:
+    """Return a function that replaces the problem by that of a folder of the package or of
+    `problems`.
+    """
+
+    def make(folder: Path) -> None:
+        for each in folder.iterdir():
+            each.unlink()
+        shutil.copytree(place, folder, dirs_exist_ok=True)
+
+    return make
+
+
+def _with_run(folder: Path) -> None:
+    problem_files.run_command(
+        "solve", folder / "problem.toml", *REDUCED, "-q", "--out", folder / "run"
+    )
 
 
 def _with_xdmf(folder: Path) -> None:
@@ -603,7 +777,43 @@ FILES = (
         words=(b"ascii", b"binary_compressed", b"FIELDS", b"F", *COUNTS),
     ),
 )
-
+ROOT = Path(__file__).resolve().parents[1]
+_TEMPLATES = ROOT / "collocation_sysid/problem/templates"
+_SHIPPED = {
+    "swing": _TEMPLATES / "swing",
+    "bench": _TEMPLATES / "compression",
+    "tensile test": _TEMPLATES / "tension",
+    "specimen": _TEMPLATES / "specimen",
+    "obstacle": ROOT / "problems/laid_block",
+    "wrench": ROOT / "problems/wrist_sensor",
+    "pressure": ROOT / "problems/pneumatic_arm",
+}
+_CHANGES = {".toml": changed_toml, ".csv": changed_table}
+FILES += tuple(
+    FileKind(f"{name}, changed {suffix}", _shipped(place), f"*{suffix}", change=change)
+    for name, place in _SHIPPED.items()
+    for suffix, change in _CHANGES.items()
+)
+FILES += (
+    FileKind(
+        "depth, changed NPZ", _with_depth("frame.npz", _npz), "frame.npz", change=changed_arrays
+    ),
+    FileKind("depth, changed .toml", _with_depth("frame.npz", _npz), "*.toml", change=changed_toml),
+    FileKind(
+        "run, changed JSON",
+        _with_run,
+        "run/result.json",
+        (("report", "run"), ("export", "run", "--to", "json")),
+        change=changed_json,
+    ),
+    FileKind(
+        "run, changed NPZ",
+        _with_run,
+        "run/trajectory.npz",
+        (("plot", "run"), ("export", "run", "--to", "json")),
+        change=changed_arrays,
+    ),
+)
 
 # Other kinds --------------------------------------------------------------------------------------
 
@@ -1021,9 +1231,23 @@ def main() -> None:
         default=30.0,
         help="processor time after which a case counts as a hang [s]",
     )
+    parser.add_argument("--quick", action="store_true", help="only read and describe the problems")
     parser.add_argument("--keep", type=Path, help="store the input of failures in this folder")
     arguments = parser.parse_args()
-    print(table(arguments.count, arguments.seed, arguments.only, arguments.limit_s, arguments.keep))
+    with (
+        mock.patch.object(problem_commands, "check_problem", _end)
+        if arguments.quick
+        else contextlib.nullcontext()
+    ):
+        print(
+            table(
+                arguments.count, arguments.seed, arguments.only, arguments.limit_s, arguments.keep
+            )
+        )
+
+
+def _end(*_: object, **__: object) -> None:
+    sys.exit(0)
 
 
 def table(
