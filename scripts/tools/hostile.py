@@ -1234,16 +1234,16 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="only read and describe the problems")
     parser.add_argument("--keep", type=Path, help="store the input of failures in this folder")
     arguments = parser.parse_args()
-    with (
-        mock.patch.object(problem_commands, "check_problem", _end)
-        if arguments.quick
-        else contextlib.nullcontext()
-    ):
-        print(
-            table(
-                arguments.count, arguments.seed, arguments.only, arguments.limit_s, arguments.keep
-            )
+    print(
+        table(
+            arguments.count,
+            arguments.seed,
+            arguments.only,
+            arguments.limit_s,
+            arguments.keep,
+            quick=arguments.quick,
         )
+    )
 
 
 def _end(*_: object, **__: object) -> None:
@@ -1251,7 +1251,12 @@ def _end(*_: object, **__: object) -> None:
 
 
 def table(
-    count: int, seed: int, only: Sequence[str], limit_s: float, failure_folder: Path | None = None
+    count: int,
+    seed: int,
+    only: Sequence[str],
+    limit_s: float,
+    failure_folder: Path | None = None,
+    quick: bool = False,
 ) -> str:
     """Run the cases, and return a table with the number of each outcome by kind.
 
@@ -1270,7 +1275,11 @@ def table(
             words = ("solve", "problem.toml", *REDUCED, "-q", "--out", "run")
             if (ended := run(words, solved, 10 * limit_s)).code not in (0, 1):
                 raise RuntimeError(f"the small problem is not solved: {ended.err}")
-        with mock.patch.object(run_record, "write_pictures"):
+        checked = _end if quick else problem_commands.check_problem
+        with (
+            mock.patch.object(run_record, "write_pictures"),
+            mock.patch.object(problem_commands, "check_problem", checked),
+        ):
             cases = CaseSettings(folder, problem, solved, count, seed, limit_s, failure_folder)
             for name in only:
                 began = time.monotonic()

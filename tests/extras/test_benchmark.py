@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from kit.problem_files import contents, run_command
 
+from collocation_sysid.common.written_files import list_files
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.benchmark import (
     BODIES,
@@ -120,6 +121,19 @@ def test_samples_that_were_not_measured_are_not_scored(written: Path):
     own = score(partial, "prediction", predicted=signals.simulated)
     assert own.count == complete.count - 4
     assert np.isfinite(own.rms)
+
+
+@pytest.mark.parametrize("role", ["measured", "simulated", "undeformed"])
+@pytest.mark.parametrize("is_shorter", [False, True])
+def test_a_table_of_the_folder_with_another_shape_is_refused(
+    folder: Path, role: str, is_shorter: bool
+):
+    file = folder / FOAM / f"swing_{role}.csv"
+    header, values = table(file)
+    write_table(file, header, values[:-1] if is_shorter else values[:, :-1])
+    list_files(folder)
+    with pytest.raises(InputError, match=r"the table swing_\w+\.csv has the shape .*; expected"):
+        score_benchmark(folder)
 
 
 @pytest.mark.parametrize("shape", ["columns", "points"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import signal
 from pathlib import Path
@@ -67,10 +69,32 @@ def test_damage_is_drawn_from_the_seed():
     assert len(others) > 40
 
 
+def test_changes_keep_the_format():
+    rng = np.random.default_rng(0)
+    table = b"t_s,tip_x_m\n0.0,1.0\n0.1,1.5\n0.2,2.0\n"
+    tables = {hostile.changed_table(rng, table) for _ in range(40)}
+    assert len(tables) > 20
+    content = b'{"a": [1, {"b": 2}], "c": {"d": "x"}}'
+    texts = {hostile.changed_json(rng, content) for _ in range(40)}
+    assert len(texts) > 10
+    assert all(json.loads(text) is not None for text in texts)
+    file = io.BytesIO()
+    np.savez(file, depth_m=np.ones((2, 3, 4)), t_s=np.arange(2.0))
+    shapes = set()
+    for _ in range(40):
+        with np.load(io.BytesIO(hostile.changed_arrays(rng, file.getvalue()))) as archive:
+            shapes.add(str({name: (a.shape, a.dtype.kind) for name, a in archive.items()}))
+    assert len(shapes) > 10
+    settings = {hostile.changed_toml(rng, b"# one\n[a]\nb = 1.5\nc = [1, 2]\n") for _ in range(40)}
+    assert len(settings) > 20
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("kind", list(hostile.KINDS))
 def test_no_case_ends_without_a_message(kind: str, tmp_path: Path):
-    table = hostile.table(2, seed=0, only=[kind], limit_s=60.0, failure_folder=tmp_path)
+    table = hostile.table(
+        2, seed=0, only=[kind], limit_s=60.0, failure_folder=tmp_path, quick="changed" in kind
+    )
     cells = [cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")]
     failures = dict(zip(hostile.OUTCOMES, cells[2:], strict=False))
     assert {name: failures[name] for name in ("traceback", "unclear", "hang", "crash")} == {

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.checked_arrays import require_shape
+from ...common.checked_arrays import float_array, require_shape
 from ...common.files import damage_refused, read_json, require_size
 from ...common.written_files import is_written_here
 from ...errors import InputError
@@ -131,7 +131,7 @@ def _read_signals(folder: Path, body: str, recording: Mapping[str, Any]) -> Reco
     )
     return RecordingSignals(
         measured,
-        np.array(recording["sigma"], dtype=np.float64),
+        float_array(recording["sigma"], "sigma", (len(measured.columns),)),
         simulated=measured.with_values(tables["simulated"][:, 1:]),
         undeformed=measured.with_values(tables["undeformed"][:, 1:]),
     )
