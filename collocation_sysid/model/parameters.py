@@ -24,7 +24,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array
 from ..common.checked_calls import checked, validate_as
-from ..common.validated_types import Finite, Positive, Text
+from ..common.validated_types import Boundless, Finite, Positive, Text
 from ..errors import InputError, hint_at
 from ..fem.body import Body
 from ..fem.laws.constants import (
@@ -135,7 +135,7 @@ class Parameter:
     is_fixed: bool = False
     prior: tuple[float, float] | None = None
     scale: Scale = "log"
-    unit: float = 1.0
+    unit: Boundless = 1.0
     tied: Tied | None = None
     stated_bounds: tuple[bool, bool] = field(default=(False, False), compare=False)
 

@@ -106,7 +106,8 @@ class CommandEnd:
             return "crash"
         if "Traceback (most recent call last)" in self.err:
             return "traceback"
-        output_text = self.err.strip().splitlines()
+        lines = self.err.strip().splitlines()
+        output_text = [line for line in lines if not line.endswith(" so far)")]  # of a slow machine
         if self.code == 2 and len(output_text) == 1 and is_clean and _is_printable(self.err):
             return "refused"
         both = self.err + self.out

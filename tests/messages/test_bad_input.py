@@ -232,8 +232,8 @@ OBJECT = [
         edit=remove("body.vtu"),
     ),
     bad("mesh-is-a-folder", "object.mesh", "is a folder", options=settings("object.mesh=.")),
-    bad("mesh-far-away", "body.vtu", "1e+50 m away",
-        edit=write_mesh(BODY.points_m * 1e50 / 0.09, {"tetra": BODY.tetrahedra})),
+    bad("mesh-far-away", "body.vtu", "1e+60 m away",
+        edit=write_mesh(BODY.points_m * 1e60 / 0.09, {"tetra": BODY.tetrahedra})),
     bad("mesh-garbage", "body.vtu", "cannot be read", ".msh", edit=write("body.vtu", "hello")),
     bad(
         "mesh-of-unknown-kind", "body.abc", "cannot be read", ".vtk",
