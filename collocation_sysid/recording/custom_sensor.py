@@ -117,6 +117,8 @@ class CustomSensor(Measurement):
             (None, 3),
             name=f"points_m of {where}",
         )
+        if not len(times):
+            raise InputError(f"t_s of {where} is empty; expected at least one time")
         vars(self).update(t_s=times, points_m=points)
         if fault := first_unordered_time(times):
             raise InputError(f"{fault[1]} in t_s of {where}", where=f"row {fault[0] + 1}")

@@ -778,7 +778,7 @@ FILES = (
         words=(b"ascii", b"binary_compressed", b"FIELDS", b"F", *COUNTS),
     ),
 )
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 _TEMPLATES = ROOT / "collocation_sysid/problem/templates"
 _SHIPPED = {
     "swing": _TEMPLATES / "swing",

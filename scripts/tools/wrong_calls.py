@@ -1,6 +1,6 @@
 """Outcomes of wrong calls of the public classes and functions, counted.
 
-    python scripts/wrong_calls.py [--all]
+    python scripts wrong_calls [--all]
 
 Each public class and function has valid arguments (`CALLS`). One argument after the other is
 replaced by values that are wrong for its kind (`WRONG`). The outcome of a call is
