@@ -121,6 +121,11 @@ def as_array(values: ArrayLike) -> Array:
         raise InputError(f"an array has rows of different lengths ({error})") from error
 
 
+def as_array_or_none(values: ArrayLike | None) -> Array | None:
+    """Return the values like `as_array`; None where the field may be None."""
+    return None if values is None else as_array(values)
+
+
 def unconverted(values: ArrayLike) -> Array:
     """Return the values unchanged; converter of array fields that ``__post_init__`` converts with
     more information.

@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
-from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args
+from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin
 
 import numpy as np
 from pydantic import PlainValidator, ValidatorFunctionWrapHandler, WrapValidator
@@ -132,10 +132,12 @@ def _accepted_type(field: Field[Any], names: Mapping[str, Any]) -> Any:
     The default value is accepted, although a problem file may not state it, and so is None for a
     field whose annotation or default is None. A field without form and converter has the form of its
     annotation, see `checked_calls.form_of`, in which `names` of the module may occur; numbers are
-    then finite, unless the default is not.
+    then finite, unless the default is not. The converter ``tuple[X, ...]`` stands for that form of
+    its annotation; type checkers then accept all iterables.
     """
     is_optional = field.default is None or str(field.type).endswith("| None")
-    if (converter := field.metadata.get("converter")) is not None:
+    converter = field.metadata.get("converter")
+    if converter is not None and get_origin(converter) is not tuple:
         return Annotated[
             Any,
             PlainValidator(
@@ -146,7 +148,7 @@ def _accepted_type(field: Field[Any], names: Mapping[str, Any]) -> Any:
     if form is None or isinstance(form, Key):
         form = form_of(field.type, names)
         is_number = field.type in ("float", "float | None") and field.default is not MISSING
-        if is_number and np.isfinite(field.default or 0.0):
+        if is_number and np.isfinite(cast(Any, field.default) or 0.0):
             form = Finite
     if form is None:
         return Any
@@ -166,7 +168,8 @@ def _refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
     object and the invalid field. See `validated_classes.Refusal` for the arguments.
     """
     field = fault["loc"] and type(instance).__dataclass_fields__[fault["loc"][0]]
-    if not field or field.metadata.get("converter") is not None:
+    converter = field and field.metadata.get("converter")
+    if not field or (converter is not None and get_origin(converter) is not tuple):
         error = fault["ctx"]["error"]
     else:
         error = _form_refusal(instance, fault, form=field.metadata.get("form"))

@@ -20,6 +20,7 @@ from typing import Any, cast
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array
@@ -987,7 +988,7 @@ def resolve_theta(
     if isinstance(values, Mapping):
         Parameters.from_mapping(values, definitions=body.constants).require_constants_of([body])
         return body.theta_from_values(values)
-    theta = float_array(values, "the parameters", (None,))
+    theta = float_array(cast(ArrayLike, values), "the parameters", (None,))
     if len(theta) != len(body.constants):
         raise InputError(
             f"{len(theta)} parameters given, expected {len(body.constants)}: "

@@ -105,7 +105,7 @@ class Problem:
         implausible size or density.
     """
 
-    experiments: tuple[Experiment, ...]
+    experiments: tuple[Experiment, ...] = key(converter=tuple[Experiment, ...])
     parameters: Parameters = key(converter=_unconverted)
     _: KW_ONLY
     scheme: str | Scheme = "midpoint"
@@ -117,7 +117,7 @@ class Problem:
     rollout: RolloutOptions = field(default_factory=RolloutOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
     title: str = ""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
@@ -310,7 +310,7 @@ class Problem:
         if isinstance(chosen, InteriorPoint):
             # Validation recordings are only simulated forward, by the energies of obstacles.
             chosen.require(each for each in self.experiments if not each.validation)
-        return chosen
+        return cast(Method, chosen)
 
     def _validate(self) -> None:
         """Raise `InputError` if experiments, parameters and options do not fit together; return

@@ -124,7 +124,7 @@ class Experiment:
 
     body: Body = key(converter=require_body)
     t_s: Array = key(converter=float_converter((None,), "t_s"))
-    grasps: tuple[Grasp, ...]
+    grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
     markers: Markers = key(default=None)
     gravity_m_s2: Array = key(
         Vector, converter=float_converter((3,), "gravity_m_s2"), default=EARTH_M_S2
@@ -139,12 +139,14 @@ class Experiment:
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
     frames_fault: str = ""
-    masses: tuple[PointMass, ...] = ()
-    forces: tuple[Force, ...] = ()
-    tendons: tuple[Tendon, ...] = ()
-    pressures: tuple[Pressure, ...] = ()
-    readings: tuple[CustomSensor, ...] = key(default=(), metadata=SENSORS)
-    depths: tuple[Depth, ...] = key(default=(), metadata=SENSORS)
+    masses: tuple[PointMass, ...] = key(converter=tuple[PointMass, ...], default=())
+    forces: tuple[Force, ...] = key(converter=tuple[Force, ...], default=())
+    tendons: tuple[Tendon, ...] = key(converter=tuple[Tendon, ...], default=())
+    pressures: tuple[Pressure, ...] = key(converter=tuple[Pressure, ...], default=())
+    readings: tuple[CustomSensor, ...] = key(
+        converter=tuple[CustomSensor, ...], default=(), metadata=SENSORS
+    )
+    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=(), metadata=SENSORS)
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
     specimen: HomogeneousDeformation | None = None

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..common.array_types import Array, Index, root_mean
 from ..common.checked_arrays import (
     as_array,
+    as_array_or_none,
     float_array,
     float_converter,
     read_only_coordinates,
@@ -100,15 +101,15 @@ class Markers(Measurement):
     t_s: Array = key(converter=float_converter((None,), "t_s of the markers"), metadata=over_time())
     positions_m: Array = key(converter=as_array, metadata=over_time())
     sigma_m: Array = key(converter=as_array)
-    names: tuple[str, ...] = key(default=None)
-    places_m: Array | None = key(converter=as_array, default=None)
+    names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
+    places_m: Array | None = key(converter=as_array_or_none, default=None)
     placement: Placement = key(converter=identity_or_none, default=None)
-    places_sigma_m: Array | None = key(converter=as_array, default=None)
+    places_sigma_m: Array | None = key(converter=as_array_or_none, default=None)
     on_surface: bool = key(_PLACES, default=False)
-    located: NDArray[np.bool_] = key(converter=as_array, default=None)
+    located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
     attach: AttachmentRule = key(AttachmentRule, default="auto")
     max_distance_m: float | None = key(Positive | None, default=None)
-    offsets_s: Array | None = key(converter=as_array, default=None, metadata=over_time())
+    offsets_s: Array | None = key(converter=as_array_or_none, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
         """Check the markers and complete the fields, in place: names m1, m2, … by default, and

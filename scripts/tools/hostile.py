@@ -787,7 +787,6 @@ _SHIPPED = {
     "specimen": _TEMPLATES / "specimen",
     "obstacle": ROOT / "problems/laid_block",
     "wrench": ROOT / "problems/wrist_sensor",
-    "pressure": ROOT / "problems/pneumatic_arm",
 }
 _CHANGES = {".toml": changed_toml, ".csv": changed_table}
 FILES += tuple(

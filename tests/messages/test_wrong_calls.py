@@ -74,9 +74,9 @@ def test_one_object_counts_as_a_list_of_one():
 
 def test_a_path_counts_as_the_problem_in_the_file(tmp_path):
     path = write_problem(tmp_path, {"swing": 8})
-    solved = []
+    solved: list[Any] = []
 
-    def method(collocation, *_):
+    def method(collocation: Any, *_: Any) -> Any:
         solved.append(collocation)
         raise KeyboardInterrupt
 
@@ -122,8 +122,8 @@ def test_tables_of_pandas_count_as_their_numbers():
     assert markers.names == ("a", "b")
     assert np.array_equal(markers.sigma_m, [1e-3, 2e-3])
     theta = pd.Series({"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.01, "gamma_m_1_s": 1.0})
-    by_name = cs.simulate(lifted(), dict(theta)).nodes_m
-    assert np.array_equal(cs.simulate(lifted(), theta[::-1]).nodes_m, by_name)
+    by_name = cs.simulate(lifted(), dict(theta)).positions_m
+    assert np.array_equal(cs.simulate(lifted(), theta[::-1]).positions_m, by_name)
 
 
 def test_arrays_of_xarray_count_as_their_numbers():
