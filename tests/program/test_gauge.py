@@ -131,7 +131,7 @@ def test_error_bars_and_verdict_know_them():
         ({"expression": speed, "unknowns": {}, "values": np.zeros(9)}, "not finite for .* at rest"),
         ({"grasp": 0}, "has both points_m and grasp"),
         ({"expression": lambda at, bias_m_s2: None}, "the function returns None"),
-        ({"unknowns": None}, r"of its unknowns \(none\)"),
+        ({"unknowns": {}}, r"of its unknowns \(none\)"),
         ({"points_m": ()}, "has neither points_m nor grasp"),
         ({"sigma": "1e-3"}, "sigma of the reading 'accelerometer' is '1e-3'; expected a number"),
         (
