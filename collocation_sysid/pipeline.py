@@ -35,13 +35,14 @@ from .runs.result_content import Elapsed, Result
 from .runs.solved_problem import SolvedProblem
 from .runs.solving import solve, solve_with_renewed_correspondences, with_workers
 from .runs.warm_start import WarmStart
-from .statistics.assessment import rotation_step_concerns
+from .statistics.assessment import WITHIN_BUDGET, fit_concerns, rotation_step_concerns
 from .statistics.budget.consider_analysis import ResidualChanges, changes_of_assumptions
 from .statistics.budget.discretisation_error import MOST_SUBSTEPS
 from .statistics.budget.systematic_effects import ASSUMPTIONS
 from .statistics.budget.uncertainty_budget import VarianceSources
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
+from .statistics.probes.budgeted_residuals import budgeted_residuals
 from .statistics.probes.deep_probes import deep_probes, routine_probes_with_steps
 from .statistics.probes.profile_likelihood import Profile, profile_of_solution
 from .statistics.probes.relaxed_assumptions import Probe, SolvedFit, probed_changes
@@ -221,13 +222,13 @@ def run(
             changes = _changes(answer, say)
             sources = _sources(answer, fit, known=known, changes=changes)
             answer = replace(answer, profiles=profiles, systematic_effects=sources)
-            answer = replace(
-                answer, probes=_probes(answer, fit, changes=changes, say=say, deep=probe)
-            )
+            solved_fit = _solved_fit(answer, fit, changes)
+            answer = replace(answer, probes=_probes(solved_fit, say=say, deep=probe))
+            answer = _with_budgeted_residuals(answer, solved_fit)
             answer = _with_offset_notes(answer, fit)
         if answer.solution.status is Status.INTERRUPTED:
             return timed(answer)
-        if seek_causes:
+        if seek_causes and answer.budgeted is None:
             say("testing possible causes of the misfit")
             causes = find_misspecifications(answer.solution)
             tested = cause_notes(answer.solution, causes)
@@ -389,27 +390,42 @@ def _evaluated_deviations(problem: Problem) -> dict[str, float | None]:
     return deviations | {name: 1.0 for name in unstated if deviations[name] is None}
 
 
-def _probes(
-    answer: Run, fit: LinearisedFit, changes: ResidualChanges, say: Log, deep: bool
-) -> tuple[Probe, ...]:
-    """Return the routine probes, or for a `deep` check those of subsets and of every assumption,
-    with a text to `say` before.
-    """
-    solution = answer.solution
-    options = answer.problem.uncertainty
+def _solved_fit(answer: Run, fit: LinearisedFit, changes: ResidualChanges) -> SolvedFit:
     deviations = _evaluated_deviations(answer.problem)
-    collocation = solution.collocation
-    z = solution.z
-    solved_fit = SolvedFit(
+    collocation, z = answer.solution.collocation, answer.solution.z
+    return SolvedFit(
         collocation=collocation,
         z=z,
         fit=fit,
-        error_model=options,
+        error_model=answer.problem.uncertainty,
         statistical=answer.optimum,
         budget=answer.budget,
         deviations=deviations,
         changes=probed_changes(collocation, z, deviations=deviations, changes=changes),
     )
+
+
+def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
+    """Return the run with a note and the residuals that deviations within the budget leave, if
+    these explain all concerns about the residuals.
+    """
+    assert answer.uncertainty is not None
+    concerns = {each.code for each in fit_concerns(answer.uncertainty)} & {*WITHIN_BUDGET}
+    if not concerns or answer.problem.uncertainty.noise == "estimated":
+        return answer
+    budgeted = budgeted_residuals(solved_fit, answer.problem.assumed_deviations)
+    if budgeted is None:
+        return answer
+    left = {each.code for each in fit_concerns(answer.uncertainty, budgeted.basis)}
+    if left & {*WITHIN_BUDGET}:
+        return answer
+    return replace(answer, budgeted=budgeted, notes=(*answer.notes, budgeted.describe()))
+
+
+def _probes(solved_fit: SolvedFit, say: Log, deep: bool) -> tuple[Probe, ...]:
+    """Return the routine probes, or for a `deep` check those of subsets and of every assumption,
+    with a text to `say` before.
+    """
     if not deep:
         return routine_probes_with_steps(solved_fit)
     say("refitting parts of the data, and with assumptions relaxed")

@@ -32,6 +32,7 @@ from ..statistics.field_estimates import FieldEstimate, field_estimates
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.linearised import DerivedModuli
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.probes.profile_likelihood import Profile
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
@@ -77,6 +78,9 @@ class SolvedProblem:
     probes : tuple of Probe
         Refits with an assumption relaxed: those of every solve, see `routine_probes`; or all, and
         of parts of the data, where these were requested. Empty without error bars.
+    budgeted : BudgetedResiduals or None
+        Residuals that deviations within the budget leave; None if the residuals gave no concern, or
+        if such deviations do not explain them.
     elapsed_s : Elapsed
         Durations of search and checks.
     """
@@ -93,6 +97,7 @@ class SolvedProblem:
     omitted_checks: str = ""
     systematic_effects: VarianceSources | None = None
     probes: tuple[Probe, ...] = ()
+    budgeted: BudgetedResiduals | None = None
     elapsed_s: Elapsed = field(default_factory=Elapsed)
 
     def __repr__(self) -> str:
@@ -264,6 +269,7 @@ class SolvedProblem:
             motions=self.modes_by_experiment.values(),
             uncertainty=self.uncertainty,
             diagnoses=self.diagnoses,
+            budgeted=self.budgeted,
         )
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
         numerical = numerical_concerns(self.optimum, uncertainties, refinement=self.refinement)

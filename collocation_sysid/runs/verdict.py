@@ -38,6 +38,7 @@ from ..statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
 )
+from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.specimen_concerns import as_specimen_concerns
@@ -57,6 +58,7 @@ def solution_concerns(
     motions: Iterable[ModesCheck],
     uncertainty: Uncertainty | None,
     diagnoses: Sequence[MarkerDiagnosis],
+    budgeted: BudgetedResiduals | None = None,
 ) -> Iterator[Concern]:
     """Yield the concerns about a solution and its forward simulations.
 
@@ -75,6 +77,8 @@ def solution_concerns(
         are parameters.
     diagnoses : sequence of MarkerDiagnosis
         Findings in the residuals.
+    budgeted : BudgetedResiduals, optional
+        Residuals that deviations within the budget leave.
     """
     status = solution.status
     yield from body_concerns(solution)
@@ -88,7 +92,7 @@ def solution_concerns(
     if uncertainty is not None:
         yield from as_specimen_concerns(
             [
-                *fit_concerns(uncertainty),
+                *fit_concerns(uncertainty, budgeted and budgeted.basis),
                 *parameter_concerns(uncertainty, solution.collocation.parameters),
             ],
             [each.experiment for each in solution.collocation.transcriptions],

@@ -35,7 +35,7 @@ from .probes.routine_probes import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import PERSISTENT
 from .residuals.noise_level import NoiseLevel
 from .residuals.residual_diagnostics import MOST_WILD, MarkerDiagnosis
-from .uncertainty import Uncertainty
+from .uncertainty import ErrorBasis, Uncertainty
 
 Verdict = Literal["good", "check", "doubtful"]
 
@@ -115,6 +115,8 @@ ANISOTROPY_ADVICE = (
     "times one plus the anisotropy. A wrong material law, or a mesh of another width, has similar "
     "effects"
 )
+# Concerns about residuals that deviations within the budget may cause.
+WITHIN_BUDGET = "residuals/persist", "residuals/shared", "noise/larger"
 # Codes of the concern about an estimated, and about a measured discretisation error.
 NUMERICAL = "scheme/step", "mesh/refined"
 
@@ -186,9 +188,12 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     ]
 
 
-def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
+def fit_concerns(uncertainty: Uncertainty, budgeted: ErrorBasis | None = None) -> list[Concern]:
     """Return concerns about the residuals: size compared with σ, correlation, outliers and
     disagreement of recordings.
+
+    Those of `WITHIN_BUDGET` are the ones of the residuals that deviations within the budget leave,
+    if these are given.
 
     Correlation counts only if the error bars use autocorrelated errors: "residuals/persist" in time
     ("doubtful" if the residuals are also more than `GROSS_MISFIT` times σ), else
@@ -203,7 +208,17 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     ----------
     uncertainty : Uncertainty
         Error bars with the tests of the residuals.
+    budgeted : ErrorBasis, optional
+        Tests of the residuals that are left, see `budgeted_residuals`.
     """
+    concerns = _residual_concerns(uncertainty)
+    if budgeted is not None:
+        left = {each.code for each in _residual_concerns(budgeted)}
+        concerns = [e for e in concerns if e.code not in WITHIN_BUDGET or e.code in left]
+    return [*concerns, *_disagreement_concerns(uncertainty)]
+
+
+def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
     level = uncertainty.level
     dependence = uncertainty.dependence
     factor = float(np.sqrt(level.pooled))
@@ -243,7 +258,6 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
             smaller, False, code="noise/smaller", factor=1 / (factor or 1.0), stated=sigma_key
         ),
         *_noisy_marker_concerns(level),
-        *_disagreement_concerns(uncertainty),
     ]
 
 

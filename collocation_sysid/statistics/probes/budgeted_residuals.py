@@ -1,0 +1,87 @@
+"""Residuals that remain if the deviations of the uncertainty budget may explain them.
+
+Real bodies deviate from every assumption a little, and with little noise such deviations show in
+the residuals. This contradicts nothing as long as the budget grants them: the combined intervals
+contain their effect. All assumptions of the budget therefore join the linearised fit at once, each
+with the prior of its deviation, and the verdict tests the residuals after one step. Alternatives,
+such as another damping law, do not take part: residuals that need them should name them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..budget.uncertainty_budget import ALTERNATIVES, source_label
+from ..distributions import chi2_isf, normal_isf
+from ..linearised import gauss_newton_step
+from ..uncertainty import ErrorBasis
+from .relaxed_assumptions import SolvedFit, assumption_name, with_relaxed_assumption
+
+# Probability that the deviations of a faultless recording are larger than the budget grants.
+RARE = 1e-4
+
+
+@dataclass(frozen=True)
+class BudgetedResiduals:
+    """Tests of the residuals after the step.
+
+    Attributes
+    ----------
+    basis : ErrorBasis
+        Size and correlation of the residuals.
+    largest : str
+        Name of the assumption with the largest deviation, with its component.
+    deviations : float
+        This deviation in standard deviations of the budget.
+    """
+
+    basis: ErrorBasis
+    largest: str
+    deviations: float
+
+    def describe(self) -> str:
+        """Return a note on the residuals as a sentence without full stop."""
+        component = self.largest.partition(" ")[2]
+        return (
+            "the residuals show deviations from the description that the uncertainty budget grants, "
+            f"the largest of {source_label(assumption_name(self.largest))}"
+            f"{' ' * bool(component)}{component}: {self.deviations:+.1f} standard deviations"
+        )
+
+
+def budgeted_residuals(
+    solved_fit: SolvedFit, budgeted: Mapping[str, float | None]
+) -> BudgetedResiduals | None:
+    """Return the residuals after one linear step of all parameters and all assumptions of the
+    budget; None if the budget is empty, or if the step needs deviations larger than it grants.
+
+    Parameters
+    ----------
+    solved_fit : SolvedFit
+        The fit. Its `changes` belong to its `deviations`.
+    budgeted : mapping of str to float or None
+        Standard deviations in the budget; assumptions that are None or missing do not take part.
+    """
+    fit = solved_fit.fit
+    first = len(fit.names)
+    changes = solved_fit.changes
+    has_effect = np.any([block.any(axis=(0, 1, 2)) for block in changes.blocks], axis=0)
+    for name in dict.fromkeys(np.array(changes.names)[has_effect].tolist()):
+        row = assumption_name(name)
+        if budgeted.get(row) and row not in ALTERNATIVES:
+            fit = with_relaxed_assumption(fit, changes, name=name)
+    step = gauss_newton_step(fit)
+    own = step[first:]
+    count = len(own)
+    if not count or not own @ own < chi2_isf(RARE, count):
+        return None
+    worst = int(np.argmax(np.abs(own)))
+    if not abs(own[worst]) < normal_isf(RARE / 2 / count):
+        return None
+    p = solved_fit.read_parameters() + step[:first]
+    basis = solved_fit.uncertainty_of_refit(fit.after_step(step), p)
+    largest = fit.names[first + worst].rpartition(" ")[0]
+    return BudgetedResiduals(basis, largest, float(own[worst]))
