@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def solved(gradient: float, deviation: float | str = DEVIATION) -> Run:
     tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
-    exact = dict.fromkeys(Assumptions().collect_deviations(), "none")
+    exact: dict[str, Any] = dict.fromkeys(Assumptions().collect_deviations(), "none")
     options = UncertaintyOptions(assumptions=Assumptions(**exact | {EFFECT: deviation}))
     unknown = {name: Unknown(value) for name, value in TRUTH.items()}
     problem = Problem([replace(hung, markers=seen)], unknown, substeps=1, uncertainty=options)
@@ -41,6 +42,7 @@ def solved(gradient: float, deviation: float | str = DEVIATION) -> Run:
 
 
 def residual_codes(finished: Run, *budgeted) -> set[str]:
+    assert finished.uncertainty is not None
     concerns = fit_concerns(finished.uncertainty, *budgeted)
     return {each.code for each in concerns} & {*WITHIN_BUDGET}
 

@@ -3,8 +3,9 @@
 Real bodies deviate from every assumption a little, and with little noise such deviations show in
 the residuals. This contradicts nothing as long as the budget grants them: the combined intervals
 contain their effect. All assumptions of the budget therefore join the linearised fit at once, each
-with the prior of its deviation, and the verdict tests the residuals after one step. Alternatives,
-such as another damping law, do not take part: residuals that need them should name them.
+with the prior of its deviation, and the verdict tests the residuals after one step. Assumptions that
+define constants, such as the damping law, do not take part: residuals that need them should name
+them.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..budget.uncertainty_budget import ALTERNATIVES, source_label
+from ..budget.uncertainty_budget import REDEFINED, source_label
 from ..distributions import chi2_isf, normal_isf
 from ..linearised import gauss_newton_step
 from ..uncertainty import ErrorBasis
@@ -71,7 +72,7 @@ def budgeted_residuals(
     has_effect = np.any([block.any(axis=(0, 1, 2)) for block in changes.blocks], axis=0)
     for name in dict.fromkeys(np.array(changes.names)[has_effect].tolist()):
         row = assumption_name(name)
-        if budgeted.get(row) and row not in ALTERNATIVES:
+        if budgeted.get(row) and not REDEFINED.get(row):
             fit = with_relaxed_assumption(fit, changes, name=name)
     step = gauss_newton_step(fit)
     own = step[first:]
