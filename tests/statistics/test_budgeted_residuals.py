@@ -35,7 +35,8 @@ def solved(gradient: float, deviation: float | str = DEVIATION) -> Run:
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
     exact: dict[str, Any] = dict.fromkeys(Assumptions().collect_deviations(), "none")
-    options = UncertaintyOptions(assumptions=Assumptions(**exact | {EFFECT: deviation}))
+    exact[EFFECT] = deviation
+    options = UncertaintyOptions(assumptions=Assumptions(**exact))
     unknown = {name: Unknown(value) for name, value in TRUTH.items()}
     problem = Problem([replace(hung, markers=seen)], unknown, substeps=1, uncertainty=options)
     return run(problem, "reduced-space", seek_causes=False)
