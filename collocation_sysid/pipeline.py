@@ -42,11 +42,11 @@ from .statistics.budget.systematic_effects import ASSUMPTIONS
 from .statistics.budget.uncertainty_budget import VarianceSources
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
-from .statistics.probes.budgeted_residuals import budgeted_residuals
+from .statistics.probes.budgeted_residuals import budgeted_residuals, is_significant_beside_budget
 from .statistics.probes.deep_probes import deep_probes, routine_probes_with_steps
 from .statistics.probes.profile_likelihood import Profile, profile_of_solution
 from .statistics.probes.relaxed_assumptions import Probe, SolvedFit, probed_changes
-from .statistics.probes.routine_probes import probed_deviations
+from .statistics.probes.routine_probes import is_alarming, probed_deviations
 from .statistics.residuals.residual_diagnostics import diagnose_markers
 from .statistics.specimen_notes import one_kind_notes
 from .statistics.specimen_offsets import stress_offset_notes
@@ -407,7 +407,8 @@ def _solved_fit(answer: Run, fit: LinearisedFit, changes: ResidualChanges) -> So
 
 def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
     """Return the run with a note and the residuals that deviations within the budget leave, if
-    these explain all concerns about the residuals.
+    these explain all concerns about the residuals. Routine probes that are not significant beside
+    these deviations are then not significant.
     """
     assert answer.uncertainty is not None
     concerns = {each.code for each in fit_concerns(answer.uncertainty)} & {*WITHIN_BUDGET}
@@ -419,7 +420,17 @@ def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
     left = {each.code for each in fit_concerns(answer.uncertainty, budgeted.basis)}
     if left & {*WITHIN_BUDGET}:
         return answer
-    return replace(answer, budgeted=budgeted, notes=(*answer.notes, budgeted.describe()))
+    granted = answer.problem.assumed_deviations
+    probes = tuple(
+        replace(probe, sentences=())
+        if probe.routine
+        and is_alarming(probe)
+        and not is_significant_beside_budget(solved_fit, granted, probe.name)
+        else probe
+        for probe in answer.probes
+    )
+    notes = (*answer.notes, budgeted.describe())
+    return replace(answer, budgeted=budgeted, probes=probes, notes=notes)
 
 
 def _probes(solved_fit: SolvedFit, say: Log, deep: bool) -> tuple[Probe, ...]:

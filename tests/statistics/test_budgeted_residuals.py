@@ -12,8 +12,12 @@ from assumed_twins import with_wrong_assumptions
 from kit.problems import hung_cube
 
 from collocation_sysid import Body, Problem, Run, UncertaintyOptions, Unknown, run
+from collocation_sysid.pipeline import _changes, _solved_fit
 from collocation_sysid.statistics.assessment import WITHIN_BUDGET, fit_concerns
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.probes.budgeted_residuals import is_significant_beside_budget
+from collocation_sysid.statistics.probes.routine_probes import is_alarming
 
 pytestmark = pytest.mark.long
 
@@ -55,6 +59,7 @@ def test_residuals_of_a_deviation_within_the_budget_are_no_reason():
     assert found.budgeted.largest == f"{EFFECT} z"
     assert found.budgeted.deviations == pytest.approx(0.1 / DEVIATION, rel=0.2)
     assert not {each.code for each in found.trust.concerns} & {*WITHIN_BUDGET}
+    assert not any(is_alarming(probe) for probe in found.probes)
     (note,) = (each for each in found.notes if "uncertainty budget grants" in each)
     assert "stiffness gradient z: +2" in note
 
@@ -70,3 +75,14 @@ def test_residuals_that_are_noise_are_not_examined_again():
     assert not residual_codes(found)
     assert found.budgeted is None
     assert not {each.code for each in found.trust.concerns} & {*WITHIN_BUDGET}
+
+
+def test_a_probe_that_absorbs_a_deviation_is_not_significant_beside_the_budget():
+    found = solved(0.1)
+    fit = linearise_fit(found.solution.collocation, found.solution.z)
+    solved_fit = _solved_fit(found, fit, _changes(found, lambda _: None))
+    memory = "memory_share τ=0.1s"
+    assert is_significant_beside_budget(solved_fit, {}, memory)
+    assert not is_significant_beside_budget(solved_fit, {EFFECT: DEVIATION}, memory)
+    # The deviation itself is not explained by its own entry.
+    assert is_significant_beside_budget(solved_fit, {EFFECT: DEVIATION}, f"{EFFECT} z")

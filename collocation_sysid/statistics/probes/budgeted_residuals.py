@@ -17,9 +17,10 @@ import numpy as np
 
 from ..budget.uncertainty_budget import REDEFINED, source_label
 from ..distributions import chi2_isf, normal_isf
-from ..linearised import gauss_newton_step
+from ..linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..uncertainty import ErrorBasis
 from .relaxed_assumptions import SolvedFit, assumption_name, with_relaxed_assumption
+from .routine_probes import prior_widening, significance_limit
 
 # Probability that the deviations of a faultless recording are larger than the budget grants.
 RARE = 1e-4
@@ -66,14 +67,8 @@ def budgeted_residuals(
     budgeted : mapping of str to float or None
         Standard deviations in the budget; assumptions that are None or missing do not take part.
     """
-    fit = solved_fit.fit
-    first = len(fit.names)
-    changes = solved_fit.changes
-    has_effect = np.any([block.any(axis=(0, 1, 2)) for block in changes.blocks], axis=0)
-    for name in dict.fromkeys(np.array(changes.names)[has_effect].tolist()):
-        row = assumption_name(name)
-        if budgeted.get(row) and not REDEFINED.get(row):
-            fit = with_relaxed_assumption(fit, changes, name=name)
+    first = len(solved_fit.fit.names)
+    fit = _with_budget(solved_fit, budgeted)
     step = gauss_newton_step(fit)
     own = step[first:]
     count = len(own)
@@ -86,3 +81,31 @@ def budgeted_residuals(
     basis = solved_fit.uncertainty_of_refit(fit.after_step(step), p)
     largest = fit.names[first + worst].rpartition(" ")[0]
     return BudgetedResiduals(basis, largest, float(own[worst]))
+
+
+def is_significant_beside_budget(
+    solved_fit: SolvedFit, budgeted: Mapping[str, float | None], name: str
+) -> bool:
+    """Return whether a routine probe, by the name of its assumption with component, is significant
+    if all other assumptions of the budget are relaxed too.
+    """
+    others = {row: s for row, s in budgeted.items() if row != assumption_name(name)}
+    fit = _with_budget(solved_fit, others)
+    changes = solved_fit.changes
+    wide = with_relaxed_assumption(fit, changes, name=name, widening=prior_widening(name))
+    information = least_squares_of_fit(wide).compute_information()
+    errors = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
+    ratios = np.abs(gauss_newton_step(wide) / errors)[len(fit.names) :]
+    return bool((ratios > significance_limit(changes, name)).any())
+
+
+def _with_budget(solved_fit: SolvedFit, budgeted: Mapping[str, float | None]) -> LinearisedFit:
+    """Return the fit with all assumptions of the budget relaxed that change any residual."""
+    fit = solved_fit.fit
+    changes = solved_fit.changes
+    has_effect = np.any([block.any(axis=(0, 1, 2)) for block in changes.blocks], axis=0)
+    for name in dict.fromkeys(np.array(changes.names)[has_effect].tolist()):
+        row = assumption_name(name)
+        if budgeted.get(row) and not REDEFINED.get(row):
+            fit = with_relaxed_assumption(fit, changes, name=name)
+    return fit

@@ -8,7 +8,7 @@ iterations of each search, whether it converged, how many terms the tests determ
 of the fit: the root mean square of the residuals, in standard deviations of the measurements, with
 those of the zeros of the strains and of the areas, which are estimated.
 
-    python scripts/study_power_laws.py
+    python scripts study_power_laws
 """
 
 from __future__ import annotations
