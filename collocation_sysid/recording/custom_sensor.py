@@ -112,11 +112,8 @@ class CustomSensor(Measurement):
         where = f"the reading '{self.name}'"
         vars(self)["unknowns"] = self.unknowns or {}
         times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
-        points = read_only_floats(
-            self.points_m if np.size(self.points_m) else np.zeros((0, 3)),
-            (None, 3),
-            name=f"points_m of {where}",
-        )
+        points = float_array(self.points_m, f"points_m of {where}", ((0,), (None, 3)))
+        points = read_only_floats(points.reshape(-1, 3), (None, 3), name=f"points_m of {where}")
         if not len(times):
             raise InputError(f"t_s of {where} is empty; expected at least one time")
         vars(self).update(t_s=times, points_m=points)

@@ -120,6 +120,7 @@ def test_error_bars_and_verdict_know_them():
         ({"sigma": 0.0}, "sigma of the reading 'accelerometer' is 0; expected a number above 0"),
         ({"unknowns": {"bias_m_s2": -1.0}}, "bias_m_s2 of the reading 'accelerometer' is -1"),
         ({"points_m": [[0.0, 0.0]]}, "points_m of the reading 'accelerometer'"),
+        ({"points_m": [[0.0], [1.0, 2.0]]}, "points_m of the reading .* must hold numbers"),
         ({"values": np.full((9, 3), np.nan)}, "all values of the reading .* are missing"),
         ({"t_s": np.zeros(9)}, "of the reading 'accelerometer'"),
         ({"values": np.zeros((9, 2))}, "gives 3 numbers; expected 2"),
