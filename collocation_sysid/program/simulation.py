@@ -397,6 +397,6 @@ def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
     for another shape.
     """
     shape = experiment.markers.positions_m.shape
-    tracks = float_array(positions_m, "marker tracks", shape, finite=False)
+    tracks = float_array(positions_m, "positions_m", shape, finite=False)
     markers = experiment.markers
     return replace(experiment, markers=markers.with_samples(markers.t_s, tracks))

@@ -32,7 +32,7 @@ SMALLEST_SINGULAR_VALUE = 1e-6
 Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
 
-def _unconverted_poses(poses: PoseSequence | ArrayLike) -> PoseSequence:
+def unconverted_poses(poses: PoseSequence | ArrayLike) -> PoseSequence:
     """Return poses unchanged, and matrices (T, 4, 4) as an array: they are converted when their
     times are known.
     """
@@ -83,7 +83,7 @@ class Grasp:
     """
 
     nodes: Index = key(Nodes, converter=node_converter("the grasp"), read=selection_from_section)
-    poses: PoseSequence = key(converter=_unconverted_poses)
+    poses: PoseSequence = key(converter=unconverted_poses)
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
     sigma_m: float | None = key(NotNegative | None, default=None)

@@ -20,7 +20,7 @@ from ..fem.contact_surface import ContactSurface
 from ..fem.laws.constants import FRICTION, Constant, constant_named
 from ..fem.meshes.selection import Selection
 from ..fem.pattern import SymmetricPattern
-from .grasp import Grasp
+from .grasp import Grasp, unconverted_poses
 from .node_selection import Nodes, selection_from_section
 from .obstacle_solids import KINDS, Solid, orthogonal_axes
 from .poses import PoseSequence
@@ -122,7 +122,9 @@ class Obstacle(Grasp):
     """
 
     nodes: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    poses: PoseSequence = field(default_factory=PoseSequence.fixed)
+    poses: PoseSequence = field(
+        default_factory=PoseSequence.fixed, metadata={"converter": unconverted_poses}
+    )
     shape: Solid = key(
         SolidSection, read=solid_from_section, converter=_require_solid, kw_only=True
     )

@@ -70,14 +70,10 @@ def foam_tests(law: str, seed: int) -> list[cs.Experiment]:
     for number, (test, strain) in enumerate(FOAM_TESTS):
         lateral = np.ones_like(strain) if number == 1 else None
         blank = cs.Specimen(
-            test,
-            strain,
-            0 * strain,
-            STRESS_NOISE_PA,
-            lateral_stretch=lateral,
-            strain_zero=0.0,
-            area_error=0.0,
+            test, strain, 0 * strain, STRESS_NOISE_PA, strain_zero=0.0, area_error=0.0
         )
+        if lateral is not None:
+            blank = replace(blank, lateral_stretch=lateral)
         values = cs.simulate(blank.experiment("hyperfoam-2"), FOAM | UNDAMPED).custom_sensor_values
         noise_pa = STRESS_NOISE_PA * rng.standard_normal(len(strain))
         specimen = replace(blank, stress_pa=values[0].ravel() + noise_pa)

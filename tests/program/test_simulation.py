@@ -331,5 +331,5 @@ def test_other_tracks_must_have_the_markers_shape():
     cube = hung_cube(10)
     tracks = np.ones_like(cube.markers.positions_m)
     np.testing.assert_array_equal(with_markers(cube, tracks).markers.positions_m, tracks)
-    with pytest.raises(InputError, match=r"shape \(10, 9, 3\), expected \(11, 9, 3\)"):
+    with pytest.raises(InputError, match=r"shape \(10, 9, 3\); expected \(11, 9, 3\)"):
         with_markers(cube, tracks[1:])

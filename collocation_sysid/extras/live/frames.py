@@ -22,7 +22,7 @@ from ...errors import InputError
 from ...problem import Problem
 from ...problem.gripper_transforms import gripper_transforms
 from ...program.streaming import StreamingModel
-from ...recording.custom_sensor import Gauge
+from ...recording.custom_sensor import CustomSensor
 from ...recording.formats.text import number_from_text
 from ...recording.formats.topics import POSE
 from ...recording.measured_wrench import WRENCH_COLUMNS, Wrench
@@ -169,7 +169,7 @@ def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence
 
 
 def parse_custom_readings(
-    readings: Mapping[str, Any] | None, gauges: Sequence[Gauge], t_s: float
+    readings: Mapping[str, Any] | None, gauges: Sequence[CustomSensor], t_s: float
 ) -> tuple[InstrumentSample, ...]:
     """Return samples of custom sensors, each as number of the instrument (from 1), time [s] and
     values (m,); a sample without a time has the time of the frame.
@@ -180,7 +180,7 @@ def parse_custom_readings(
         Samples of each sensor: its m values (or a number, if there is one), a mapping with exactly
         the keys "t_s" and "values", or a list of such mappings. None, also as values, for no
         sample; single values that are None or NaN are missing and become NaN.
-    gauges : sequence of Gauge
+    gauges : sequence of CustomSensor
         Custom sensors of the problem; instrument k is the k-th of them, from 1.
     t_s : float
         Time of the frame [s].
@@ -325,7 +325,7 @@ class FrameReader:
         Names of the markers.
     source : str
         Name of the source for messages.
-    gauges : sequence of Gauge
+    gauges : sequence of CustomSensor
         Custom sensors of the problem; in a table their columns have the names that the sensors
         state.
     wrenches : mapping of grasp number to Wrench
@@ -345,7 +345,7 @@ class FrameReader:
         grasps: Sequence[int] | Index,
         names: Sequence[str],
         source: str = "input",
-        gauges: Sequence[Gauge] = (),
+        gauges: Sequence[CustomSensor] = (),
         wrenches: Mapping[int, Wrench] = MappingProxyType({}),
         gripper_transforms: Sequence[Array | None] = (),
     ) -> None:

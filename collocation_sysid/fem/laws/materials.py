@@ -408,13 +408,6 @@ class DampingLaw:
                 f"the damping law {self.name!r} has neither a stress nor a potential; expected "
                 "stress=function or potential=function"
             )
-        if not isinstance(self.constants, tuple) or not all(
-            isinstance(constant, Constant) for constant in self.constants
-        ):
-            raise InputError(
-                f"constants of the damping law {self.name!r} are not a tuple of Constant; expected for "
-                "example (viscosity,)"
-            )
 
 
 def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:

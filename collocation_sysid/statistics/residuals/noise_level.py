@@ -193,13 +193,10 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
         of_score=of_score + prior_score,
     )
     sigma_keys = {
-        f"{block.name}/{name}": block.sigma_key
+        f"{block.name}/{block.marker_names[k]}": block.sigma_key
         for block in fit.blocks
         if not block.has_noise_floor
-        for name, is_used in zip(
-            block.marker_names, block.is_present.any(axis=0).tolist(), strict=True
-        )
-        if is_used
+        for k in np.flatnonzero(block.is_present.any(axis=0))
     }
     # That of places stands for all.
     stated = min(sigma_keys.values(), key="sigma_m".__ne__, default="sigma_m")
