@@ -361,7 +361,7 @@ def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
 
 
 def too_soft() -> dict[str, Unknown | float]:
-    return {**NOTHING, **{n: Unknown(lower=1e-4, upper=2e-4) for n in ("lambda_pa", "mu_pa")}}
+    return {**NOTHING, **{n: Unknown(lower=2e-3, upper=4e-3) for n in ("lambda_pa", "mu_pa")}}
 
 
 def test_a_body_that_can_never_be_simulated_is_refused():
@@ -377,7 +377,7 @@ def test_a_body_that_can_never_be_simulated_is_refused():
 
 @pytest.mark.long
 def test_with_a_guess_it_is_left_to_the_method():
-    given = too_soft() | {n: Unknown(1.5e-4, 1e-4, 2e-4) for n in ("lambda_pa", "mu_pa")}
+    given = too_soft() | {n: Unknown(3e-3, 2e-3, 4e-3) for n in ("lambda_pa", "mu_pa")}
     solution = solve(cube(given | {"gamma_r_s": 1e-3, "gamma_m_1_s": 1.0}))
     assert solution.status is Status.NOT_SIMULABLE
     assert solution.scan is None
