@@ -485,7 +485,7 @@ def test_a_motion_a_bench_and_a_specimen_share_the_parameters(tmp_path):
     pressed = np.column_stack([np.arange(6.0), np.linspace(0.0, 12.0, 6), np.zeros(6)])
     header = "Time (s),Displacement (mm),Force (N)"
     np.savetxt(tmp_path / "press.csv", pressed, delimiter=",", header=header, comments="")
-    pulled = np.column_stack([STRAIN, 0 * STRAIN])
+    pulled = np.column_stack([STRAIN, 1e3 * STRAIN])
     written(tmp_path, header="strain (-),stress (Pa)", rows=pulled)
     pull = PROBLEM[PROBLEM.index("[[") :].replace("100.0", "0.5")
     path.write_text(motion + BENCH + pull)
