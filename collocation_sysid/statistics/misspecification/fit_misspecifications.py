@@ -191,10 +191,10 @@ def _refit_hypotheses(
             [
                 *lags,
                 *_slip_hypotheses(first, fitted_m, of=of),
+                *_grasp_layer_hypotheses(first, of),  # few, before others use up the sweeps
                 *turned,
                 *bodies,
                 *mirrored,
-                *_grasp_layer_hypotheses(first, of),
             ]
         ),
         *replace(trial, required_factor=PARTLY).accepted(coarse_mesh_hypotheses(solution, of)),
