@@ -414,13 +414,13 @@ def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
     concerns = {each.code for each in fit_concerns(answer.uncertainty)} & {*WITHIN_BUDGET}
     if not concerns or answer.problem.uncertainty.noise == "estimated":
         return answer
-    budgeted = budgeted_residuals(solved_fit, answer.problem.assumed_deviations)
+    granted = answer.problem.assumed_deviations
+    budgeted = budgeted_residuals(solved_fit, granted)
     if budgeted is None:
         return answer
     left = {each.code for each in fit_concerns(answer.uncertainty, budgeted.basis)}
     if left & {*WITHIN_BUDGET}:
         return answer
-    granted = answer.problem.assumed_deviations
     probes = tuple(
         replace(probe, sentences=())
         if probe.routine

@@ -204,9 +204,9 @@ def wrench_deviations(parts: Sequence[ExperimentIterate]) -> list[WrenchDeviatio
                 deviations.append(
                     WrenchDeviation(
                         transcription.experiment.name,
-                        measured / wrench.stack_sigmas(),
-                        simulated=simulated / wrench.stack_sigmas(),
-                        sigmas=wrench.stack_sigmas(),
+                        measured / wrench.value_sigmas,
+                        simulated=simulated / wrench.value_sigmas,
+                        sigmas=wrench.value_sigmas,
                         tare=transcription.experiment.nuisance.tare or 0.0,
                         is_inertial=has_inertial_wrenches(transcription.experiment),
                     )

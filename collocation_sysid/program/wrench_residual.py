@@ -85,7 +85,7 @@ class WrenchResidual(MeasurementResidual):
             huber=huber,
             names=(f"force{label}", f"torque{label}"),
             t_s=wrench.t_s,
-            sigmas=wrench.stack_sigmas()[[0, 3]],
+            sigmas=wrench.value_sigmas[[0, 3]],
             measured=wrench.values[:, None],
             is_compared=is_compared.reshape(-1, 2, 3),
             own_parameters=np.concatenate([observable.parameter_indices(row) for row in rows])[

@@ -136,8 +136,11 @@ class Wrench(Measurement):
 
     @property
     def value_sigmas(self) -> Array:
-        """(6,) standard deviations of the components [N, N m]."""
-        return self.stack_sigmas()
+        """(6,) standard deviations of the components [N, N m]; those of torques are 1 if `sigma_nm`
+        is None, as no torque is measured then.
+        """
+        torque = 1.0 if self.sigma_nm is None else self.sigma_nm
+        return np.repeat([self.sigma_n, torque], 3)
 
     @property
     def number_names(self) -> tuple[str, ...]:
@@ -177,16 +180,9 @@ class Wrench(Measurement):
     def component_noises(self) -> list[tuple[int, str, str, float]]:
         """Return index, name, unit and σ of each component that is measured at any sample."""
         return [
-            (k, COMPONENTS[k], UNITS[k], float(self.stack_sigmas()[k]))
+            (k, COMPONENTS[k], UNITS[k], float(self.value_sigmas[k]))
             for k in np.flatnonzero(self.measured_components).tolist()
         ]
-
-    def stack_sigmas(self) -> Array:
-        """Return (6,) standard deviations of the components [N, N m]; those of torques are 1 if
-        `sigma_nm` is None, as no torque is measured then.
-        """
-        torque = 1.0 if self.sigma_nm is None else self.sigma_nm
-        return np.repeat([self.sigma_n, torque], 3)
 
 
 def read_wrench(

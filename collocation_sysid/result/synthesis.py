@@ -40,7 +40,7 @@ from ..program.simulation import NEWMARK, Trajectory, simulate
 from ..recording import Experiment, write_gauge_csv, write_markers_csv, write_poses_csv
 from ..recording.recording_writers import write_columns_csv
 from ..recording.specimen_files import SpecimenLayout, specimen_columns
-from ..statistics.concerns import message_of
+from ..statistics.stability_concerns import branch_concern
 from .run_writers import (
     FRAMES_FILE,
     replaced_folder,
@@ -190,12 +190,7 @@ def write_data(
     for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
         change = trajectory.branch_change
         if report is not None and change is not None:
-            data = {
-                "experiment": experiment.name,
-                "time_s": change.time_s,
-                "why": change.describe(),
-            }
-            report(message_of("stability/branch", data))
+            report(branch_concern(experiment.name, change).message)
     written: list[Path] = []
     drafts_of: dict[Path, Path] = {}
     with ExitStack() as stack:  # all files appear at its end, or none

@@ -12,7 +12,7 @@ from ..common.array_types import Array
 from ..fem.body import Body
 from ..fem.laws.material_stability import is_examined, principal_stretches, stability_margins
 from ..program.experiment_iterate import ExperimentIterate
-from ..program.forward.stable_path import find_branch_change
+from ..program.forward.stable_path import BranchChange, find_branch_change
 from .concerns import Concern
 
 # Number of states of a motion that are examined.
@@ -84,16 +84,17 @@ def branch_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator[Concern]:
         experiment = iterate.transcription.experiment
         change = find_branch_change(experiment, iterate.equations.dynamics, iterate.x)
         if change is not None:
-            wrinkles = change.loss is not None and change.loss.is_surface_instability
-            yield Concern(
-                "stability/branch",
-                "doubtful" if wrinkles else "check",
-                data={
-                    "experiment": experiment.name,
-                    "time_s": change.time_s,
-                    "why": change.describe(),
-                },
-            )
+            yield branch_concern(experiment.name, change)
+
+
+def branch_concern(experiment: str, change: BranchChange) -> Concern:
+    """Return the concern about the equilibria of an experiment, by name, see `branch_concerns`."""
+    wrinkles = change.loss is not None and change.loss.is_surface_instability
+    return Concern(
+        "stability/branch",
+        "doubtful" if wrinkles else "check",
+        data={"experiment": experiment, "time_s": change.time_s, "why": change.describe()},
+    )
 
 
 def _part_concerns(

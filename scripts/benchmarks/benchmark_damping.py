@@ -11,19 +11,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from benchmark_methods import PAPER_SIZE, PARAMETERS, TRUTH, experiment_of
+from benchmark_ogden import timed_sweep
 
 from collocation_sysid import Body, Collocation
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
-from collocation_sysid.model.dynamics import Dynamics
-from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
-from collocation_sysid.program.stopwatch import Stopwatch
-from collocation_sysid.program.sweep import Sweep
 
 LAWS = ("rayleigh", "kelvin-voigt")
 
@@ -86,22 +82,7 @@ def make_sweep(
     experiment = replace(
         recording, body=body, grasps=(grasp,), markers=recording.markers.on_body(body)
     )
-    collocation = Collocation([experiment], PARAMETERS)
-    (transcription,) = collocation.transcriptions
-    x = simulate_scheme(
-        experiment,
-        Dynamics.from_experiment(experiment, "midpoint").with_theta(body.theta_from_values(TRUTH)),
-    )
-    (part,) = collocation.iterates_at(collocation.guess_p, [x])
-
-    def sweep() -> tuple[float, ...]:
-        watch = Stopwatch()
-        began = time.perf_counter()
-        Sweep(transcription, stopwatch=watch).forward(part.x, part.equations)
-        return (time.perf_counter() - began, watch.evaluations, watch.linear_algebra)
-
-    sweep()
-    return sweep
+    return timed_sweep(Collocation([experiment], PARAMETERS), body.theta_from_values(TRUTH))
 
 
 if __name__ == "__main__":

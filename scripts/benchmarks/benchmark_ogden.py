@@ -19,6 +19,7 @@ import numpy as np
 from benchmark_methods import PAPER_SIZE, experiment_of
 
 from collocation_sysid import Body, Collocation, Parameters, Unknown
+from collocation_sysid.common.array_types import Array
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
@@ -108,12 +109,17 @@ def make_sweep(material: str, arguments: argparse.Namespace) -> Callable[[], tup
         for name, value in values.items()
     }
     collocation = Collocation([experiment], Parameters.from_mapping(unknowns))
+    return timed_sweep(collocation, body.theta_from_values(values))
+
+
+def timed_sweep(collocation: Collocation, theta: Array) -> Callable[[], tuple[float, ...]]:
+    """Return a function that sweeps over the motion of the only experiment at θ, and returns times
+    [s].
+    """
     (transcription,) = collocation.transcriptions
-    theta = body.theta_from_values(values)
-    x = simulate_scheme(
-        experiment, Dynamics.from_experiment(experiment, "midpoint").with_theta(theta)
-    )
-    (part,) = collocation.iterates_at(collocation.guess_p, [x])
+    experiment = transcription.experiment
+    dynamics = Dynamics.from_experiment(experiment, "midpoint").with_theta(theta)
+    (part,) = collocation.iterates_at(collocation.guess_p, [simulate_scheme(experiment, dynamics)])
 
     def sweep() -> tuple[float, ...]:
         """Return the times of a sweep, of its evaluations and of its linear algebra [s]."""

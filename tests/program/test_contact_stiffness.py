@@ -60,7 +60,7 @@ def first_order_n(experiment: Experiment, values: dict[str, float]) -> np.ndarra
     positions = cs.simulate(experiment, values).positions_m
     z = collocation.pack(collocation.guess_p, [positions.reshape(len(positions), -1)])
     _, blocks = changed_residuals(collocation, z, [(SOFTNESS, 1.0)])
-    sensor_sigma = experiment.wrenches[-1].stack_sigmas().reshape(2, 3)[0, 2]
+    sensor_sigma = experiment.wrenches[-1].value_sigmas.reshape(2, 3)[0, 2]
     return blocks[-1][:, 0, 2, 0] * sensor_sigma
 
 

@@ -51,7 +51,7 @@ def noisy(experiment: Experiment, seed: int = 0) -> Experiment:
     rng, tracks = np.random.default_rng(seed), experiment.markers.positions_m
     seen = with_markers(experiment, tracks + 1e-4 * rng.normal(size=tracks.shape))
     felt = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
-    values = [w.values + 0.1 * w.stack_sigmas() * rng.normal(size=w.values.shape) for w in felt]
+    values = [w.values + 0.1 * w.value_sigmas * rng.normal(size=w.values.shape) for w in felt]
     return with_wrenches(seen, values)
 
 

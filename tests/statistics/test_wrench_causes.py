@@ -141,7 +141,7 @@ def test_a_large_tare_is_named_although_its_prior_can_follow_it():
     experiment = swung(nuisance=Nuisance())
     (grasp,) = experiment.grasps
     assert grasp.wrench is not None
-    offset = replace(grasp.wrench, values=grasp.wrench.values + 40 * grasp.wrench.stack_sigmas())
+    offset = replace(grasp.wrench, values=grasp.wrench.values + 40 * grasp.wrench.value_sigmas)
     given = replace(experiment, grasps=[replace(grasp, wrench=offset)])
     (cause,) = wrench_mistakes(Collocation([given], GUESS)).hypotheses
     assert cause.cause == "wrench-tare"

@@ -181,7 +181,7 @@ def _force_signals(experiment: Experiment, trajectory: Trajectory) -> RecordingS
             columns.append(f"grasp_{number}_{COMPONENTS[component]}_n")
             measured.append(wrench.symmetry * wrench.values[:, component])
             simulated.append(wrench.symmetry * prediction[:, component])
-            sigma.append(wrench.symmetry * float(wrench.stack_sigmas()[component]))
+            sigma.append(wrench.symmetry * float(wrench.value_sigmas[component]))
     signal = Signal(
         "forces", TIME_KEY, experiment.wrenches[0].t_s, tuple(columns), np.column_stack(measured)
     )

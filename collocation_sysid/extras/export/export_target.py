@@ -152,7 +152,7 @@ class TargetCapabilities:
         for region in body.regions:
             damped = bool(region.gamma_r_s)
             templates = [
-                *[VISCOELASTICITY] * (bool(region.branches)),
+                *[VISCOELASTICITY] * bool(region.branches),
                 *[self.other_materials] * (region.material not in self.materials),
                 *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),

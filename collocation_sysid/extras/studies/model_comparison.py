@@ -95,6 +95,8 @@ def compare_models(
     """
     if len(models) < 2:
         raise InputError(f"found {len(models)} models; expected two or more to compare")
+    for problem in models.values():
+        require_predictable(problem)
     first, *others = (
         {e.name: measured_count(e) for e in problem.experiments if not e.validation}
         for problem in models.values()
@@ -109,7 +111,6 @@ def compare_models(
     held_out = ("", *fitted_recordings(next(iter(models.values()))))
     for test_name in held_out:
         for name, problem in models.items():
-            require_predictable(problem)
             by = method or problem.method
             if not isinstance(by, str):
                 raise InputError("found a method that is an object; expected the name of a method")

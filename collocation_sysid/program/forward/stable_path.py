@@ -40,7 +40,6 @@ DISTANCE = 1e-4
 LOCATED = 1 / 16
 # Shortest step, as a share of the way from sample to sample.
 SHORTEST_STEP = 0.5**16
-
 # Largest number of steps from sample to sample, each with a factorisation.
 STEPS = 60
 
@@ -194,16 +193,15 @@ def _follow(solver: NewtonSolver, equations: Equations, x: Array) -> tuple[Array
             return x, share, True
         stable = x, share
         step = min(longest, 1 - share)
-        trial = None
-        while trial is None:
-            if step < SHORTEST_STEP:
-                return x, share, False
+        while step >= SHORTEST_STEP:
             residual, _, goal = equations(share + step)
             trial = _corrected(solver, factor, residual, x, goal_m=goal, stiffness=at.symmetric)
-            longest = 2 * step
+            if trial is not None:
+                break
             step /= 4
-        x = trial
-        share = min(share + 4 * step, 1.0)
+        else:
+            return x, share, False
+        x, share, longest = trial, min(share + step, 1.0), 2 * step
     return x, share, False
 
 
