@@ -151,7 +151,7 @@ class Dynamics:
         rows = len(t_s)
         first_row = 0 if experiment.start == "equilibrium" else 1
         tables = StencilTables.from_scheme(table, rows, first_row=first_row)
-        velocity = experiment.start_velocities_m_s
+        velocity = experiment.initial_velocities_m_s
         dofs = experiment.body.pattern.size
         lags = tables.p @ np.arange(tables.p.shape[1])
         evaluated_s = t_s - lags * experiment.timestep_s / substeps

@@ -425,7 +425,7 @@ class ExperimentSection(NamedSection, of=Experiment):
         in the frame of the poses by static transforms. The frame of the poses by default.
     start : {"equilibrium", "undeformed"}
         State of the body at the first time. "equilibrium": at rest under its loads. "undeformed":
-        undeformed and at rest.
+        undeformed, and at rest unless `start_velocity_m_s` or `start_spin_rad_s` is stated.
     mass : list of PointMassSection
         [[experiment.mass]] tables: point masses tied to the body.
     force : list of ForceSection
@@ -464,6 +464,8 @@ class ExperimentSection(NamedSection, of=Experiment):
     gravity_frame: Text | None = None
     kind: Declared
     start: Literal["equilibrium", "undeformed"] = "equilibrium"
+    start_velocity_m_s: Declared
+    start_spin_rad_s: Declared
     start_rule: Declared
     loaded_since_s: Declared
     validation: Declared

@@ -80,12 +80,18 @@ class Experiment:
         "dynamic": a motion. "static": each sample is an equilibrium, and a material with memory
         relaxes between the samples.
     start : {"equilibrium", "undeformed", "given"}
-        State at the first time: at rest under its loads; undeformed and at rest; or as given.
+        State at the first time: at rest under its loads; undeformed, at rest or with `start_velocity_m_s`
+        and `start_spin_rad_s`; or as given.
     start_rule : {"standard", "paper"}
         Inertia in the first time step. "standard": from the initial velocity. "paper": zero
         acceleration.
     start_positions_m, start_velocities_m_s : (n, 3) arrays, optional
         The state for "given"; at rest if the velocities are left out.
+    start_velocity_m_s : (3,) array, optional
+        Velocity [x, y, z] of the centre of mass at the first time, of a body that starts
+        "undeformed"; at rest by default.
+    start_spin_rad_s : (3,) array, optional
+        Angular velocity [x, y, z] of such a body about its centre of mass; zero by default.
     loaded_since_s : float
         How long a body with memory has been in the shape of its initial equilibrium [s]; by default
         the material is completely relaxed.
@@ -136,6 +142,12 @@ class Experiment:
     start_rule: StartRule = key(StartRule, default="standard")
     start_positions_m: Array | None = key(converter=_state("positions_m"), default=None)
     start_velocities_m_s: Array | None = key(converter=_state("velocities_m_s"), default=None)
+    start_velocity_m_s: Array | None = key(
+        Vector | None, converter=float_converter((3,), "start_velocity_m_s"), default=None
+    )
+    start_spin_rad_s: Array | None = key(
+        Vector | None, converter=float_converter((3,), "start_spin_rad_s"), default=None
+    )
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
     frames_fault: str = ""
@@ -703,23 +715,51 @@ class Experiment:
                 f"start_positions_m or start_velocities_m_s is given, but start is '{self.start}'; "
                 "expected start = 'given', or neither of them"
             )
+        for name in ("start_velocity_m_s", "start_spin_rad_s"):
+            if self.start != "undeformed" and getattr(self, name) is not None:
+                raise InputError(
+                    f"{name} is given, but start is '{self.start}'; expected start = 'undeformed', "
+                    f"or no {name}",
+                    where=name,
+                )
         if self.start == "equilibrium":
             self._require_unique_equilibrium()
+
+    @property
+    def initial_velocities_m_s(self) -> Array | None:
+        """Velocities (n, 3) at the first time [m/s]: given ones, or those of a rigid motion with
+        `start_velocity_m_s` and `start_spin_rad_s`; None for a body at rest. Frames of obstacles
+        follow their own poses.
+        """
+        if self.start_velocity_m_s is None and self.start_spin_rad_s is None:
+            return self.start_velocities_m_s
+        x_m = self.rigid_positions(self.t_s[:1])[0]
+        mass_kg = self.moving_node_mass_kg(self.t_s[:1])[0]
+        arms_m = x_m - mass_kg @ x_m / mass_kg.sum()
+        spin = np.zeros(3) if self.start_spin_rad_s is None else self.start_spin_rad_s
+        velocities = np.cross(spin, arms_m)
+        velocities += 0.0 if self.start_velocity_m_s is None else self.start_velocity_m_s
+        frames = self.body.frames.ravel()
+        velocities[frames] = self._frame_motion()[1]
+        return velocities
 
     def _append_obstacle_frames(self, node_count: int) -> None:
         """Append positions and velocities of the obstacles' frames to a given start state without
         them, in place; a state that has them is unchanged.
-
-        Velocities are differences over a thousandth of the time between samples.
         """
-        frames = self.body.frames.ravel()
         if node_count == len(self.body.nodes_m):
             return
-        at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
-        places = self.rigid_positions(at_s)[:, frames]
-        rates = np.diff(places, axis=0)[0] / np.diff(at_s)
-        for name, own in (("start_positions_m", places[0]), ("start_velocities_m_s", rates)):
+        state = ("start_positions_m", "start_velocities_m_s")
+        for name, own in zip(state, self._frame_motion(), strict=True):
             vars(self)[name] = np.vstack([getattr(self, name), own])
+
+    def _frame_motion(self) -> tuple[Array, Array]:
+        """Return positions [m] and velocities [m/s] of the nodes of the obstacles' frames at the
+        first time, as differences over a thousandth of the time between samples.
+        """
+        at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
+        places = self.rigid_positions(at_s)[:, self.body.frames.ravel()]
+        return places[0], np.diff(places, axis=0)[0] / np.diff(at_s)
 
     def _require_unique_equilibrium(self) -> None:
         """Raise an `InputError` if the grasps at the first sample leave the body a rigid motion;

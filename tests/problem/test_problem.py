@@ -87,6 +87,19 @@ def test_overrides_are_written_as_in_toml(tiny):
     assert file.solver.methods["reduced-space"].ladder == (0.5, 1.0)
 
 
+def test_the_velocity_of_a_body_that_is_thrown_is_stated_in_the_file(tiny):
+    stated = (
+        "start = 'undeformed'\nstart_velocity_m_s = [0.1, 0, 2]\nstart_spin_rad_s = [0, 3, 0]\n"
+    )
+    replace_text('name = "swing"\n', f'name = "swing"\n{stated}')(tiny)
+    thrown = experiment_of(tiny)
+    np.testing.assert_array_equal(thrown.start_velocity_m_s, [0.1, 0, 2])
+    np.testing.assert_array_equal(thrown.start_spin_rad_s, [0, 3, 0])
+    assert np.ptp(thrown.initial_velocities_m_s[:, 0]) == pytest.approx(3 * SIZE_M[2])
+    with pytest.raises(InputError, match="start_velocity_m_s is given, but start is 'equilibrium'"):
+        experiment_of(tiny, "experiment.swing.start=equilibrium")
+
+
 def test_the_text_as_run_has_the_overrides_in_it(tiny):
     given = (tiny / "problem.toml").read_text()
     assert text_of(load(tiny)) == given

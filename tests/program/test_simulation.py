@@ -216,6 +216,25 @@ def test_a_body_thrown_along_with_its_grasp_stays_undeformed(integrator: str):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_thrown_body_starts_with_the_stated_velocity_and_spin(integrator: str):
+    cube = replace(hung_cube(), grasps=(), start="undeformed", air_density_kg_m3="none")
+    velocity, spin = np.array([0.5, -0.2, 3.0]), np.array([0.3, -0.4, 0.5])
+    places_m, mass_kg = cube.body.nodes_m, cube.body.node_mass
+    middle_m = mass_kg @ places_m / mass_kg.sum()
+    thrown = replace(cube, start_velocity_m_s=velocity, start_spin_rad_s=spin)
+    started = np.cross(spin, places_m - middle_m) + velocity
+    np.testing.assert_allclose(thrown.initial_velocities_m_s, started, atol=1e-14)
+    motion = simulate(thrown, {**TRUTH, "gamma_m_1_s": 0.0}, integrator, substeps=2)
+    t_s = cube.t_s[:, None] - cube.t_s[0]
+    flight_m = middle_m + velocity * t_s + thrown.gravity_m_s2 / 2 * t_s**2
+    middles_m = mass_kg @ motion.positions_m / mass_kg.sum()
+    damped = integrator in ("bdf2", "backward-euler")
+    np.testing.assert_allclose(middles_m, flight_m, atol=5e-3 if damped else 1e-9)
+    turned_m = Rotation.from_rotvec(spin * t_s[-1]).apply(places_m - middle_m)
+    np.testing.assert_allclose(motion.positions_m[-1] - middles_m[-1], turned_m, atol=1e-3)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_held_nodes_follow_their_grasp(integrator: str):
     cube = hung_cube()
     motion = simulate(cube, TRUTH, integrator)

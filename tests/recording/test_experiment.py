@@ -119,6 +119,9 @@ def test_a_given_start_is_at_rest_unless_velocities_are_given():
         ({"start": "given"}, "needs start_positions_m"),
         ({"start_positions_m": NODES}, "but start is 'equilibrium'"),
         ({"start": "given", "start_positions_m": NODES[1:]}, "start_positions_m has the shape"),
+        ({"start_velocity_m_s": [0, 0, 1]}, "start_velocity_m_s is given, but start is 'equilibr"),
+        ({"start_spin_rad_s": [0, 0, 1]}, "expected start = 'undeformed', or no start_spin_rad_s"),
+        ({"start": "undeformed", "start_velocity_m_s": [1.0]}, "start_velocity_m_s has the shape"),
         (
             {"forces": (Force([5], [0, 0, 1]),)},
             "force acts on node 5; expected node indices from 0 to 4",

@@ -231,7 +231,7 @@ def _keyframe_xml(body: IdentifiedBody) -> str:
     """
     free = ~body.is_node_prescribed
     shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
-    started = body.experiment.start_velocities_m_s
+    started = body.experiment.initial_velocities_m_s
     velocity = np.zeros_like(shape) if started is None else started
     grasps = body.experiment.grasps
     carriers = [np.concatenate(_pose_at(grasp, body.start_s)) for grasp in grasps]

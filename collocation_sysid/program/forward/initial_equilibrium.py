@@ -213,7 +213,7 @@ def initial_state(
     SimulationError
         If no stable equilibrium is found.
     """
-    velocity = experiment.start_velocities_m_s
+    velocity = experiment.initial_velocities_m_s
     v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
     if experiment.start == "equilibrium":
         at_s = float(experiment.t_s[0])
