@@ -737,7 +737,7 @@ class Experiment:
         mass_kg = self.moving_node_mass_kg(self.t_s[:1])[0]
         arms_m = x_m - mass_kg @ x_m / mass_kg.sum()
         spin = np.zeros(3) if self.start_spin_rad_s is None else self.start_spin_rad_s
-        velocities = np.cross(spin, arms_m)
+        velocities: Array = np.asarray(np.cross(spin, arms_m), dtype=np.float64)
         velocities += 0.0 if self.start_velocity_m_s is None else self.start_velocity_m_s
         frames = self.body.frames.ravel()
         velocities[frames] = self._frame_motion()[1]

@@ -95,6 +95,7 @@ def test_the_velocity_of_a_body_that_is_thrown_is_stated_in_the_file(tiny):
     thrown = experiment_of(tiny)
     np.testing.assert_array_equal(thrown.start_velocity_m_s, [0.1, 0, 2])
     np.testing.assert_array_equal(thrown.start_spin_rad_s, [0, 3, 0])
+    assert thrown.initial_velocities_m_s is not None
     assert np.ptp(thrown.initial_velocities_m_s[:, 0]) == pytest.approx(3 * SIZE_M[2])
     with pytest.raises(InputError, match="start_velocity_m_s is given, but start is 'equilibrium'"):
         experiment_of(tiny, "experiment.swing.start=equilibrium")

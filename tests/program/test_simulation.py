@@ -223,7 +223,9 @@ def test_a_thrown_body_starts_with_the_stated_velocity_and_spin(integrator: str)
     middle_m = mass_kg @ places_m / mass_kg.sum()
     thrown = replace(cube, start_velocity_m_s=velocity, start_spin_rad_s=spin)
     started = np.cross(spin, places_m - middle_m) + velocity
-    np.testing.assert_allclose(thrown.initial_velocities_m_s, started, atol=1e-14)
+    initial_m_s = thrown.initial_velocities_m_s
+    assert initial_m_s is not None
+    np.testing.assert_allclose(initial_m_s, started, atol=1e-14)
     motion = simulate(thrown, {**TRUTH, "gamma_m_1_s": 0.0}, integrator, substeps=2)
     t_s = cube.t_s[:, None] - cube.t_s[0]
     flight_m = middle_m + velocity * t_s + thrown.gravity_m_s2 / 2 * t_s**2
