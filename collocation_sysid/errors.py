@@ -24,6 +24,8 @@ def hint_at(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
+# Characters without width, such as a byte order mark within a file: a quoted number would look right.
+_INVISIBLE = (0xAD, 0x61C, 0x200B, 0x200E, 0x200F, *range(0x2060, 0x2065), 0xFEFF)
 # Marks in place of what would control a terminal or turn its text around, and of what neither UTF-8
 # nor XML can hold.
 _MARKS = (
@@ -31,6 +33,7 @@ _MARKS = (
     | {0x7F: 0x2421}
     | dict.fromkeys((*range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)), 0xFFFD)
     | dict.fromkeys((*range(0xD800, 0xE000), 0xFFFE, 0xFFFF), 0xFFFD)
+    | dict.fromkeys((*_INVISIBLE, 0x2028, 0x2029), 0xFFFD)
 )
 # Longest message [characters]: a screen of text, so that quoted input cannot flood a terminal.
 LONGEST = 1500
@@ -43,8 +46,8 @@ def printable(text: str) -> str:
     """Return the text with visible marks in place of control characters.
 
     ASCII control characters except tab and line feed become their symbols (U+2400 + code); further
-    controls, bidirectional overrides, surrogates and other characters that XML or UTF-8 cannot hold
-    become U+FFFD.
+    controls, bidirectional overrides, invisible characters, surrogates and other characters that XML
+    or UTF-8 cannot hold become U+FFFD.
     """
     return text.translate(_MARKS)
 

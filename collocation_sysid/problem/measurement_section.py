@@ -11,12 +11,12 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, create_model
+from pydantic import AfterValidator, BeforeValidator, create_model
 
 from ..common.array_types import Array
 from ..common.schema_tables import Section
@@ -148,6 +148,25 @@ class MeasurementSection(NamedSection):
 @cache
 def registered_tables() -> type[Section] | None:
     """Return a table of the lists of tables of other packages, by their keys; None without any."""
-    kinds = {each.name: each.load() for each in entry_points(group=ENTRY_POINTS)}
-    lists: dict[str, Any] = {key: (list[kind], []) for key, kind in kinds.items()}
+    lists: dict[str, Any] = {e.name: (_type_of(e), []) for e in entry_points(group=ENTRY_POINTS)}
     return create_model("RegisteredTables", __base__=Section, **lists) if lists else None
+
+
+def _type_of(entry: EntryPoint) -> Any:
+    """Return the type of a list of tables of another package; one that refuses every value with the
+    reason if the class cannot be imported, so that only problems with such a table are refused.
+    """
+    try:
+        kind = entry.load()
+        if issubclass(kind, MeasurementSection):
+            return list[kind]
+        reason = "it is no MeasurementSection"
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0].rstrip(": ")
+    package = f" of the package {entry.dist.name!r}" if entry.dist else ""
+    message = f"the table {entry.value!r}{package} cannot be used ({reason}); repair or remove the package"
+
+    def refuse(_: Any) -> Any:
+        raise ValueError(message)
+
+    return Annotated[Any, BeforeValidator(refuse)]

@@ -431,6 +431,8 @@ def changed_arrays(rng: Rng, content: bytes) -> bytes:
         lambda: array.astype(float).astype(int).astype(kinds[int(rng.integers(len(kinds)))]),
         lambda: np.zeros(rng.integers(0, 4, size=int(rng.integers(0, 5)))),
     ]
+    if array.dtype.kind not in "biuf":  # texts have no products
+        actions = [each for k, each in enumerate(actions) if k not in (8, 9)]
     action = int(rng.integers(len(actions) + 1))
     if action == len(actions):
         arrays[str(rng.choice(["x", "t_s", "points_m", "depth_m"]))] = arrays.pop(name)

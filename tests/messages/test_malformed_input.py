@@ -110,6 +110,12 @@ def test_only_digits_of_ascii_are_digits(tiny: Path, file: str, number: str):
     assert f"'{number}'; expected a number" in refused("check", "problem.toml")
 
 
+@pytest.mark.parametrize("mark", "\ufeff\u200b\u2060\xad\u2028\u200e")
+def test_an_invisible_character_in_a_number_is_made_visible(tiny: Path, mark: str):
+    replace_cell(MARKERS, 3, 1, f"0.0{mark}1")(tiny)
+    assert "'0.0\ufffd1'; expected a number" in refused("check", "problem.toml")
+
+
 def test_nor_are_others_places_in_a_list_or_counts(tiny: Path):
     words = settings("experiment.٠.start=undeformed")
     assert "expected its number, from 0" in refused("check", "problem.toml", *words)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
-from kit.problem_files import AT_TRUTH, TRUTH, replace_text, run_command, settings
+from kit.problem_files import AT_TRUTH, TRUTH, replace_text, run_command, settings, write_problem
 
 from collocation_sysid import InputError, Problem
 from collocation_sysid.problem.measurement_section import registered_tables
@@ -76,6 +79,36 @@ def test_without_the_package_its_table_is_unknown(strung: Path, monkeypatch: pyt
     registered_tables.cache_clear()
     with pytest.raises(InputError, match="string_potentiometer"):
         Problem.read(strung / "problem.toml")
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("import a_library_that_is_missing", "ModuleNotFoundError: No module named"),
+        ("raise RuntimeError('first\\nsecond')", r"RuntimeError: first\)"),
+        ("def broken(:", "SyntaxError"),
+        ("", "AttributeError"),
+        ("StringPotentiometerSection = 3", "TypeError"),
+        ("StringPotentiometerSection = dict", "no MeasurementSection"),
+    ],
+)
+def test_a_broken_package_is_named_where_its_table_is_used(
+    strung: Path, monkeypatch: pytest.MonkeyPatch, code: str, reason: str
+):
+    packages = strung / "packages"
+    shutil.copytree(PACKAGES, packages)
+    (packages / "string_potentiometer.py").write_text(code)
+    monkeypatch.syspath_prepend(packages)
+    monkeypatch.delitem(sys.modules, "string_potentiometer", raising=False)
+    with pytest.raises(InputError) as caught:
+        Problem.read(strung / "problem.toml", simulation=True)
+    (line,) = str(caught.value).splitlines()
+    assert "string_potentiometer: the table 'string_potentiometer:String" in line
+    assert "of the package 'string-potentiometer' cannot be used" in line.replace("_", "-")
+    assert re.search(reason, line)
+    (strung / "other").mkdir()
+    write_problem(strung / "other", {"swing": 8})
+    Problem.read(strung / "other" / "problem.toml")  # has no such table
 
 
 @pytest.mark.long
