@@ -314,10 +314,10 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     rows = _row_count(solution)
     try:
         with counted_phase(StepUnit.TIME_STEP, rows):
-            fit = linearise_fit(solution.collocation, solution.z)
+            own = linearise_fit(solution.collocation, solution.z)
         say("computing the effect of noise of the poses")
         with counted_phase(StepUnit.TIME_STEP, rows):
-            fit, noises = with_pose_noise(fit, solution.collocation, z=solution.z)
+            fit, noises = with_pose_noise(own, solution.collocation, z=solution.z)
     except SimulationError as error:
         return Run(
             problem,
@@ -327,7 +327,7 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
             notes=(f"no error bars: {error}",),
         ), None
     answer = Run(
-        problem, solution, rollouts=rollouts, uncertainty=None, diagnoses=diagnose_markers(fit)
+        problem, solution, rollouts, uncertainty=None, fit=own, diagnoses=diagnose_markers(fit)
     )
     if not solution.collocation.nq:
         return answer, fit

@@ -30,7 +30,7 @@ from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate, relative_derivatives
 from ..statistics.field_estimates import FieldEstimate, field_estimates
 from ..statistics.identifiability import identifiability_sentences
-from ..statistics.linearised import DerivedModuli
+from ..statistics.linearised import DerivedModuli, LinearisedFit
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.probes.profile_likelihood import Profile
@@ -59,6 +59,9 @@ class SolvedProblem:
         Forward simulations, or the reason why there is none.
     uncertainty : Uncertainty or None
         None if the solve did not converge.
+    fit : LinearisedFit or None
+        Linearised fit at the solution, without the noise of the poses; None if the solve did not
+        converge or cannot be linearised.
     diagnoses : tuple of MarkerDiagnosis
         Findings in the residuals.
     profiles : tuple of Profile
@@ -89,6 +92,7 @@ class SolvedProblem:
     solution: Solution
     rollouts: Mapping[str, ForwardSimulation | str]
     uncertainty: Uncertainty | None
+    fit: LinearisedFit | None = None
     diagnoses: tuple[MarkerDiagnosis, ...] = ()
     profiles: tuple[Profile, ...] = ()
     notes: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.fits import autoregressive, problem
-from kit.problem_files import EXPERIMENT, PROBLEM, run_command, write_problem
+from kit.problem_files import EXPERIMENT, PROBLEM, replace_text, run_command, write_problem
 from kit.problems import TRUTH, as_theta, box, hung_cube, smooth_poses, times
 from kit.region_files import TWO_REGIONS
 from kit.static import block
@@ -718,6 +718,7 @@ def test_a_model_that_cannot_be_simulated_elsewhere_is_named():
 def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
     monkeypatch.chdir(tiny)
     monkeypatch.setenv("COLUMNS", "80")
+    replace_text("[rollout]", '[environment]\nair_density_kg_m3 = "none"\n\n[rollout]')(tiny)
     words = ("compare-models", "problem.toml", "--materials", "neo-hookean,st-venant-kirchhoff")
     words = (*words, "--method", "reduced-space", "--workers", "2", "--out", "models")
     done = run_command(*words, "--quiet")
@@ -731,6 +732,16 @@ def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
     assert sum(row["chosen"] for row in summary["runs"]) == 1
     listed = run_command(*words, "--dry-run")
     assert listed.out.count("finished") == 4
+    solved = run_command(
+        "solve", "problem.toml", "--method", "reduced-space", "-q", "--no-pictures", "--out", "run"
+    )
+    assert solved.code == 0, solved.err
+    estimates = json.loads((tiny / "run" / "result.json").read_text())["parameters"]
+    row = next(row for row in summary["runs"] if row["model"] == "neo-hookean")
+    assert row["parameters"].keys() >= estimates.keys() >= {"mu_pa", "gamma_r_s"}
+    for name, estimate in estimates.items():
+        assert row["parameters"][name] == pytest.approx(estimate["value"], rel=1e-9)
+        assert row["budget"][name]["combined95"] == pytest.approx(estimate["combined95"], rel=1e-9)
     page = run_command("report", "models")
     assert summary["advice"].split(":")[0] in (tiny / "models" / "report.html").read_text()
     assert page.code == 0

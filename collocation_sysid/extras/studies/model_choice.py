@@ -28,7 +28,6 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import SimulationError
 from ...features.measurements import fit_rms, judged_residuals
 from ...fem.laws.constants import symbol_of, unit_of
 from ...methods.solution import Solution
@@ -44,7 +43,6 @@ from ...statistics.linearised import (
     LinearisedFit,
     ResidualBlock,
     factorise_information,
-    linearise_fit,
     parameter_values,
 )
 from ...statistics.residuals.autocorrelation import ErrorProcess, error_processes
@@ -606,14 +604,15 @@ def _complete_record(problem: Problem, method: str) -> dict[str, Any]:
     record["time_s"] = time.perf_counter() - began_s
     if not solution.status.converged:
         return record
-    try:
-        fit = linearise_fit(solution.collocation, solution.z)
-    except SimulationError as error:
-        return record | {"converged": False, "status": str(error)}
+    if finished.fit is None:
+        return record | {
+            "converged": False,
+            "status": "; ".join(finished.notes) or finished.omitted_checks,
+        }
     reported = {name: each.value for name, each in finished.estimates.items()}
     return record | {
         "parameters": {n: reported.get(n, value) for n, value in record["parameters"].items()},
-        "evidence": asdict(evidence_from_fit(fit)),
+        "evidence": asdict(evidence_from_fit(finished.fit)),
         "budget": {name: asdict(line) for name, line in finished.budget.items()},
     }
 
