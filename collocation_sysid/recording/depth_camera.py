@@ -35,6 +35,8 @@ LARGEST_RELATIVE_JUMP = 0.02
 UNDISTORTION_ITERATIONS = 12
 # Error of an inverted distortion above which the iteration counts as not converged [pixels].
 LARGEST_DISTORTION_ERROR_PX = 1.0
+# Points of a cloud nearer to the plane of a camera with a matrix have no viewing direction [m].
+LEAST_DEPTH_M = 1e-6
 # Largest number of images of a recording whose outlines are compared: they are stored in memory,
 # and one of 640 x 480 pixels takes 1.2 MB.
 MOST_OUTLINE_IMAGES = 40
@@ -390,7 +392,7 @@ class Depth(Measurement):
 
     def _thin_cloud(self, cloud: Array) -> Array:
         """Return the finite points of a cloud (P, 3) or (P, 6), one for each cube of a grid of
-        `spacing_m`, in their order in the cloud.
+        `spacing_m`, in their order in the cloud; without those at the camera, if it has a matrix.
 
         Of the points in a cube the one nearest to the cube's centre across the optical axis is
         selected; the depth has no influence.
@@ -401,6 +403,8 @@ class Depth(Measurement):
                 "(points, 3), or (points, 6) with normals"
             )
         cloud = cloud[np.isfinite(cloud).all(axis=1)]
+        if self.camera.matrix is not None:  # such as (0, 0, 0), where nothing was measured
+            cloud = cloud[np.abs(cloud[:, 2]) > LEAST_DEPTH_M]
         cubes = np.floor(cloud[:, :3] / self.spacing_m)
         # Across the view only: noise of the depth must not choose.
         away = np.linalg.norm((cloud[:, :3] / self.spacing_m - cubes - 0.5)[:, :2], axis=1)

@@ -122,6 +122,17 @@ def test_the_picture_names_points_out_of_view():
     assert said == ["the body is not in view"]
 
 
+@pytest.mark.filterwarnings("error")
+def test_points_of_a_cloud_at_the_camera_do_not_count():
+    camera = cs.DepthCamera(MATRIX, pose=POSE)
+    seen = points_from_image(image_m(), cs.DepthCamera(MATRIX))
+    cloud = np.vstack([seen, [[0.0, 0.0, 0.0], [0.1, 0.1, 1e-320], [0.1, 0.0, -1e-9]]])
+    depths = [cs.Depth("scan", [0.0], [each], 1e-3, camera) for each in (seen, cloud)]
+    (expected,), (rows,) = (undeformed_rows(hanging((each,))).values() for each in depths)
+    assert np.array_equal(rows, expected, equal_nan=True)
+    assert depth_picture(rows).axes
+
+
 def test_a_cloud_is_drawn_with_the_body_from_its_broad_side():
     cloud = points_from_image(image_m(), cs.DepthCamera(MATRIX)) @ POSE[:3, :3].T + POSE[:3, 3]
     (rows,) = undeformed_rows(hanging((cs.Depth("scan", [0.0], [cloud], 1e-3),))).values()
