@@ -177,8 +177,9 @@ def test_every_kind_of_nuisance_parameter_is_explained():
 
 
 @pytest.mark.long
-def test_every_word_that_a_solve_prints_is_explained(tmp_path):
-    create_problem(tmp_path / "strip", "specimen")
+@pytest.mark.parametrize("kind", ["specimen", "compression", "swing"])
+def test_every_word_that_a_solve_prints_is_explained(tmp_path, kind: str):
+    create_problem(tmp_path / "strip", kind)
     found = run(Problem.read(tmp_path / "strip" / "problem.toml"), seek_causes=False)
     shown = run_summary(found.result, details=True, budget=True)
     tables = [each for each in shown if isinstance(each, Table)]
@@ -186,8 +187,10 @@ def test_every_word_that_a_solve_prints_is_explained(tmp_path):
     words = {cell for table in tables for cell in table.heads} - {"", "value", "% of the variance"}
     rows = [row[0] for table in tables for row in table.rows]
     words |= {re.sub(r" (Pa|kPa|MPa|GPa|s|1/s)$", "", row) for row in rows}
-    words |= {note.split(":")[0] for note in found.result.fit.experiments["pull"].notes}
-    words |= {label.rpartition(" [")[0] for label in found.result.nuisance["pull"]}
+    for each in found.result.fit.experiments.values():
+        words |= {re.sub(r"\d+ ", "", re.split("[:,]", note)[0]) for note in each.notes}
+    for each in found.result.nuisance.values():
+        words |= {label.rpartition(" [")[0] for label in each}
     words |= {"fit", "forward simulation", "reduced χ²", found.trust.verdict}
     unknown = [word for word in sorted(words) if run_command("explain", word).code]
     assert unknown == []

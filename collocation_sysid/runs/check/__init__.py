@@ -43,7 +43,14 @@ from .body_check import (
     check_grasps,
     grasp_concerns,
 )
-from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
+from .cost import (
+    MethodCost,
+    cost_concerns,
+    cost_notes,
+    estimated_sweeps_s,
+    method_costs,
+    nonzeros,
+)
 from .derivatives import derivative_errors, shortened_problem
 from .grasp_extent import grasp_extent_concerns
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
@@ -348,6 +355,16 @@ def check_problem(
     findings = replace(findings, concerns=concerns)
     known = [note for note in problem.notes if note not in findings.warnings]
     return replace(findings, notes=(*known, *lost, *notes))
+
+
+def expected_search_s(problem: Problem) -> float | None:
+    """Return a rough estimate of the time of a search in reduced space [s], from one sweep over the
+    first samples at the guesses, or at typical values without; None if these cannot be simulated.
+    """
+    first = shortened_problem(problem).collocation()
+    first = replace(first, parameters=typical_parameters(first.parameters, SOFT_PA))
+    z, failures = initial_variables(first)
+    return None if failures else estimated_sweeps_s(problem.collocation(), first, z=z)
 
 
 def _fit_to_markers_s(collocation: Collocation, total_s: float, samples: int) -> float:

@@ -185,7 +185,7 @@ def method_costs(
         MethodCost(
             "reduced-space",
             memory_mb(collocation),
-            time_s=_estimated_sweeps_s(collocation, short, z=z, factorisation=factorisation),
+            time_s=estimated_sweeps_s(collocation, short, z=z, factorisation=factorisation),
         ),
         MethodCost(
             "interior-point",
@@ -249,8 +249,8 @@ def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Conc
     return [Concern("memory/short", data={"method": chosen.method, **sizes, "remedy": remedy})]
 
 
-def _estimated_sweeps_s(
-    collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
+def estimated_sweeps_s(
+    collocation: Collocation, short: Collocation, z: Array, factorisation: Choice = "auto"
 ) -> float | None:
     """Return the estimated time of all sweeps of a solve [s], from one timed sweep over the first
     rows of each experiment and its `search_factor`; None if the equations cannot be solved.
