@@ -9,6 +9,7 @@ from pathlib import Path
 
 import typer
 
+from ..common.display import duration
 from ..common.files import require_possible, run_name
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..common.validated_classes import validated
@@ -149,7 +150,9 @@ def compare_models(options: CompareModelsCommand) -> None:
     if not options.with_ and {options.materials, options.damping, options.prony} == {None}:
         raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
     from ..result.solve_progress import SolveProgress
+    from ..runs.check import expected_search_s
 
+    is_announced = not (options.quiet or options.dry_run)
     method = _single_method(options.method)
     problem = options.read_problem()
     others = [replace(options, problem=file).read_problem() for file in options.with_ or ()]
@@ -165,14 +168,22 @@ def compare_models(options: CompareModelsCommand) -> None:
         SolveProgress(error_console, quiet=options.quiet, activity="reading the models"),
         counted_phase(StepUnit.PROBLEM, len(variants)),
     ):
+        searches_s = []
         for variant in variants:  # an impossible model would fail every run
-            Problem.read(variant.path, variant.overrides, allow_code=options.allow_code)
+            read = Problem.read(variant.path, variant.overrides, allow_code=options.allow_code)
+            if is_announced:
+                searches_s.append(expected_search_s(read))
             complete_steps(StepUnit.PROBLEM)
     planned = plan_models(problem, variants, method=method, allow_code=options.allow_code)
-    if not (options.quiet or options.dry_run):
+    if is_announced:
+        known_s = [each for each in searches_s if each is not None]
+        about = "the first fit shows how long they take"
+        if known_s:
+            total_s = len(planned) * sum(known_s) / len(known_s)
+            about = f"the searches take about {duration(total_s)} (rough estimate, without checks)"
         error_console.print(
             f"{len(planned)} fits: {len(variants)} models, each to all data and without held-out "
-            "data; the first fit shows how long they take",
+            f"data; {about}",
             soft_wrap=True,
         )
     _run_study(MODEL_STUDY, options, planned=planned)

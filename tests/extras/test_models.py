@@ -758,8 +758,9 @@ def test_a_comparison_of_laws_of_damping_from_the_command_line(tiny: Path, monke
         "--out",
         "laws",
     )
-    done = run_command(*words, "--quiet")
+    done = run_command(*words)
     assert done.code == 0, done.err
+    assert re.search(r"4 fits: 2 models, .* about [\d.]+ (s|min) \(rough estimate", done.err)
     summary = json.loads((tiny / "laws" / "summary.json").read_text())
     assert [row["model"] for row in summary["runs"]] == ["kelvin-voigt", "material"]
     assert all("gamma_r_s" in row["parameters"] for row in summary["runs"])

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from ...common.array_types import Array
 from ...common.serialisation import content
+from ...errors import SimulationError
 from ...features.feature import SimulatedCheck
 from ...features.measurements import lost_samples
 from ...features.registry import FEATURES
@@ -43,14 +44,7 @@ from .body_check import (
     check_grasps,
     grasp_concerns,
 )
-from .cost import (
-    MethodCost,
-    cost_concerns,
-    cost_notes,
-    estimated_sweeps_s,
-    method_costs,
-    nonzeros,
-)
+from .cost import MethodCost, cost_concerns, cost_notes, estimated_sweeps_s, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
 from .grasp_extent import grasp_extent_concerns
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
@@ -363,7 +357,10 @@ def expected_search_s(problem: Problem) -> float | None:
     """
     first = shortened_problem(problem).collocation()
     first = replace(first, parameters=typical_parameters(first.parameters, SOFT_PA))
-    z, failures = initial_variables(first)
+    try:
+        z, failures = initial_variables(first)
+    except SimulationError:  # no stress-free shape
+        return None
     return None if failures else estimated_sweeps_s(problem.collocation(), first, z=z)
 
 
