@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ..features.registry import FEATURES
 from ..methods.solution import Solution
 from ..statistics.misspecification.fit_misspecifications import (
-    markers_miss,
+    measurements_miss,
     motion_misspecifications,
 )
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
@@ -24,8 +24,8 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
     are noise.
 
-    Hypotheses of the features and about specimens are always tested; others only if the markers of
-    an experiment miss, see `motion_misspecifications`.
+    Hypotheses of the features and about specimens are always tested; others only if a
+    measurement of an experiment misses, see `motion_misspecifications`.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
 
 
 def cause_notes(solution: Solution, causes: Sequence[Hypothesis]) -> tuple[str, ...]:
-    """Return a note that refits found no cause of a misfit; empty if there is a cause, or if the
-    markers do not miss.
+    """Return a note that refits found no cause of a misfit; empty if there is a cause, or if
+    the measurements do not miss.
     """
-    return () if causes or not markers_miss(solution) else (NO_CAUSE,)
+    return () if causes or not measurements_miss(solution) else (NO_CAUSE,)

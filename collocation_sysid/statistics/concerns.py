@@ -134,11 +134,26 @@ TOPICS: dict[str, Topic] = {
             "tracks-filtered": "the tracks have hardly any noise above {frequency_hz:.2g} Hz "
             "({percent:.2g} % of sigma_m above twice this frequency), as after a low-pass filter, "
             "which changes the motion too: export the tracks without filtering",
+            "sensor-filtered": "{what} has hardly any noise above {frequency_hz:.2g} Hz "
+            "({percent:.2g} % of {stated} above twice this frequency), as after a low-pass filter, "
+            "which changes the signal too: export its values without filtering",
             "markers-same": "the tracks of markers {first} and {second} are {by_mm:.2g} mm (RMS) apart, "
             "but these markers are at different places of the body: one track is a copy of the other; "
             "correct markers.labels, or omit one of them",
             "markers-same/unplaced": "the tracks of markers {first} and {second} are {by_mm:.2g} mm "
             "(RMS) apart: one track is a copy of the other; omit one of them",
+            "sensor-sign": "its values fit with the opposite sign: multiply them by -1, or reverse the "
+            "direction of the sensor in its description",
+            "sensor-unit": "its values fit if multiplied by {factor:.4g}: check the unit of its columns",
+            "sensor-axes": "its axes are exchanged or reversed: its values fit with ({axes}) in place "
+            "of (x, y, z); reorder the columns, or rotate the axes",
+            "sensor-zero": "its zero is wrong: its values fit if {offset} is subtracted; zero the "
+            "sensor before the recording, or estimate the offset",
+            "sensor-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s state: its "
+            "clock differs from that of the poses; correct t_s of this sensor",
+            "measured-twice": "the values of {first} and {second} are exactly the same, which those of "
+            "two measurements are not: one is a copy of the other; correct the file or its columns, or "
+            "omit one of them",
             "marker-slip": "marker {marker} slips at about t = {t_s:.4g} s: give it "
             "markers.weights = 0, or end window_s before",
             "marker-slip/alone": "marker {marker} slips by {by_mm:.2g} mm at t = {t_s:.4g} s, the "

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.array_types import Array, root_mean
+from ...common.array_types import Array
 from ...common.time_dependence import at_times
 from ...errors import InputError, SimulationError
 from ...methods.continuation import first_samples
@@ -44,6 +44,7 @@ from .model_misspecifications import (
     mirror_images,
     screened_bodies,
 )
+from .sensor_misspecifications import sensor_hypotheses, sensor_misfits
 from .track_misspecifications import filtered_tracks, same_tracks
 
 # Factor by which the misfit of a refit must decrease, unless only noise remains.
@@ -95,8 +96,8 @@ SHORTEST = 4
 def motion_misspecifications(
     solution: Solution, known: Sequence[Hypothesis], budget: int | None = None
 ) -> list[Hypothesis]:
-    """Return hypotheses about the motion of the experiment with the largest misfit, by natural
-    modes and refits; empty if its markers miss by at most `NOISE` σ.
+    """Return hypotheses about the motion and the sensors of the experiment with the largest misfit,
+    by natural modes and refits; empty if its measurements miss by at most `NOISE` σ.
 
     Parameters
     ----------
@@ -130,25 +131,26 @@ def motion_misspecifications(
     return hypotheses
 
 
-def markers_miss(solution: Solution) -> bool:
-    """Return whether the markers of an experiment miss by more than noise, or its body is turned
-    or shifted in its grasp more than such errors are.
+def measurements_miss(solution: Solution) -> bool:
+    """Return whether a measurement of an experiment misses by more than noise, or its body is
+    turned or shifted in its grasp more than such errors are.
     """
     return max(_discrepancy(solution, k) for k in range(len(solution.parts))) > 1.0
 
 
 def _discrepancy(solution: Solution, number: int = 0) -> float:
-    """Return the discrepancy of an experiment (index) of a fit, 1 or less for noise: the RMS
-    residual of its markers over `NOISE` σ, or the largest error of gravity or of the pose in the
-    grasp over the largest one that a faultless recording has, if that is larger.
+    """Return the discrepancy of an experiment (index) of a fit, 1 or less for noise: the largest
+    RMS residual of its measurements over `NOISE` σ, or the largest error of gravity or of the pose
+    in the grasp over the largest one that a faultless recording has, if that is larger. Specimens,
+    which have hypotheses of their own, and depth images do not count.
     """
     part = solution.parts[number]
-    if not part.transcription.experiment.markers.count_samples():
+    misfits = sensor_misfits(solution, number)
+    if part.transcription.experiment.specimen is not None or not misfits:
         return 0.0
     limit = float(normal_isf(RARE / 2 / max(1, len(part.phi))))
     largest = _pose_deviation(part) / limit
-    misfit = _misfit(part.transcription.experiment, solution.readings_m[number])
-    return max(misfit / NOISE, largest)
+    return max(max(misfits.values()) / NOISE, largest)
 
 
 def _pose_deviation(part: ExperimentIterate) -> float:
@@ -178,6 +180,14 @@ def _refit_hypotheses(
         smallest_misfit=1 / NOISE,
         noise_level=1.0,
     )
+    partly = replace(trial, required_factor=PARTLY)
+    sensors = [
+        better
+        for each in partly.accepted(sensor_hypotheses(stated, NOISE))
+        for better in trial.accepted(_corrected_again(each, alone, partly))
+    ]
+    if any(each.strength > CERTAIN and (each.remaining or 0.0) <= 1.0 for each in sensors):
+        return _named_alone_or_together(sensors, alone.loss_after_refit)
     of = f"'{experiment.name}'"
     lags = [] if first.is_static else _clock_hypotheses(alone, first, stated=stated, of=of)
     comparison = ModalComparison.from_experiment(first, solution.parameters)
@@ -187,6 +197,7 @@ def _refit_hypotheses(
     bodies = [*screened_bodies(solution, first, is_far=is_far)]
     alone.near_answer.update(each.corrected for each in bodies)
     tested = [
+        *sensors,
         *trial.accepted(
             [
                 *lags,
@@ -197,9 +208,23 @@ def _refit_hypotheses(
                 *mirrored,
             ]
         ),
-        *replace(trial, required_factor=PARTLY).accepted(coarse_mesh_hypotheses(solution, of)),
+        *partly.accepted(coarse_mesh_hypotheses(solution, of)),
     ]
     return _named_alone_or_together(tested, alone.loss_after_refit)
+
+
+def _corrected_again(
+    hypothesis: Hypothesis, alone: _Refitter, trial: HypothesisTest
+) -> Iterator[Hypothesis]:
+    """Yield a hypothesis about a sensor, if its correction does not suffice with the correction of
+    another linear step.
+    """
+    refitted = alone.fit(hypothesis.corrected)
+    if refitted is not None and (hypothesis.remaining or 0.0) > 1.0:
+        again = sensor_hypotheses(refitted, NOISE, declared=alone.declared)
+        same = [e for e in again if (e.code, e.subject) == (hypothesis.code, hypothesis.subject)]
+        hypothesis = next(trial.accepted(same), hypothesis)
+    yield hypothesis
 
 
 def _named_alone_or_together(
@@ -276,9 +301,11 @@ def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator
     described = DeclaredMotion.from_experiment(declared)
     if described is not None:
         residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
+    if residual.shape[1] < 2:
+        return
     clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
     m = int(np.argmax([ratio for ratio, _ in clearest]))
-    if clearest[m][0] < SLIP or residual.shape[1] < 2:
+    if clearest[m][0] < SLIP:
         return
     tracks = np.array(declared.markers.positions_m)
     tracks[:, m] = np.nan
@@ -403,7 +430,7 @@ def _clock_hypotheses(
     fitted = stated
     best = None
     for _ in range(CLOCK_REFITS):
-        more_s = _marker_lag_s(shifted, fitted.readings_m[0])
+        more_s = _lag_s(fitted)
         lag_s += more_s
         if abs(more_s) < SAME_LAG_S:
             break
@@ -465,19 +492,32 @@ def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
     )
 
 
-def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
-    """Return by how much the markers lag behind predicted tracks (T, M, 3) [m], in seconds, to
-    first order; negative if they are early.
+def _lag_s(fitted: Solution) -> float:
+    """Return by how much the measurements of one fitted experiment lag behind their predictions, in
+    seconds, to first order; negative if they are early. Markers are used, or without them all
+    sensors with numbers.
 
-    It is Σ r·v / Σ v·v of residuals r (predicted less measured) and velocities v of the predicted
-    tracks; 0 without motion. Missing samples are ignored.
+    It is Σ r·v / Σ v·v of residuals r (predicted less measured) and rates v of the predictions,
+    both over σ; 0 without motion. Missing values are ignored.
     """
-    v = np.gradient(predicted_m, experiment.timestep_s, axis=0)
-    residual = np.where(
-        np.isfinite(experiment.markers.positions_m), _residual(experiment, predicted_m), 0.0
-    )
-    moving = np.where(experiment.markers.is_measured, v, 0.0)
-    return float(np.sum(residual * moving) / max(np.sum(moving**2), 1e-300))
+    (part,) = fitted.parts
+    experiment = part.transcription.experiment
+    pairs = zip(experiment.measurements, fitted.fitted_values[experiment.name], strict=True)
+    numbers = [
+        (each, values)
+        for each, values in pairs
+        if isinstance(values, np.ndarray) and len(values) > 1
+    ]
+    if experiment.markers.count_samples():
+        numbers = [pair for pair in numbers if pair[0] is experiment.markers]
+    lagged = moved = 0.0
+    for each, values in numbers:
+        residual = (values - each.measured_values) / each.value_sigmas
+        rates = np.gradient(values, each.sample_times_s, axis=0) / each.value_sigmas
+        known = np.isfinite(residual) & np.isfinite(rates)
+        lagged += float(np.sum((residual * rates)[known]))
+        moved += float(np.sum(rates[known] ** 2))
+    return lagged / max(moved, 1e-300)
 
 
 def _with_shifted_grasps(experiment: Experiment, deeper: bool) -> Experiment | None:
@@ -511,11 +551,3 @@ def _residual(experiment: Experiment, predicted_m: Array) -> Array:
     return np.where(
         experiment.markers.is_measured, predicted_m - experiment.markers.positions_m, np.nan
     )
-
-
-def _misfit(experiment: Experiment, predicted_m: Array) -> float:
-    """Return the root mean square of the residuals of predicted markers (T, M, 3) [m] in standard
-    deviations; missing samples are ignored; 0 without samples.
-    """
-    scaled = _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
-    return root_mean(scaled[experiment.markers.is_measured] ** 2)

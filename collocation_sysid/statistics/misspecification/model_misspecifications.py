@@ -29,7 +29,7 @@ from ..budget.consider_analysis import changed_residuals
 from ..budget.mesh_error import LARGEST_NODE_COUNT, finer_mesh_row
 from ..budget.shape_error import GRAVITY_M_S2, sag_m
 from ..budget.systematic_effects import Assumption, Effect, ExperimentAtAnswer
-from ..linearised import linearise_fit
+from ..linearised import LinearisedFit, linearise_fit
 from .misspecification_hypothesis import Hypothesis
 
 AXES = "xyz"
@@ -232,7 +232,7 @@ def screened_bodies(
     if not rows:
         return
     columns = changed_residuals(collocation, solution.z, [(row, 1.0) for row in rows])
-    gram = _projected_gram(solution, columns.blocks)
+    gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
     found: list[tuple[float, Hypothesis]] = []
     for change in changes:
         decrease, amplitudes = _gain(gram, change)
@@ -264,7 +264,7 @@ def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
         columns = changed_residuals(collocation, solution.z, [(row, 1.0)])
     except (InputError, SimulationError, np.linalg.LinAlgError):
         return
-    gram = _projected_gram(solution, columns.blocks)
+    gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
     amplitude = -gram[1, 0] / max(gram[1, 1], 1e-300)
     if amplitude < MESH_AMPLITUDES[0]:
         return
@@ -283,11 +283,10 @@ def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
         yield Hypothesis("mesh-coarse", of, data=data, corrected=corrected)
 
 
-def _projected_gram(solution: Solution, blocks: Sequence[Array]) -> Array:
+def projected_gram(fit: LinearisedFit, blocks: Sequence[Array]) -> Array:
     """Return the Gram matrix (1 + c, 1 + c) of the residuals of a fit and of c changes of them, less
     what a step of its parameters explains.
     """
-    fit = linearise_fit(solution.collocation, solution.z)
     free = ~fit.at_bound
     stacked = []
     slopes = []
@@ -295,7 +294,7 @@ def _projected_gram(solution: Solution, blocks: Sequence[Array]) -> Array:
         weight = (block.compute_root_weight() * block.is_measured)[..., None]
         both = np.concatenate([block.residual[..., None], change * weight], axis=3)
         stacked.append(both.reshape(-1, both.shape[-1]))
-        slopes.append(block.jacobian.reshape(len(stacked[-1]), -1))
+        slopes.append(block.jacobian.reshape(-1, block.jacobian.shape[-1]))
     values = np.concatenate(stacked)
     jacobian = np.concatenate(slopes)[:, free]
     of_prior = np.zeros((len(fit.prior_residual), values.shape[1]))

@@ -1,0 +1,205 @@
+"""Misspecification hypotheses for sensors that a fit misses: sign, unit, axes, zero and clock of
+custom sensors, and of wrenches in recordings without markers.
+
+Of recordings with markers, `features.wrench_causes` compares wrenches with the prediction of the
+markers. Here nothing else may be measured, so that each mistake is corrected in a refit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ...common.array_types import Array, root_mean
+from ...errors import InputError
+from ...methods.solution import Solution
+from ...recording.custom_sensor import CustomSensor
+from ...recording.experiment import Experiment
+from ...recording.measured_wrench import Wrench
+from ...recording.measurement import Measurement
+from ..axes import OTHER_AXES
+from ..linearised import LinearisedFit, linearise_fit
+from .misspecification_hypothesis import Hypothesis
+from .model_misspecifications import projected_gram
+
+# Factors of wrong units: prefixes, percent, degrees, kilograms-force, pounds-force, psi, inches.
+FACTORS = (1e6, 1e3, 1e2, 1e1, 180 / np.pi, 9.80665, 4.4482216, 6894.757, 25.4)
+# Largest ratio of the size of the prediction and that of the values in another unit.
+SAME_SIZE = 3.0
+# Most units that are fitted again.
+MOST_UNITS = 2
+# Factor by which other axes must bring the values nearer to the prediction of the fit.
+BETTER = 1.5
+# Largest lag over the length of the recording.
+LATEST = 0.25
+
+
+def sensor_misfits(solution: Solution, number: int) -> dict[Measurement, float]:
+    """Return the RMS residual in σ of each measurement with numbers of a fitted experiment (index);
+    values that are not measured or not predicted do not count.
+    """
+    experiment = solution.parts[number].transcription.experiment
+    return {
+        each: root_mean(ratio[np.isfinite(ratio)] ** 2)
+        for each, values in zip(
+            experiment.measurements, solution.fitted_values[experiment.name], strict=True
+        )
+        if isinstance(values, np.ndarray) and each.has_samples()
+        for ratio in [(values - each.measured_values) / each.value_sigmas]
+    }
+
+
+def sensor_hypotheses(
+    stated: Solution, least_misfit: float, declared: Experiment | None = None
+) -> Iterator[Hypothesis]:
+    """Yield hypotheses about the sensors of a fit of one experiment that miss by more than
+    `least_misfit` σ, with the experiment without the mistake as `corrected`.
+
+    `declared` is the experiment as it was stated, if the fitted one is already corrected: only
+    zeros and clocks, of which a correction follows from a linear step, are corrected again.
+    """
+    (part,) = stated.parts
+    experiment = part.transcription.experiment
+    origins = (declared or experiment).measurements
+    missed = [
+        each
+        for each, misfit in sensor_misfits(stated, 0).items()
+        if misfit > least_misfit
+        and (
+            isinstance(each, CustomSensor)
+            or (isinstance(each, Wrench) and not experiment.markers.count_samples())
+        )
+    ]
+    if not missed:
+        return
+    fit = linearise_fit(stated.collocation, stated.z)
+    predictions = dict(
+        zip(experiment.measurements, stated.fitted_values[experiment.name], strict=True)
+    )
+    models = dict(zip(experiment.measurements, part.transcription.measurement_models, strict=True))
+    numbers = {id(each): k for k, each in enumerate(part.transcription.residuals)}
+    for sensor in missed:
+        own = numbers[id(models[sensor])]
+        origin = origins[experiment.measurements.index(sensor)]
+        linear = _linear_mistakes(sensor, predictions[sensor], fit, own, origin)
+        whole = () if declared else _mistakes(sensor, predictions[sensor])
+        for hypothesis in (*whole, *linear):
+            values, t_s = hypothesis.corrected
+            try:
+                corrected = _with_samples(experiment, sensor, values, t_s)
+            except InputError:
+                continue
+            title = sensor.samples_text or sensor.title
+            of = f"{title} of '{experiment.name}'"
+            yield replace(hypothesis, subject=of, corrected=corrected)
+
+
+def _mistakes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
+    """Yield wrong signs, units and axes of a sensor, with values (S, m) and times (S,) without
+    them.
+    """
+    measured = sensor.measured_values
+    t_s = sensor.sample_times_s
+    sigmas = sensor.value_sigmas
+    yield Hypothesis("sensor-sign", corrected=(-measured, t_s))
+    known = np.isfinite(measured + predicted)
+    size = root_mean((measured / sigmas)[known] ** 2)
+    ratio = root_mean((predicted / sigmas)[known] ** 2) / max(size, 1e-300)
+    units = sorted(
+        (max(ratio / factor, factor / ratio), factor)
+        for each in (FACTORS if ratio > 0 else ())
+        for factor in (each, 1 / each)
+    )
+    for apart, factor in units[:MOST_UNITS]:
+        if apart < SAME_SIZE:
+            corrected = factor * measured, t_s
+            yield Hypothesis("sensor-unit", data={"factor": factor}, corrected=corrected)
+    if measured.shape[1] % 3 == 0:
+        yield from _other_axes(sensor, predicted)
+
+
+def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
+    """Yield the other order or signs of the axes that bring the values nearest to the prediction;
+    nothing if none is clearly nearer.
+    """
+    measured = sensor.measured_values
+
+    def misfit(values: Array) -> float:
+        ratio = (values - predicted) / sensor.value_sigmas
+        return root_mean(ratio[np.isfinite(ratio)] ** 2) if np.isfinite(ratio).any() else np.inf
+
+    vectors = measured.reshape(len(measured), -1, 3)
+    turned = {
+        axes: (np.array(signs) * vectors[..., [*order]]).reshape(measured.shape)
+        for axes, (order, signs) in OTHER_AXES.items()
+        if len({*signs}) > 1 or order != (0, 1, 2)  # else a matter of the sign
+    }
+    axes = min(turned, key=lambda each: misfit(turned[each]))
+    if BETTER * misfit(turned[axes]) < misfit(measured):
+        corrected = turned[axes], sensor.sample_times_s
+        yield Hypothesis("sensor-axes", data={"axes": axes}, corrected=corrected)
+
+
+def _linear_mistakes(
+    sensor: Measurement, predicted: Array, fit: LinearisedFit, own: int, origin: Measurement
+) -> Iterator[Hypothesis]:
+    """Yield a wrong zero and a wrong clock of a sensor, by the amounts that explain its residuals,
+    the block `own` of the fit, best; with values (S, m) and times (S,) without them. Messages state
+    the differences from `origin`, the sensor as it was stated.
+    """
+    measured = sensor.measured_values
+    t_s = sensor.sample_times_s
+    used = np.flatnonzero(np.isfinite(measured).any(axis=0))
+    columns = [
+        np.broadcast_to(np.eye(len(each))[k] / each, measured.shape)
+        for each in (sensor.value_sigmas,)
+        for k in used
+    ]
+    zeros = np.zeros(measured.shape[1])
+    zeros[used] = _amplitudes(fit, columns, own)
+    whole = np.nanmean((origin.measured_values - measured)[:, used] + zeros[used], axis=0)
+    shown = ", ".join(f"{each:.3g}" for each in whole)
+    data = {"offset": f"{shown} {sensor.unit}".rstrip()}
+    yield Hypothesis("sensor-zero", data=data, corrected=(measured - zeros, t_s))
+    if fit.blocks[own].is_static or len(t_s) < 3:
+        return
+    rates = np.nan_to_num(np.gradient(predicted, t_s, axis=0))
+    (more_s,) = _amplitudes(fit, [rates / sensor.value_sigmas], own)
+    lag_s = float(np.mean(t_s - origin.sample_times_s) + more_s)
+    if 0 < abs(lag_s) < LATEST * float(np.ptp(t_s)):
+        named = {"by_ms": 1e3 * abs(lag_s), "when": "later" if lag_s > 0 else "earlier"}
+        yield Hypothesis("sensor-clock", data=named, corrected=(measured, t_s + more_s))
+
+
+def _amplitudes(fit: LinearisedFit, columns: Sequence[Array], own: int) -> Array:
+    """Return the amplitudes of changes (S, m) of the residuals of one block (index) that explain
+    the residuals of a fit best.
+    """
+    blocks = [np.zeros((*each.residual.shape, len(columns))) for each in fit.blocks]
+    samples, groups, each = fit.blocks[own].residual.shape
+    changes = np.zeros((samples, groups * each, len(columns)))
+    for k, column in enumerate(columns):
+        changes[:, : column.shape[1], k] = column
+    blocks[own] = changes.reshape(blocks[own].shape)
+    gram = projected_gram(fit, blocks)
+    return np.asarray(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=1e-8)[0])
+
+
+def _with_samples(
+    experiment: Experiment, sensor: Measurement, values: Array, t_s: Array
+) -> Experiment:
+    """Return the experiment with other samples of a custom sensor or of a wrench."""
+    if isinstance(sensor, CustomSensor):
+        readings = [
+            each.with_samples(t_s, values) if each is sensor else each
+            for each in experiment.readings
+        ]
+        return replace(experiment, readings=readings)
+    assert isinstance(sensor, Wrench)
+    other = replace(sensor, values=values, t_s=t_s)
+    grasps = [
+        replace(each, wrench=other) if each.wrench is sensor else each for each in experiment.grasps
+    ]
+    return replace(experiment, grasps=grasps)

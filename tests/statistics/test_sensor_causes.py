@@ -1,0 +1,77 @@
+"""Mistakes in the description of sensors are named, also where nothing else is measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from kit.problems import GUESS, TRUTH, hung_cube, measured
+
+import collocation_sysid as cs
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.runs.misspecifications import find_misspecifications
+
+SIGMA = 2e-4
+STEPS = 15
+
+
+def sensed(mistake=lambda t_s, values: (t_s, values), markers=True, seed=0):
+    """A swung cube of whose lower corners two are sensed, one with a mistake; noise of SIGMA."""
+    cube = measured(hung_cube(STEPS))
+    rng = np.random.default_rng(seed)
+
+    def gauge(name, point_m, t_s, values):
+        return cs.Gauge(
+            name, lambda at: at.position_m[:, 0], t_s, values, SIGMA, [point_m], unit="m"
+        )
+
+    made = []
+    for name, point_m in (("probe", [0.1, 0, 0]), ("other", [0, 0.1, 0])):
+        blank = gauge(name, point_m, cube.t_s, np.zeros((STEPS + 1, 3)))
+        (values,) = simulate(
+            replace(cube, readings=[blank]), TRUTH, "midpoint", substeps=1
+        ).custom_sensor_values
+        t_s, values = (mistake if name == "probe" else lambda *given: given)(cube.t_s, values)
+        made.append(gauge(name, point_m, t_s, values + SIGMA * rng.normal(size=values.shape)))
+    tracks_m = cube.markers.positions_m
+    noise_m = cube.markers.sigma_m[0] * rng.normal(size=tracks_m.shape)
+    seen = replace(cube.markers, positions_m=tracks_m + noise_m)
+    changes = {} if markers else {"markers": None}
+    return replace(replace(cube, markers=seen), readings=made, **changes)
+
+
+def causes(experiment):
+    solution = cs.solve(cs.Problem([experiment], GUESS, scheme="midpoint", substeps=1))
+    return find_misspecifications(solution)
+
+
+MISTAKES = {
+    "sensor-sign": lambda t_s, values: (t_s, -values),
+    "sensor-unit": lambda t_s, values: (t_s, 1e3 * values),
+    "sensor-zero": lambda t_s, values: (t_s, values + np.array([0.0, 0.004, -0.003])),
+    "sensor-axes": lambda t_s, values: (t_s, values[:, [1, 0, 2]]),
+    "sensor-clock": lambda t_s, values: (t_s - 0.008, values),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("code", "markers"),
+    [
+        *((code, True) for code in MISTAKES),
+        ("sensor-sign", False),
+        ("sensor-unit", False),
+        ("sensor-zero", False),
+    ],
+)
+def test_a_mistake_of_a_sensor_is_named(code, markers):
+    first, *_ = causes(sensed(MISTAKES[code], markers=markers))
+    assert first.code == code, first.message
+    assert "probe" in first.message
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(2))
+def test_right_sensors_have_no_cause(seed):
+    assert causes(sensed(seed=seed)) == ()
