@@ -272,7 +272,6 @@ class SolvedProblem:
             self.rollouts,
             motions=self.modes_by_experiment.values(),
             uncertainty=self.uncertainty,
-            diagnoses=self.diagnoses,
             budgeted=self.budgeted,
         )
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}

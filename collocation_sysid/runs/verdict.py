@@ -13,6 +13,7 @@ from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
 from ..model.schemes import as_scheme
 from ..problem import Problem
+from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
 from ..recording.grasp_rotation import DOUBTFUL_ANGLE_RAD
 from ..recording.nuisance import TIME
@@ -38,8 +39,8 @@ from ..statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
 )
+from ..statistics.misspecification.track_misspecifications import copied_measurements
 from ..statistics.probes.budgeted_residuals import BudgetedResiduals
-from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.specimen_concerns import as_specimen_concerns
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
@@ -57,7 +58,6 @@ def solution_concerns(
     rollouts: Mapping[str, ForwardSimulation | str],
     motions: Iterable[ModesCheck],
     uncertainty: Uncertainty | None,
-    diagnoses: Sequence[MarkerDiagnosis],
     budgeted: BudgetedResiduals | None = None,
 ) -> Iterator[Concern]:
     """Yield the concerns about a solution and its forward simulations.
@@ -75,8 +75,6 @@ def solution_concerns(
     uncertainty : Uncertainty or None
         Statistical uncertainty; None without error bars, which is a concern of its own if there
         are parameters.
-    diagnoses : sequence of MarkerDiagnosis
-        Findings in the residuals.
     budgeted : BudgetedResiduals, optional
         Residuals that deviations within the budget leave.
     """
@@ -100,7 +98,9 @@ def solution_concerns(
     elif solution.collocation.nq:
         yield Concern("solve/no-error-bars", "doubtful")
     yield from allowance_concerns(solution)
-    yield from outlier_share_concerns(diagnoses)
+    fitted_experiments = [each.experiment for each in solution.collocation.transcriptions]
+    yield from (each.concern() for each in copied_measurements(fitted_experiments))
+    yield from outlier_share_concerns(*_outlier_counts(solution))
     for part in solution.parts:
         nuisance = part.transcription.nuisance
         low, high = nuisance.bounds(part.transcription.association.clock_samples)
@@ -148,6 +148,23 @@ def solution_concerns(
                 added_ratio=motion.first_mode.numerical_damping_ratio,
                 period_error=motion.first_mode.period_error,
             )
+
+
+def _outlier_counts(solution: Solution) -> tuple[int, int]:
+    """Return the numbers of samples beyond the threshold of a stated Huber loss, and of all samples;
+    points of depth cameras, which always have this loss because of edges, do not count.
+    """
+    huber = solution.collocation.huber or np.inf
+    wild = samples = 0
+    for part in solution.parts:
+        pairs = zip(part.transcription.residuals, part.observables, strict=True)
+        for model, values in pairs:
+            if isinstance(model, CorrespondenceResidual):
+                continue
+            lengths = np.linalg.norm(model.residuals(values, part.phi), axis=2)
+            wild += int(np.sum(lengths > huber))
+            samples += int(model.is_compared.any(axis=2).sum())
+    return wild, samples
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:

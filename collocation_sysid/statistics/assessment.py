@@ -34,7 +34,7 @@ from .probes.relaxed_assumptions import ANISOTROPY, DRIFT, MEMORY, Probe, assump
 from .probes.routine_probes import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import PERSISTENT
 from .residuals.noise_level import NoiseLevel
-from .residuals.residual_diagnostics import MOST_WILD, MarkerDiagnosis
+from .residuals.residual_diagnostics import MOST_WILD
 from .uncertainty import ErrorBasis, Uncertainty
 
 Verdict = Literal["good", "check", "doubtful"]
@@ -278,13 +278,13 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
     """Return one concern, as a list, if markers or other sensors are much noisier than the others;
     else empty.
 
-    Noisy are markers whose residuals exceed `MARKER_MISFIT` times the median of all markers, and
-    `MARKER_MISFIT` times σ. Nothing is reported unless the test for unequal variances is
+    Noisy are markers whose residuals exceed `MARKER_MISFIT` times the median of all markers (the
+    lower one of an even number), and `MARKER_MISFIT` times σ. Nothing is reported unless the test for unequal variances is
     significant at `RARE`.
     """
     if not level.unequal_p < RARE:
         return []
-    usual = float(np.median([*level.factors.values()]))
+    usual = sorted(level.factors.values())[(len(level.factors) - 1) // 2]
     noisy = [n for n, f in level.factors.items() if f > MARKER_MISFIT * max(1.0, usual)]
     if not noisy:
         return []
@@ -465,13 +465,11 @@ def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
     return f"{symbol_of(name)} = {value:.4g} ± {move.std_error:.2g} {unit_of(name)}".strip()
 
 
-def outlier_share_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
+def outlier_share_concerns(wild: int, samples: int) -> list[Concern]:
     """Return one concern, as a list, if the share of samples beyond Huber's threshold, of all
-    samples of all markers, exceeds `WILD`; "doubtful" above `HARDLY_TAME`. Else empty, also
-    without samples.
+    samples, exceeds `WILD`; "doubtful" above `HARDLY_TAME`. Else empty, also without samples.
     """
-    diagnoses_list = tuple(diagnoses)
-    share = sum(d.wild for d in diagnoses_list) / max(1, sum(d.samples for d in diagnoses_list))
+    share = wild / max(1, samples)
     return concern_if(share > WILD, share > HARDLY_TAME, code="residuals/wild", percent=100 * share)
 
 

@@ -1,12 +1,19 @@
-"""Every check for every kind of measurement: a table without an empty field."""
+"""Every check for every kind of measurement: the table of docs/howto/verdict.md."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from kit.depth import hanging
+from kit.fits import PARAMETERS, autoregressive, problem
 from kit.problems import hung_cube, measured
+from scipy.signal import butter, sosfiltfilt
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
@@ -17,17 +24,32 @@ from collocation_sysid.features.measurements import (
     lost_samples,
     reason_against_copy,
 )
-from collocation_sysid.statistics.assessment import validation_concerns
+from collocation_sysid.program.depth.depth_comparison import DepthError, SurfaceComparison
+from collocation_sysid.runs.verdict import _outlier_counts
+from collocation_sysid.statistics.assessment import (
+    fit_concerns,
+    forward_simulation_concerns,
+    outlier_share_concerns,
+    prediction_concerns,
+    validation_concerns,
+)
+from collocation_sysid.statistics.misspecification.track_misspecifications import (
+    copied_measurements,
+    filtered_signals,
+)
+from collocation_sysid.statistics.specimen_concerns import SPECIMEN_CODES, as_specimen_concerns
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
-NUMBERS = ("markers", "wrench", "sensor", "specimen")
+NUMBERS = ("markers", "wrench", "custom sensor", "specimen")
 
 
-def only(kind):
+@cache
+def only(kind, cube=None):
     """Experiment in which one kind of measurement is measured, with values of one."""
     if kind == "specimen":
         strain = np.linspace(0.1, 0.5, 11)
         return cs.Specimen("uniaxial", strain, 1.0 + 0 * strain, 0.1).experiment(name="pull")
-    cube = measured(hung_cube())
+    cube = cube or measured(hung_cube())
     ones = np.ones(len(cube.t_s))
     if kind == "markers":
         return cube
@@ -35,6 +57,9 @@ def only(kind):
         force = cs.Wrench(cube.t_s, ones[:, None] * [[1.0, 1.0, 1.0]], sigma_n=0.1)
         grasps = [replace(cube.grasps[0], wrench=force)]
         return replace(cube, grasps=grasps, markers=None)
+    if kind == "depth camera":
+        points_m = np.random.default_rng(0).uniform(0.1, 0.2, size=(20, 3))
+        return hanging([cs.Depth("front", [0.0], [points_m], 1e-3)])
     gauge = cs.Gauge("height", lambda at: at.position_m[2, 0], cube.t_s, ones, 0.1, [[0, 0, 0]])
     return replace(cube, readings=[gauge], markers=None)
 
@@ -102,3 +127,302 @@ def test_texts_name_the_instrument_and_its_noise(case):
     assert measurement.sigma_text
     assert measurement.noise_key
     assert all(measurement.presence)
+
+
+# The table ----------------------------------------------------------------------------------------
+
+KINDS = (*NUMBERS, "depth camera")
+# Key of sigma and numbers of one sample (entities, numbers of each) in a linearised fit.
+BLOCKS = {
+    "markers": ("sigma_m", (3, 3)),
+    "wrench": ("sigma_n", (2, 3)),
+    "custom sensor": ("sigma", (3, 1)),
+    "specimen": ("sigma", (3, 1)),
+    "depth camera": ("sigma_m of depth", (5, 3)),
+}
+SAMPLES = 80
+
+
+class Surface(SurfaceComparison):
+    """Comparison of an image with a surface that is away from it by multiples of sigma."""
+
+    def __init__(self, sigmas: float) -> None:
+        vars(self)["sigmas"] = sigmas
+
+    @property
+    def error(self) -> DepthError:
+        off_m = 1e-3 * self.sigmas
+        return DepthError(20, 20, off_m, 1.0, 1.0, 0.0, off_m, self.sigmas, self.sigmas)
+
+
+def predictions(experiment, sigmas):
+    """Predictions that are `sigmas` standard deviations away from all measurements."""
+    return [
+        each.measured_values + sigmas * each.value_sigmas
+        if each.value_sigmas.size
+        else Surface(sigmas)
+        for each in experiment.measurements
+    ]
+
+
+def codes(kind, errors, second=None):
+    """Codes of the concerns about a fit to errors (T, M, 3) of a kind of measurement, in sigma; of
+    two recordings if errors of a second one are given.
+    """
+    key, (entities, numbers) = BLOCKS[kind]
+    both = [errors] if second is None else [errors, second]
+    made = problem((SAMPLES,) * len(both), entities, offsets=False)
+    is_number = np.arange(3) < numbers
+    slopes = tuple(each * is_number[:, None] for each in made.slopes)
+    made = replace(made, slopes=slopes)
+    fit, wrong = made.fit([each * is_number for each in both], np.zeros(len(made.names)))
+    blocks = [
+        replace(
+            each,
+            sigma_key=key,
+            components=np.broadcast_to(is_number, each.residual.shape),
+            is_static=kind == "specimen",
+        )
+        for each in fit.blocks
+    ]
+    found = uncertainty_from_fit(replace(fit, blocks=tuple(blocks)), PARAMETERS, wrong[:4])
+    concerns = fit_concerns(found)
+    if kind == "specimen":
+        concerns = as_specimen_concerns(concerns, [only(kind)])
+    return {each.code for each in concerns}
+
+
+def named(kind, code):
+    """The code of a concern about a kind of measurement."""
+    code = code.replace("marker", "sensor") if kind != "markers" else code
+    return SPECIMEN_CODES.get(code, code) if kind == "specimen" else code
+
+
+def white(kind, seed=0):
+    return np.random.default_rng(seed).normal(size=(SAMPLES, BLOCKS[kind][1][0], 3))
+
+
+def size_of_residuals(kind):
+    assert codes(kind, white(kind)) == set()
+    assert named(kind, "noise/larger") in codes(kind, 5 * white(kind))
+    assert named(kind, "noise/smaller") in codes(kind, white(kind) / 5)
+
+
+def one_is_noisier(kind):
+    assert named(kind, "noise/marker") in codes(
+        kind, white(kind) * [[1.0], [30.0], *[[1.0]] * (BLOCKS[kind][1][0] - 2)]
+    )
+
+
+def correlation_in_time(kind):
+    slow = autoregressive(np.random.default_rng(3), SAMPLES, BLOCKS[kind][1][0], 0.95)
+    assert named(kind, "residuals/persist") in codes(kind, 2 * slow)
+
+
+def correlation_of_numbers(kind):
+    common = np.random.default_rng(8).normal(size=(SAMPLES, 1, 1))
+    assert "residuals/shared" in codes(kind, common + 0.1 * white(kind))
+
+
+def single_samples(kind):
+    errors = white(kind)
+    errors[40, 1] = [150.0, 50.0, 0.0]
+    assert named(kind, "residuals/outlier") in codes(kind, errors)
+
+
+def recordings_disagree(kind):
+    made = problem((SAMPLES,), BLOCKS[kind][1][0], offsets=False)
+    off = 0.6 * made.slopes[0][..., 0]
+    assert "residuals/recordings" in codes(kind, white(kind) + off, white(kind, 1) - off)
+
+
+def loss_of_samples(kind):
+    experiment = only(kind)
+    assert lost_samples(experiment) == []
+    measurement = experiment.measurements[-1]
+    assert all(each.any() for each in measurement.presence.values())
+
+
+def same_values_twice(kind):
+    first = only(kind)
+    rng = np.random.default_rng(0)
+
+    def shaken(experiment, name):
+        """The experiment with other values, as noise makes them."""
+        made = experiment.measurements[-1]
+        if kind == "depth camera":
+            return replace(experiment, name=name)
+        values = made.measured_values + rng.normal(size=made.measured_values.shape)
+        return replace(with_values(experiment, values), name=name)
+
+    one = shaken(first, "one")
+    twice = replace(one, name="two")
+    (found,) = copied_measurements([one, twice])
+    assert "of 'one' and" in found.message
+    assert "of 'two' are exactly the same" in found.message
+    if kind != "depth camera":
+        assert copied_measurements([one, shaken(first, "two")]) == []
+
+
+def with_values(experiment, values):
+    """The experiment with other numbers of its last measurement."""
+    measurement = experiment.measurements[-1]
+    if measurement is experiment.markers:
+        tracks_m = values.reshape(measurement.positions_m.shape)
+        return replace(experiment, markers=replace(measurement, positions_m=tracks_m))
+    other = replace(measurement, values=values)
+    if experiment.readings:
+        return replace(experiment, readings=[other])
+    return replace(experiment, grasps=[replace(experiment.grasps[0], wrench=other)])
+
+
+def outlier_share(kind):
+    """Of 20 samples of two instruments of this kind, three are beyond the threshold."""
+    _, (entities, numbers) = BLOCKS[kind]
+    residuals = np.ones((20, entities, numbers))
+    residuals[:3, 0] = 50.0
+    model = SimpleNamespace(
+        residuals=lambda *_: residuals, is_compared=np.ones(residuals.shape, dtype=bool)
+    )
+    part = SimpleNamespace(
+        transcription=SimpleNamespace(residuals=[model]), observables=[None], phi=None
+    )
+    solution = SimpleNamespace(collocation=SimpleNamespace(huber=3.0 * numbers), parts=[part])
+    assert _outlier_counts(solution) == (3, 20 * entities)
+    solution.collocation.huber = None
+    assert _outlier_counts(solution) == (0, 20 * entities)
+    assert [each.code for each in outlier_share_concerns(10, 100)] == ["residuals/wild"]
+
+
+def filtered(kind):
+    rng = np.random.default_rng(0)
+    experiment = only(kind, hung_cube(199))
+    t_s = experiment.t_s
+    (measurement,) = (e for e in experiment.measurements if e.has_samples())
+    noise = rng.normal(size=measurement.measured_values.shape)
+    smooth = sosfiltfilt(butter(2, 8.0, output="sos", fs=100.0), noise, axis=0)
+    slow = 3 * np.sin(9 * t_s)[:, None]
+    for error, is_named in ((noise, False), (smooth, True)):
+        predicted = measurement.measured_values + (error + slow) * measurement.value_sigmas
+        fitted = [predicted if e is measurement else None for e in experiment.measurements]
+        found = [*filtered_signals(experiment, fitted)]
+        assert bool(found) == is_named
+        assert not found or measurement.sigma_text in found[0].message or kind == "markers"
+
+
+def forward(kind):
+    experiment = only(kind)
+    near, far = (instrument_misfits(experiment, predictions(experiment, k)) for k in (1.0, 9.0))
+    assert not forward_simulation_concerns("a", near[-1], near[-1])
+    (concern,) = forward_simulation_concerns("a", far[-1], near[-1])
+    assert (concern.code, concern.grade) == ("roll-out/misses", "doubtful")
+    assert far[-1].what in concern.message
+
+
+def validation(kind):
+    experiment = only(kind)
+    (misfit,) = instrument_misfits(experiment, predictions(experiment, 20.0))[-1:]
+    (concern,) = validation_concerns("a", misfit, 1.0, {})
+    assert (concern.code, concern.grade) == ("roll-out/predicted", "doubtful")
+    assert misfit.what in concern.message
+
+
+def prediction(kind):
+    experiment = only(kind)
+    (misfit,) = instrument_misfits(experiment, predictions(experiment, 20.0))[-1:]
+    (concern,) = prediction_concerns("a", **vars(misfit))
+    assert (concern.code, concern.grade) == ("prediction/misses", "doubtful")
+
+
+def copies(kind):
+    experiment = only(kind)
+    assert reason_against_copy(experiment, experiment) == ""
+
+
+def elsewhere(**places):
+    """A check that other tests make: their names by kind of measurement."""
+
+    def check(kind):
+        file, name = places.get(kind.partition(" ")[0], places.get("all", "")).split("::")
+        assert f"def {name}(" in (TESTS / file).read_text()
+
+    return check
+
+
+PROBED = "statistics/test_routine_probes.py::test_a_probe_alarms_if_it_is_significant_and_relevant"
+CHECKS = {
+    "loss of samples": loss_of_samples,
+    "the same values twice": same_values_twice,
+    "size of the residuals": size_of_residuals,
+    "one instrument is noisier": one_is_noisier,
+    "correlation in time": correlation_in_time,
+    "correlation between numbers": correlation_of_numbers,
+    "single samples": single_samples,
+    "share of outliers": outlier_share,
+    "sentence on the pattern": elsewhere(
+        markers="statistics/test_diagnostics.py::test_a_constant_part_is_a_marker_off_its_place"
+    ),
+    "disagreement of recordings": recordings_disagree,
+    "mistakes in the description of the instrument": elsewhere(
+        markers="statistics/test_wrong_descriptions.py::test_a_wrong_description_is_named_after_solving",
+        wrench="statistics/test_wrench_causes.py::test_a_mistake_is_the_likeliest_cause",
+        custom="statistics/test_sensor_causes.py::test_a_mistake_of_a_sensor_is_named",
+        specimen="statistics/test_specimen_misspecifications.py::test_another_kind_of_test_is_named",
+        depth="statistics/test_wrong_depth_images.py::test_solve_names_a_wrong_matrix",
+    ),
+    "the same in `check`": elsewhere(
+        markers="statistics/test_wrong_descriptions.py::test_a_wrong_description_is_named_before_solving",
+        wrench="statistics/test_wrench_causes.py::test_a_mistake_is_named_before_solving",
+        depth="statistics/test_wrong_depth_images.py::test_check_names_a_flipped_image",
+    ),
+    "mistakes in the description of body": elsewhere(
+        markers="statistics/test_wrong_tracks.py::test_hidden_errors_of_a_bent_bar_are_named",
+        all="statistics/test_sensor_causes.py::test_a_wrong_grasp_is_named_without_markers",
+    ),
+    "filtered signals": filtered,
+    "drift of the stiffness": elsewhere(all=PROBED),
+    "forward simulation": forward,
+    "validation": validation,
+    "prediction without a fit": prediction,
+    "copy of another recording": copies,
+    "picture with measurement": elsewhere(
+        markers="result/test_plots.py::test_a_run_has_all_its_pictures",
+        wrench="statistics/test_wrench_fit.py::test_a_run_reports_the_wrench",
+        custom="program/test_gauge.py::test_error_bars_and_verdict_know_them",
+        specimen="result/test_specimen_output.py::test_an_undetermined_parameter_is_stated_once",
+        depth="result/test_depth_pictures.py::"
+        "test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart",
+    ),
+}
+TESTS = Path(__file__).parents[1]
+PAGE = (TESTS.parent / "docs" / "howto" / "verdict.md").read_text()
+
+
+def table():
+    """Cells of the table in the documentation by the check and the kind, and its sentences."""
+    section = PAGE.partition("## Checks by measurement")[2].partition("\n## ")[0]
+    rows = re.findall(r"(?m)^\| (.+) \|$", section)
+    header, *lines = [row.split(" | ") for row in rows]
+    cells = {
+        (line[0], kind): cell
+        for line in lines
+        for kind, cell in zip(header[1:], line[1:], strict=True)
+    }
+    return cells, re.findall(r"(?m)^(\d+)\. ", section)
+
+
+CELLS, REASONS = table()
+
+
+def test_the_documentation_has_a_row_for_every_check_and_no_empty_field():
+    titles = {title for title, _ in CELLS}
+    assert {kind for _, kind in CELLS} == set(KINDS)
+    assert all(any(title.startswith(each) for title in titles) for each in CHECKS)
+    assert len(titles) == len(CHECKS)
+    assert {cell for cell in CELLS.values() if cell != "yes"} == set(REASONS)
+
+
+@pytest.mark.parametrize(("title", "kind"), [each for each, cell in CELLS.items() if cell == "yes"])
+def test_a_check_concerns_the_kinds_of_measurement_of_its_row(title, kind):
+    (check,) = (check for name, check in CHECKS.items() if title.startswith(name))
+    check(kind)

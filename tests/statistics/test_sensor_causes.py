@@ -75,3 +75,18 @@ def test_a_mistake_of_a_sensor_is_named(code, markers):
 @pytest.mark.parametrize("seed", range(2))
 def test_right_sensors_have_no_cause(seed):
     assert causes(sensed(seed=seed)) == ()
+
+
+@pytest.mark.long
+def test_a_wrong_grasp_is_named_without_markers():
+    right = sensed(markers=False)
+    layer = cs.Grasp(np.flatnonzero(right.body.nodes_m[:, 2] > 0.04), right.grasps[0].poses)
+    deeper = replace(right, grasps=[layer])
+    simulated = simulate(deeper, TRUTH, "midpoint", substeps=1).custom_sensor_values
+    rng = np.random.default_rng(0)
+    read = [
+        replace(each, values=values + SIGMA * rng.normal(size=values.shape))
+        for each, values in zip(right.readings, simulated, strict=True)
+    ]
+    first, *_ = causes(replace(right, readings=read))
+    assert "one layer of nodes more than stated" in first.message

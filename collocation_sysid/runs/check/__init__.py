@@ -34,6 +34,7 @@ from ...statistics.concerns import Concern
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
 from ...statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
 from ...statistics.misspecification.plausibility import size_and_density_hypotheses
+from ...statistics.misspecification.track_misspecifications import copied_measurements
 from ...statistics.scale_identifiability import scale_concerns, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from .body_check import (
@@ -453,7 +454,7 @@ def _concerns(
     chosen = findings.find_chosen_cost()
     body_of = {name: body for body in bodies for name in body.experiments}
     return (
-        *(cause.concern() for cause in findings.causes),
+        *(cause.concern() for cause in (*findings.causes, *copied_measurements(experiments))),
         *static_concerns(experiments, parameters),
         *scale_concerns(experiments, parameters),
         *(each for body in bodies for each in _body_concerns(body, len(bodies) == 1)),

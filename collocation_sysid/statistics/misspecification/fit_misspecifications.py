@@ -45,7 +45,7 @@ from .model_misspecifications import (
     screened_bodies,
 )
 from .sensor_misspecifications import sensor_hypotheses, sensor_misfits
-from .track_misspecifications import filtered_tracks, same_tracks
+from .track_misspecifications import filtered_signals, same_tracks
 
 # Factor by which the misfit of a refit must decrease, unless only noise remains.
 BETTER = 1.5
@@ -112,7 +112,11 @@ def motion_misspecifications(
     """
     fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
     hypotheses = [each for experiment in fitted for each in same_tracks(experiment)]
-    hypotheses += [each for part in solution.parts for each in filtered_tracks(part)]
+    hypotheses += [
+        each
+        for experiment in fitted
+        for each in filtered_signals(experiment, solution.fitted_values[experiment.name])
+    ]
     discrepancies = [_discrepancy(solution, k) for k in range(len(fitted))]
     if max(discrepancies) <= 1.0 or hypotheses:
         return hypotheses

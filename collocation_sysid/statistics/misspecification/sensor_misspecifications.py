@@ -75,9 +75,12 @@ def sensor_hypotheses(
     if not missed:
         return
     fit = linearise_fit(stated.collocation, stated.z)
-    predictions = dict(
-        zip(experiment.measurements, stated.fitted_values[experiment.name], strict=True)
-    )
+    fitted = stated.fitted_values[experiment.name]
+    predictions = {
+        each: values
+        for each, values in zip(experiment.measurements, fitted, strict=True)
+        if isinstance(values, np.ndarray)
+    }
     models = dict(zip(experiment.measurements, part.transcription.measurement_models, strict=True))
     numbers = {id(each): k for k, each in enumerate(part.transcription.residuals)}
     for sensor in missed:
@@ -184,7 +187,8 @@ def _amplitudes(fit: LinearisedFit, columns: Sequence[Array], own: int) -> Array
         changes[:, : column.shape[1], k] = column
     blocks[own] = changes.reshape(blocks[own].shape)
     gram = projected_gram(fit, blocks)
-    return np.asarray(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=1e-8)[0])
+    best: Array = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=1e-8)[0].astype(float)
+    return -best
 
 
 def _with_samples(

@@ -1,17 +1,20 @@
-"""Misspecification hypotheses about tracks that the software of the cameras has changed: copies of
-a track, and filtered tracks.
+"""Misspecification hypotheses about measured values that are copies of others, and about filtered
+ones, as by the software of cameras.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from ...common.array_types import Array
-from ...program.experiment_iterate import ExperimentIterate
+from ...program.measured_motion import Predicted
+from ...recording.depth_camera import Depth
 from ...recording.experiment import Experiment
+from ...recording.markers import Markers
+from ...recording.measurement import Measurement
 from .misspecification_hypothesis import Hypothesis
 
 # RMS distance of two tracks over that of independent noise at one place, up to which they are the
@@ -21,6 +24,10 @@ SAME_TRACK = 1.4
 NEAR = 10.0
 # Distance of two stated places over that of the tracks, from which on the places are different.
 OTHER_PLACE = 5.0
+# Fewest different values of a series that can be a copy of another one.
+FEWEST_VALUES = 5
+# Largest difference of the intervals between samples, over their mean, of a series with a spectrum.
+EVEN = 0.01
 # Fewest samples whose spectrum is examined.
 FEWEST_SAMPLES = 32
 # Largest amplitude of noise over σ above twice the cutoff of a filter.
@@ -63,26 +70,69 @@ def same_tracks(experiment: Experiment) -> Iterator[Hypothesis]:
         return
 
 
-def filtered_tracks(part: ExperimentIterate) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the tracks of a fitted experiment were low-passed, if the spectrum
-    of its residuals is that of noise at low frequencies and falls far below it at high ones.
+def copied_measurements(experiments: Iterable[Experiment]) -> list[Hypothesis]:
+    """Return each pair of measurements, of the same or of two recordings, with a series of values
+    that is exactly the same in both; noise excludes this. Constant series do not count, and of
+    markers only those of two recordings, see `same_tracks`.
     """
-    experiment = part.transcription.experiment
-    markers = experiment.markers
-    if experiment.is_static or len(experiment.t_s) < FEWEST_SAMPLES:
-        return
-    complete = markers.is_measured.all(axis=0)
-    if not complete.any():
-        return
-    predicted_m = part.transcription.markers.predict_positions(part.x, part.phi)
-    scaled = ((predicted_m - markers.positions_m) / markers.sigma_m[:, None])[:, complete]
-    frequency_hz, amplitude = _amplitudes(scaled, experiment.timestep_s)
-    cutoff = _cutoff(amplitude)
-    if cutoff is None:
-        return
-    high = float(np.sqrt(np.mean(amplitude[2 * cutoff :] ** 2)))
-    data = {"frequency_hz": float(frequency_hz[cutoff]), "percent": 100 * high}
-    yield Hypothesis("tracks-filtered", f"'{experiment.name}'", data=data, strength=1 / STOPPED)
+    first: dict[bytes, tuple[Experiment, Measurement, str]] = {}
+    pairs: dict[tuple[Experiment, Measurement, Experiment, Measurement], Hypothesis] = {}
+    for experiment in experiments:
+        for measurement in experiment.measurements:
+            for name, values in _series(measurement):
+                if len(np.unique(values[np.isfinite(values)])) < FEWEST_VALUES:
+                    continue
+                found = experiment, measurement, f"{name} of '{experiment.name}'"
+                earlier = first.setdefault(values.tobytes(), found)
+                is_track = isinstance(measurement, Markers) and earlier[0] is experiment
+                if earlier is not found and not is_track:
+                    data = {"first": earlier[2], "second": found[2]}
+                    twice = Hypothesis("measured-twice", data=data)
+                    pairs.setdefault((*earlier[:2], *found[:2]), twice)
+    return [*pairs.values()]
+
+
+def _series(measurement: Measurement) -> Iterator[tuple[str, Array]]:
+    """Yield the names and the values of the series of a measurement: tracks of markers, numbers of
+    sensors, or all points of a depth camera.
+    """
+    if isinstance(measurement, Depth):
+        yield measurement.title, np.concatenate([*measurement.points_m, np.zeros((0, 3))])
+    elif isinstance(measurement, Markers):
+        for k, name in enumerate(measurement.names):
+            yield f"marker {name}", np.ascontiguousarray(measurement.positions_m[:, k])
+    else:
+        columns = np.ascontiguousarray(measurement.measured_values.T)
+        yield from zip(map(str, measurement.number_names), columns, strict=True)
+
+
+def filtered_signals(experiment: Experiment, fitted: Iterable[Predicted]) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that values of a fitted experiment were low-passed, for each measurement
+    whose residuals have a spectrum of noise at low frequencies that falls far below it at high ones.
+    """
+    for measurement, predicted in zip(experiment.measurements, fitted, strict=True):
+        t_s = measurement.sample_times_s
+        if experiment.is_static or not isinstance(predicted, np.ndarray):
+            continue
+        scaled = (predicted - measurement.measured_values) / measurement.value_sigmas
+        used = np.isfinite(scaled).any(axis=1)
+        complete = np.isfinite(scaled[used]).all(axis=0)
+        if used.sum() < FEWEST_SAMPLES or not complete.any():
+            continue
+        intervals_s = np.diff(t_s[used])
+        if np.ptp(intervals_s) > EVEN * intervals_s.mean():
+            continue
+        frequency_hz, amplitude = _amplitudes(scaled[used][:, complete], float(intervals_s.mean()))
+        cutoff = _cutoff(amplitude)
+        if cutoff is None:
+            continue
+        high = float(np.sqrt(np.mean(amplitude[2 * cutoff :] ** 2)))
+        data = {"frequency_hz": float(frequency_hz[cutoff]), "percent": 100 * high}
+        code = "tracks-filtered"
+        if not isinstance(measurement, Markers):
+            code = "sensor-filtered"
+            data |= {"what": measurement.title, "stated": measurement.sigma_text}
+        yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=1 / STOPPED)
 
 
 def _amplitudes(values: Array, interval_s: float) -> tuple[Array, Array]:
