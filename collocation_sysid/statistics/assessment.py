@@ -279,8 +279,8 @@ def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
     else empty.
 
     Noisy are markers whose residuals exceed `MARKER_MISFIT` times the median of all markers (the
-    lower one of an even number), and `MARKER_MISFIT` times σ. Nothing is reported unless the test for unequal variances is
-    significant at `RARE`.
+    lower one of an even number), and `MARKER_MISFIT` times σ. Nothing is reported unless the test
+    for unequal variances is significant at `RARE`.
     """
     if not level.unequal_p < RARE:
         return []

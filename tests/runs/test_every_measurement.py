@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def only(kind, cube=None):
         return replace(cube, grasps=grasps, markers=None)
     if kind == "depth camera":
         points_m = np.random.default_rng(0).uniform(0.1, 0.2, size=(20, 3))
-        return hanging([cs.Depth("front", [0.0], [points_m], 1e-3)])
+        return hanging((cs.Depth("front", [0.0], [points_m], 1e-3),))
     gauge = cs.Gauge("height", lambda at: at.position_m[2, 0], cube.t_s, ones, 0.1, [[0, 0, 0]])
     return replace(cube, readings=[gauge], markers=None)
 
@@ -145,6 +146,8 @@ SAMPLES = 80
 
 class Surface(SurfaceComparison):
     """Comparison of an image with a surface that is away from it by multiples of sigma."""
+
+    sigmas: float
 
     def __init__(self, sigmas: float) -> None:
         vars(self)["sigmas"] = sigmas
@@ -287,7 +290,7 @@ def outlier_share(kind):
     part = SimpleNamespace(
         transcription=SimpleNamespace(residuals=[model]), observables=[None], phi=None
     )
-    solution = SimpleNamespace(collocation=SimpleNamespace(huber=3.0 * numbers), parts=[part])
+    solution: Any = SimpleNamespace(collocation=SimpleNamespace(huber=3.0 * numbers), parts=[part])
     assert _outlier_counts(solution) == (3, 20 * entities)
     solution.collocation.huber = None
     assert _outlier_counts(solution) == (0, 20 * entities)
@@ -304,7 +307,9 @@ def filtered(kind):
     slow = 3 * np.sin(9 * t_s)[:, None]
     for error, is_named in ((noise, False), (smooth, True)):
         predicted = measurement.measured_values + (error + slow) * measurement.value_sigmas
-        fitted = [predicted if e is measurement else None for e in experiment.measurements]
+        fitted: list[Any] = [
+            predicted if e is measurement else None for e in experiment.measurements
+        ]
         found = [*filtered_signals(experiment, fitted)]
         assert bool(found) == is_named
         assert not found or measurement.sigma_text in found[0].message or kind == "markers"
