@@ -747,6 +747,54 @@ class Body(Discretisation):
         internal = self._evaluate("force", [x, v], theta=theta, memory_input=memory_input)
         return internal - self._damping_coefficients(theta, tied_kg) * v
 
+    def mean_stresses(
+        self,
+        x: Array,
+        v: Array,
+        theta: Array,
+        velocity_slope: float = 0.0,
+        memory_input: MemoryInput | None = None,
+    ) -> Array:
+        """Return the mean stress σ = tr(Cauchy stress)/3 (E,) [Pa] of each element at one state.
+
+        It follows from the forces of the element on its nodes: 3 v σ = −Σ_a f_a · x_a, with its
+        current volume v.
+
+        Parameters
+        ----------
+        x, v : (1, 3n)
+            Positions [m] and velocities [m/s].
+        theta : (k,)
+        velocity_slope : float
+            Derivative of the velocities by the positions [1/s]. Rayleigh's forces −γ_r K v then
+            count with the stress that their derivative K contains.
+        memory_input : MemoryInput, optional
+            Internal variables, see `force`.
+        """
+        forces = self._evaluate("element_force", [x, v], theta, memory_input=memory_input)
+        if velocity_slope and (rates := self._rayleigh_rates(theta)).any():
+            elastic = self._evaluate(
+                "element_force", [x, np.zeros_like(x)], theta, memory_input=memory_input
+            )
+            shares = np.repeat(velocity_slope * rates, 3 * self.element.nodes)
+            forces = forces + shares * elastic
+        at_nodes = x.reshape(-1, 3)
+        by_node = forces.reshape(len(self.cells), -1, 3)
+        virials = np.zeros(len(self.cells))
+        for part in self.parts:
+            nodes, _ = self.part_elements(part)
+            virials[part.cells] = np.einsum("eai,eai->e", by_node[part.cells], at_nodes[nodes])
+        volumes = (self.volume_ratios(x)[0] * self.geometry[..., -1]).sum(axis=1)
+        return -virials / (3 * volumes)
+
+    def _rayleigh_rates(self, theta: Array) -> Array:
+        """Return γ_r (E,) [s] of the elements with Rayleigh damping, 0 for others."""
+        rates = np.zeros(len(self.cells))
+        for part, values in zip(self.parts, self.split_theta(theta), strict=False):
+            if part.damping.name == "rayleigh":
+                rates[part.cells] = values[len(part.material.constants)]
+        return rates
+
     def linearise(
         self,
         positions: ArrayLike,

@@ -35,6 +35,8 @@ BY_FIELD = {
     "linearisation": ("by_theta",),
     "curvature": ("position_theta", "velocity_theta", "theta_theta", "gradient_theta"),
 }
+# Kernels of evaluations that have another name.
+KERNEL_NAMES = {"element_force": "force"}
 
 
 class Discretisation(ConstantsModel):
@@ -248,7 +250,7 @@ class Discretisation(ConstantsModel):
         Parameters
         ----------
         name : str
-            Kernel in `expressions.KERNELS`; the result is empty unless `BY_FIELD` has it.
+            Name of an evaluation; the result is empty unless `BY_FIELD` has it.
 
         Returns
         -------
@@ -337,6 +339,32 @@ class Discretisation(ConstantsModel):
             + a[2] * (b[0] * c[1] - b[1] * c[0])
         )
         return ratios.reshape(count, points, -1).transpose(2, 0, 1)
+
+    def volume_stiffness(self, positions: Array, stress_pa: Array) -> Array:
+        """Return the lower triangle (m,) of Σ_e σ_e ∂²v_e/∂x² [N/m], with the current volumes v_e of
+        the elements at positions (3n,) [m] and stresses σ_e (E,) [Pa] that do not change.
+        """
+        count, points = self.geometry.shape[:2]
+        gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
+        at_nodes = positions.reshape(-1, 3)[self.cells]
+        F = np.einsum("eai,eqaj->eqij", at_nodes, gradients, optimize=True)
+        spatial = gradients @ np.linalg.inv(F)
+        weights = stress_pa[:, None] * self.geometry[..., -1] * np.linalg.det(F)
+        size = 3 * self.element.nodes
+        spatial = spatial.reshape(count, points, size)
+        products = (spatial * weights[..., None]).swapaxes(1, 2) @ spatial
+        shape = (count, self.element.nodes, 3, self.element.nodes, 3)
+        exchanged = products.reshape(shape).swapaxes(2, 4).reshape(products.shape)
+        columns, rows = np.triu_indices(size)
+        values = (products - exchanged)[:, rows, columns]
+        return np.bincount(
+            self._entries_of_cells.ravel(), values.ravel(), minlength=self.pattern.entry_count
+        )
+
+    @cached_property
+    def _entries_of_cells(self) -> Index:
+        """Positions in `pattern` of the lower triangles of the cells (E, any)."""
+        return element_destinations(self.pattern, self.cells)[1]
 
     @cached_property
     def shape_gradients(self) -> sp.csr_array:
@@ -447,6 +475,7 @@ class Discretisation(ConstantsModel):
         return {
             "energy": 1,
             "force": size,
+            "element_force": 3 * self.cells.size,
             "linearisation": (1 + k) * size + entries,
             "curvature": 2 * k * size + entries + k * (k + 1),
         }[name]
@@ -458,7 +487,7 @@ class Discretisation(ConstantsModel):
         """
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
-        kernel = KERNELS[name](self.element, self.law(number, memory))
+        kernel = KERNELS[KERNEL_NAMES.get(name, name)](self.element, self.law(number, memory))
         cells, geometry = self.part_elements(part)
         destinations = self._destinations(name, number, cells=cells, kernel=kernel)
         columns = self._data_columns(name, number, points=geometry.shape[1])
@@ -489,6 +518,9 @@ class Discretisation(ConstantsModel):
         # Positions and length of each kind of output.
         energy = np.zeros((count, 1), dtype=np.int64), 1
         nodal = vector, self.pattern.size
+        if name == "element_force":
+            dofs = 3 * self.element.nodes
+            nodal = dofs * part.cells[:, None] + np.arange(dofs), self._width(name)
         matrix = lower, self.pattern.entry_count
         nodal_by_theta = by_theta, total * self.pattern.size
         theta = np.broadcast_to(columns, (count, len(columns))), total

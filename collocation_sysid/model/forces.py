@@ -241,6 +241,18 @@ class Forces:
             total = total + term.force(states_for(term))
         return total
 
+    def mean_stresses(self, xi: Array, nu: Array, velocity_slope: float) -> Array:
+        """Return the mean stress (E,) [Pa] of each element at one state ξ, ν, (1, 3n) each, see
+        `Body.mean_stresses`.
+        """
+        return self.body.mean_stresses(
+            xi,
+            self.states_of_terms(xi, nu)(self.weight).nu,
+            theta=self.theta,
+            velocity_slope=0.0 if self.is_static else velocity_slope,
+            memory_input=self.memory_state,
+        )
+
     def linearise(self, xi: Array, nu: Array, out: Array | None = None) -> Linearisation:
         """Return the forces and their first derivatives by state and inputs; columns of `by_theta`
         are those of θ, then of the inputs of each term.

@@ -26,7 +26,7 @@ from scipy.linalg import get_lapack_funcs
 from ...common.array_types import Array, Index
 from ...model.local_force import ActivePoints, LocalForces
 from ..linear_algebra.factorisation import Factor
-from .newton_linearisation import NewtonLinearisation
+from .newton_linearisation import LaggedStress, NewtonLinearisation
 
 # Largest number of active dofs: dense matrices of this size take as long as the factor of a body of
 # some thousand nodes.
@@ -67,14 +67,23 @@ class StepEquations(ABC):
         Derivatives of the state ξ and of the velocity ν of the local forces by the positions.
     local_weight : float
         Factor of the local forces in the residual.
+    stress : LaggedStress
+        Mean stresses of the elements.
 
     Parameters
     ----------
-    local, rates, local_weight
+    local, rates, local_weight, stress
         See the attributes.
     """
 
-    def __init__(self, local: LocalForces, rates: tuple[float, float], local_weight: float) -> None:
+    def __init__(
+        self,
+        local: LocalForces,
+        rates: tuple[float, float],
+        local_weight: float,
+        stress: LaggedStress,
+    ) -> None:
+        self.stress = stress
         self.local = local
         self.rates = rates
         self.local_weight = local_weight

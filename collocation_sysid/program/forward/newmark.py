@@ -32,9 +32,9 @@ from ..linear_algebra.lapack import one_blas_thread
 from ..observables import ReactionForces
 from .condensed_steps import StepEquations
 from .initial_equilibrium import initial_state
+from .newton_linearisation import LaggedStress, NewtonLinearisation
 from .newton_solver import (
     NewtonFailure,
-    NewtonLinearisation,
     NewtonOptions,
     NewtonSolver,
     NewtonSolvers,
@@ -196,11 +196,17 @@ class _NewmarkEquations(StepEquations):
         prescribed_dofs: Index,
         prescribed: _PrescribedMotion,
     ) -> None:
-        super().__init__(forces.local_forces(), rates=(0.5, 1 / step_s), local_weight=2.0)
+        rest = forces.without_local_forces()
+        super().__init__(
+            forces.local_forces(),
+            rates=(0.5, 1 / step_s),
+            local_weight=2.0,
+            stress=LaggedStress(rest, self._end_states, velocity_slope=2.0 / step_s),
+        )
         self.mass_kg = forces.mass.inertia_kg[0]
         self._state = state
         self._step_s = step_s
-        self._forces = forces.without_local_forces()
+        self._forces = rest
         self._prescribed_dofs = prescribed_dofs
         self._prescribed = prescribed
         # Derivative of the velocity at the end by the position at the end.
@@ -242,6 +248,10 @@ class _NewmarkEquations(StepEquations):
         v[self._prescribed_dofs] = self._prescribed.velocities_m_s
         a[self._prescribed_dofs] = self._prescribed.accelerations_m_s2
         return v, a
+
+    def _end_states(self, x: Array) -> tuple[Array, Array]:
+        """Return positions x [m] and velocities [m/s] at the end of the step, (1, 3n) each."""
+        return x[None], self.kinematics(x)[0][None]
 
     def states(self, x: Array) -> tuple[Array, Array]:
         """Return the mean position ξ [m] and velocity ν [m/s] of the step, (1, 3n) each, if it ends

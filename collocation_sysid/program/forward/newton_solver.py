@@ -23,7 +23,7 @@ from ..linear_algebra.reused_factor import (
 )
 from ..stopwatch import Stopwatch
 from .condensed_steps import Compliance, CondensationError, CondensedSteps, StepEquations
-from .newton_linearisation import NewtonLinearisation
+from .newton_linearisation import LaggedStress, NewtonLinearisation
 from .retraction import Retraction, add_increment
 
 # Skew part of a matrix that is approximated by its symmetric part.
@@ -193,6 +193,8 @@ class NewtonSolver:
         self.last_factor: Factor | None = None
         self.compliance: Compliance | None = None
         self.definite_factor: Factor | None = None
+        # Mean stresses of the elements in the last time step, and its solution (3n,) [m].
+        self._last_step: tuple[LaggedStress, Array] | None = None
 
     def solve_equilibrium(
         self, x: Array, residual: Residual, linearise: Linearise, prescribed_m: Array | None = None
@@ -262,7 +264,9 @@ class NewtonSolver:
 
         Local forces are condensed to the dofs on which they act, with the factor of the body
         without them of earlier steps. Where that does not converge, the complete equations are
-        solved, first with the factor of the previous solution as long as steps shrink fast.
+        solved, first with the factor of the previous solution as long as steps shrink fast. Newton's
+        method then takes the mean stresses of the elements from the step before and from its own
+        last iterate, see `newton_linearisation`.
 
         Parameters
         ----------
@@ -281,6 +285,12 @@ class NewtonSolver:
         NewtonFailure
             If no method converges, or an element is inverted at the start.
         """
+        solution = self._solve_step(x, equations)
+        self._last_step = equations.stress, solution
+        return solution
+
+    def _solve_step(self, x: Array, equations: StepEquations) -> Array:
+        """Return the solution of `solve_step`."""
         if equations.local.has_forces and self.has_no_inverted_element(x):
             improved, done = self._simplified_newton(x, _CondensedIteration(self, equations))
             if done:
@@ -290,14 +300,22 @@ class NewtonSolver:
         improved, done = self._simplified_newton(x, _CompleteIteration(self, equations))
         if done:
             return improved
-        iterate = self._iterate_at(x.copy(), equations.linearise, keep_definite=False)
+        linearise = equations.linearise
+        if self._last_step is not None:
+            stress, before = self._last_step
+            linearise = equations.stress.expecting(stress.at(before), linearise)
+        iterate = self._iterate_at(x.copy(), linearise, keep_definite=False)
         for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
                 self.last_factor = iterate.factor
                 iterate.x[self.free] += iterate.step
                 return iterate.x
             iterate = self._backtrack(
-                iterate, equations.residual, linearise=equations.linearise, keep_definite=False
+                iterate,
+                equations.residual,
+                linearise=equations.linearise,
+                keep_definite=False,
+                stress=equations.stress,
             )
         raise self._iteration_failure(iterate)
 
@@ -422,12 +440,20 @@ class NewtonSolver:
         return state
 
     def _backtrack(
-        self, iterate: _Iterate, residual: Residual, linearise: Linearise, keep_definite: bool
+        self,
+        iterate: _Iterate,
+        residual: Residual,
+        linearise: Linearise,
+        keep_definite: bool,
+        stress: LaggedStress | None = None,
     ) -> _Iterate:
         """Return the next iterate, with the first of the halved steps that is acceptable.
 
         A step is acceptable when the next one, computed with the same factor, is shorter
-        (Deuflhard's natural monotonicity test), and no element is inverted.
+        (Deuflhard's natural monotonicity test), and no element is inverted. With mean stresses
+        `stress` a whole step is also acceptable if the next one with its own factor is shorter: the
+        volumes of a nearly incompressible body are wrong after a long step, and only that factor
+        removes the errors without further displacements.
         """
         x = iterate.x
         factor = iterate.factor
@@ -444,16 +470,19 @@ class NewtonSolver:
                     at = linearise(trial) if share == 1 else None
                     value = residual(trial) if at is None else at.residual
                 next_step = self.step(factor, value)
-                if np.linalg.norm(next_step) <= (1 - share / 4) * length:
-                    is_last = self._is_last(next_step, OLD_FACTOR_SHARE)
-                    if is_last and not keep_definite:
-                        return _Iterate(trial, factor, step=next_step)
-                    if at is None:
-                        with self.stopwatch.evaluating():
-                            at = linearise(trial)
+                is_shorter = np.linalg.norm(next_step) <= (1 - share / 4) * length
+                if is_shorter and not keep_definite and self._is_last(next_step, OLD_FACTOR_SHARE):
+                    return _Iterate(trial, factor, step=next_step)
+                if is_shorter or (stress is not None and share == 1):
+                    with self.stopwatch.evaluating():
+                        at = linearise(trial) if at is None else at
+                        if stress is not None:
+                            at = stress.replace_stress(at, trial, stress.after(x, increment))
                     try:
                         own = self.factorise(at, trial, keep_definite=keep_definite)
-                        return _Iterate(trial, own, step=self.step(own, at.residual))
+                        own_step = self.step(own, at.residual)
+                        if is_shorter or np.linalg.norm(own_step) <= length:
+                            return _Iterate(trial, own, step=own_step)
                     except NewtonFailure:
                         pass
             share /= 2

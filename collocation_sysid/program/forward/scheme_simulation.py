@@ -20,9 +20,9 @@ from ..linear_algebra.lapack import one_blas_thread
 from ..stopwatch import Stopwatch
 from .condensed_steps import StepEquations
 from .initial_equilibrium import initial_state
+from .newton_linearisation import LaggedStress, NewtonLinearisation
 from .newton_solver import (
     NewtonFailure,
-    NewtonLinearisation,
     NewtonOptions,
     NewtonSolver,
     NewtonSolvers,
@@ -260,7 +260,15 @@ class RowEquations(StepEquations):
         )
         row = self.row
         super().__init__(
-            self.forces.local_forces(), rates=(row.p[0], row.q[0]), local_weight=row.w[0]
+            self.forces.local_forces(),
+            rates=(row.p[0], row.q[0]),
+            local_weight=row.w[0],
+            stress=LaggedStress(
+                self.rest,
+                self.states,
+                weight=row.w[0] * row.p[0],
+                velocity_slope=row.q[0] / row.p[0],
+            ),
         )
         first = max(0, t - dynamics.largest_lag)
         shape = x.shape[1:]

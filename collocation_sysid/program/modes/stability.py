@@ -7,6 +7,7 @@ positive definite beyond buckling, nor D where a damping law feeds energy in.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,13 +162,38 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
 def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
     """Return vectors (n, `DIRECTIONS`) with the smallest eigenvalues of a symmetric matrix; if the
     iteration stops early, those that have converged and the start vector.
+
+    The matrix is inverted with a shift below its smallest eigenvalue: in a nearly incompressible
+    body the largest ones are so large that without it the iteration hardly converges.
     """
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
-    options = {"which": "SA", "tol": TOLERANCE, "v0": start, "ncv": 12 * DIRECTIONS}
+    shift, inverse = _inverse_below(matrix)
+    options = {"tol": TOLERANCE, "v0": start, "ncv": 4 * DIRECTIONS}
     try:
-        return np.asarray(eigsh(matrix, DIRECTIONS, **options)[1])
+        return np.asarray(eigsh(matrix, DIRECTIONS, sigma=-shift, OPinv=inverse, **options)[1])
     except ArpackNoConvergence as stopped:
         return np.column_stack([stopped.eigenvectors, start])
+
+
+def _inverse_below(matrix: sp.csc_array) -> tuple[float, LinearOperator]:
+    """Return a shift σ > 0 with which the matrix + σ is positive definite, at most ten times the
+    least one of use, and the inverse of that sum.
+    """
+    size = len(matrix.diagonal())
+    shift = SHIFT * float(abs(matrix).sum(axis=1).max())
+    while True:
+        # Without row exchanges the signs of the pivots are those of the eigenvalues.
+        with suppress(RuntimeError):  # exactly singular
+            factor = splu(
+                sp.csc_array(matrix + shift * sp.eye_array(size)),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+            is_exchanged = (factor.perm_r != factor.perm_c).any()
+            if not is_exchanged and factor.U.diagonal().min() > 0:
+                return shift, LinearOperator((size, size), matvec=factor.solve, dtype=float)
+        shift *= 10
 
 
 def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
