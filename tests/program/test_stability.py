@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import casadi as ca
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from kit.problems import IDEAL, nodes_where, point_markers
-from scipy.sparse.linalg import ArpackNoConvergence
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.kernel import from_lower_triangle
@@ -175,6 +178,13 @@ def test_growth_is_found_where_the_search_for_directions_ends_early(monkeypatch)
     assert growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free) == pytest.approx(
         expected
     )
+
+
+def test_negative_directions_are_found_in_few_iterations_beside_a_bulk_modulus(monkeypatch):
+    values = np.concatenate([[-3.0, -2.0, -1.0], np.logspace(0, 10, 297)])
+    monkeypatch.setattr(stability, "eigsh", partial(eigsh, maxiter=5))
+    vectors = stability._lowest_eigenvectors(sp.csc_array(sp.diags_array(values)))
+    np.testing.assert_allclose(np.linalg.norm(vectors[:3], axis=1), 1.0, atol=1e-2)
 
 
 def test_a_body_that_nobody_holds_is_stable():

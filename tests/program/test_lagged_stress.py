@@ -1,0 +1,108 @@
+"""Mean stresses of the elements as unknowns of the time steps of nearly incompressible bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kit.problems import nodes_where
+
+from collocation_sysid import (
+    Body,
+    Experiment,
+    Grasp,
+    Markers,
+    Nuisance,
+    PoseSequence,
+    box_mesh,
+    simulate,
+)
+from collocation_sysid.program.forward.newton_linearisation import LaggedStress
+from collocation_sysid.program.linear_algebra.factorisation import Factoriser
+
+SIZE_M = (0.03, 0.03, 0.09)
+MODULI = {"gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
+
+
+def bar(element: str = "tet10-p0", damping: str = "rayleigh") -> Body:
+    mesh = box_mesh(SIZE_M, (1, 1, 2))
+    return Body(mesh, density_kg_m3=1000.0, element=element, damping=damping)
+
+
+def deformed(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    x = body.nodes_m.ravel() + 5e-4 * rng.normal(size=body.nodes_m.size)
+    return x, 0.1 * rng.normal(size=x.size)
+
+
+def volume_slopes(body: Body, x: np.ndarray, stress_pa: np.ndarray) -> np.ndarray:
+    """Derivative of Σ σ_e v_e by the positions, by central differences."""
+
+    def total(state: np.ndarray) -> float:
+        return stress_pa @ (body.volume_ratios(state)[0] * body.geometry[..., -1]).sum(axis=1)
+
+    steps = 1e-7 * np.eye(x.size)
+    return np.array([(total(x + step) - total(x - step)) / 2e-7 for step in steps])
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10-p0"])
+def test_the_volume_stiffness_is_the_derivative_of_the_slopes_of_the_volumes(element):
+    body = bar(element)
+    x, direction = deformed(body)
+    stress_pa = np.random.default_rng(1).normal(size=len(body.cells))
+    stiffness = body.pattern.matrix(body.volume_stiffness(x, stress_pa))
+    slopes = [volume_slopes(body, x + h * direction, stress_pa) for h in (1e-4, -1e-4)]
+    expected = (slopes[0] - slopes[1]) / 2e-4
+    np.testing.assert_allclose(stiffness @ direction, expected, atol=1e-5 * abs(expected).max())
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10-p0"])
+def test_a_larger_bulk_modulus_adds_the_forces_of_the_mean_stresses(element):
+    body = bar(element)
+    x, _ = deformed(body)
+    still = np.zeros_like(x)
+    thetas = [
+        body.theta_from_values(MODULI | {"mu_pa": 1e4, "lambda_pa": value}) for value in (3e5, 4e5)
+    ]
+    stresses = [body.mean_stresses(x[None], still[None], theta) for theta in thetas]
+    forces = [body.force(x, still, theta)[0] for theta in thetas]
+    added = -volume_slopes(body, x, stresses[1] - stresses[0])
+    np.testing.assert_allclose(forces[1] - forces[0], added, atol=1e-6 * abs(added).max())
+
+
+def swayed(damping: str) -> Experiment:
+    body = bar(damping=damping)
+    t_s = np.arange(5) / 120
+    sway_m = np.outer(0.03 * (1 - np.cos(20 * t_s)), [1.0, 0.5, 0.3])
+    poses = PoseSequence(t_s, sway_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)))
+    markers = Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=[body.nodes_m[0]])
+    grasp = Grasp(nodes_where(body, 2, SIZE_M[2]), poses)
+    return Experiment(body, t_s, [grasp], markers, nuisance=Nuisance.none())
+
+
+def moved(damping: str, poisson: float) -> np.ndarray:
+    truth = MODULI | {"young_pa": 2e4, "poisson": poisson}
+    return simulate(swayed(damping), truth, "bdf2", substeps=1).positions_m
+
+
+@pytest.mark.parametrize(
+    ("damping", "poisson", "most"), [("rayleigh", 0.499, 50), ("kelvin-voigt", 0.4999, 100)]
+)
+def test_steps_of_a_nearly_incompressible_body_take_few_factorisations(
+    damping, poisson, most, monkeypatch
+):
+    factorised = []
+    factorise = Factoriser.factorise
+
+    def counting(self, *matrix, **options):
+        factorised.append(self)
+        return factorise(self, *matrix, **options)
+
+    monkeypatch.setattr(Factoriser, "factorise", counting)
+    moved(damping, poisson)
+    assert len(factorised) <= most  # 127 and 329 with the stresses of the iterates
+
+
+def test_the_stresses_change_the_way_to_a_solution_and_not_the_solution(monkeypatch):
+    with_stresses_m = moved("rayleigh", 0.49)
+    monkeypatch.setattr(LaggedStress, "replace_stress", lambda self, at, x, stress_pa: at)
+    np.testing.assert_allclose(moved("rayleigh", 0.49), with_stresses_m, atol=1e-9)
