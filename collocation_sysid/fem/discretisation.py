@@ -357,9 +357,9 @@ class Discretisation(ConstantsModel):
         exchanged = products.reshape(shape).swapaxes(2, 4).reshape(products.shape)
         columns, rows = np.triu_indices(size)
         values = (products - exchanged)[:, rows, columns]
-        return np.bincount(
-            self._entries_of_cells.ravel(), values.ravel(), minlength=self.pattern.entry_count
-        )
+        entries = self._entries_of_cells.ravel()
+        summed = np.bincount(entries, values.ravel(), minlength=self.pattern.entry_count)
+        return np.asarray(summed, dtype=float)
 
     @cached_property
     def _entries_of_cells(self) -> Index:

@@ -167,17 +167,16 @@ def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
     body the largest ones are so large that without it the iteration hardly converges.
     """
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
-    shift, inverse = _inverse_below(matrix)
-    options = {"tol": TOLERANCE, "v0": start, "ncv": 4 * DIRECTIONS}
+    options = {"sigma": -_definite_shift(matrix), "tol": TOLERANCE, "v0": start}
     try:
-        return np.asarray(eigsh(matrix, DIRECTIONS, sigma=-shift, OPinv=inverse, **options)[1])
+        return np.asarray(eigsh(matrix, DIRECTIONS, ncv=4 * DIRECTIONS, **options)[1])
     except ArpackNoConvergence as stopped:
         return np.column_stack([stopped.eigenvectors, start])
 
 
-def _inverse_below(matrix: sp.csc_array) -> tuple[float, LinearOperator]:
-    """Return a shift σ > 0 with which the matrix + σ is positive definite, at most ten times the
-    least one of use, and the inverse of that sum.
+def _definite_shift(matrix: sp.csc_array) -> float:
+    """Return a shift σ > 0 with which the matrix + σ is positive definite, less than ten times the
+    least one, but for rounding errors.
     """
     size = len(matrix.diagonal())
     shift = SHIFT * float(abs(matrix).sum(axis=1).max())
@@ -192,7 +191,7 @@ def _inverse_below(matrix: sp.csc_array) -> tuple[float, LinearOperator]:
             )
             is_exchanged = (factor.perm_r != factor.perm_c).any()
             if not is_exchanged and factor.U.diagonal().min() > 0:
-                return shift, LinearOperator((size, size), matvec=factor.solve, dtype=float)
+                return shift
         shift *= 10
 
 
