@@ -241,7 +241,7 @@ class Forces:
             total = total + term.force(states_for(term))
         return total
 
-    def mean_stresses(self, xi: Array, nu: Array, velocity_slope: float) -> Array:
+    def mean_stresses(self, xi: Array, nu: Array, velocity_slope: float = 0.0) -> Array:
         """Return the mean stress (E,) [Pa] of each element at one state ξ, ν, (1, 3n) each, see
         `Body.mean_stresses`.
         """

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError, SimulationError
 from ..fem.body import Body
-from ..fem.laws.constants import without_region
+from ..fem.laws.constants import YOUNG, without_region
 from ..fem.laws.moduli import ELASTIC
 from ..methods.solution import Solution
 from ..problem import Problem
@@ -33,6 +33,8 @@ MESH_ERROR = "mesh/error"
 LARGEST_CHANGE = 0.5
 # Largest change of a logarithm: a larger one is no estimate.
 LARGEST_STEP = 2.0
+# Moduli of which a larger change shows that the estimate to first order does not hold.
+CHECKED_MODULI = (YOUNG.name, "mu_pa")
 # Lowest order of convergence of the elements.
 LEAST_ORDERS = {LINEAR: 0.5}
 
@@ -75,6 +77,12 @@ def estimate_mesh_error(
         change = mesh_change(collocation, solution.z, fit)
     except (InputError, SimulationError, np.linalg.LinAlgError) as error:
         return known, f"the error of the mesh was not estimated: {error}"
+    values = parameter_values(collocation, solution.q + change)
+    before = parameter_values(collocation, solution.q)
+    modulus = next(_modulus_beyond_first_order(before, values), "")
+    if modulus:
+        reason = f"to first order, {modulus} would change to {values[modulus]:.2g} Pa"
+        return known, f"the error of the mesh was not estimated: {reason}; `refine` measures it"
     linear = collocation.parameters.list_linear_names()
     is_linear = np.array([item.name in linear for item in collocation.parameters.free], dtype=bool)
     change = np.where(is_linear, change, np.clip(change, -LARGEST_STEP, LARGEST_STEP))
@@ -86,6 +94,17 @@ def estimate_mesh_error(
         least_order=min(LEAST_ORDERS.get(body.element.name, 1.0) for body in bodies),
         linear=linear,
     ), ""
+
+
+def _modulus_beyond_first_order(
+    before: Mapping[str, float], after: Mapping[str, float]
+) -> Iterator[str]:
+    """Yield the moduli that change by more than `LARGEST_STEP` of the logarithm, or their sign."""
+    for name, value in after.items():
+        if without_region(name) in CHECKED_MODULI:
+            ratio = value / before[name]
+            if not np.exp(-LARGEST_STEP) < ratio < np.exp(LARGEST_STEP):
+                yield name
 
 
 def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) -> list[Concern]:
@@ -116,19 +135,21 @@ def _few_cells_concerns(problem: Problem) -> list[Concern]:
 
 def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> Iterator[Concern]:
     """Yield a concern about the estimated elastic constant whose change on a finer mesh is largest,
-    if that is more than `LARGEST_CHANGE` of its value. Derived moduli do not count: λ changes
-    without limit near ν = ½.
+    if that is more than `LARGEST_CHANGE` of its value. Constants on a linear scale do not count,
+    since they may be near zero, and of derived moduli only E: λ changes without limit near ν = ½.
     """
     if refinement is None:
         return
     bodies = dict.fromkeys(e.body for e in problem.experiments if e.specimen is None)
     elastic = set().union(*map(_elastic_names, bodies))
-    estimated = {item.name for item in problem.parameters.free}
+    linear = problem.parameters.list_linear_names()
+    judged = {item.name for item in problem.parameters.free if item.name not in linear}
     changes = {
         name: error.estimated_mesh / abs(error.extrapolated)
         for name, error in refinement.errors.items()
         if error.estimated_mesh is not None and error.extrapolated
-        if name in estimated and without_region(name) in elastic
+        if without_region(name) == YOUNG.name
+        or (name in judged and without_region(name) in elastic)
     }
     name = max(changes, key=lambda each: abs(changes[each]), default="")
     if name and abs(changes[name]) > LARGEST_CHANGE:

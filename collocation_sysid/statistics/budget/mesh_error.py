@@ -2,27 +2,31 @@
 
 On the mesh with every tetrahedron split into eight, the nodes of the given mesh (with quadratic
 elements, its mid nodes too) are corners, and the other nodes are new. With the interpolation I of
-the given mesh, the finer mesh moves by I x + e; e is the motion of the new nodes relative to the
-given shape functions, and changes slowly compared with their own vibrations. It follows from the
-equilibrium of the new nodes, with the derivatives K = −∂F/∂ξ of the forces at I x,
+the given mesh, the finer mesh moves by I x + e. With the derivatives K = −∂F/∂ξ of the forces at
+I x, its nodes satisfy
 
-    K_ss e = F_s(I ξ, I ν) − M_s I a,
+    K e = F(I ξ, I ν) − M I a
 
-and the given nodes are subject to a change of force
+to first order. In a motion, e is set to zero at the given nodes: e of the new ones, relative to the
+given shape functions, changes slowly compared with their own vibrations (static condensation in a
+hierarchical basis: Zienkiewicz, Gago and Kelly, Computers & Structures 16, 1983). In equilibria all
+free nodes move, and nothing is neglected. The given nodes are subject to a change of force
 
-    Iᵀ(F(I ξ, I ν) − M I a − K e) − (f(ξ, ν) − m a)
+    Iᵀ(F(I ξ, I ν) − M I a − K e) − (f(ξ, ν) − m a) + k e_g
 
-compared with the given mesh (static condensation in a hierarchical basis: Zienkiewicz, Gago and
-Kelly, Computers & Structures 16, 1983). For nested elements the first part is zero, and the change
-is the softening by the new nodes; for elements with mean dilatation it contains the stiffening by
-the additional pressures. The equations of motion of the given mesh turn this change of the
-forces into a change of the measurements, like that of any systematic effect. No matrix of the finer
-mesh is factorised at every time step.
+compared with the given mesh, with its own derivatives k and the part e_g of e at the given nodes:
+this change makes them move by e_g, and changes the forces on held nodes like the finer mesh. The
+equations of motion of the given mesh turn it into a change of the measurements, like that of any
+systematic effect. No matrix of the finer mesh is factorised at every time step of a motion.
+
+Elements with mean dilatation have the pressures of the given mesh in K. Those of I x contain errors
+of the interpolated volumes times the bulk modulus, which the equilibrium of the finer mesh does not
+have; as geometric stiffness they would make e arbitrary in a nearly incompressible body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 
 import numpy as np
@@ -34,6 +38,7 @@ from ...errors import InputError
 from ...fem.body import Body
 from ...fem.meshes.refinement import refine_body
 from ...model.dynamics import Dynamics
+from ...model.forces import Forces
 from ...model.schemes import Scheme
 from ...program.collocation import Collocation
 from ...program.linear_algebra.factorisation import NONE, Factoriser
@@ -115,11 +120,12 @@ def _effect(
     by_dof = sp.csr_array(sp.kron(interpolation, sp.eye_array(3)))
     held = np.zeros(iterate.x.shape[1], dtype=bool)
     held[transcription.prescribed_dofs] = True
-    condensed = _condensed_forces(
-        dynamics, iterate.x @ by_dof.T, by_dof, new=_new_dofs(by_dof, held)
-    )
-    given = _forces_less_inertia(at.dynamics, iterate.x)
-    return Effect(force_n=at.pad_rows(condensed - given))
+    is_given, given = _given_dofs(by_dof)
+    moving = np.flatnonzero((abs(by_dof) @ ~held > 0) & (at.dynamics.is_static | ~is_given))
+    forces_n, moved_m = _forces_and_motion(at, dynamics, by_dof, moving)
+    if at.dynamics.is_static:
+        forces_n += _stiffness_products(at, moved_m[:, given])
+    return Effect(force_n=at.pad_rows(forces_n - _forces_less_inertia(at.dynamics, iterate.x)))
 
 
 def _forces_less_inertia(dynamics: Dynamics, x: Array) -> Array:
@@ -128,40 +134,70 @@ def _forces_less_inertia(dynamics: Dynamics, x: Array) -> Array:
     return dynamics.force(x) - inertia_n[dynamics.first_row :]
 
 
-def _condensed_forces(
-    dynamics: Dynamics, x: Array, interpolation: sp.csr_array, new: Index
-) -> Array:
-    """Return Iᵀ(F − M a − K e) (N − first row, 3n) [N] at the evaluations.
+def _forces_and_motion(
+    at: ExperimentAtAnswer, dynamics: Dynamics, interpolation: sp.csr_array, moving: Index
+) -> tuple[Array, Array]:
+    """Return Iᵀ(F − M a − K e) (N − first row, 3n) [N] at the evaluations, and e of the finer mesh
+    (N − first row, 3m) [m].
 
     Parameters
     ----------
+    at : ExperimentAtAnswer
     dynamics : Dynamics
         Equations of motion on the finer mesh.
-    x : (N, 3m) array
-        Interpolated positions [m].
     interpolation : (3m, 3n) sparse array
         Matrix I.
-    new : (k,) array
-        Free dofs of the new nodes.
+    moving : (k,) array
+        Dofs of the finer mesh of which e is sought.
     """
+    x = np.ascontiguousarray(at.iterate.x @ interpolation.T)
     unbalanced_n = _forces_less_inertia(dynamics, x)
-    xi, nu = dynamics.evaluation_states(x)
-    histories = dynamics.histories(x)
+    xi, nu = map(np.ascontiguousarray, dynamics.evaluation_states(x))
+    forces = _forces_by_row(dynamics, x)
+    given = zip(*at.dynamics.evaluation_states(at.iterate.x), strict=True)
     sequence = FactorSequence(
-        Factoriser.cached(dynamics.pattern, new),
-        NodeRotation(new, dynamics.pattern.size // 3),
+        Factoriser.cached(dynamics.pattern, moving),
+        NodeRotation(moving, dynamics.pattern.size // 3),
         accuracy=ACCURACY,
     )
-    relative = np.zeros(dynamics.pattern.size)
-    for k in range(len(xi)):
+    relative = np.zeros_like(xi)
+    parents = _forces_by_row(at.dynamics, at.iterate.x)
+    for k, (own, parent) in enumerate(zip(forces, parents, strict=True)):
         now = slice(k, k + 1)
-        row = dynamics.first_row + k
-        forces = dynamics.forces_with_histories(histories, slice(row, row + 1))
-        stiffness = -forces.linearise(xi[now], nu[now]).by_position[0]
-        system = ReusedFactor(sequence, Matrix(stiffness, NONE), points_m=xi[k].reshape(-1, 3))
-        relative[new] = system.solve(unbalanced_n[k, new], guess=relative[new])
-        unbalanced_n[k] -= dynamics.pattern.products(stiffness[None], relative[None])[0]
-    return unbalanced_n @ interpolation
+        stiffness = -_by_position(own, xi[now], nu[now])
+        if dynamics.body.element.mean_dilatation:
+            stress_pa = np.repeat(parent.mean_stresses(*(each[None] for each in next(given))), 8)
+            stress_pa -= own.mean_stresses(xi[now], nu[now])
+            lagged = dynamics.body.volume_stiffness(xi[k], stress_pa)
+            stiffness += own.joint_pattern.expand(lagged[None])
+        system = ReusedFactor(sequence, Matrix(stiffness[0], NONE), points_m=xi[k].reshape(-1, 3))
+        guess = relative[max(0, k - 1), moving]
+        relative[k, moving] = system.solve(unbalanced_n[k, moving], guess=guess)
+        unbalanced_n[now] -= dynamics.pattern.products(stiffness, relative[now])
+    return unbalanced_n @ interpolation, relative
+
+
+def _forces_by_row(dynamics: Dynamics, x: Array) -> Iterator[Forces]:
+    """Yield the forces of each evaluation along a motion (N, 3n) [m]."""
+    histories = dynamics.histories(x)
+    for row in range(dynamics.first_row, dynamics.row_count):
+        yield dynamics.forces_with_histories(histories, slice(row, row + 1))
+
+
+def _by_position(forces: Forces, xi: Array, nu: Array) -> Array:
+    """Return ∂F/∂ξ (1, m) [N/m]."""
+    return forces.linearise(xi, nu).by_position
+
+
+def _stiffness_products(at: ExperimentAtAnswer, moved_m: Array) -> Array:
+    """Return k e_g (N − first row, 3n) [N] of the given mesh with e_g (N − first row, 3n) [m]."""
+    products_n = np.empty_like(moved_m)
+    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
+    for k, forces in enumerate(_forces_by_row(at.dynamics, at.iterate.x)):
+        now = slice(k, k + 1)
+        stiffness = -_by_position(forces, xi[now], nu[now])
+        products_n[now] = at.dynamics.pattern.products(stiffness, moved_m[now])
+    return products_n
 
 
 def _interpolation(body: Body, finer: Body) -> sp.csr_array:
@@ -187,9 +223,13 @@ def _interpolation(body: Body, finer: Body) -> sp.csr_array:
     return sp.csr_array(sp.block_diag([matrix, sp.eye_array(frames)])) if frames else matrix
 
 
-def _new_dofs(by_dof: sp.csr_array, held: NDArray[np.bool_]) -> Index:
-    """Return the free dofs (k,) of the finer mesh that belong to new nodes: they are interpolated
-    from several dofs, at least one of which is not `held` (3n,).
+def _given_dofs(by_dof: sp.csr_array) -> tuple[NDArray[np.bool_], Index]:
+    """Return which dofs (3m,) of the finer mesh are dofs of the given mesh, and for each dof of
+    the given mesh (3n,) that of the finer one.
     """
-    is_new = np.diff(by_dof.indptr) > 1
-    return np.flatnonzero(is_new & (abs(by_dof) @ ~held > 0))
+    is_given = np.diff(by_dof.indptr) == 1
+    rows = np.flatnonzero(is_given)
+    given = np.empty(by_dof.shape[1], dtype=np.int64)
+    entries = by_dof[rows].tocoo()
+    given[entries.col] = rows[entries.row]
+    return is_given, given
