@@ -407,12 +407,14 @@ def _solved_fit(answer: Run, fit: LinearisedFit, changes: ResidualChanges) -> So
 
 def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
     """Return the run with a note and the residuals that deviations within the budget leave, if
-    these explain all concerns about the residuals. Routine probes that are not significant beside
-    these deviations are then not significant.
+    there are concerns about the residuals or significant probes, and these deviations explain all
+    concerns about the residuals. Routine probes that do not remain beside them are then not
+    significant.
     """
     assert answer.uncertainty is not None
     concerns = {each.code for each in fit_concerns(answer.uncertainty)} & {*WITHIN_BUDGET}
-    if not concerns or answer.problem.uncertainty.noise == "estimated":
+    is_contradicted = concerns or any(p.routine and is_alarming(p) for p in answer.probes)
+    if not is_contradicted or answer.problem.uncertainty.noise == "estimated":
         return answer
     granted = answer.problem.assumed_deviations
     budgeted = budgeted_residuals(solved_fit, granted)

@@ -71,7 +71,7 @@ OWN_ONSET = 2.0
 # Nuisance parameters in standard deviations of their priors: "doubtful".
 ABSURD = 6.0
 # Time shift in standard deviations of its prior: "check".
-LATE = 1.8
+LATE = 3.0
 # Share of the samples beyond Huber's threshold: "check".
 WILD = MOST_WILD
 # The same for "doubtful".

@@ -33,6 +33,8 @@ from ...fem.body import Body
 ANCHOR = 1e-10
 # Largest logarithmic strain of an increment, far beyond those that are accepted.
 LARGEST_STRAIN = 20.0
+# Largest entry of the gradient of an increment.
+LONGEST_STEP = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +103,8 @@ class Retraction:
         """
         deformation = self._deformation(x)
         relative = self._deformation(increment) @ np.linalg.inv(deformation)
+        # Steps of a singular matrix may be of any length; they are rejected or halved later.
+        relative = np.nan_to_num(relative).clip(-LONGEST_STEP, LONGEST_STEP)
         strain = (relative + relative.transpose(0, 2, 1)) / 2
         spin = (relative - relative.transpose(0, 2, 1)) / 2
         vectors = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)

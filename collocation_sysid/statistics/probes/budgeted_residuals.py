@@ -24,6 +24,9 @@ from .routine_probes import prior_widening, significance_limit
 
 # Probability that the deviations of a faultless recording are larger than the budget grants.
 RARE = 1e-4
+# Deviation of an assumption that is probed in every solve, in standard deviations of the budget, up
+# to which it is within the budget.
+GRANTED = 3.0
 
 
 @dataclass(frozen=True)
@@ -86,11 +89,18 @@ def budgeted_residuals(
 def is_significant_beside_budget(
     solved_fit: SolvedFit, budgeted: Mapping[str, float | None], name: str
 ) -> bool:
-    """Return whether a routine probe, by the name of its assumption with component, is significant
-    if all other assumptions of the budget are relaxed too.
+    """Return whether a routine probe, by the name of its assumption with component, remains if all
+    assumptions of the budget are relaxed.
+
+    One that the budget contains remains if its deviation is larger than `GRANTED`; another, like
+    memory, if it is significant.
     """
-    others = {row: s for row, s in budgeted.items() if row != assumption_name(name)}
-    fit = _with_budget(solved_fit, others)
+    row = assumption_name(name)
+    fit = _with_budget(solved_fit, budgeted)
+    if budgeted.get(row):
+        first = len(solved_fit.fit.names)
+        own = [assumption_name(each.rpartition(" ")[0]) == row for each in fit.names[first:]]
+        return bool((np.abs(gauss_newton_step(fit)[first:][own]) > GRANTED).any())
     changes = solved_fit.changes
     wide = with_relaxed_assumption(fit, changes, name=name, widening=prior_widening(name))
     information = least_squares_of_fit(wide).compute_information()
