@@ -29,17 +29,17 @@ EFFECT = "stiffness_gradient"
 
 
 @cache
-def solved(gradient: float, deviation: float | str = DEVIATION) -> Run:
-    """A swung cube whose stiffness changes along its height by a gradient."""
+def solved(size: float, deviation: float | str = DEVIATION, effect: str = f"{EFFECT} z") -> Run:
+    """A swung cube whose stiffness changes along its height, or another effect."""
     hung = hung_cube(40)
     hung = replace(hung, body=Body(hung.body.mesh, density_kg_m3=60.0))
-    errors = {f"{EFFECT} z": gradient} if gradient else {}
+    errors = {effect: size} if size else {}
     tracks = with_wrong_assumptions(hung, TRUTH, errors).markers.positions_m
     tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
     exact: dict[str, Any] = dict.fromkeys(Assumptions().collect_deviations(), "none")
-    exact[EFFECT] = deviation
+    exact[effect.partition(" ")[0]] = deviation
     options = UncertaintyOptions(assumptions=Assumptions(**exact))
     unknown = {name: Unknown(value) for name, value in TRUTH.items()}
     problem = Problem([replace(hung, markers=seen)], unknown, substeps=1, uncertainty=options)
@@ -84,5 +84,15 @@ def test_a_probe_that_absorbs_a_deviation_is_not_significant_beside_the_budget()
     memory = "memory_share τ=0.1s"
     assert is_significant_beside_budget(solved_fit, {}, memory)
     assert not is_significant_beside_budget(solved_fit, {EFFECT: DEVIATION}, memory)
-    # The deviation itself is not explained by its own entry.
-    assert is_significant_beside_budget(solved_fit, {EFFECT: DEVIATION}, f"{EFFECT} z")
+    # The effect itself is two standard deviations of the budget.
+    assert not is_significant_beside_budget(solved_fit, {EFFECT: DEVIATION}, f"{EFFECT} z")
+
+
+@pytest.mark.parametrize(("size", "is_granted"), [(0.05, True), (0.2, False)])
+def test_a_drift_of_the_stiffness_counts_beyond_the_budget(size, is_granted):
+    found = solved(size, 0.02, "stiffness_drift")
+    (drift,) = (probe for probe in found.probes if probe.name == "stiffness_drift")
+    assert drift.size == pytest.approx(size, rel=0.3)
+    assert is_alarming(drift) is not is_granted
+    codes = {each.code for each in found.trust.concerns if each.code == "assumption/contradicted"}
+    assert bool(codes) is not is_granted
