@@ -16,7 +16,7 @@ from ..common.array_types import Array
 from ..common.checked_arrays import point_text
 from ..common.declarations import keys_of
 from ..common.schema_tables import declared_in
-from ..errors import InputError, hint_at, located
+from ..errors import InputError, hint_at, listed, located
 from ..fem.body import Body
 from ..methods.stiffness_scan import typical_constants
 from ..model.parameters import Parameters
@@ -160,6 +160,15 @@ class RecordingReader:
             **declared,
             **loads,
         )
+        for before, after in zip(grasps, experiment.grasps, strict=False):
+            if before.wrench is not None and after.wrench is not None:
+                kept = after.wrench.list_component_names()
+                left = [n for n in before.wrench.list_component_names() if n not in kept]
+                if left and not self.simulation:
+                    self._add_notes(
+                        f"{listed(left)} of the sensor are not used: by symmetry, they vanish on the "
+                        "complete specimen"
+                    )
         if section.has_markers and not self.simulation:
             frames_fault = self._frames.markers_fault()
             require_plausible_markers(

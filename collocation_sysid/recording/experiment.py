@@ -16,7 +16,7 @@ from ..common.checked_arrays import float_converter, read_only_floats
 from ..common.declarations import declaration, key
 from ..common.schema_tables import Vector
 from ..common.validated_types import Flag, NotNegative
-from ..errors import InputError
+from ..errors import InputError, listed
 from .actuator import Actuator
 from .custom_sensor import CustomSensor
 from .depth_camera import Depth
@@ -43,6 +43,9 @@ Kind = Literal["dynamic", "static"]
 Start = Literal["equilibrium", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
 
+# Relative tolerance of the flatness of a face, and of a node that lies in a plane: rounding of mesh
+# files in single precision, over the longest extent of the body.
+FLATNESS = 1e-4
 # Default gravity [m/s²], with z upwards.
 EARTH_M_S2 = (0.0, 0.0, -9.81)
 DEFAULT_NUISANCE = Nuisance()
@@ -190,6 +193,7 @@ class Experiment:
         self._check_time()
         vars(self)["markers"] = self.markers.on_body(self.body, self._undeformed_places)
         self._check_nodes()
+        vars(self)["grasps"] = tuple(self._without_symmetric_loads(each) for each in self.grasps)
         self._check_start()
         self._check_actuators()
         self._check_obstacles()
@@ -245,6 +249,49 @@ class Experiment:
             for number, grasp in enumerate(self.grasps, 1)
             if grasp.wrench is not None
         }
+
+    @cached_property
+    def planes_of_symmetry(self) -> list[tuple[int, Index]]:
+        """Normal axis, 0 to 2, and nodes of the body in each plane of symmetry: the plane in which
+        the nodes of a grasp lie that holds them along its normal alone.
+        """
+        nodes_m = self.body.nodes.points_m
+        tolerance_m = FLATNESS * float(np.ptp(nodes_m, axis=0).max())
+        planes = []
+        for grasp in self.body_grasps:
+            if len(grasp.axes) > 1:
+                continue
+            normal = int(grasp.axis_indices[0])
+            heights_m = nodes_m[grasp.nodes, normal]
+            if np.ptp(heights_m) <= tolerance_m:
+                is_in_plane = np.abs(nodes_m[:, normal] - heights_m.mean()) <= tolerance_m
+                planes.append((normal, np.flatnonzero(is_in_plane)))
+        return planes
+
+    def _without_symmetric_loads(self, grasp: Grasp) -> Grasp:
+        """Return the grasp without those measured components that vanish on the complete specimen:
+        the part's own are those of one half, and those of the other half are opposite.
+        """
+        wrench = grasp.wrench
+        if wrench is None or wrench.symmetry == 1 or isinstance(grasp, Obstacle):
+            return grasp
+        vanishes = np.zeros(6, dtype=bool)
+        for normal, nodes in self.planes_of_symmetry:
+            is_own = len(grasp.axes) == 1 and grasp.axis_indices[0] == normal
+            if not is_own and np.isin(grasp.nodes, nodes).any():
+                vanishes[normal] = True
+                vanishes[3:] |= np.arange(3) != normal
+        if not (vanishes & wrench.measured_components).any():
+            return grasp
+        if not (wrench.measured_components & ~vanishes).any():
+            names = listed(wrench.list_component_names())
+            raise InputError(
+                f"{names} of the complete specimen vanish by symmetry across the planes in which "
+                "grasps hold the body; expected the measured force along the load"
+            )
+        return replace(
+            grasp, wrench=replace(wrench, values=np.where(vanishes, np.nan, wrench.values))
+        )
 
     def find_symmetry(self) -> int:
         """Return the ratio of the specimen's loads to those of the modelled part: that of the

@@ -267,6 +267,37 @@ def test_a_scale_is_positive_and_not_of_strains(tmp_path, stated, message):
         Problem.read(block_problem(tmp_path, text))
 
 
+PLANES = """\
+    { nodes = { box_m = [[-1e-4, -1, 1e-4], [1e-4, 1, 0.0999]] }, axes = "x" },
+    { nodes = { box_m = [[-1, -1e-4, 1e-4], [1, 1e-4, 0.0999]] }, axes = "y" },
+]
+"""
+
+
+def test_components_that_vanish_by_symmetry_are_not_fitted(tmp_path):
+    """Those of the quarter do not vanish: the other quarters balance them."""
+    cell = SHARED.replace("wrench = { sign = -1", 'wrench = { file = "cell.csv", sign = -1')
+    cell = cell.replace("sigma_n = 0.04", "sigma_n = 0.04, sigma_nm = 0.01")
+    file = block_problem(tmp_path, cell)
+    head = "t_s,fx_n,fy_n,fz_n,tx_nm,ty_nm,tz_nm\n"
+    rows = [f"{k / 10},0.01,0.02,{load},0.1,0.1,0.1" for k, load in enumerate((0, -2.5, -6, -9))]
+    (tmp_path / "cell.csv").write_text(head + "\n".join(rows) + "\n")
+    without = Problem.read(file)
+    (sensor,) = without.experiments[1].wrenches
+    assert len(sensor.list_component_names()) == 6
+    file.write_text(cell.replace("]\n\n[[experiment]]", f"{PLANES}\n[[experiment]]", 1))
+    problem = Problem.read(file)
+    (sensor,) = problem.experiments[1].wrenches
+    assert sensor.list_component_names() == ("fz",)
+    np.testing.assert_allclose(sensor.values[:, 2], np.array([0, 2.5, 6, 9]) / 4)
+    assert any("fx, fy, tx, ty and tz of the sensor are not used" in n for n in problem.notes)
+    columns = [row.rpartition(",")[0] for row in (head, *rows)]
+    columns = [",".join(row.split(",")[:3]) for row in columns]
+    (tmp_path / "cell.csv").write_text("\n".join(columns) + "\n")
+    with pytest.raises(InputError, match=r"fx and fy of the complete specimen vanish by symmetry"):
+        Problem.read(file)
+
+
 @pytest.mark.long
 def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
     """As those of the same part whose file has its own loads, times four."""

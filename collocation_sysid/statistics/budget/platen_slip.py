@@ -14,13 +14,10 @@ from scipy.sparse.linalg import splu
 
 from ...common.array_types import Array, Index
 from ...program.experiment_iterate import ExperimentIterate
-from ...recording.experiment import Experiment
+from ...recording.experiment import FLATNESS, Experiment
 from ...recording.grasp import Grasp, free_rigid_modes
 from ...recording.measurement_selection import is_load_only
 
-# Relative tolerance of the flatness of a face, and of a node that lies in a plane: rounding of mesh
-# files in single precision, over the longest extent of the body.
-FLATNESS = 1e-4
 # Largest tensile reaction of a face over its largest compressive one for which it may slide: above,
 # the face is bonded, since a platen does not pull. Errors of the zero remain below.
 LARGEST_TENSION = 0.2
@@ -133,13 +130,8 @@ def sliding_faces(
 
 def _released_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> Index:
     """Return the tangential dofs (s,) of the faces, ascending, without those that a plane of
-    symmetry holds.
-
-    A plane of symmetry is a resting grasp of coplanar nodes along the normal of their plane; nodes
-    of the faces that lie in that plane remain held along this normal.
+    symmetry holds: nodes of the faces that lie in that plane remain held along its normal.
     """
-    nodes_m = experiment.body.nodes.points_m
-    tolerance_m = FLATNESS * float(np.ptp(nodes_m, axis=0).max())
     released = {
         int(3 * node + other)
         for face in faces
@@ -147,15 +139,9 @@ def _released_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> Ind
         for other in range(3)
         if other != axis
     }
-    for grasp in experiment.body_grasps:
-        if len(grasp.axes) > 1 or grasp.axis_indices[0] == axis:
-            continue
-        normal = int(grasp.axis_indices[0])
-        heights_m = nodes_m[grasp.nodes, normal]
-        if np.ptp(heights_m) > tolerance_m:
-            continue
-        in_plane = np.abs(nodes_m[:, normal] - heights_m.mean()) <= tolerance_m
-        released -= set((3 * np.flatnonzero(in_plane) + normal).tolist())
+    for normal, nodes in experiment.planes_of_symmetry:
+        if normal != axis:
+            released -= set((3 * nodes + normal).tolist())
     return np.array(sorted(released), dtype=np.int64)
 
 
