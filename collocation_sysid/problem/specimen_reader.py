@@ -13,6 +13,7 @@ from ..common.time_dependence import at_times, values_over_time
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen
+from ..recording.hysteresis import loading_rows
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen_checks import (
     order_warnings,
@@ -20,7 +21,6 @@ from ..recording.specimen_checks import (
     rows_after_cycles,
 )
 from ..recording.specimen_files import SpecimenLayout, SpecimenTable, read_specimen
-from ..recording.specimen_hysteresis import loading_rows
 from .named_files import existing_file
 from .specimen_schema import SpecimenSection, deviation
 

@@ -16,7 +16,7 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
 - `environment`: the density of the air.
 - `specimen`, `specimen_stretches`, `homogeneous_deformation`: material tests without a mesh;
   `specimen_files` reads their tables, `specimen_checks` finds mistakes in them, and
-  `specimen_hysteresis` compares loading and unloading.
+  `hysteresis` compares loading and unloading.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
 displacements, pressures, custom sensors) and the subpackage `formats`; `recording_writers` writes

@@ -24,6 +24,7 @@ from ..features.measurement_results import WRENCH_SERIES, SensorSeries
 from ..fem.elements import EDGES
 from ..fem.laws.constants import symbol_of, without_region
 from ..recording.experiment import Experiment
+from ..recording.hysteresis import bench_travel
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen_files import specimen_strains
 from ..runs.result_content import Result
@@ -239,7 +240,7 @@ class MotionRecord:
             obstacles_m=_obstacle_outlines(experiment),
             reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit},
             strain=specimen_strains(experiment)[0] if experiment.specimen else None,
-            travel_m=_bench_travel(experiment),
+            travel_m=bench_travel(experiment),
             **recorded,
         )
 
@@ -362,30 +363,6 @@ class MotionRecord:
                 f"{len(stored['part_names']) - 1}, the indices of part_names"
             )
         return cls(name=name, **stored)
-
-
-# Part of its way by which a bench may leave the line along which it moves.
-LINE_TOLERANCE = 1e-3
-
-
-def _bench_travel(experiment: Experiment) -> Array | None:
-    """Return the displacement (T, 3) [m] of the grasp or obstacle that moves farthest, of the whole
-    specimen; None if no force is measured, anything turns, or the displacement is on no line.
-    """
-    if experiment.specimen or not experiment.wrenches:
-        return None
-    travels = [np.zeros((len(experiment.t_s), 3))]
-    for grasp in experiment.grasps:
-        rotations, shifts = grasp.poses.at(experiment.t_s)
-        if not np.allclose(rotations, np.eye(3), atol=1e-6):
-            return None
-        travels.append(shifts / grasp.displacement_scale)
-    farthest = max(travels, key=lambda travel: float(np.ptp(travel, axis=0).max()))
-    for travel in (farthest, farthest - farthest[0]):
-        sizes = np.linalg.svd(travel, compute_uv=False)
-        if len(sizes) == 1 or sizes[1] <= LINE_TOLERANCE * sizes[0]:
-            return travel if np.ptp(travel, axis=0).max() > 0 else None
-    return None
 
 
 def _obstacle_outlines(experiment: Experiment) -> Array | None:

@@ -18,9 +18,11 @@ from ..program.modes.stability import find_instabilities
 from ..recording.grasp_rotation import DOUBTFUL_ANGLE_RAD
 from ..recording.nuisance import TIME
 from ..statistics.assessment import (
+    WITHIN_BUDGET,
     clock_concerns,
     fit_concerns,
     forward_simulation_concerns,
+    hysteresis_concerns,
     nuisance_concerns,
     onset_concerns,
     outlier_share_concerns,
@@ -88,12 +90,13 @@ def solution_concerns(
     if ENDED_BY_ASSOCIATION in solution.notes:
         yield Concern("solve/jump")
     if uncertainty is not None:
+        experiments = [each.experiment for each in solution.collocation.transcriptions]
+        misfits = fit_concerns(uncertainty, budgeted and budgeted.basis)
+        if {each.code for each in misfits} & {*WITHIN_BUDGET}:
+            yield from hysteresis_concerns(experiments)
         yield from as_specimen_concerns(
-            [
-                *fit_concerns(uncertainty, budgeted and budgeted.basis),
-                *parameter_concerns(uncertainty, solution.collocation.parameters),
-            ],
-            [each.experiment for each in solution.collocation.transcriptions],
+            [*misfits, *parameter_concerns(uncertainty, solution.collocation.parameters)],
+            experiments,
         )
     elif solution.collocation.nq:
         yield Concern("solve/no-error-bars", "doubtful")

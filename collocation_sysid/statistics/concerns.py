@@ -239,6 +239,9 @@ TOPICS: dict[str, Topic] = {
             "persist": "the residuals are not independent noise: consecutive samples are "
             "correlated (autocorrelation {autocorrelation:.2f}). The model or the description of "
             "the experiment lacks an effect: look at the residuals over time",
+            "hysteresis": "the force in unloading differs from that in loading by {sizes}: this is "
+            "hysteresis, and the elastic law is fitted between both branches. To fit the loading "
+            "alone, end window_s at the largest displacement",
             "shared": "the residuals are not independent noise: they are correlated between "
             "markers or axes. The model or the description of the experiment lacks an effect: "
             "look at the residuals over time",

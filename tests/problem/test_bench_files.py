@@ -22,6 +22,7 @@ from collocation_sysid.problem.new_problem import TEMPLATES, create_problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
+from collocation_sysid.recording.hysteresis import unloading_difference
 from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report
 from collocation_sysid.result.run_summary import run_summary
@@ -296,6 +297,36 @@ def test_components_that_vanish_by_symmetry_are_not_fitted(tmp_path):
     (tmp_path / "cell.csv").write_text("\n".join(columns) + "\n")
     with pytest.raises(InputError, match=r"fx and fy of the complete specimen vanish by symmetry"):
         Problem.read(file)
+
+
+def cycle_of_a_bench(folder: Path, softening: float) -> Path:
+    """A block whose force in unloading is less by a share, of a known modulus otherwise."""
+    text = SHARED.partition("[[experiment]]")[0].replace("every = 2\n", "")
+    text += '[[experiment]]\nname = "press"\nfile = "press.csv"\n'
+    text = text.replace("sign = -1, symmetry = 4, sigma_n = 0.04", "sign = -1, sigma_n = 0.01")
+    file = block_problem(folder, text)
+    mm = np.concatenate([np.linspace(0, 2, 9), np.linspace(1.75, 0, 8)])
+    load_n = 10 * mm * (1 - softening * (np.arange(len(mm)) > 8))
+    rows = [f"{k},{x:.4f},{f:.5f}" for k, (x, f) in enumerate(zip(mm, load_n, strict=True))]
+    (folder / "press.csv").write_text("\n".join([PLAIN.partition("\n")[0], *rows, ""]))
+    return file
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("softening", [0.0, 0.1])
+def test_hysteresis_of_a_bench_is_named_where_the_fit_is_poor(tmp_path, softening):
+    problem = Problem.read(cycle_of_a_bench(tmp_path, softening))
+    (experiment,) = problem.experiments
+    found = run(problem, seek_causes=False)
+    said = [each.message for each in found.trust.concerns if each.code == "residuals/hysteresis"]
+    if not softening:
+        assert unloading_difference(experiment) is None
+        assert said == []
+    else:
+        assert unloading_difference(experiment) == pytest.approx(-0.1, abs=0.01)
+        assert found.trust.verdict != "good"
+        assert re.search(r"in unloading differs from that in loading by -\d+ % in 'press'", *said)
+        assert "window_s" in said[0]
 
 
 @pytest.mark.long

@@ -10,7 +10,7 @@ import pytest
 from kit.problem_files import run_command
 
 import collocation_sysid as cs
-from collocation_sysid.recording.specimen_hysteresis import loading_rows, unloading_difference
+from collocation_sysid.recording.hysteresis import loading_rows, unloading_difference
 from collocation_sysid.statistics.assessment import probe_concerns
 from collocation_sysid.statistics.probes.relaxed_assumptions import EstimateChange, Probe
 
