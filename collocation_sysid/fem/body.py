@@ -169,6 +169,9 @@ class Body(Discretisation):
         Origin of the mesh: the drawing from which the body was made, or a scan of the body. It
         selects defaults of the budget, too; a scan without a stated `rest_shape` counts as made
         in an unknown orientation to gravity.
+    material_density_kg_m3 : float, optional
+        Known density of the material of a body with `mass_kg`, with which the mass over the volume
+        of the mesh is compared.
     evaluator : {"auto", "simd", "casadi"}
         Evaluator of the element kernels, see `kernels`. "auto" uses CasADi's map, with a note, for
         a material that vector code cannot evaluate.
@@ -219,6 +222,7 @@ class Body(Discretisation):
         rest_shape: UnderGravity | Literal["stress_free"] | None = None,
         made: Made | None = None,
         mesh_from: MeshOrigin | None = None,
+        material_density_kg_m3: Positive | None = None,
         evaluator: str = "auto",
         threads: AtLeastOne | None = None,
     ) -> None:
@@ -235,6 +239,13 @@ class Body(Discretisation):
         _require_origin(made, mesh_from, rest_shape=rest_shape)
         self.made: Made | None = made
         self.mesh_from: MeshOrigin | None = mesh_from
+        self.material_density_kg_m3: float | None = material_density_kg_m3
+        if material_density_kg_m3 is not None and mass_kg is None:
+            raise InputError(
+                "found no mass_kg; expected the weighed mass, which over the volume of the mesh is "
+                "compared with this density, or density_kg_m3 instead",
+                where="material_density_kg_m3",
+            )
         is_drawn = mesh.is_generated or mesh_from == "cad"
         generated: Literal["stress_free"] | None = "stress_free" if is_drawn else None
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (

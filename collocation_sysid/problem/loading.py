@@ -375,6 +375,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         rest_shape=_rest_shape(section),
         made=section.made,
         mesh_from=section.mesh_from,
+        material_density_kg_m3=section.material_density_kg_m3,
         evaluator=section.evaluator,
     )
 

@@ -182,6 +182,9 @@ class ObjectSection(Section):
         parameter.
     density_kg_m3 : float, optional
         Uniform density [kg/m³], instead of the mass.
+    material_density_kg_m3 : float, optional
+        Known density of the material [kg/m³], beside mass_kg: with it the mass over the volume of
+        the mesh is compared, which shows a mesh of another section or size.
     material : Material
         Name of a built-in material, or a table with the file and the function of a custom one.
     damping : DampingName
@@ -226,6 +229,7 @@ class ObjectSection(Section):
     length_unit: Unit = "m"
     mass_kg: Positive | None = None
     density_kg_m3: Positive | None = None
+    material_density_kg_m3: Positive | None = None
     material: Material = "neo-hookean"
     damping: DampingName = "kelvin-voigt"
     element: ElementName = "tet4"

@@ -49,7 +49,9 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
 
 
 def cause_notes(solution: Solution, causes: Sequence[Hypothesis]) -> tuple[str, ...]:
-    """Return a note that refits found no cause of a misfit; empty if there is a cause, or if
-    the measurements do not miss.
+    """Return notes on causes that the data do not show (`Hypothesis.is_open`), or else that refits
+    found no cause of a misfit; empty if there is another cause, or if the measurements do not miss.
     """
-    return () if causes or not measurements_miss(solution) else (NO_CAUSE,)
+    if causes:
+        return tuple(each.message for each in causes if each.is_open)
+    return (NO_CAUSE,) if measurements_miss(solution) else ()

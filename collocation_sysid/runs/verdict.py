@@ -37,7 +37,7 @@ from ..statistics.assessment import (
 from ..statistics.concerns import Concern
 from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.misspecification.plausibility import (
-    making_concerns,
+    density_concerns,
     material_hypothesis,
     size_and_density_hypotheses,
 )
@@ -182,7 +182,7 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
             material_hypothesis(body, body.theta_from_values(solution.parameters))
         ]
         yield from (each.concern("doubtful") for each in odd if each is not None)
-        yield from making_concerns(body)
+        yield from density_concerns(body)
     experiments = [
         transcription.experiment for transcription in solution.collocation.transcriptions
     ]

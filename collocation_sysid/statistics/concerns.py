@@ -78,9 +78,13 @@ TOPICS: dict[str, Topic] = {
             "density": "the body's density is {density_kg_m3:.4g} kg/m³; expected {least:g} to "
             "{most:g}: correct object.density_kg_m3 or mass_kg ({likely}), and check "
             "object.length_unit",
+            "density-of-mesh": "mass_kg over the volume of the mesh is {density_kg_m3:.4g} kg/m³, but "
+            "material_density_kg_m3 is {stated:.4g}: the mesh has {times:.3g} times the volume of the "
+            "body; probably {likely}",
             "density-of-making": "the stated density of {density_kg_m3:.4g} kg/m³ is not one of bodies "
             'with made = "{made}", which have {least:g} to {most:g} kg/m³: check object.mass_kg (does '
-            "it contain the gripper?), length_unit and made",
+            "it contain the gripper?), length_unit, made and the section of the mesh (that of a round "
+            "body meshed as a square of the same width gives 0.785 times the density)",
             "density/metal": "the body is as dense as metal ({density_kg_m3:.4g} kg/m³) and as "
             "soft as rubber (E = {young_pa:.3g} Pa): both are 1000 times too large if the mass "
             "was stated in g instead of kg; check object.density_kg_m3 or mass_kg",
@@ -193,6 +197,10 @@ TOPICS: dict[str, Topic] = {
             '"strain (%)"',
             "specimen-kind": "its curve fits as that of a {test} test, with the same law: check the "
             "kind of test; if it is right, compare laws with compare-models --materials",
+            "specimen-kind/likelier": "the curve fits better as that of another kind of test, with the "
+            "same law: {kinds}, instead of {stated} ({young}): check the kind of test",
+            "specimen-kind/open": "the curve does not show the kind of test: with the same law it fits "
+            "as well as {kinds}, instead of {stated} ({young}); make sure that the kind is right",
             "specimen-placeholder": "its {quantity} is zero in all rows, and the rest fits better "
             "without it: leave the column out if this was not measured",
             "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "

@@ -17,7 +17,7 @@ from collocation_sysid.statistics.budget.alternatives import modulus_axis_senten
 from collocation_sysid.statistics.budget.systematic_effects import usual_deviations
 from collocation_sysid.statistics.budget.uncertainty_budget import VarianceSources
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.misspecification.plausibility import making_concerns
+from collocation_sysid.statistics.misspecification.plausibility import density_concerns
 
 BOX = cs.box_mesh((0.04, 0.04, 0.08), (1, 1, 2))
 
@@ -55,11 +55,11 @@ def test_a_drawing_cannot_hang():
 
 
 def test_a_density_that_such_bodies_do_not_have_is_a_concern():
-    assert not making_concerns(body(1070.0, made="cast"))
-    (concern,) = making_concerns(body(1.2 * 1070.0, made="cast"))
+    assert not density_concerns(body(1070.0, made="cast"))
+    (concern,) = density_concerns(body(1.2 * 1070.0, made="cast"))
     assert concern.grade == "check"
     assert "1284 kg/m³" in concern.message
-    assert not making_concerns(body(1.2 * 1070.0))
+    assert not density_concerns(body(1.2 * 1070.0))
 
 
 def test_check_asks_for_unstated_origins():
@@ -126,3 +126,27 @@ def test_the_answer_states_along_which_axis_the_modulus_is_measured(anisotropy, 
     sentence = modulus_axis_sentence(sources, estimates, anisotropy)
     assert ("E is mainly the modulus along the z axis of the mesh" in sentence) is is_said
     assert ("E is 90% of this larger" in sentence) is is_said
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (np.pi / 4, ["a round section is meshed as a square one", "1.27 times the volume"]),
+        (4 / np.pi, ["a square section is meshed as a round one"]),
+        (0.9, ["1.11 times the volume"]),
+    ],
+)
+def test_a_mesh_of_another_section_shows_in_the_density(times, words):
+    known = 1070.0
+    mesh = TetMesh(BOX.points_m, BOX.tetrahedra)
+    mass_kg = times * known * BOX.volume_m3
+    (concern,) = density_concerns(cs.Body(mesh, mass_kg=mass_kg, material_density_kg_m3=known))
+    assert concern.code == "description/density-of-mesh"
+    assert all(word in concern.message for word in words)
+    right = cs.Body(mesh, mass_kg=known * BOX.volume_m3, material_density_kg_m3=1.02 * known)
+    assert not density_concerns(right)
+
+
+def test_the_known_density_needs_a_mass():
+    with pytest.raises(InputError, match="expected the weighed mass"):
+        body(material_density_kg_m3=1070.0)

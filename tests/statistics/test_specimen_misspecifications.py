@@ -193,3 +193,46 @@ def test_concerns_of_specimens_name_no_markers():
     for word in ("marker", "reference_m", "sigma_m", "motion", "over time"):
         assert word not in text
     assert as_specimen_concerns(general, []) == general
+
+
+# Curves that fit with several kinds of test ---------------------------------------------------------
+
+
+def sheared_pa(gamma):
+    """Shear stress of Ogden's law with one term, 30 kPa and the exponent 5: E is 225 kPa."""
+    larger = 0.5 * gamma + np.hypot(0.5 * gamma, 1)
+    return 3e4 * (larger**5 - larger**-5) / (larger + 1 / larger)
+
+
+def run_of_curve(test, strain, stress_pa, seed, law="yeoh", sigma_pa=SIGMA_PA):
+    noise_pa = sigma_pa * np.random.default_rng(seed).normal(size=len(strain))
+    specimen = cs.Specimen(test, strain, stress_pa + noise_pa, sigma_pa)
+    unknown = {name: cs.Unknown() for name in LAWS[law]}
+    return cs.run(cs.Problem([specimen.experiment(law, "one")], unknown | FIXED))
+
+
+@pytest.mark.long
+def test_a_kind_of_test_that_a_flexible_law_fits_is_not_good_in_silence():
+    strain = np.linspace(0.1, 1.3, 24)
+    run = run_of_curve("planar", strain, sheared_pa(strain), seed=1)
+    (cause,) = run.causes
+    assert cause.code == "specimen-kind/likelier"
+    assert "simple-shear (E = 22" in cause.message
+    assert run.assessment.verdict == "check"
+
+
+@pytest.mark.long
+def test_a_curve_of_small_strains_does_not_show_the_kind_of_test():
+    strain = np.linspace(0.01, 0.1, 12)
+    run = run_of_curve("uniaxial", strain, neo_hookean_pa(strain), seed=2, law="mooney-rivlin")
+    assert not run.causes
+    assert any("does not show the kind of test" in note for note in run.notes)
+    assert run.assessment.verdict == "good"
+
+
+@pytest.mark.long
+def test_a_kind_that_the_curve_shows_is_not_in_doubt():
+    strain = np.linspace(0.05, 1.5, 24)
+    run = run_of_curve("uniaxial", strain, neo_hookean_pa(strain), seed=3, law="neo-hookean")
+    assert not run.causes
+    assert not any("kind of test" in note for note in run.notes)

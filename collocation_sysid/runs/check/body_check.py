@@ -18,7 +18,7 @@ from ...fem.spatial_field import FieldResolution
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...statistics.concerns import Concern, concern_if
-from ...statistics.misspecification.plausibility import making_concerns
+from ...statistics.misspecification.plausibility import density_concerns
 from ...statistics.stability_concerns import rest_stability_concerns
 
 # Mean-ratio quality below which an element's shape functions are poor.
@@ -343,7 +343,7 @@ def check_body(
         concerns=(
             *(() if is_homogeneous else element_concerns(body, theta, shape=shape, worst=worst[0])),
             *rest_stability_concerns(body, theta),
-            *(() if is_homogeneous else making_concerns(body)),
+            *(() if is_homogeneous else density_concerns(body)),
             *(() if is_homogeneous else _field_concerns(fields)),
         ),
         fields=fields,

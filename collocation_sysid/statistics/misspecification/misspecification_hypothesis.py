@@ -55,6 +55,11 @@ class Hypothesis:
         return self.code.partition("/")[0]
 
     @property
+    def is_open(self) -> bool:
+        """Whether the data fit with the mistake as well as without, which contradicts nothing."""
+        return self.code.endswith("/open")
+
+    @property
     def message(self) -> str:
         """Message with the likely mistake and the remedy, that of `concern`."""
         return self.concern().message

@@ -98,17 +98,45 @@ DENSITIES_BY_MAKING_KG_M3 = {
 }
 
 
-def making_concerns(body: Body) -> list[Concern]:
-    """Return one concern, as a list, if the stated density of a body is not one of bodies that were
-    made like it (`Body.made`); else empty.
+# Deviation of the mass over the volume of the mesh from the known density: data sheets are right to
+# 1 %, meshes and balances too.
+DENSITY_DEVIATION = 0.05
+# Relative difference up to which the ratio of both is that of a round and a square section.
+SECTION_RATIO = 0.03
+
+
+def density_concerns(body: Body) -> list[Concern]:
+    """Return one concern, as a list, if the density of a body, its mass over the volume of its mesh,
+    is not that of its material (`Body.material_density_kg_m3`), or not one of bodies that were made
+    like it (`Body.made`); else empty.
     """
-    if body.made is None or any(part.has_free_density for part in body.parts):
+    if any(part.has_free_density for part in body.parts):
+        return []
+    density_kg_m3 = float(body.mass_kg / body.mesh.volume_m3)
+    if body.material_density_kg_m3 is not None:
+        ratio = density_kg_m3 / body.material_density_kg_m3
+        if abs(np.log(ratio)) > np.log(1 + DENSITY_DEVIATION):
+            data = {
+                "density_kg_m3": density_kg_m3,
+                "stated": body.material_density_kg_m3,
+                "times": 1 / ratio,
+                "likely": _likely_section(ratio),
+            }
+            return [Concern("description/density-of-mesh", data=data)]
+    if body.made is None:
         return []
     least, most = DENSITIES_BY_MAKING_KG_M3[body.made]
-    density_kg_m3 = float(body.mass_kg / body.mesh.volume_m3)
     data = {"made": body.made, "density_kg_m3": density_kg_m3, "least": least, "most": most}
     is_usual = least <= density_kg_m3 <= most
     return [] if is_usual else [Concern("description/density-of-making", data=data)]
+
+
+def _likely_section(ratio: float) -> str:
+    """Return what a ratio of the density in the mesh to the known one indicates, for a message."""
+    for meshed, real, expected in (("square", "round", np.pi / 4), ("round", "square", 4 / np.pi)):
+        if abs(ratio / expected - 1) < SECTION_RATIO:
+            return f"a {real} section is meshed as a {meshed} one of the same width"
+    return "the section or the length of the mesh is not that of the body, or mass_kg is wrong"
 
 
 def _likely_length(body: Body, *, too_large: bool) -> str:

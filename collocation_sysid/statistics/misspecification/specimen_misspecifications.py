@@ -9,6 +9,10 @@ the mistake is that one was none.
 
 A law that is too simple, a toe region or hysteresis also decrease the misfit of some correction. A
 mistake is therefore named only if the corrected description explains the data, see `_is_explained`.
+
+A flexible law also fits the curve of another kind of test, with other constants. If all specimens
+are of one kind and fit, the other kinds are therefore compared by their likelihood, see
+`_kinds_in_doubt`.
 """
 
 from __future__ import annotations
@@ -20,7 +24,9 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array
-from ...errors import InputError, SimulationError
+from ...common.display import readable_stress
+from ...errors import InputError, SimulationError, listed
+from ...fem.laws.moduli import engineering_constants
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
@@ -66,6 +72,9 @@ UNCORRELATED = 2.0
 PLAUSIBLE_NUISANCE = 4.0
 # Decrease of χ² that no statistical fluctuation causes: a ratio of likelihoods of e^10.
 DECISIVE = 20.0
+# Decrease of χ², over that of one measurement, from which on one kind of test is likelier than
+# another: a ratio of likelihoods of e^5, which the wrong kind reaches in less than 1 of 100 tests.
+LIKELIER = 10.0
 # Samples of each specimen, and most iterations, of the fit that decides.
 DECIDING_SAMPLES = 60
 DECIDING_ITERATIONS = 30
@@ -87,7 +96,8 @@ PERCENT_STRAIN = 1.0
 
 def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
     """Return hypotheses of what is described wrongly of the specimens of a fit; empty without
-    specimens, where they fit, after a search that did not converge, or if refits fail.
+    specimens, after a search that did not converge, or if refits fail; where the specimens fit,
+    only the kinds of test in doubt.
 
     The specimens with the largest misfit are tested first; a nearly certain hypothesis (`CERTAIN`)
     about one ends the search, after all those about it, several of which may explain its data. A
@@ -105,7 +115,7 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         return []
     stated_misfit = _misfit(fitted)
     if stated_misfit <= NOISE_LEVEL:
-        return []
+        return _kinds_in_doubt(solution)
     fitted.sort(key=lambda part: -_misfit([part]))
     originals = [part.transcription.experiment for part in fitted]
     experiments = [_thinned(each, most_samples=REFITTED_SAMPLES) for each in originals]
@@ -141,6 +151,58 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         if any(each.strength > CERTAIN for each in hypotheses):
             break
     return hypotheses
+
+
+def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
+    """Return one hypothesis, as a list, about the kind of test of specimens that fit: that another
+    kind is likelier, or that others fit as well; empty if the data exclude all others
+    (`LIKELIER`), and unless all recordings are specimens of one kind.
+    """
+    experiments = [part.transcription.experiment for part in solution.parts]
+    kinds = {each.specimen.test if each.specimen else "" for each in experiments}
+    if len(kinds) != 1 or "" in kinds or max(len(e.t_s) for e in experiments) < FEWEST_SAMPLES:
+        return []
+    chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
+    corrections: dict[str, list[Experiment]] = {}
+    for each in chosen:
+        for hypothesis in _kind_hypotheses(each, ""):
+            corrections.setdefault(hypothesis.data["test"], []).append(hypothesis.corrected)
+    stated = _refit(solution, chosen, iterations=DECIDING_ITERATIONS)
+    if stated is None:
+        return []
+    refits = {
+        test: refit
+        for test, corrected in corrections.items()
+        if len(corrected) == len(chosen)
+        and (refit := _refit(solution, corrected, iterations=DECIDING_ITERATIONS))
+    }
+    count = sum(len(row) for part in stated.parts for row in _residuals(part))
+    stated_loss = _square_sum(stated.parts)
+    loss = {test: _square_sum(each.parts) for test, each in refits.items()}
+    unit = max(1.0, min([stated_loss, *loss.values()]) / max(1, count - stated.collocation.nq))
+    gains = {test: (stated_loss - value) / unit for test, value in loss.items()}
+    best = max(gains.values(), default=-np.inf)
+    if best <= -LIKELIER:
+        return []
+    possible = [test for test in gains if gains[test] > best - LIKELIER]
+    possible.sort(key=lambda test: -gains[test])
+    data = {
+        "stated": kinds.pop(),
+        "young": _young_text(stated),
+        "kinds": [f"{test} ({_young_text(refits[test])})" for test in possible],
+    }
+    of = listed([f"'{each.name}'" for each in experiments])
+    code = "specimen-kind/likelier" if best >= LIKELIER else "specimen-kind/open"
+    return [Hypothesis(code, of, data=data, strength=np.sqrt(stated_loss / min(loss.values())))]
+
+
+def _young_text(solution: Solution) -> str:
+    """Return Young's modulus of small strain at a fit of specimens, with its unit."""
+    body = solution.parts[0].transcription.body
+    theta = body.theta_from_values(solution.parameters)
+    young_pa = max(float(engineering_constants(*lame)[0]) for lame in body.lame(theta).values())
+    factor, unit = readable_stress([young_pa])
+    return f"E = {factor * young_pa:.3g} {unit}"
 
 
 def _refit(
@@ -237,14 +299,14 @@ def _misfit(parts: Sequence[ExperimentIterate]) -> float:
     """Return the root of the squares of residuals and nuisance parameters, in standard deviations,
     per measured value; NaN residuals are ignored.
     """
-    squares = 0.0
-    count = 0
-    for part in parts:
-        squares += float(np.sum(part.phi**2))
-        for residuals in _residuals(part):
-            squares += float(np.sum(residuals**2))
-            count += len(residuals)
-    return float(np.sqrt(squares / max(1, count)))
+    count = sum(len(residuals) for part in parts for residuals in _residuals(part))
+    return float(np.sqrt(_square_sum(parts) / max(1, count)))
+
+
+def _square_sum(parts: Sequence[ExperimentIterate]) -> float:
+    """Return χ²: the sum of the squares of residuals and nuisance parameters."""
+    rows = [row for part in parts for row in (part.phi, *_residuals(part))]
+    return sum(float(np.sum(row**2)) for row in rows)
 
 
 def _residuals(part: ExperimentIterate) -> list[Array]:
@@ -302,6 +364,8 @@ def _kind_hypotheses(experiment: Experiment, of: str) -> Iterator[Hypothesis]:
     if experiment.specimen.test == "uniaxial" and (strain <= 0).all():
         kinds = (*kinds, "confined")
     for test in kinds:
+        if test == "simple-shear" and "stretch" in experiment.specimen.columns:
+            continue
         corrected = _of_another_kind(experiment, test)
         if corrected is not None:
             yield Hypothesis("specimen-kind", of, data={"test": test}, corrected=corrected)
