@@ -27,8 +27,9 @@ from ..fem.laws.ogden import is_power_law, term_numbers
 from ..model.parameters import Parameter, Parameters, Tied
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
-from ..recording.homogeneous_deformation import AXES, CELL_SIZE_M
+from ..recording.homogeneous_deformation import AXES
 from ..recording.specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
+from ..recording.specimen_files import deformed_gradients
 
 # Sizes of the exponents of the grid, each with both signs.
 GRID = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 18.0, 22.0)
@@ -61,7 +62,8 @@ class _Stress:
     Attributes
     ----------
     axis : int
-        Direction; in simple shear that of the larger principal stretch.
+        Direction; in simple shear that of the larger principal stretch, of a difference that of
+        the first stress.
     values : (T,) array
     sigma : float
     deviations : (2,) array
@@ -83,11 +85,11 @@ class _Test:
     gradient : (T, 3, 3) array
         Prescribed deformation gradients, 1 where the specimen is free.
     per_strain : (3, 3) array
-        Derivative of the gradient by the first strain.
+        Derivative of the gradient by an offset of all strains.
     free : int
         Number of directions in which the specimen is free to contract.
-    is_shear : bool
-        Whether the test is simple shear.
+    test : str
+        Kind of test, see `Specimen`.
     strain_zero : float
         Prior standard deviation of a constant offset of the first strain; 0 if exact.
     stresses : list of _Stress
@@ -98,7 +100,7 @@ class _Test:
     gradient: Array
     per_strain: Array
     free: int
-    is_shear: bool
+    test: str
     strain_zero: float
     stresses: list[_Stress]
     lateral: tuple[Array, float] | None
@@ -110,14 +112,20 @@ class _Test:
         return sum(int(np.isfinite(each).sum()) for each in values)
 
     def log_stretches(self, offset: float) -> Array:
-        """Return the logarithms (T, 3) of the stretches, 0 where free, with an offset of the
-        strain; in simple shear those of the principal stretches.
+        """Return the logarithms (T, 3) of the principal stretches, 0 where free, with an offset of
+        the strain: along x, y and z, or, of the two in the plane of shear, the larger one last for
+        a shear that is not negative.
         """
         gradient = self.gradient + offset * self.per_strain
-        if self.is_shear:
-            larger = np.arcsinh(0.5 * gradient[:, 0, 2])
-            return np.column_stack([-larger, np.zeros_like(larger), larger])
-        return np.log(np.einsum("tii->ti", gradient))
+        x, y, z = np.einsum("tii->it", gradient)
+        shear = gradient[:, 0, 2]
+        if self.test == "simple-shear":
+            total = np.hypot(x + z, shear)
+            difference = np.copysign(np.hypot(x - z, shear), shear)
+            x, z = (total - difference) / 2, (total + difference) / 2
+        elif self.test == "biaxial-difference":
+            x, z = z - shear, z + shear
+        return np.log(np.column_stack([x, y, z]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -598,12 +606,26 @@ def _nominal_stresses(
     """Return the nominal stress (T, n) of each term with a share of the shear modulus of 1:
     (2/α) (λ^α − v^α) / λ, where v is the free stretch of an incompressible specimen, or J^(−β).
 
-    In simple shear it is (2/α) (λ^α − λ^(−α)) λ / (1 + λ²) with the larger principal stretch λ.
+    In simple shear it is (2/α) (λ^(α−1) ∂λ + ν^(α−1) ∂ν) with the derivatives of the principal
+    stretches λ and ν in the plane of shear by F_xz; of a difference of true stresses, multiplied by
+    J, it is (2/α) (λ^α − ν^α).
     """
     stretch = logs[:, axis]
     size = np.exp(stretch)
-    if test.is_shear:
-        pressed, size = _power(-stretch, alpha), 2 * np.cosh(stretch)
+    if test.test == "simple-shear":
+        other = np.exp(logs[:, 0])
+        # F_xz² = (λ − ν)² − (F_xx − F_zz)².
+        gap = test.gradient[:, 0, 0] - test.gradient[:, 2, 2]
+        share = np.divide(gap, size - other, out=np.zeros_like(size), where=gap != 0)
+        ratio = np.sqrt(np.maximum(0.0, 1 - share**2))
+        turned = ratio * (size - other) / (size + other)
+        of_larger, of_smaller = ((turned + sign * ratio) / 2 for sign in (1, -1))
+        return (2 / alpha) * (
+            _power(stretch, alpha - 1) * of_larger[:, None]
+            + _power(logs[:, 0], alpha - 1) * of_smaller[:, None]
+        )
+    if test.test == "biaxial-difference":
+        pressed, size = _power(logs[:, 0], alpha), np.ones_like(size)
     elif beta is None:
         pressed = _power(free, alpha)
     else:
@@ -622,14 +644,10 @@ def _test(experiment: Experiment, is_foam: bool) -> _Test | None:
     """
     deformation = experiment.specimen
     assert deformation is not None
-    is_shear = deformation.test == "simple-shear"
-    if not (deformation.free or is_shear or is_foam):
+    if not (deformation.free or deformation.test == "simple-shear" or is_foam):
         return None
-    gradient = np.tile(np.eye(3), (len(experiment.t_s), 1, 1))
-    per_strain = np.zeros((3, 3))
-    for node, (by_first, _) in deformation.displaced_nodes().items():
-        gradient[:, :, node - 1] += experiment.grasps[node].poses.positions_m / CELL_SIZE_M
-        per_strain[:, node - 1] = by_first / CELL_SIZE_M
+    gradient = deformed_gradients(experiment)
+    per_strain = deformation.per_strain().sum(axis=0)
     axes = {STRESS_NAME: AXES.index("z"), SECOND_STRESS_NAME: AXES.index("x")}
     stresses, lateral = [], None
     for gauge in experiment.readings:
@@ -644,4 +662,4 @@ def _test(experiment: Experiment, is_foam: bool) -> _Test | None:
         return None
     zero = experiment.nuisance.strain_zero or 0.0
     free = len(deformation.free)
-    return _Test(gradient, per_strain, free, is_shear, zero, stresses, lateral)
+    return _Test(gradient, per_strain, free, deformation.test, zero, stresses, lateral)

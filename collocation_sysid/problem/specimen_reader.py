@@ -72,11 +72,15 @@ class SpecimenReader:
                 section, requires_times=self.body.has_memory or section.window_s is not None
             ),
         )
-        if table.is_incompressible and section.stress == "true":
+        if table.is_incompressible:
+            what = (
+                "the difference of the true stresses is taken"
+                if section.test == "biaxial-difference"
+                else "true stresses were converted to engineering stresses"
+            )
             self._add_note(
-                "true stresses were converted to engineering stresses as if the material was "
-                "incompressible, because the file has no lateral stretch; a lateral stretch would be "
-                "used instead"
+                f"{what} as if the material was incompressible, because the file has no lateral "
+                "stretch; a lateral stretch would be used instead"
             )
         if table.unread:
             which = "this column is" if len(table.unread) == 1 else "these columns are"
@@ -126,6 +130,8 @@ class SpecimenReader:
         return Specimen(
             section.test,
             **arguments,
+            axial_stretch=section.axial_stretch,
+            transverse_stretch=section.transverse_stretch,
             sigma_pa=self._sigma_pa(),
             lateral_sigma=section.lateral_sigma,
             strain_zero=deviation(section.strain_zero),
@@ -219,4 +225,6 @@ def layout_from_section(
         length_m=section.length_m,
         area_m2=section.area_m2,
         requires_times=requires_times,
+        axial_stretch=section.axial_stretch,
+        transverse_stretch=section.transverse_stretch,
     )

@@ -42,7 +42,13 @@ class SpecimenSection(NamedSection):
         over the deformed area.
     length_m : float, optional
         Undeformed length by which a displacement is divided; in a shear test, the height of the
-        gap.
+        gap, after axial_stretch.
+    axial_stretch : float
+        Constant stretch of a simple-shear test along the normal of the planes that slide, such as
+        0.8 of a specimen that is compressed by 20 % and then sheared.
+    transverse_stretch : float, optional
+        Constant stretch across axial_stretch; by default that of an incompressible specimen,
+        1/√axial_stretch.
     area_m2 : float, optional
         Undeformed area by which a force is divided.
     sigma_pa : float, optional
@@ -81,6 +87,8 @@ class SpecimenSection(NamedSection):
     stress_sign: Literal[1, -1] = 1
     stress: Literal["engineering", "true"] = "engineering"
     length_m: Positive | None = None
+    axial_stretch: Positive = 1.0
+    transverse_stretch: Positive | None = None
     area_m2: Positive | None = None
     sigma_pa: Positive | None = None
     sigma_n: Positive | None = None

@@ -10,7 +10,7 @@ vanish. The nominal stress P is proportional to the forces on the nodes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -29,7 +29,7 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class HomogeneousDeformation:
-    """Deformation of one kind of material test, F = I + e₁ D₁ + e₂ D₂, apart from its free
+    """Deformation of one kind of material test, F = I + H + s (e₁ D₁ + e₂ D₂), apart from its free
     components.
 
     Attributes
@@ -39,7 +39,11 @@ class HomogeneousDeformation:
     first : tuple of str
         Components of D₁ that are 1, such as ("zz",): displacement direction, then node.
     second : tuple of str
-        Components of D₂ that are 1; empty if the test has one strain.
+        Components of D₂ that are 1, or −1 with a "-" in front; empty if the test has one strain.
+    scale : float
+        Factor s of the strains.
+    held : tuple of (str, float)
+        Components of the constant H with their values, such as those of a pre-stretch.
     free : str
         Axes along which the normal stress vanishes and the stretch is free.
     first_stress : str
@@ -63,6 +67,8 @@ class HomogeneousDeformation:
     test: str
     first: tuple[str, ...]
     second: tuple[str, ...] = ()
+    scale: float = 1.0
+    held: tuple[tuple[str, float], ...] = ()
     free: str = ""
     first_stress: str = "zz"
     second_stress: str = ""
@@ -76,16 +82,45 @@ class HomogeneousDeformation:
         """Whether the strain is the displacement of grips over a length."""
         return bool(self.area_over_length_m) or "displacement" in self.columns
 
-    def displaced_nodes(self) -> dict[int, tuple[Array, Array]]:
-        """Return for each moving node of the cell, by its index from 0, the displacement by a unit
-        strain e₁ and by a unit strain e₂, each (3,) [m]; nodes at rest are left out.
-        """
-        directions = np.zeros((2, 4, 3))
+    def per_strain(self) -> Array:
+        """Return the derivatives (2, 3, 3) of F by e₁ and by e₂."""
+        derivatives = np.zeros((2, 3, 3))
         for k, components in enumerate((self.first, self.second)):
-            for direction, node in components:
-                directions[k, 1 + AXES.index(node), AXES.index(direction)] = CELL_SIZE_M
-        moving = np.flatnonzero(np.abs(directions).max(axis=(0, 2)))
-        return {int(node): (directions[0, node], directions[1, node]) for node in moving}
+            for component in components:
+                derivatives[(k, *_indices(component))] = (
+                    -self.scale if "-" in component else self.scale
+                )
+        return derivatives
+
+    def held_gradient(self) -> Array:
+        """Return I + H (3, 3)."""
+        gradient = np.eye(3)
+        for component, value in self.held:
+            gradient[_indices(component)] += value
+        return gradient
+
+    def gradients(self, strain: Array, second_strain: Array | None) -> Array:
+        """Return F (T, 3, 3) at strains (T,), with 1 in place of free components."""
+        second = np.zeros_like(strain) if second_strain is None else second_strain
+        strains = np.column_stack([strain, second])
+        return self.held_gradient() + np.tensordot(strains, self.per_strain(), axes=1)
+
+    def displaced_nodes(self) -> dict[int, tuple[Array, Array]]:
+        """Return for each node of the cell that moves with the strains, by its index from 0, the
+        displacement by a unit strain e₁ and by a unit strain e₂, each (3,) [m].
+        """
+        first, second = CELL_SIZE_M * self.per_strain()
+        moving = np.flatnonzero(np.abs(first).max(axis=0) + np.abs(second).max(axis=0))
+        return {1 + int(axis): (first[:, axis], second[:, axis]) for axis in moving}
+
+    def pre_stretched(self, axial: float, transverse: float | None) -> HomogeneousDeformation:
+        """Return the deformation of a simple-shear test at a constant stretch along the normal of
+        the planes that slide, F = (I + γ e_x⊗e_z) diag(t, t, a), with the stretch `transverse` to
+        it, that of an incompressible specimen by default.
+        """
+        across = transverse_stretch(axial, transverse)
+        held = (("xx", across - 1), ("yy", across - 1), ("zz", axial - 1))
+        return replace(self, scale=axial, held=held, young_ratio=axial * self.young_ratio)
 
     def prescribed_axes(self, node: int) -> Axes:
         """Return the axes along which a node of the cell is prescribed, by its index from 0: all
@@ -94,6 +129,17 @@ class HomogeneousDeformation:
         own = AXES[node - 1] if node else ""
         prescribed = "".join(axis for axis in AXES if not (axis == own and axis in self.free))
         return cast(Axes, prescribed)
+
+
+def _indices(component: str) -> tuple[int, int]:
+    """Return the indices of a component of F, such as (0, 2) of "xz" and of "-xz"."""
+    direction, node = component.removeprefix("-")
+    return AXES.index(direction), AXES.index(node)
+
+
+def transverse_stretch(axial: float, transverse: float | None) -> float:
+    """Return the stretch across a pre-stretch: 1/√axial, of an incompressible specimen, for None."""
+    return axial**-0.5 if transverse is None else transverse
 
 
 DEFORMATIONS = {
@@ -109,6 +155,16 @@ DEFORMATIONS = {
             second=("xx",),
             free="y",
             second_stress="xx",
+            lateral="y",
+            young_ratio=np.nan,
+        ),
+        # In axes at 45° to the stretches, so that the force on one node has the shares of both.
+        HomogeneousDeformation(
+            "biaxial-difference",
+            first=("zz", "xx", "xz", "zx"),
+            second=("zz", "xx", "-xz", "-zx"),
+            scale=0.5,
+            free="y",
             lateral="y",
             young_ratio=np.nan,
         ),

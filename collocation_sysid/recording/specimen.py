@@ -56,25 +56,28 @@ class Specimen:
     The strain is that of the test: stretch minus one in "uniaxial", "equibiaxial", "biaxial",
     "planar" (pure shear) and "confined" tests, the amount of shear γ in "simple-shear", and the
     change of every length, J^(1/3) − 1, in "volumetric" tests. Stresses are engineering (nominal)
-    stresses: force over undeformed area, positive in tension. Stresses across free surfaces vanish.
+    stresses: force over undeformed area, positive in tension; in "biaxial-difference" tests they
+    are the difference of both true stresses. Stresses across free surfaces vanish.
 
     Parameters
     ----------
     test : str
-        "uniaxial", "equibiaxial", "biaxial", "planar", "simple-shear", "confined" or "volumetric".
+        "uniaxial", "equibiaxial", "biaxial", "biaxial-difference", "planar", "simple-shear",
+        "confined" or "volumetric".
     strain : (T,) array
         Strain of each sample.
     stress_pa : (T,) array
         Engineering stress of each sample; NaN where missing. In "simple-shear" the shear stress
         P_xz on a plane that keeps its normal; in "volumetric" the normal stress −p J^(2/3) of a
-        pressure p.
+        pressure p; in "biaxial-difference" the difference of the true stresses along the first and
+        the second axis, multiplied by J.
     sigma_pa : float
         Standard deviation of the noise of the stresses.
     t_s : (T,) array, optional
         Times, ascending; rows are numbered in seconds by default, which a material with memory
         does not accept from files.
     second_strain : (T,) array, optional
-        Strain along the second axis of a "biaxial" test.
+        Strain along the second axis of a "biaxial" or "biaxial-difference" test.
     second_stress_pa : (T,) array, optional
         Stress along the second axis of a "biaxial" or "planar" test; NaN where missing.
     lateral_stretch : (T,) array, optional
@@ -87,6 +90,13 @@ class Specimen:
         Standard deviation of the relative error of the area, which is estimated; 0 if exact.
     stress_zero_pa : float
         Standard deviation of a constant offset of the stresses, which is estimated; 0 if exact.
+    axial_stretch : float
+        Constant stretch of a "simple-shear" test along the normal of the planes that slide. The
+        amount of shear γ is the displacement of these planes over their distance after this
+        stretch.
+    transverse_stretch : float, optional
+        Constant stretch across `axial_stretch`; by default 1/√axial_stretch, that of an
+        incompressible specimen.
     length_m, area_m2 : float, optional
         Undeformed length and area of the specimen, if `strain` is the displacement of a test bench
         over the length: the budget then contains the compliance of the bench. None (both) if the
@@ -117,6 +127,8 @@ class Specimen:
     strain_zero: float = key(NotNegative, default=STRAIN_ZERO)
     area_error: float = key(NotNegative, default=AREA_ERROR)
     stress_zero_pa: float = key(NotNegative, default=0.0)
+    axial_stretch: float = key(Positive, default=1.0)
+    transverse_stretch: float | None = key(Positive, default=None)
     length_m: float | None = key(Positive, default=None)
     area_m2: float | None = key(Positive, default=None)
 
@@ -172,6 +184,16 @@ class Specimen:
                 else f"{of} does not have a second strain; leave it out"
             )
             raise InputError(fault, None, where="second_strain")
+        if self.test != "simple-shear" and (self.axial_stretch, self.transverse_stretch) != (
+            1,
+            None,
+        ):
+            raise InputError(
+                f"{of} has no constant stretch beside its strains; expected axial_stretch and "
+                'transverse_stretch with test = "simple-shear" only',
+                None,
+                where="axial_stretch",
+            )
         if self.second_stress_pa is not None and not self.find_deformation().second_stress:
             raise InputError(
                 f"{of} does not have a second stress; leave it out", None, where="second_stress_pa"
@@ -191,6 +213,8 @@ class Specimen:
         the compliance of the test bench needs.
         """
         deformation = DEFORMATIONS[self.test]
+        if self.axial_stretch != 1 or self.transverse_stretch is not None:
+            deformation = deformation.pre_stretched(self.axial_stretch, self.transverse_stretch)
         if self.length_m is None or self.area_m2 is None:
             return deformation
         return replace(deformation, area_over_length_m=self.area_m2 / self.length_m)
@@ -230,7 +254,9 @@ class Specimen:
         """
         cell = cell_body(self.test, material, prony=prony) if body is None else body
         assert self.t_s is not None
-        require_evaluable_law(cell, self.test, strain=self.strain, second_strain=self.second_strain)
+        require_evaluable_law(
+            cell, self.find_deformation(), strain=self.strain, second_strain=self.second_strain
+        )
         nuisance = Nuisance.none(strain_zero=self.strain_zero or None)
         return Experiment(
             cell,
@@ -251,19 +277,18 @@ class Specimen:
         the displacements of the test at `t_s`.
         """
         assert self.t_s is not None
-        moving = self.find_deformation().displaced_nodes()
-        second = np.zeros_like(self.strain) if self.second_strain is None else self.second_strain
+        deformation = self.find_deformation()
+        shifts = deformation.gradients(self.strain, self.second_strain) - np.eye(3)
         grasps = []
         for node in range(1 + len(AXES)):
             poses = PoseSequence.fixed()
-            if node in moving:
-                by_first, by_second = moving[node]
-                shifts_m = np.outer(self.strain, by_first) + np.outer(second, by_second)
+            if node and shifts[:, :, node - 1].any():
+                shifts_m = CELL_SIZE_M * shifts[:, :, node - 1]
                 no_rotation = np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
                 poses = PoseSequence(
                     self.t_s, shifts_m, quaternions_xyzw=no_rotation, interpolation="linear"
                 )
-            axes = self.find_deformation().prescribed_axes(node)
+            axes = deformation.prescribed_axes(node)
             grasps.append(Grasp(np.array([node]), poses, axes=axes))
         return grasps
 
@@ -301,9 +326,13 @@ class Specimen:
         deviations = {"area_error": self.area_error, "stress_zero_pa": self.stress_zero_pa}
         direction, normal = (AXES.index(axis) for axis in component)
         assert self.t_s is not None
+        quantity = NominalStress(direction)
+        if self.test == "biaxial-difference":
+            assert self.second_strain is not None
+            quantity = StressDifference(self.t_s, self.strain - self.second_strain)
         return Gauge(
             name,
-            NominalStress(direction),
+            quantity,
             t_s=self.t_s,
             values=values,
             sigma=self.sigma_pa,
@@ -337,6 +366,40 @@ class NominalStress:
         """
         stress_pa = STRESS_PER_FORCE * at.force_n[self.direction]
         return stress_pa * (1 + area_error) + stress_zero_pa
+
+
+class StressDifference:
+    """Expression of the difference of two principal true stresses, multiplied by J, measured with a
+    wrong area and zero.
+
+    The cell is at 45° to the stretches λ₁ and λ₂: the node on its axis z has the position
+    ½ (λ₁ − λ₂, 0, λ₁ + λ₂) size and the nominal stress ½ (P₁ − P₂, 0, P₁ + P₂), and
+    λ₁ P₁ − λ₂ P₂ = J (σ₁ − σ₂).
+
+    Attributes
+    ----------
+    t_s : (T,) array
+        Sample times [s].
+    difference : (T,) array
+        λ₁ − λ₂.
+    """
+
+    def __init__(self, t_s: Array, difference: Array) -> None:
+        self.t_s = t_s
+        self.difference = difference
+
+    def __call__(
+        self,
+        at: GraspQuantities,
+        area_error: ca.SX | float = 0.0,
+        stress_zero_pa: ca.SX | float = 0.0,
+    ) -> ca.SX:
+        """Return the measured difference [Pa], with the same errors as a `NominalStress`."""
+        difference = self.difference[0]
+        if len(self.t_s) > 1:
+            difference = ca.pw_lin(at.t_s, ca.DM(self.t_s), ca.DM(self.difference))
+        lever_n = at.torque_nm[1] / CELL_SIZE_M + difference * at.force_n[2]
+        return 2 * STRESS_PER_FORCE * lever_n * (1 + area_error) + stress_zero_pa
 
 
 class LateralStretch:

@@ -31,6 +31,7 @@ from .formats.columns import (
     SECOND_STRETCH,
     STRAIN,
     STRESS,
+    STRESS_DIFFERENCE,
     STRETCH,
     TIME,
     TRUE_STRESS,
@@ -46,7 +47,7 @@ from .formats.columns import (
 )
 from .formats.text import TextTable, names_file_in_errors
 from .formats.units import si_factor
-from .homogeneous_deformation import AXES, CELL_SIZE_M
+from .homogeneous_deformation import AXES, CELL_SIZE_M, DEFORMATIONS, transverse_stretch
 from .specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
 
 # Most statements of columns that a message lists: more are not read.
@@ -76,6 +77,8 @@ class SpecimenLayout:
         Undeformed area by which a force is divided.
     requires_times : bool
         Whether the table must have times.
+    axial_stretch, transverse_stretch
+        Those of `Specimen`.
     """
 
     test: str
@@ -86,26 +89,35 @@ class SpecimenLayout:
     length_m: float | None = None
     area_m2: float | None = None
     requires_times: bool = False
+    axial_stretch: float = 1.0
+    transverse_stretch: float | None = None
 
     def list_quantities(self) -> tuple[Quantity, ...]:
         """Return the quantities that the table of this kind of test may have.
 
         All have strain, stress, displacement and force, and all but simple shear stretch;
-        "volumetric" tests have volume ratio, stretch, strain, pressure and stress only. The second
-        axis of "biaxial" and "planar" tests and a lateral stretch or strain are added where the
-        test has them, true stress if `stress` is "true".
+        "volumetric" tests have volume ratio, stretch, strain, pressure and stress only,
+        "biaxial-difference" tests the difference of the stresses and no other. The second axis and
+        a lateral stretch or strain are added where the test has them, true stress if `stress` is
+        "true".
         """
+        deformation = DEFORMATIONS[self.test]
         stresses = (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
         if self.test == "volumetric":
             return VOLUME_RATIO, STRETCH, STRAIN, PRESSURE, *stresses
-        quantities = [STRAIN, *stresses, DISPLACEMENT, FORCE]
+        loads = (*stresses, FORCE)
+        quantities = [
+            STRAIN,
+            *((STRESS_DIFFERENCE,) if self.test == "biaxial-difference" else loads),
+            DISPLACEMENT,
+        ]
         if self.test != "simple-shear":
             quantities.append(STRETCH)
-        if self.test == "biaxial":
+        if deformation.second:
             quantities += [SECOND_STRETCH, SECOND_STRAIN]
-        if self.test in ("biaxial", "planar"):
+        if deformation.second_stress:
             quantities.append(SECOND_STRESS)
-        if self.test in ("uniaxial", "equibiaxial", "biaxial", "planar"):
+        if deformation.lateral:
             quantities += [LATERAL_STRETCH, LATERAL_STRAIN]
         return tuple(quantities)
 
@@ -117,15 +129,14 @@ class SpecimenLayout:
     @property
     def loads(self) -> tuple[Quantity, ...]:
         """Quantities of which the table must have exactly one, the first load."""
-        known = (STRESS, TRUE_STRESS, FORCE, PRESSURE)
+        known = (STRESS, TRUE_STRESS, FORCE, PRESSURE, STRESS_DIFFERENCE)
         return tuple(each for each in known if each in self.list_quantities())
 
     def list_second_deformations(self) -> tuple[Quantity, ...]:
-        """Return the quantities of which the table of a "biaxial" test must have exactly one; empty
-        for other tests.
+        """Return the quantities of which the table of a test with two strains must have exactly
+        one; empty for other tests.
         """
-        known = (SECOND_STRETCH, SECOND_STRAIN)
-        return known if self.test == "biaxial" else ()
+        return (SECOND_STRETCH, SECOND_STRAIN) if DEFORMATIONS[self.test].second else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +152,7 @@ class SpecimenTable:
     second_strain, second_stress_pa, lateral_stretch : (T,) array or None
         None if the table has no such column; stress and stretch NaN where the cell is blank.
     is_incompressible : bool
-        Whether true stresses were converted as those of an incompressible specimen.
+        Whether true stresses, or their difference, count as those of an incompressible specimen.
     columns : tuple of str
         Quantities that the table has, such as "stretch" and "lateral_strain".
     unread : tuple of str
@@ -203,6 +214,9 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     second_pa = table.values.get(SECOND_STRESS.key)
     if layout.test == "volumetric":
         stress_pa = stress_pa * (1 + strain) ** 2
+    elif layout.test == "biaxial-difference":
+        assert second_strain is not None
+        stress_pa = stress_pa * _volume_ratio(strain, second_strain, lateral)
     elif layout.stress == "true":
         stress_pa = stress_pa * areas[0]
     if second_pa is not None:
@@ -215,9 +229,9 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         second_strain=second_strain,
         second_stress_pa=second_pa,
         lateral_stretch=lateral,
-        is_incompressible=layout.stress == "true"
+        is_incompressible=(layout.stress == "true" or layout.test == "biaxial-difference")
         and lateral is None
-        and layout.test in ("uniaxial", "equibiaxial", "planar", "biaxial"),
+        and bool(DEFORMATIONS[layout.test].lateral),
         columns=tuple(table.values),
         unread=table.unread,
     )
@@ -412,8 +426,8 @@ def _require_positive(table: QuantityTable, quantity: Quantity, ratio: Array) ->
 
 
 def _second_strain(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
-    """Return the strain (T,) along the second axis; None unless the test is biaxial."""
-    if layout.test != "biaxial":
+    """Return the strain (T,) along the second axis; None for tests with one strain."""
+    if not DEFORMATIONS[layout.test].second:
         return None
     quantity = _one_of(
         table,
@@ -472,13 +486,14 @@ def _area_ratios(
     """Return the deformed over the undeformed area (T,) of the faces of the first and of the second
     stress.
 
-    Both are 1 in "confined", "simple-shear" and "volumetric" tests. Otherwise they follow from the
-    strains (T,) and the lateral stretch (T,); where `lateral` is None, from that of an
-    incompressible specimen. `second_strain` is None unless the test is biaxial.
+    Both are 1 in "confined" and "volumetric" tests, and constant in "simple-shear" tests.
+    Otherwise they follow from the strains (T,) and the lateral stretch (T,); where `lateral` is
+    None, from that of an incompressible specimen. `second_strain` is None for tests with one.
     """
     stretch = 1 + strain
-    if layout.test in ("confined", "simple-shear", "volumetric"):
-        return np.ones_like(stretch), np.ones_like(stretch)
+    if layout.test in ("confined", "simple-shear", "volumetric", "biaxial-difference"):
+        across = transverse_stretch(layout.axial_stretch, layout.transverse_stretch)
+        return np.full_like(stretch, across**2), np.full_like(stretch, across**2)
     second = {
         "equibiaxial": stretch,
         "planar": np.ones_like(stretch),
@@ -491,21 +506,32 @@ def _area_ratios(
     return second * thickness, stretch * thickness
 
 
+def _volume_ratio(strain: Array, second_strain: Array, lateral: Array | None) -> Array:
+    """Return J (T,) of a specimen with two strains; 1 without a lateral stretch."""
+    if lateral is None:
+        return np.ones_like(strain)
+    return (1 + strain) * (1 + second_strain) * lateral
+
+
 def specimen_strains(experiment: Experiment) -> tuple[Array, Array]:
     """Return the first and the second strain (T,) of the experiment of a specimen, from the poses
-    of its grasps; the second is zero unless the test is biaxial.
+    of its grasps; the second is zero unless the test has two.
     """
     deformation = experiment.specimen
     assert deformation is not None
-    strains = []
-    for components in (deformation.first, deformation.second):
-        strain = np.zeros(len(experiment.t_s))
-        for direction, node in components[:1]:
-            grasp = experiment.grasps[1 + AXES.index(node)]
-            shifts_m = grasp.poses.at(experiment.t_s)[1]
-            strain = shifts_m[:, AXES.index(direction)] / CELL_SIZE_M
-        strains.append(strain)
-    return strains[0], strains[1]
+    shifts = deformed_gradients(experiment) - deformation.held_gradient()
+    by_strain = deformation.per_strain().reshape(2, 9)
+    # Components of different strains are orthogonal.
+    strains = shifts.reshape(-1, 9) @ by_strain.T / np.maximum((by_strain**2).sum(axis=1), 1e-300)
+    return strains[:, 0], strains[:, 1]
+
+
+def deformed_gradients(experiment: Experiment) -> Array:
+    """Return F (T, 3, 3) that the grasps of a specimen prescribe, with 1 in place of free
+    components.
+    """
+    shifts_m = [grasp.poses.at(experiment.t_s)[1] for grasp in experiment.grasps[1 : 1 + len(AXES)]]
+    return np.eye(3) + np.stack(shifts_m, axis=2) / CELL_SIZE_M
 
 
 def specimen_columns(
@@ -547,7 +573,9 @@ def _usual_quantities(layout: SpecimenLayout) -> tuple[Quantity, ...]:
     if layout.test == "volumetric":
         return VOLUME_RATIO, PRESSURE
     deformation = STRAIN if layout.test == "simple-shear" else STRETCH
-    return (deformation, SECOND_STRETCH, STRESS, SECOND_STRESS, LATERAL_STRETCH)
+    return (
+        *(deformation, SECOND_STRETCH, STRESS, STRESS_DIFFERENCE, SECOND_STRESS, LATERAL_STRETCH),
+    )
 
 
 def _specimen_quantities(
@@ -571,7 +599,7 @@ def _specimen_quantities(
     }
     if layout.length_m is not None:
         quantities[DISPLACEMENT] = layout.strain_sign * strain * layout.length_m
-    if layout.test == "biaxial":
+    if layout.list_second_deformations():
         quantities[SECOND_STRETCH] = 1 + second_strain
         quantities[SECOND_STRAIN] = layout.strain_sign * second_strain
     if lateral is not None:
@@ -583,6 +611,9 @@ def _specimen_quantities(
             stress_pa = stress_pa / stretch**2
         elif is_true:
             stress_pa = stress_pa / areas[0]
+        if layout.test == "biaxial-difference":
+            difference_pa = stress_pa / _volume_ratio(strain, second_strain, lateral)
+            return quantities | {STRESS_DIFFERENCE: layout.stress_sign * difference_pa}
         quantities[PRESSURE] = -stress_pa
         quantities[STRESS] = layout.stress_sign * stress_pa
         quantities[TRUE_STRESS] = quantities[STRESS]

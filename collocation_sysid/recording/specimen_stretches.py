@@ -8,13 +8,14 @@ from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.laws.ogden import is_power_law
+from .homogeneous_deformation import AXES, HomogeneousDeformation
 
 # Smallest principal stretch at which laws in powers of the stretches are accurate to 0.1 %.
 SMALLEST_POWER_STRETCH = 0.05
 
 
 def require_evaluable_law(
-    body: Body, test: str, strain: Array, second_strain: Array | None
+    body: Body, deformation: HomogeneousDeformation, strain: Array, second_strain: Array | None
 ) -> None:
     """Raise an `InputError` if stretches leave the range in which the law is evaluated accurately.
 
@@ -26,17 +27,17 @@ def require_evaluable_law(
     ----------
     body : Body
         Cell of the specimen.
-    test : str
-        Kind of test, see `Specimen`.
+    deformation : HomogeneousDeformation
+        Deformation of the test.
     strain : (T,) array
         Strain of the test.
     second_strain : (T,) array or None
-        Strain along the second axis of a "biaxial" test; None for other tests.
+        Strain along the second axis of a biaxial test; None for other tests.
     """
     laws = [part.material.name for part in body.parts if is_power_law(part.material.name)]
     if not laws or not len(strain):
         return
-    stretches = isochoric_stretches(test, strain, second_strain=second_strain)
+    stretches = isochoric_stretches(deformation, strain, second_strain=second_strain)
     row = int(stretches.min(axis=1).argmin())
     smallest = float(stretches[row].min())
     if smallest < SMALLEST_POWER_STRETCH:
@@ -48,7 +49,9 @@ def require_evaluable_law(
         )
 
 
-def isochoric_stretches(test: str, strain: Array, second_strain: Array | None) -> Array:
+def isochoric_stretches(
+    deformation: HomogeneousDeformation, strain: Array, second_strain: Array | None
+) -> Array:
     """Return the principal stretches (T, 3) without their change of volume, so that their product
     is 1, not sorted.
 
@@ -56,23 +59,12 @@ def isochoric_stretches(test: str, strain: Array, second_strain: Array | None) -
 
     Parameters
     ----------
-    test, strain, second_strain
+    deformation, strain, second_strain
         See `require_evaluable_law`.
     """
-    first = 1 + strain
-    one = np.ones_like(first)
-    if test == "simple-shear":
-        half = 0.5 * strain
-        larger = np.abs(half) + np.hypot(half, 1)
-        return np.column_stack([larger, one, 1 / larger])
-    if test in ("confined", "volumetric"):
-        across = one if test == "confined" else first
-        stretches = np.column_stack([first, across, across])
-        return stretches / np.cbrt(stretches.prod(axis=1, keepdims=True))
-    second = {
-        "uniaxial": 1 / np.sqrt(first),
-        "equibiaxial": first,
-        "planar": one,
-        "biaxial": one if second_strain is None else 1 + second_strain,
-    }[test]
-    return np.column_stack([first, second, 1 / (first * second)])
+    gradients = deformation.gradients(strain, second_strain)
+    free = [AXES.index(axis) for axis in deformation.free]
+    if free:
+        gradients[:, free, free] = np.linalg.det(gradients)[:, None] ** (-1 / len(free))
+    stretches = np.linalg.svd(gradients, compute_uv=False)
+    return stretches / np.cbrt(stretches.prod(axis=1, keepdims=True))

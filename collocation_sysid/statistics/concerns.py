@@ -201,6 +201,8 @@ TOPICS: dict[str, Topic] = {
             "same law: {kinds}, instead of {stated} ({young}): check the kind of test",
             "specimen-kind/open": "the curve does not show the kind of test: with the same law it fits "
             "as well as {kinds}, instead of {stated} ({young}); make sure that the kind is right",
+            "specimen-gap": "its amounts of shear fit as the displacement over the distance before "
+            "axial_stretch: divide them by axial_stretch, or state the distance after it as length_m",
             "specimen-placeholder": "its {quantity} is zero in all rows, and the rest fits better "
             "without it: leave the column out if this was not measured",
             "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "

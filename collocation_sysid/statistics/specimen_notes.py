@@ -11,7 +11,7 @@ from ..recording.experiment import Experiment
 # Moduli of small strain, whose meaning does not depend on the law.
 MODULI = frozenset({"young_pa", "poisson", "lambda_pa", "mu_pa", "kappa_pa"})
 # Kinds of test in which two stretches differ independently.
-GENERAL_TESTS = frozenset({"biaxial"})
+GENERAL_TESTS = frozenset({"biaxial", "biaxial-difference"})
 # Fewest estimated constants with which different laws fit one curve equally well.
 FEWEST_CONSTANTS = 2
 

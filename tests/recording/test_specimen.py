@@ -49,10 +49,12 @@ def expected(test, strain):
     if test == "uniaxial":
         free = lateral_stretch(lambda free: (free, free, stretch))
         return nominal_pa((stretch, free, free))[0], np.nan, free
-    if test in ("equibiaxial", "biaxial", "planar"):
-        second = {"equibiaxial": stretch, "planar": 1.0, "biaxial": 1 + strain / 2}[test]
+    if test in ("equibiaxial", "biaxial", "biaxial-difference", "planar"):
+        second = {"equibiaxial": stretch, "planar": 1.0}.get(test, 1 + strain / 2)
         free = lateral_stretch(lambda free: (free, second, stretch))
         first_pa, second_pa, _ = nominal_pa((stretch, second, free))
+        if test == "biaxial-difference":
+            return stretch * first_pa - second * second_pa, np.nan, free
         return first_pa, second_pa, free
     if test == "simple-shear":
         return MU_PA * strain, np.nan, np.nan
@@ -64,11 +66,11 @@ def specimen(test, strain, **keys):
     """Specimen of a test with zeros in place of the measurements that the test has."""
     strain = np.asarray(strain, dtype=float)
     zeros = np.zeros_like(strain)
-    if test == "biaxial":
+    if test in ("biaxial", "biaxial-difference"):
         keys = {"second_strain": strain / 2, **keys}
     if test in ("biaxial", "planar"):
         keys = {"second_stress_pa": zeros, **keys}
-    if test in ("uniaxial", "equibiaxial", "biaxial", "planar"):
+    if test in ("uniaxial", "equibiaxial", "biaxial", "biaxial-difference", "planar"):
         keys = {"lateral_stretch": 1 + zeros, **keys}
     return cs.Specimen(test, strain, zeros, **{"sigma_pa": 100.0, **EXACT, **keys})
 
@@ -423,7 +425,7 @@ def test_a_simulated_table_has_the_columns_that_the_problem_names(tmp_path, head
 
 @pytest.mark.parametrize("test", TESTS)
 def test_columns_of_every_test_are_read_back(tmp_path, test):
-    second = -0.5 * STRAIN if test == "biaxial" else None
+    second = -0.5 * STRAIN if test in ("biaxial", "biaxial-difference") else None
     strain = -0.5 * STRAIN if test in ("confined", "volumetric") else STRAIN
     twin = specimen(test, strain, second_strain=second)
     stress_pa = 1e3 * np.arange(1.0, len(strain) + 1)

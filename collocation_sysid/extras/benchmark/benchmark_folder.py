@@ -322,7 +322,7 @@ def _stretches(experiment: Experiment) -> dict[str, Array]:
     """
     deformation = experiment.specimen
     assert deformation is not None
-    assert deformation.test != "simple-shear"
+    assert deformation.test not in ("simple-shear", "biaxial-difference")
     first, second = specimen_strains(experiment)
     samples = np.arange(1.0, len(first) + 1)
     table = {SAMPLE_KEY: samples}

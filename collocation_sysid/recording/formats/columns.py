@@ -97,11 +97,14 @@ SECOND_STRESS = Quantity(
 TRUE_STRESS = Quantity(
     "true_stress", "pressure", unit="pa", words=STRESS.words, qualifier="deformed"
 )
+STRESS_DIFFERENCE = Quantity(
+    "stress_difference", "pressure", unit="pa", words=STRESS.words, qualifier="difference"
+)
 KNOWN_QUANTITIES = (
     *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
     *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
     *(STRETCH, SECOND_STRETCH, LATERAL_STRETCH, SECOND_STRAIN, LATERAL_STRAIN),
-    *(VOLUME_RATIO, SECOND_STRESS, TRUE_STRESS),
+    *(VOLUME_RATIO, SECOND_STRESS, TRUE_STRESS, STRESS_DIFFERENCE),
 )
 
 # A column's name and its unit: Load (kN), Load [kN], Load / kN, Load in kN, load_kn.
@@ -118,9 +121,10 @@ QUALIFIERS = {
     "deformed": _DEFORMED,
     "second": {"second", "zweite"},
     "lateral": {"lateral", "transverse", "quer", "querdehnung"},
+    "difference": {"difference", "differenz", "différence"},
     # Of no quantity: values that are computed from others, of something else, or not measured.
     "other": {
-        *("difference", "differenz", "différence", "deviatoric", "hydrostatic", "mises", "tresca"),
+        *("deviatoric", "hydrostatic", "mises", "tresca"),
         *("volumetric", "rate", "energy", "error", "fehler", "deviation", "abweichung", "std"),
         *("uncertainty", "residual", "target", "setpoint", "command", "commanded", "sollwert"),
     },
@@ -381,6 +385,8 @@ def _name_fits(column: str, quantity: Quantity) -> bool:
     words = _words(name)
     called = words & set(quantity.words.split())
     qualifiers = {key for key, of_key in QUALIFIERS.items() if words & of_key}
+    if "difference" in qualifiers:  # one of true stresses, whether the name says so or not
+        qualifiers.discard("deformed")
     own = {quantity.qualifier} if quantity.qualifier else set()
     return _key_of(name) == quantity.key or bool(called and qualifiers == own)
 
@@ -400,7 +406,8 @@ def _other_word(column: str) -> str:
     """Return the word of a column's name that makes it another quantity than any that is read; ""
     without one.
     """
-    return next(iter(sorted(_words(name_and_unit(column)[0]) & QUALIFIERS["other"])), "")
+    others = QUALIFIERS["other"] | QUALIFIERS["difference"]
+    return next(iter(sorted(_words(name_and_unit(column)[0]) & others)), "")
 
 
 def name_and_unit(column: str) -> tuple[str, str | None]:

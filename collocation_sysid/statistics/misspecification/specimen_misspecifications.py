@@ -342,7 +342,9 @@ def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Ite
     )
     if deformation.test in ("uniaxial", "equibiaxial", "planar") and is_invertible:
         yield Hypothesis("specimen-compression", of, data={}, corrected=_compressed(experiment))
-    if strain.max() > PERCENT_STRAIN and deformation.test != "volumetric":
+    if deformation.held:
+        yield Hypothesis("specimen-gap", of, data={}, corrected=_of_undeformed_gap(experiment))
+    elif strain.max() > PERCENT_STRAIN and deformation.test != "volumetric":
         yield Hypothesis("specimen-percent", of, data={}, corrected=_strained(experiment, 0.01))
     yield from _placeholder_hypotheses(experiment, of)
     yield from _kind_hypotheses(experiment, of)
@@ -376,6 +378,8 @@ def _of_another_kind(experiment: Experiment, test: str) -> Experiment | None:
     None if that test cannot have all of them.
     """
     assert experiment.specimen is not None
+    if experiment.specimen.held:
+        return None
     strain, _ = specimen_strains(experiment)
     values = {gauge.name: gauge.measured_values[:, 0] for gauge in experiment.readings}
     body = experiment.body
@@ -404,6 +408,23 @@ def _of_another_kind(experiment: Experiment, test: str) -> Experiment | None:
         for gauge in experiment.readings
     ]
     return replace(other, readings=readings, nuisance=experiment.nuisance)
+
+
+def _of_undeformed_gap(experiment: Experiment) -> Experiment:
+    """Return a copy of the experiment of a pre-stretched shear test whose amounts of shear are the
+    displacement over the distance before the stretch.
+    """
+    deformation = experiment.specimen
+    assert deformation is not None
+
+    def corrected(grasp: Grasp) -> Grasp:
+        """Return a grasp with its shift along the direction of shear as without pre-stretch."""
+        if int(grasp.nodes[0]) not in deformation.displaced_nodes():
+            return grasp
+        shifts_m = grasp.poses.positions_m / [deformation.scale, 1.0, 1.0]
+        return replace(grasp, poses=replace(grasp.poses, positions_m=shifts_m))
+
+    return replace(experiment, grasps=[corrected(grasp) for grasp in experiment.grasps])
 
 
 def _placeholder_hypotheses(experiment: Experiment, of: str) -> Iterator[Hypothesis]:
