@@ -149,4 +149,4 @@ def test_a_mesh_of_another_section_shows_in_the_density(times, words):
 
 def test_the_known_density_needs_a_mass():
     with pytest.raises(InputError, match="expected the weighed mass"):
-        body(material_density_kg_m3=1070.0)
+        cs.Body(BOX, density_kg_m3=1070.0, material_density_kg_m3=1070.0)

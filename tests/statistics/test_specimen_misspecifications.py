@@ -218,7 +218,7 @@ def test_a_kind_of_test_that_a_flexible_law_fits_is_not_good_in_silence():
     (cause,) = run.causes
     assert cause.code == "specimen-kind/likelier"
     assert "simple-shear (E = 22" in cause.message
-    assert run.assessment.verdict == "check"
+    assert run.trust.verdict == "check"
 
 
 @pytest.mark.long
@@ -227,7 +227,7 @@ def test_a_curve_of_small_strains_does_not_show_the_kind_of_test():
     run = run_of_curve("uniaxial", strain, neo_hookean_pa(strain), seed=2, law="mooney-rivlin")
     assert not run.causes
     assert any("does not show the kind of test" in note for note in run.notes)
-    assert run.assessment.verdict == "good"
+    assert run.trust.verdict == "good"
 
 
 @pytest.mark.long
