@@ -8,6 +8,12 @@ iterations of each search, whether it converged, how many terms the tests determ
 of the fit: the root mean square of the residuals, in standard deviations of the measurements, with
 those of the zeros of the strains and of the areas, which are estimated.
 
+With `--curves FOLDER`, published curves in that folder are fitted too, if it has them: all three
+tests of Treloar, each test alone, silicone by Meunier et al. (2008), and white matter of the brain
+by Budday et al. (2017) in tension, compression, and shear at axial stretches from 0.75 to 1.25.
+The files are named and have the columns as in the repository
+Chongran-Zhao/Calibration-Hyperelasticity, decoded to tables.
+
     python scripts study_power_laws
 """
 
@@ -18,6 +24,7 @@ import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from studies import markdown
@@ -40,6 +47,36 @@ FOAM_TESTS = (
 )
 STRESS_NOISE_PA = 100.0
 STRETCH_NOISE = 5e-3
+KINDS = {"UT": "uniaxial", "ET": "equibiaxial", "PS": "planar", "SS": "simple-shear"}
+# Published curves: name, files, unit of their stresses and standard deviation [Pa], and laws.
+RUBBERS = ("ogden-1", "ogden-2", "ogden-3")
+BRAIN_STRETCHES = ("0d75", "0d80", "0d85", "0d90", "0d95", "1d05", "1d10", "1d15", "1d20", "1d25")
+BRAIN = ("Budday_2017_UT_T_{}", "Budday_2017_UT_C_{}", "Budday_2017_SS_{}")
+BRAIN_FILES = tuple(each.format("corona_radiata") for each in BRAIN)
+SHEARED_FILES = tuple(f"Budday_2017_CSS_corona_radiata_lambda_{each}" for each in BRAIN_STRETCHES)
+CURVES = (
+    *(
+        (f"Treloar, {KINDS[kind]} ²", (f"Treloar_1944_{kind}",), 1e6, 2e4, RUBBERS)
+        for kind in ("PS", "ET")
+    ),
+    (
+        "Treloar, three tests ²",
+        ("Treloar_1944_UT", "Treloar_1944_PS", "Treloar_1944_ET"),
+        1e6,
+        1e4,
+        RUBBERS,
+    ),
+    (
+        "Meunier, three tests",
+        ("Meunier_2008_UT", "Meunier_2008_PS", "Meunier_2008_ET"),
+        1e6,
+        1e4,
+        RUBBERS,
+    ),
+    ("brain, pull, press, shear", BRAIN_FILES, 1e3, 20.0, ("ogden-1", "ogden-2")),
+    ("brain, shear at ten pre-stretches", SHEARED_FILES, 1e3, 20.0, ("ogden-1", "ogden-2")),
+    ("brain, all", (*BRAIN_FILES, *SHEARED_FILES), 1e3, 20.0, ("ogden-1", "ogden-2")),
+)
 HEADS = ("tests", "law", "converged", "iterations", "CPU s", "terms", "error of the fit, σ")
 
 
@@ -48,7 +85,20 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--foams", type=int, default=5, help="simulated foams")
+    parser.add_argument("--curves", type=Path, help="folder with published curves")
     options = parser.parse_args()
+    if options.curves is not None:
+        published = [
+            row(
+                name,
+                law,
+                [curve(options.curves / f"{file}.csv", law, unit, sigma) for file in files],
+            )
+            for name, files, unit, sigma, laws in CURVES
+            if all((options.curves / f"{file}.csv").is_file() for file in files)
+            for law in laws
+        ]
+        print(markdown(HEADS, published), flush=True)
     treloar = cs.datasets.treloar_1944
     rows = [
         row("Treloar, uniaxial", law, treloar(law)) for law in ("ogden-1", "ogden-2", "ogden-3")
@@ -61,6 +111,24 @@ def main() -> None:
         for law in ("hyperfoam-1", "hyperfoam-2"):
             rows.append(row(f"foam, noise {seed}", law, foam_tests(law, seed)))
     print(markdown(HEADS, rows))
+
+
+def curve(file: Path, law: str, unit: float, sigma_pa: float) -> cs.Experiment:
+    """Return the test in a file, to be fitted by a law."""
+    columns = np.genfromtxt(file, delimiter=",", skip_header=1, unpack=True)
+    kind = file.stem.split("_")[2]
+    if kind == "CSS":
+        specimen = cs.Specimen(
+            "simple-shear",
+            columns[1],
+            unit * columns[3],
+            sigma_pa,
+            axial_stretch=float(columns[0][0]),
+        )
+    else:
+        strain = columns[0] - (kind != "SS")
+        specimen = cs.Specimen(KINDS[kind], strain, unit * columns[1], sigma_pa)
+    return specimen.experiment(law, file.stem)
 
 
 def foam_tests(law: str, seed: int) -> list[cs.Experiment]:
