@@ -73,7 +73,7 @@ def test_the_difference_of_true_stresses_minimises_the_energy(law, values):
             lambda third: energy(law, np.exp([*logarithms, third])),
             bounds=(-1.5, 1.5), method="bounded", options={"xatol": 1e-12},
         )  # fmt: skip
-        return found.fun
+        return energy(law, np.exp([*logarithms, found["x"]]))
 
     def drawn(k):
         """Derivative by the logarithm of the first stretch, less that by that of the second."""
