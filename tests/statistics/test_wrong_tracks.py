@@ -118,6 +118,23 @@ def test_a_coarse_mesh_is_named_if_its_error_to_first_order_explains_most():
     assert "gripper" not in partial.message
 
 
+def test_a_mesh_that_is_known_to_be_coarse_comes_before_what_also_explains_its_error():
+    law = Hypothesis("law", "'a'", {"material": "x"}, corrected=1, strength=3.0, remaining=0.9)
+
+    def mesh(strength: float) -> Hypothesis:
+        data = {"sigmas": 3.0, "remedy": "refine the mesh"}
+        corrected = LinearCorrection(strength**-2)
+        return Hypothesis("mesh-coarse", "", data, corrected, strength=strength, remaining=1.4)
+
+    losses = {1: 100.0}
+    (named,) = _named_alone_or_together([law, mesh(2.2)], lambda each: losses.get(each, 1e3))
+    assert named.code == "mesh-coarse"
+    (several,) = _named_alone_or_together([law, mesh(1.5)], lambda each: losses.get(each, 1e3))
+    assert several.code == "several"
+    assert several.strength == law.strength
+    assert several.message.index("the mesh is too coarse") < several.message.index("another law")
+
+
 def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():
     hung = hung_cube(5)
     assert not [*mirror_images(hung)]

@@ -234,20 +234,23 @@ def _corrected_again(
 def _named_alone_or_together(
     tested: Sequence[Hypothesis], loss_of: Callable[[Any], float]
 ) -> list[Hypothesis]:
-    """Return the hypothesis that brings the residuals to the noise, or that does so as far as a
-    linear correction can (`LINEAR`); as one of several if others do so with a loss that is larger by
-    at most `INDISTINGUISHABLE`, of one cause the one that changes less; if none does, those that
-    reduce them most, as one hypothesis, or only a linear one: beside an error that is known, what
-    others explain says little.
+    """Return the hypothesis that brings the residuals to the noise; as one of several if others do
+    so with a loss that is larger by at most `INDISTINGUISHABLE`, of one cause the one that changes
+    less; if none does, those that reduce them most, as one hypothesis.
+
+    A linear correction, such as a finer mesh, is of an error that is known, beside which other
+    corrections say little: it is named alone if it explains the residuals as far as a linear
+    correction can (`LINEAR`) or nothing else brings them to the noise, else before the others.
     """
+    linear = [each for each in tested if isinstance(each.corrected, LinearCorrection)]
+    if any(each.strength >= LINEAR for each in linear):
+        return [each for each in linear if each.strength >= LINEAR]
     sufficient = [
         each
         for each in tested
-        if (each.remaining is not None and each.remaining <= 1.0)
-        or (isinstance(each.corrected, LinearCorrection) and each.strength >= LINEAR)
+        if each not in linear and each.remaining is not None and each.remaining <= 1.0
     ]
     if not sufficient:
-        linear = [each for each in tested if isinstance(each.corrected, LinearCorrection)]
         partial = sorted(linear or tested, key=lambda each: -each.strength)
         partial = [each for each in partial if each.strength > PARTIAL * partial[0].strength]
         return _together("insufficient", partial)
@@ -260,18 +263,19 @@ def _named_alone_or_together(
     simplest: dict[str, Hypothesis] = {}
     for each in sorted(likely, key=lambda each: each.code.endswith("/both")):
         simplest.setdefault(each.cause, each)
-    likely = [*simplest.values()]
+    likely = [*linear, *rank(simplest.values())]
     return likely if len(likely) == 1 else _together("several", likely)
 
 
 def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return hypotheses as one, whose message contains theirs; nothing if there are none."""
+    """Return hypotheses as one, as likely as the likeliest, whose message contains theirs in their
+    order; nothing if there are none.
+    """
     if not hypotheses:
         return []
-    ranked = rank(hypotheses)
-    texts = (replace(each, subject="", corrected=None).message for each in ranked)
+    texts = (replace(each, subject="", corrected=None).message for each in hypotheses)
     data = {"causes": "; or ".join(texts)}
-    return [replace(ranked[0], code=code, data=data)]
+    return [replace(rank(hypotheses)[0], code=code, data=data)]
 
 
 def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
