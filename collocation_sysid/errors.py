@@ -15,12 +15,14 @@ def hint_at(name: str, known: Iterable[str]) -> str:
     likely means; "" if there is none.
 
     The first known name that begins with `name` is preferred (if `name` has two letters or more),
-    then the most similar one (`difflib.get_close_matches`). Known names of one or two letters are
-    never suggested.
+    then the most similar one (`difflib.get_close_matches`), then the only one of which `name` is a
+    word, such as "unit" of "length_unit". Known names of one or two letters are never suggested.
     """
     names = [other for other in known if len(other) > 2]  # each of two letters is near another
     longer = [other for other in names if len(name) > 1 and other.startswith(name)]
     close = longer or difflib.get_close_matches(name, names, n=1)
+    words = [other for other in names if len(name) > 2 and name in other.split("_")]
+    close = close or (words if len(words) == 1 else [])
     return f"; did you mean {close[0]!r}?" if close else ""
 
 

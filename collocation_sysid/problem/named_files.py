@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..common.files import require_regular
-from ..errors import InputError
+from ..errors import InputError, hint_at
 from ..recording.formats.logs import stored_files
 
 
@@ -24,9 +24,11 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
         fault = "is a folder" if file.is_dir() else "does not exist"
         hint = folder / "README.md"
         see = f"; {hint} may explain how to get it" if hint.is_file() else ""
+        beside = [each.name for each in file.parent.iterdir()] if file.parent.is_dir() else []
+        similar = hint_at(file.name, sorted(beside)) if not file.exists() else ""
         message = (
             f"{file} {fault}; expected a file: the path is relative to the folder of the problem "
-            f"file{see}"
+            f"file{similar}{see}"
         )
         raise InputError(message, where=key)
     return file

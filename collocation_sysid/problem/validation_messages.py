@@ -49,6 +49,10 @@ def explain_validation_error(
     return InputError(message, path, where=where or None)
 
 
+# Tags of the alternatives of a union in the location of a fault.
+_TAGS = re.compile(r"<|(function-\w+|literal)\[|constrained-\w+$|(float|int|str|bool)$")
+
+
 def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
     """Return the parts of the key of a fault, from the root of the file: keys, and indices from 0
     of tables in lists.
@@ -57,7 +61,7 @@ def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
     """
     loc = fault["loc"]
     own = len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)  # that is the file's
-    parts = [p for k, p in enumerate(loc) if k >= own or not str(p).startswith("<")]
+    parts = [p for k, p in enumerate(loc) if k >= own or not _TAGS.match(str(p))]
     field, part_count = _schema_field(parts, root)
     if field is not None and _table_model(field.annotation) is None:
         while len(parts) > part_count and isinstance(parts[-1], int):

@@ -21,6 +21,8 @@ from .text import TextTable, numeric_cells, read_table
 from .units import METRES_PER_UNIT, length_unit_of_spelling
 
 _BRACKETED = re.compile(r"(?P<name>.*?)\s*[(\[](?P<unit>[^()\[\]]+)[)\]]")
+# Names of columns of times in other units than seconds.
+_TIME_UNIT = re.compile(r"(?P<name>t|time)_(?P<unit>ms|msec|us|µs|min|minutes)", re.IGNORECASE)
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
@@ -45,7 +47,7 @@ def _without_bracketed_units(table: TextTable) -> tuple[TextTable, str | None]:
     columns = []
     units: dict[str | None, str] = {}
     for column in table.columns:
-        parts = _BRACKETED.fullmatch(column)
+        parts = _BRACKETED.fullmatch(column) or _TIME_UNIT.fullmatch(column)
         name, stated = (column, "") if parts is None else (parts["name"], parts["unit"].strip())
         is_time = name.lower() in ("t", "time", "t_s")
         is_place = name in ("x", "y", "z") or name[-2:] in ("_x", "_y", "_z")
@@ -54,7 +56,7 @@ def _without_bracketed_units(table: TextTable) -> tuple[TextTable, str | None]:
         if stated and (is_time or is_place) and unit not in known:
             raise table.error_at(
                 f"column {column} has the unit {stated}; expected one of {', '.join(known)}: convert "
-                "its values"
+                f"its values{', then call it t_s' if is_time else ''}"
             )
         if is_place:
             units[unit] = column
