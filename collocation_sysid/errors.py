@@ -14,12 +14,12 @@ def hint_at(name: str, known: Iterable[str]) -> str:
     """Return "; did you mean 'NAME'?" with the known name that a misspelt or abbreviated name most
     likely means; "" if there is none.
 
-    The first known name that begins with `name` is preferred (if `name` has two letters or more),
+    The shortest known name that begins with `name` is preferred (if `name` has two letters or more),
     then the most similar one (`difflib.get_close_matches`), then the only one of which `name` is a
     word, such as "unit" of "length_unit". Known names of one or two letters are never suggested.
     """
     names = [other for other in known if len(other) > 2]  # each of two letters is near another
-    longer = [other for other in names if len(name) > 1 and other.startswith(name)]
+    longer = sorted((e for e in names if len(name) > 1 and e.startswith(name)), key=len)
     close = longer or difflib.get_close_matches(name, names, n=1)
     words = [other for other in names if len(name) > 2 and name in other.split("_")]
     close = close or (words if len(words) == 1 else [])
