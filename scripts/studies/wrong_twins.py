@@ -255,7 +255,7 @@ FAULTS = {
     "poses inverted": Fault(lambda e, rng: _with_poses(e, inverted), ("poses-inverted",)),
     "wxyz as xyzw": Fault(lambda e, rng: _with_poses(e, reordered(1)), ("quaternion-order",)),
     "xyzw as wxyz": Fault(lambda e, rng: _with_poses(e, reordered(-1)), ("quaternion-order",)),
-    "clock 10 ms late": Fault(late(0.01), ("clock",)),
+    "clock 20 ms late": Fault(late(0.02), ("clock",)),
     "clock 30 ms late": Fault(late(0.03), ("clock",)),
     "clock 100 ms late": Fault(late(0.1), ("clock",)),
     "clock 30 ms early": Fault(late(-0.03), ("clock",)),
