@@ -8,10 +8,11 @@ with those of the uncertainty budget, so that a probe costs one least-squares pr
 simulation. `deep_probes` (``solve --probe``) relaxes all other assumptions, refits parts of the data,
 and follows effects that are too large for one linear step.
 
-A probe is *significant* if its amplitude is farther from zero than noise explains, and *relevant*
-if relaxing the assumption changes what is reported. Only what is both, and explains the residuals,
-gives concern, see `assessment.probe_concerns`: with much data any imperfection is significant, with
-little data any change is large, and any error of the model is absorbed by any assumption in part.
+A probe is *significant* if its amplitude is farther from zero than noise explains, also where the
+priors of fields do not smooth them, and *relevant* if relaxing the assumption changes what is
+reported. Only what is both, and explains the residuals, gives concern, see
+`assessment.probe_concerns`: with much data any imperfection is significant, with little data any
+change is large, and any error of the model is absorbed by any assumption in part.
 """
 
 from __future__ import annotations
@@ -20,10 +21,14 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
+import numpy as np
+
+from ...model.parameters import FieldCoefficients
 from ...recording.nuisance import CLOCK_RATE
 from ..budget.consider_analysis import ResidualChanges
 from ..budget.systematic_effects import ASSUMPTIONS
 from ..distributions import normal_isf
+from ..linearised import gauss_newton_step
 from .relaxed_assumptions import (
     ANISOTROPY,
     DRIFT,
@@ -90,16 +95,38 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
         Probes with `routine` set; `sentences` is empty where the amplitude is not significant.
     """
     names = filter(is_routine_assumption, solved_fit.changes.names)
-    return tuple(
-        replace(
-            probe,
-            routine=True,
-            sentences=(probe.name,)
-            if probe.is_beyond(significance_limit(solved_fit.changes, probe.name))
-            else (),
+    loose = _with_loose_fields(solved_fit)
+    probes = []
+    for probe in one_step_probes(solved_fit, names):
+        limit = significance_limit(solved_fit.changes, probe.name)
+        is_significant = probe.is_beyond(limit)
+        if is_significant and loose is not None:
+            (of_loose,) = one_step_probes(loose, [probe.name])
+            is_significant = of_loose.is_beyond(limit)
+        probes.append(
+            replace(probe, routine=True, sentences=(probe.name,) if is_significant else ())
         )
-        for probe in one_step_probes(solved_fit, names)
+    return tuple(probes)
+
+
+def _with_loose_fields(solved_fit: SolvedFit) -> SolvedFit | None:
+    """Return the fit with `WIDENING` times wider priors of the coefficients of fields, at its
+    optimum; None without fields.
+
+    The prior of a field smooths it. What it smooths away is in the residuals, and an assumption that
+    is significant only there is a substitute for it.
+    """
+    items = solved_fit.collocation.parameters.items
+    fields = [item for item in items if isinstance(item, FieldCoefficients)]
+    coefficients = {each.name for item in fields for each in item.components}
+    if not coefficients:
+        return None
+    fit = solved_fit.fit
+    scale = np.where([name in coefficients for name in fit.names], 1 / WIDENING, 1.0)
+    loose = replace(
+        fit, prior_residual=scale * fit.prior_residual, prior_jacobian=scale * fit.prior_jacobian
     )
+    return replace(solved_fit, fit=loose.after_step(gauss_newton_step(loose)))
 
 
 def one_step_probes(solved_fit: SolvedFit, names: Iterable[str]) -> Iterator[Probe]:
