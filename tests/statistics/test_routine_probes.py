@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 from collocation_sysid import (
     Body,
     Experiment,
+    Field,
     Grasp,
     PoseSequence,
     Problem,
@@ -230,6 +231,31 @@ def test_an_assumption_must_explain_the_residuals_and_not_only_a_part_of_them():
         assert probe.size > 0
         assert probe.suffices is suffices
         assert is_alarming(probe) is suffices
+
+
+def test_what_a_field_smooths_away_is_no_memory():
+    plain = swung(samples=24)
+    (hung,) = plain.experiments
+    body = Body(hung.body.mesh, density_kg_m3=60.0, field=Field(0.1, modes=6, amplitude=0.02))
+    at = answered(replace(plain, experiments=[replace(hung, body=body)]))
+    name = f"{MEMORY} τ=0.1s"
+    column = at.changes.names.index(name)
+    of_memory = [change[..., column] for change in at.changes.blocks]
+    of_field = [n.startswith("field_") for n in at.fit.names]
+    assert sum(of_field) == 6
+    slopes = np.concatenate([b.jacobian.reshape(-1, len(of_field)) for b in at.fit.blocks])
+    stacked = np.concatenate([each.ravel() for each in of_memory])
+    shares, *_ = np.linalg.lstsq(slopes[:, of_field], stacked, rcond=None)
+    rng = np.random.default_rng(5)
+    noise = [rng.standard_normal(block.residual.shape) for block in at.fit.blocks]
+    # What the field could describe if its prior allowed it, or memory itself.
+    smoothed = [block.jacobian[..., of_field] @ shares for block in at.fit.blocks]
+    for wrong, size, is_named in ((smoothed, 10, False), (of_memory, 20, True)):
+        residuals = [one - size * other for one, other in zip(noise, wrong, strict=True)]
+        here = with_residuals(at, residuals)
+        probes = {probe.name: probe for probe in routine_probes(here)}
+        assert probes[name].is_beyond(5.0)
+        assert bool(probes[name].sentences) is is_named
 
 
 def test_quantities_stated_as_exact_are_probed_too():

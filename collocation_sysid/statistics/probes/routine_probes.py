@@ -55,6 +55,9 @@ FALSE_ALARMS = 1e-4
 # the model needs an impossible anisotropy (0.7 to 0.9 in twins without any).
 WIDENING = 10.0
 WIDENING_OF_ANISOTROPY = 4.0
+# Factor on the standard deviations of the coefficients of fields for which a probe must be
+# significant, too: hardly anything is smoothed then, and what the data do not determine stays bounded.
+WIDENING_OF_FIELDS = 100.0
 # Least change of an estimate that is relevant, in half widths of its combined interval, which is the
 # one to publish: with the deviations of real bodies and laboratories every assumption is violated a
 # little, and the interval contains that. Memory left out changes E by two half widths and more.
@@ -110,8 +113,8 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
 
 
 def _with_loose_fields(solved_fit: SolvedFit) -> SolvedFit | None:
-    """Return the fit with `WIDENING` times wider priors of the coefficients of fields, at its
-    optimum; None without fields.
+    """Return the fit with `WIDENING_OF_FIELDS` times wider priors of the coefficients of fields, at
+    its optimum; None without fields.
 
     The prior of a field smooths it. What it smooths away is in the residuals, and an assumption that
     is significant only there is a substitute for it.
@@ -122,7 +125,7 @@ def _with_loose_fields(solved_fit: SolvedFit) -> SolvedFit | None:
     if not coefficients:
         return None
     fit = solved_fit.fit
-    scale = np.where([name in coefficients for name in fit.names], 1 / WIDENING, 1.0)
+    scale = np.where([name in coefficients for name in fit.names], 1 / WIDENING_OF_FIELDS, 1.0)
     loose = replace(
         fit, prior_residual=scale * fit.prior_residual, prior_jacobian=scale * fit.prior_jacobian
     )
