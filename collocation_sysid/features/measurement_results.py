@@ -5,7 +5,7 @@ The fields of each class name the kinds of measurements; `measurements` computes
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,6 @@ from ..common.display import short
 from ..common.serialisation import optional
 from ..model.contact.contact_summary import FrictionSummary
 from ..program.depth.depth_comparison import DepthError
-from ..recording.measured_wrench import COMPONENTS, UNITS
 
 
 @dataclass(frozen=True)
@@ -272,58 +271,6 @@ class ForwardResult:
     rms_m: float | None
     max_m: float | None
     experiments: Mapping[str, SimulatedExperiment]
-
-
-@dataclass(frozen=True, eq=False)
-class SensorSeries:
-    """Numbers of one sensor over time: measured, fitted and simulated.
-
-    Attributes
-    ----------
-    kind : str
-        Kind of the sensor, with which names of pictures begin.
-    number : int
-        Number of the sensor among those of its kind, from 1.
-    columns : (S, 1 + 3m)
-        Time [s], and m numbers as measured, fitted and simulated; NaN where one is missing.
-    names : sequence of m str
-        Names of the numbers.
-    units : sequence of m str
-        Units of the numbers; empty if they are not stated.
-    """
-
-    kind: str
-    number: int
-    columns: Array
-    names: Sequence[str]
-    units: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
-class SeriesKind:
-    """Numbers that all sensors of one kind measure over time.
-
-    Attributes
-    ----------
-    name : str
-        Name of the kind, with which names of pictures and stored arrays begin.
-    number_names : sequence of m str
-        Names of the numbers.
-    units : sequence of m str
-        Their units.
-    """
-
-    name: str
-    number_names: Sequence[str]
-    units: Sequence[str]
-
-    def series(self, number: int, columns: Array) -> SensorSeries:
-        """Return the series of one sensor; number and columns are those of `SensorSeries`."""
-        return SensorSeries(self.name, number, columns, self.number_names, units=self.units)
-
-
-# Force and torque of grasps.
-WRENCH_SERIES = SeriesKind("wrench", COMPONENTS, units=UNITS)
 
 
 @dataclass(frozen=True, eq=False)

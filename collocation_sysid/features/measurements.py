@@ -24,7 +24,7 @@ from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..statistics.instrument_misfit import InstrumentMisfit, misfit
-from .measurement_results import WRENCH_SERIES, PredictionErrors, PredictionResiduals
+from .measurement_results import PredictionErrors, PredictionResiduals
 
 # Share of the samples below which a note says what is missing, and most names in it.
 LEAST_SHARE = 0.5
@@ -294,7 +294,7 @@ def recorded_series(
             wrenches.append(_columns(measurement, predicted))
         elif isinstance(measurement, CustomSensor):
             readings[measurement.name] = _columns(measurement, predicted)
-    return {"sensor_columns": {WRENCH_SERIES.name: wrenches}, "readings": readings}
+    return {"wrenches": wrenches, "readings": readings}
 
 
 def _columns(measurement: Measurement, models: Iterable[Any]) -> Array:

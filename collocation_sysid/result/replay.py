@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from ..common.array_types import Array
 from ..common.files import RESULT_FILE, damage_refused, require_own
 from ..errors import InputError
-from ..features.measurement_results import WRENCH_SERIES, SensorSeries
 from ..fem.elements import EDGES
 from ..fem.laws.constants import symbol_of, without_region
 from ..recording.experiment import Experiment
@@ -30,8 +29,8 @@ from ..recording.specimen_files import specimen_strains
 from ..runs.result_content import Result
 
 ARRAYS_FILE = "trajectory.npz"
-# Kinds of sensors whose arrays are named after the kind and the number of the sensor, from 1.
-SERIES_KINDS = {WRENCH_SERIES.name: WRENCH_SERIES}
+# Prefix of arrays of wrenches, before the number of the sensor, from 1.
+WRENCH_PREFIX = "wrench_"
 # Prefixes of arrays of the attributes that are mappings, before the name.
 GROUP_PREFIXES = {"readings": "reading_", "fields": "field_", "visible_points": "visible_"}
 # Prefix of the unit of a custom sensor, before its name.
@@ -121,9 +120,9 @@ class MotionRecord:
         Nodes and markers of the forward simulation; None if it failed.
     natural_hz : (k,), or None
         Natural frequencies at the estimate, ascending; None if they are unknown.
-    sensor_columns : mapping of name to sequence of (S, 1 + 3m)
-        For each kind in `SERIES_KINDS` and each of its sensors: time [s], and m numbers as
-        measured, fitted and simulated; NaN where one of these is missing.
+    wrenches : sequence of (S, 19)
+        For each force–torque sensor: time [s], and force and torque [N, N m] as measured, fitted
+        and simulated; NaN where one of these is missing.
     static : bool
         Whether every sample is an equilibrium of its own.
     tendons_m : (p, 3), or None
@@ -168,7 +167,7 @@ class MotionRecord:
     rolled_out_positions_m: Array | None = None
     rolled_out_m: Array | None = None
     natural_hz: Array | None = None
-    sensor_columns: Mapping[str, Sequence[Array]] = field(default_factory=dict)
+    wrenches: Sequence[Array] = ()
     static: bool = False
     tendons_m: Array | None = None
     readings: Mapping[str, Array] = field(default_factory=dict)
@@ -267,15 +266,6 @@ class MotionRecord:
                 nearest.append(points[points[:, 0] == times[differences_s.argmin()], 5:])
         return np.concatenate(nearest)
 
-    @property
-    def sensor_series(self) -> list[SensorSeries]:
-        """Numbers over time of each sensor of the kinds in `SERIES_KINDS`."""
-        return [
-            SERIES_KINDS[kind].series(k, columns)
-            for kind, of_sensors in self.sensor_columns.items()
-            for k, columns in enumerate(of_sensors, start=1)
-        ]
-
     def has_shapes(self) -> bool:
         """Return whether at least one sample has finite positions of all nodes."""
         shapes_m = self.shapes_m
@@ -297,7 +287,7 @@ class MotionRecord:
         stored |= {key: np.array(getattr(self, key)) for key in ("part_names", "marker_names")}
         stored["static"] = np.array(True) if self.static else None
         stored["residuals_m"] = None if self.markers_m is None else self.markers_m - self.measured_m
-        stored |= {f"{each.kind}_{each.number}": each.columns for each in self.sensor_series}
+        stored |= {f"{WRENCH_PREFIX}{k}": columns for k, columns in enumerate(self.wrenches, 1)}
         for group, front in GROUP_PREFIXES.items():
             stored |= {f"{front}{name}": values for name, values in getattr(self, group).items()}
         stored |= {f"{UNIT_PREFIX}{n}": np.array(unit) for n, unit in self.reading_units.items()}
@@ -328,12 +318,8 @@ class MotionRecord:
         stored: dict[str, Any] = {
             key: arrays[at] if key in needed else arrays.get(at) for key, at in own.items()
         }
-        stored["sensor_columns"] = {}
-        for kind in SERIES_KINDS:
-            keys = [f"{prefix}{kind}_{k}" for k in range(1, len(arrays) + 1)]
-            stored["sensor_columns"][kind] = [
-                arrays[key] for key in takewhile(arrays.__contains__, keys)
-            ]
+        keys = [f"{prefix}{WRENCH_PREFIX}{k}" for k in range(1, len(arrays) + 1)]
+        stored["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
         for group, front in GROUP_PREFIXES.items():
             group_prefix = f"{prefix}{front}"
             stored[group] = {

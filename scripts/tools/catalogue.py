@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
+from collocation_sysid.extras.benchmark.identified_constants import IdentifiedConstant
 from collocation_sysid.fem.laws.constants import symbol_of
 
 # Readable units: smallest magnitude, factor from the SI unit, and name; the largest first.
@@ -45,39 +46,6 @@ this repository unless their problem is in `collocation_sysid/datasets`.
 
 
 @dataclass(frozen=True)
-class CatalogueConstant:
-    """One constant of an entry.
-
-    Attributes
-    ----------
-    name : str
-        Name in problem files, with its unit.
-    unit : str
-        Unit of the values; "1" for ratios.
-    value : float
-    combined95 : (lower, upper) or None
-        Combined 95 % interval; None if the constant was stated, or has no interval.
-    is_stated : bool
-        Whether the constant was stated in the problem, not estimated.
-    is_derived : bool
-        Whether the constant follows from the parameters, such as Young's modulus at small strain.
-    reason : str or None
-        Why an estimated constant has no interval.
-    true_value : float or None
-        Value with which a twin was simulated; None for measured data.
-    """
-
-    name: str
-    unit: str
-    value: float
-    combined95: tuple[float, float] | None
-    is_stated: bool
-    is_derived: bool
-    reason: str | None
-    true_value: float | None
-
-
-@dataclass(frozen=True)
 class QuantileRange:
     """Quantiles and extremes of a quantity over a body and its samples.
 
@@ -107,7 +75,7 @@ class CatalogueEntry:
         Material law of each region, with the number of memory branches.
     damping : tuple of str
         Damping law of each region; empty if every recording is static.
-    constants : tuple of CatalogueConstant
+    constants : tuple of IdentifiedConstant
         Parameters, then derived moduli.
     stretch : QuantileRange
         Principal stretches.
@@ -131,7 +99,7 @@ class CatalogueEntry:
     is_measured: bool
     law: tuple[str, ...]
     damping: tuple[str, ...]
-    constants: tuple[CatalogueConstant, ...]
+    constants: tuple[IdentifiedConstant, ...]
     stretch: QuantileRange
     strain_rate_1_s: QuantileRange | None
     verdict: str
@@ -217,7 +185,7 @@ def _section(entry: CatalogueEntry) -> str:
     return "\n".join(lines)
 
 
-def _constant_row(constant: CatalogueConstant) -> dict[str, str]:
+def _constant_row(constant: IdentifiedConstant) -> dict[str, str]:
     """Return the cells of a constant by heading."""
     factor, unit = _readable_unit(constant)
     interval = ""
@@ -238,7 +206,7 @@ def _constant_row(constant: CatalogueConstant) -> dict[str, str]:
     }
 
 
-def _with_interval(constant: CatalogueConstant) -> str:
+def _with_interval(constant: IdentifiedConstant) -> str:
     """Return value, interval and unit of a constant in one cell."""
     factor, unit = _readable_unit(constant)
     value = f"{factor * constant.value:.3g}"
@@ -248,7 +216,7 @@ def _with_interval(constant: CatalogueConstant) -> str:
     return f"{value} {unit}".removesuffix(" 1")
 
 
-def _readable_unit(constant: CatalogueConstant) -> tuple[float, str]:
+def _readable_unit(constant: IdentifiedConstant) -> tuple[float, str]:
     """Return the factor to a readable unit, and the name of that unit."""
     units = READABLE_UNITS.get(constant.unit, ((0.0, 1.0, constant.unit),))
     size = abs(constant.value) if isfinite(constant.value) else 0.0

@@ -23,20 +23,14 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from catalogue import (
-    Catalogue,
-    CatalogueConstant,
-    CatalogueEntry,
-    Omission,
-    QuantileRange,
-    catalogue_page,
-)
+from catalogue import Catalogue, CatalogueEntry, Omission, QuantileRange, catalogue_page
 from catalogue_sources import ROOT, SOURCES, CatalogueSource
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.common.files import RESULT_FILE, write_text_file
 from collocation_sysid.common.serialisation import as_json, read
+from collocation_sysid.extras.benchmark.identified_constants import IdentifiedConstant
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.constants import is_damping, unit_of
 from collocation_sysid.fem.regions import BodyPart
@@ -190,7 +184,7 @@ def _truth(source: CatalogueSource) -> dict[str, float]:
 
 def constants_of(
     result: Result, truth: Mapping[str, float], *, is_static: bool
-) -> tuple[CatalogueConstant, ...]:
+) -> tuple[IdentifiedConstant, ...]:
     """Return parameters and derived moduli; without the dampings of equilibria, which have none."""
     named = {
         n: e for n, e in result.collect_estimates().items() if not (is_static and is_damping(n))
@@ -203,9 +197,9 @@ def constants_of(
 
 def _constant(
     name: str, estimate: ReportedEstimate, is_derived: bool, true_value: float | None
-) -> CatalogueConstant:
+) -> IdentifiedConstant:
     """Return one constant of an entry."""
-    return CatalogueConstant(
+    return IdentifiedConstant(
         name=name,
         unit=unit_of(name) or "1",
         value=estimate.value,

@@ -533,7 +533,7 @@ def bench(measured_axes: tuple[int, ...] = (2,)) -> MotionRecord:
         columns[:, 1 + axis] = -1000.0 * way_m
     columns[:, 7:10] = np.outer(-1100.0 * way_m, [0.3, 0.3, 1.0])
     travel_m = np.outer(way_m, [0.0, 0.0, -1.0])
-    return replace(seen, sensor_columns={"wrench": [columns]}, travel_m=travel_m)
+    return replace(seen, wrenches=[columns], travel_m=travel_m)
 
 
 def test_a_bench_is_drawn_as_force_over_displacement():

@@ -15,7 +15,7 @@ CATALOGUE_FILE = "catalogue.json"
 
 @dataclass(frozen=True)
 class IdentifiedConstant:
-    """One constant of a body.
+    """One constant of a body, as an entry of the catalogue.
 
     Attributes
     ----------
@@ -25,13 +25,15 @@ class IdentifiedConstant:
         Unit of the values; "1" for ratios.
     value : float
     combined95 : (lower, upper) or None
-        Combined 95 % interval; None if the constant was stated.
+        Combined 95 % interval; None if the constant was stated, or has no interval.
     is_stated : bool
-        Whether the constant was stated, not estimated.
+        Whether the constant was stated in the problem, not estimated.
     is_derived : bool
-        Whether the constant follows from the others.
+        Whether the constant follows from the parameters, such as Young's modulus at small strain.
+    reason : str or None
+        Why an estimated constant has no interval.
     true_value : float or None
-        Value with which a recording was simulated; None for measurements.
+        Value with which a recording was simulated; None for measured data.
     """
 
     name: str
@@ -40,6 +42,7 @@ class IdentifiedConstant:
     combined95: tuple[float, float] | None
     is_stated: bool
     is_derived: bool
+    reason: str | None
     true_value: float | None
 
 
@@ -103,13 +106,7 @@ def catalogue_entry(name: str) -> CatalogueEntry:
     entry = entries[name]
     constants = tuple(
         IdentifiedConstant(
-            name=each["name"],
-            unit=each["unit"],
-            value=each["value"],
-            combined95=each["combined95"] and tuple(each["combined95"]),
-            is_stated=each["is_stated"],
-            is_derived=each["is_derived"],
-            true_value=each["true_value"],
+            **each | {"combined95": each["combined95"] and tuple(each["combined95"])}
         )
         for each in entry["constants"]
     )

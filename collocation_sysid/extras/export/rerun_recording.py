@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ...common.array_types import Array
 from ...common.display import as_markdown
 from ...errors import InputError
+from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...result.animation import experiment_named
 from ...result.frame_fields import field_on_faces
 from ...result.replay import MotionRecord, read_run
@@ -363,16 +364,15 @@ class _Recording:
         """Write each component of forces and torques as measured, fitted and simulated, as far as
         they are finite; grasps with a sensor are numbered from 1.
         """
-        for series in replay.sensor_series:
-            t_s = series.columns[:, 0]
-            values = series.columns[:, 1:].reshape(len(t_s), 3, len(series.names))
+        for number, columns in enumerate(replay.wrenches, 1):
+            t_s = columns[:, 0]
+            values = columns[:, 1:].reshape(len(t_s), 3, len(COMPONENTS))
             for kind, each in zip(
                 ("measured", "fitted", "simulated"), np.moveaxis(values, 1, 0), strict=True
             ):
-                for component, unit, curve in zip(series.names, series.units, each.T, strict=True):
+                for component, unit, curve in zip(COMPONENTS, UNITS, each.T, strict=True):
                     label = f"{component} [{unit}]"
-                    sensor = f"{series.kind}_{series.number}"
-                    path = self._path(replay.name, sensor, label, kind)
+                    path = self._path(replay.name, f"wrench_{number}", label, kind)
                     self._write_curve(path, t_s, values=curve)
 
     def _write_curve(self, path: str, t_s: Array, values: Sequence[float] | Array) -> None:

@@ -13,6 +13,7 @@ from ...common.array_types import Array
 from ...common.files import replaced_file, safe_name
 from ...common.signal_handling import INTERRUPTS
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
+from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI, own_settings
 from ..replay import MotionRecord, damaged_run_refused, read_run
@@ -120,17 +121,13 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
             f"spectrum_{replay.name}",
             spectrum_picture(t_s, measured, fitted_m=fitted, natural_hz=replay.natural_hz),
         )
-    for series in replay.sensor_series:
-        count = len(replay.sensor_columns[series.kind])
-        which = "" if count == 1 else f"_{series.number}"
-        if replay.travel_m is not None and series.kind == "wrench":
-            curve = force_picture(replay.travel_m, t_s, series.columns)
+    for number, columns in enumerate(replay.wrenches, 1):
+        which = "" if len(replay.wrenches) == 1 else f"_{number}"
+        if replay.travel_m is not None:
+            curve = force_picture(replay.travel_m, t_s, columns)
             if curve is not None:
                 yield f"force_displacement_{replay.name}{which}", curve
-        yield (
-            f"{series.kind}_{replay.name}{which}",
-            sensor_picture(series.columns, series.names, units=series.units),
-        )
+        yield f"wrench_{replay.name}{which}", sensor_picture(columns, COMPONENTS, units=UNITS)
     for name, values in replay.readings.items():
         places = values.shape[1] // 3
         names = [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
