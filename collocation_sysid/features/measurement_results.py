@@ -15,7 +15,7 @@ from ..common.array_types import Array
 from ..common.display import short
 from ..common.serialisation import optional
 from ..model.contact.contact_summary import FrictionSummary
-from ..program.depth.depth_comparison import DepthError
+from ..program.depth.surface_comparison import DepthError
 
 
 @dataclass(frozen=True)

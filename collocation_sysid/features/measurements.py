@@ -15,7 +15,7 @@ import numpy as np
 from ..common.array_types import Array, root_mean
 from ..errors import InputError
 from ..methods.solution import Solution, pooled_wrench_rms, wrench_rms
-from ..program.depth.depth_comparison import SurfaceComparison
+from ..program.depth.surface_comparison import SurfaceComparison
 from ..program.measured_motion import Predicted
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
@@ -49,13 +49,6 @@ def surfaces(experiment: Experiment, predicted: Predictions) -> dict[str, Surfac
     """Return the comparisons of depth cameras with a predicted surface, by name of the camera."""
     views = (each for each in predicted if isinstance(each, SurfaceComparison))
     return dict(zip(experiment.camera_names, views, strict=False))
-
-
-def tracks_m(experiment: Experiment, predicted: Predictions) -> Array:
-    """Return the predicted positions (T, M, 3) of the markers [m]."""
-    for markers, values in _predicted_numbers(experiment, predicted, Markers):
-        return markers.vectors(values)
-    return np.zeros((len(experiment.t_s), 0, 3))
 
 
 def titles(measurements: Sequence[Measurement]) -> Iterator[str]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..program.collocation import ExperimentIterate
+from ..program.wrench_residual import WrenchResidual
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import COMPONENTS, UNITS
 from ..statistics.axes import OTHER_AXES
@@ -193,7 +194,7 @@ def wrench_deviations(parts: Sequence[ExperimentIterate]) -> list[WrenchDeviatio
     deviations = []
     for part in parts:
         transcription = part.transcription
-        for sensor in transcription.sensors:
+        for sensor in transcription.residuals_of(WrenchResidual):
             wrench = sensor.wrench
             motion = part.motion_for(sensor.observable)
             phi = np.zeros(transcription.nuisance.size)

@@ -22,6 +22,7 @@ from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..program.collocation import Collocation, ExperimentIterate
+from ..program.markers.marker_residual import MarkerResidual
 from ..program.observables import ObservedMotion, ReactionForces
 from ..program.transcription import Transcription
 from ..program.wrench_residual import WrenchResidual, without_grasp_sensors
@@ -171,7 +172,7 @@ def wrench_mistakes(collocation: Collocation) -> WrenchComparison:
     with_both = [
         s
         for s in collocation.transcriptions
-        if s.sensors
+        if s.experiment.wrenches
         and s.experiment.markers.count_samples()
         and not len(s.nuisance.indices_of_rows(*TOOL))
     ]
@@ -191,12 +192,10 @@ def _misses(part: ExperimentIterate) -> bool:
     """Whether the root mean square of the residuals of any wrench sensor of an experiment exceeds
     `MISFIT` standard deviations; false without sensors.
     """
-    # They are behind the markers.
-    pairs = zip(part.transcription.sensors, part.observables[1:], strict=False)
     return any(
         float(np.sum(sensor.residuals(observation, part.phi) ** 2))
         > MISFIT**2 * sensor.is_compared.reshape(-1, 6).sum()
-        for sensor, observation in pairs
+        for sensor, observation in part.residuals_of(WrenchResidual)
     )
 
 
@@ -204,7 +203,8 @@ def _markers_misfit(part: ExperimentIterate) -> float:
     """Return the root mean square of the markers' residuals in standard deviations; 0 without
     samples.
     """
-    residuals = part.transcription.markers.residuals(part.observables[0], part.phi)
+    ((markers, positions),) = part.residuals_of(MarkerResidual)
+    residuals = markers.residuals(positions, part.phi)
     return float(
         np.sqrt(
             np.sum(residuals**2) / max(1, 3 * part.transcription.experiment.markers.count_samples())
@@ -251,7 +251,7 @@ def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
     hypotheses: list[Hypothesis] = []
     for part in parts:
         forced = part.reactions
-        for sensor in part.transcription.sensors:
+        for sensor in part.transcription.residuals_of(WrenchResidual):
             hypotheses += _OneSensor(part, sensor, forced=forced).causes()
     return hypotheses
 

@@ -16,7 +16,8 @@ from ..fem.body import Body
 from ..recording.experiment import Experiment
 from .correspondences import Correspondences
 from .markers.marker_association import MarkerAssociation
-from .unlabelled_points import declared_points, initial_correspondences
+from .measurement_model import CorrespondenceModel, MotionGrid
+from .measurement_models import measurement_models, with_correspondences
 
 # The clock leaves its sample when its shift differs by more than this [samples].
 SAMPLES_OFF = 1.0
@@ -45,9 +46,16 @@ class Association:
         """Return the association for the stated places of an experiment's markers and sensors, with
         a clock that is not shifted.
         """
+        models = ()
+        if with_correspondences(experiment):
+            models = measurement_models(MotionGrid.at_samples(experiment))
         return cls(
             MarkerAssociation.from_experiment(experiment),
-            correspondences=initial_correspondences(experiment),
+            correspondences=tuple(
+                model.first_correspondences()
+                for model in models
+                if isinstance(model, CorrespondenceModel)
+            ),
         )
 
     def matches(self, experiment: Experiment) -> bool:
@@ -56,7 +64,7 @@ class Association:
         """
         return self.markers.matches(experiment) and [
             each.measured for each in self.correspondences
-        ] == declared_points(experiment)
+        ] == with_correspondences(experiment)
 
     def centred_at(self, places_m: Array) -> Association:
         """Return the association with the markers centred at places (M, 3) [m] on the undeformed

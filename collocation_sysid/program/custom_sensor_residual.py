@@ -7,8 +7,10 @@ the five grid times around a sample.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -21,7 +23,9 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE
 from ..recording.placement import place_markers
 from ..recording.sample_times import TIME_TOLERANCE_S
+from .correspondences import Correspondences
 from .markers.marker_association import MarkerAssociation
+from .measurement_model import MeasurementModel
 from .measurement_residual import (
     GROUP,
     MeasurementResidual,
@@ -32,6 +36,9 @@ from .measurement_residual import (
 )
 from .observables import ObservedMotion, PointPositions
 from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
+
+if TYPE_CHECKING:
+    from .association import Association
 
 # Grid times around a sample, for positions, velocities and accelerations.
 NEIGHBOURS = 5
@@ -113,6 +120,11 @@ class CustomSensorResidual(MeasurementResidual):
             observable_s=at_s,
             is_static=static,
         )
+
+    @property
+    def measurement(self) -> CustomSensor:
+        """The user's sensor with its samples."""
+        return self.sensor
 
     def at_samples(self, t_s: Array, grid: ReactionGrid) -> CustomSensorResidual:
         """Return the model for a motion known at other times, as `MeasurementResidual.at_samples`."""
@@ -218,52 +230,43 @@ def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
     return (t_s >= at_s[0] - TIME_TOLERANCE_S) & (t_s <= at_s[-1] + TIME_TOLERANCE_S)
 
 
-def custom_sensor_residuals(
-    experiment: Experiment,
-    t_s: Array,
-    grid: ReactionGrid,
-    nuisance: NuisanceMap,
-    huber: float | None = None,
-) -> tuple[CustomSensorResidual, ...]:
-    """Build the measurement models of all custom sensors of an experiment, in their order.
+class CustomSensorModel(MeasurementModel):
+    """Custom sensor of points or of a grasp; its residual is the same for all associations."""
 
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    t_s : (N,) array
-        Times of the rows of x [s], at which sensors of points are observed.
-    grid : ReactionGrid
-        Times at which reaction forces are known, for sensors of a grasp.
-    nuisance : NuisanceMap
-        Nuisance parameters of the experiment.
-    huber : float or None
-        Threshold of Huber's loss; None means a quadratic loss.
-    """
-    models = []
-    for number, gauge in enumerate(experiment.readings):
-        if gauge.grasp is None:
-            channel = observed_points(experiment, gauge, rows=len(t_s))
-            at_s = t_s
+    measurement: CustomSensor
+
+    @cached_property
+    def _residual(self) -> CustomSensorResidual:
+        grid, sensor = self.grid, self.measurement
+        experiment = grid.experiment
+        if sensor.grasp is None:
+            observable = observed_points(experiment, sensor, rows=len(grid.t_s))
+            at_s = grid.t_s
         else:
-            grasp = experiment.grasps[gauge.grasp - 1]
-            origin = np.zeros(3)
-            channel = ReactionResultant.from_experiment(
-                experiment, grasp, frame=gauge.frame, point_m=origin, grid=grid, nuisance=nuisance
+            observable = ReactionResultant.from_experiment(
+                experiment,
+                experiment.grasps[sensor.grasp - 1],
+                frame=sensor.frame,
+                point_m=np.zeros(3),
+                grid=grid.reaction_grid,
+                nuisance=grid.nuisance,
             )
-            at_s = channel.t_s
-        models.append(
-            CustomSensorResidual.from_sensor(
-                gauge,
-                number,
-                observable=channel,
-                at_s=at_s,
-                nuisance=nuisance,
-                huber=huber,
-                static=experiment.is_static,
-            )
+            at_s = observable.t_s
+        return CustomSensorResidual.from_sensor(
+            sensor,
+            self.number,
+            observable=observable,
+            at_s=at_s,
+            nuisance=grid.nuisance,
+            huber=grid.huber,
+            static=experiment.is_static,
         )
-    return tuple(models)
+
+    def residuals(
+        self, association: Association, correspondences: Correspondences | None
+    ) -> Sequence[CustomSensorResidual]:
+        """Return the residual of the sensor."""
+        return (self._residual,)
 
 
 def observed_points(experiment: Experiment, sensor: CustomSensor, rows: int) -> PointPositions:

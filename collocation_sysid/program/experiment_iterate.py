@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,10 +19,12 @@ from ..common.array_types import Array
 from ..fem.body import Linearisation
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.internal_variables import AnyHistory
-from .measurement_residual import Observable
+from .measurement_residual import MeasurementResidual, Observable
 from .observables import ObservedMotion, ReactionForces
 from .reactions.reaction_forces import reaction_vjp, reactions_at
 from .transcription import Transcription
+
+R = TypeVar("R", bound=MeasurementResidual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +105,13 @@ class ExperimentIterate:
             else reading.observable.evaluate(self.motion_for(reading.observable), self.phi)
             for k, reading in enumerate(self.transcription.residuals)
         ]
+
+    def residuals_of(self, kind: type[R]) -> list[tuple[R, Array]]:
+        """Return the measurement residuals of one class, each with the values (n, e, 3) of its
+        observable.
+        """
+        pairs = zip(self.transcription.residuals, self.observables, strict=True)
+        return [(each, values) for each, values in pairs if isinstance(each, kind)]
 
     @property
     def loss(self) -> float:

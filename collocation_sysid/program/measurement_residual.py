@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ..common.array_types import Array, Index
 from ..model.generated_functions import GeneratedFunction
 from ..model.nuisance_map import NuisanceMap
+from ..recording.measurement import Measurement
 from .observables import ObservableDerivatives, ObservedMotion, PointPositions, SparseEntries
 from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
 
@@ -229,6 +230,24 @@ class PooledResiduals:
     places_m: Array | None = None
 
 
+class SampledMotion(NamedTuple):
+    """Motion that is known at the samples of an experiment.
+
+    Attributes
+    ----------
+    t_s : (T,) array
+        Times of the samples [s].
+    reaction_grid : ReactionGrid
+        Times at which reaction forces are known.
+    observed : ObservedMotion
+        Positions at the samples, and reaction forces.
+    """
+
+    t_s: Array
+    reaction_grid: ReactionGrid
+    observed: ObservedMotion
+
+
 @dataclass(frozen=True, eq=False)
 class MeasurementResidual(ABC):
     """Measurement model: S samples of E entities at a time, of m numbers each, in one experiment.
@@ -289,6 +308,11 @@ class MeasurementResidual(ABC):
     has_fixed_stencils: ClassVar[bool] = True
     has_noise_floor: ClassVar[bool] = False
     is_compiled: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def measurement(self) -> Measurement:
+        """Measurement of the experiment that is compared."""
 
     @property
     def first_needed_s(self) -> float:
@@ -510,9 +534,49 @@ class MeasurementResidual(ABC):
         """
         return self.predict(self.observable.evaluate(motion, phi), phi)
 
+    def predict_samples(self, motion: SampledMotion, phi: Array) -> Array:
+        """Return predictions (S, G, g) for a motion that is known at the samples, at φ (k,)."""
+        at_samples = self.at_samples(motion.t_s, motion.reaction_grid)
+        return at_samples.predict_motion(motion.observed, phi)
+
     def numbers(self, predicted: Array) -> Array:
         """Return predictions (S, G, g) as the numbers (S, m) of the `Measurement`."""
         return predicted.reshape(len(predicted), -1)
+
+    def fitted(self, motion: ObservedMotion, phi: Array) -> Any:
+        """Return what a fit predicts: the numbers (S, m) of the measurement, or the comparison of
+        its points; the motion is that of all grid times.
+        """
+        return self.numbers(self.predict_motion(motion, phi))
+
+    def simulated(self, motion: SampledMotion, phi: Array) -> Any:
+        """Return what a simulated motion predicts, as `fitted` does."""
+        return self.numbers(self.predict_samples(motion, phi))
+
+    def changes(
+        self,
+        values: Array,
+        fitted: SampledMotion,
+        simulated: SampledMotion,
+        phi: Array,
+        share: float,
+    ) -> Array:
+        """Return the changes (S, M, 3) of the residuals for `share` times the difference between a
+        simulated motion and a fit; zero where not predicted.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Values of the observable in the fit.
+        fitted, simulated : SampledMotion
+            Both motions at the samples.
+        phi : (k,) array
+            Nuisance parameters.
+        share : float
+            Factor of the difference.
+        """
+        of_fit, of_simulation = (self.predict_samples(each, phi) for each in (fitted, simulated))
+        return share * np.nan_to_num((of_simulation - of_fit) / self.sigmas[:, None])
 
     def residuals(self, values: Array, phi: Array) -> Array:
         """Return residuals (y − ŷ) / σ (s, G, g) of the samples that the values suffice for, zero

@@ -31,7 +31,6 @@ from ..model.nuisance_map import NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
-from .custom_sensor_residual import CustomSensorResidual, custom_sensor_residuals
 from .linear_algebra.block_band import (
     BandBlock,
     BlockBand,
@@ -39,11 +38,11 @@ from .linear_algebra.block_band import (
     full_skew_values,
     skew_block_band,
 )
+from .measurement_model import MeasurementModel, MotionGrid
+from .measurement_models import measurement_models
 from .motion_jacobian import MotionJacobian, shifted_back
 from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
 from .shared_nuisances import NuisanceIndices
-from .unlabelled_points import SensorModels, sensor_models
-from .wrench_residual import WrenchResidual, wrench_residuals
 
 T = TypeVar("T", bound=np.generic)
 # Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v from the stencils (p, q) of two positions, see
@@ -156,27 +155,20 @@ class MotionTranscription:
         return NuisanceMap.from_experiment(self.experiment, self.nuisance_indices.pivot_m)
 
     @cached_property
-    def sensors(self) -> tuple[WrenchResidual, ...]:
-        """Measurement models of the grasps' force–torque sensors, in the order of the grasps."""
-        return wrench_residuals(
-            self.experiment,
-            ReactionGrid.from_dynamics(self.dynamics),
-            nuisance=self.nuisance,
-            huber=self.huber,
+    def measurement_models(self) -> tuple[MeasurementModel, ...]:
+        """Models of the measurements, for any association, see `measurement_models`."""
+        reaction_grid = ReactionGrid.from_dynamics(self.dynamics)
+        return measurement_models(
+            MotionGrid(
+                self.experiment,
+                self.nuisance,
+                t_s=reaction_grid.t_s,
+                reaction_grid=reaction_grid,
+                sample_rows=np.arange(len(self.experiment.t_s)) * self.substeps,
+                huber=self.huber,
+                is_initially_at_rest=not self.dynamics.start_velocity_m_s.any(),
+            )
         )
-
-    @cached_property
-    def custom_sensors(self) -> tuple[CustomSensorResidual, ...]:
-        """Measurement models of the custom sensors, in their order."""
-        grid = ReactionGrid.from_dynamics(self.dynamics)
-        return custom_sensor_residuals(
-            self.experiment, grid.t_s, grid=grid, nuisance=self.nuisance, huber=self.huber
-        )
-
-    @cached_property
-    def sensor_models(self) -> SensorModels:
-        """Models of the sensors that measure unlabelled points, in their order."""
-        return sensor_models(self.experiment, self.nuisance)
 
     @cached_property
     def sensed_dofs(self) -> Index:

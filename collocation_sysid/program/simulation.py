@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,21 +24,27 @@ from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, SimulationError
 from ..fem.laws.constants import with_undamped
 from ..model.dynamics import Dynamics
-from ..model.nuisance_map import NuisanceMap
 from ..model.parameters import Parameters, resolve_theta
 from ..model.schemes import MOST_STEPS, Scheme, as_scheme
+from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
+from ..recording.markers import Markers
+from ..recording.measured_wrench import Wrench
+from ..recording.measurement import Measurement
 from ..recording.nuisance import Nuisance
-from .custom_sensor_residual import custom_sensor_residuals
+from .association import Association
 from .forward.loss_of_stability import explain_failure
 from .forward.newmark import simulate_newmark
 from .forward.newton_solver import NewtonOptions
 from .forward.scheme_simulation import Progress, simulate_scheme
 from .forward.stable_path import BranchChange, find_branch_change
+from .markers.marker_association import MarkerAssociation
+from .measurement_model import CorrespondenceModel, MotionGrid
+from .measurement_models import measurement_models
+from .measurement_residual import SampledMotion
 from .observables import ObservedMotion, ReactionForces
 from .reactions.reaction_forces import reactions_at
 from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
-from .wrench_residual import wrench_residuals
 
 # Name of the integrator that is no collocation scheme.
 NEWMARK = "newmark"
@@ -67,48 +74,79 @@ class Trajectory:
 
     Attributes
     ----------
-    t_s : (T,) array
-        Times of the samples [s].
+    experiment : Experiment
+        The experiment.
     positions_m : (T, n, 3) array
         Node positions [m].
     velocities_m_s : (T, n, 3) array
         Node velocities [m/s]; zero in a static experiment.
-    markers_m : (T, M, 3) array
-        Markers [m].
     reactions : (ReactionGrid, ReactionForces)
         Reaction forces on the dofs of instrumented grasps at the times of the time steps, and these
         times.
-    wrenches : tuple of (S, 6) arrays
-        Predictions of the force–torque sensors at the times of their samples [N] and [N m], NaN
-        outside the known times.
-    custom_sensor_values : tuple of (S, m) arrays
-        Predictions of the custom sensors, from the positions at the samples.
+    predicted : tuple
+        Prediction of each of `Experiment.measurements`, in their order: its numbers (S, m), NaN
+        outside the known times. Those of a depth camera are none, m = 0, as `simulate` predicts
+        them; in the forward simulation of a run its points are compared with the surface.
     steps_per_sample : int
         Time steps between samples; 1 in a static experiment.
     step_error_m : float or None
         Largest error of node positions at the samples due to the time step [m], estimated by
         halving the step; None where the step was stated, the experiment is static, or only the
         finest steps could be simulated.
-    branch_change : BranchChange or None
-        First sample of a static experiment that is not on the path of stable equilibria to which
-        its loads lead, see `program.find_branch_change`; None if there is none.
+    equilibria : Dynamics or None
+        Equations of a static experiment at the parameters; None for a motion.
     """
 
-    t_s: Array
+    experiment: Experiment
     positions_m: Array
     velocities_m_s: Array
-    markers_m: Array
     reactions: tuple[ReactionGrid, ReactionForces]
-    wrenches: tuple[Array, ...]
-    custom_sensor_values: tuple[Array, ...] = ()
+    predicted: tuple[Any, ...] = ()
     steps_per_sample: int = 1
     step_error_m: float | None = None
-    branch_change: BranchChange | None = None
+    equilibria: Dynamics | None = None
 
     @property
-    def observed(self) -> ObservedMotion:
-        """Motion with reaction forces, of which measurements are functions."""
-        return ObservedMotion(self.positions_m.reshape(len(self.t_s), -1), self.reactions[1])
+    def t_s(self) -> Array:
+        """Times (T,) of the samples [s]."""
+        return self.experiment.t_s
+
+    @property
+    def sampled(self) -> SampledMotion:
+        """Motion at the samples with reaction forces, of which measurements are functions."""
+        x = self.positions_m.reshape(len(self.t_s), -1)
+        return SampledMotion(self.t_s, self.reactions[0], ObservedMotion(x, self.reactions[1]))
+
+    @property
+    def markers_m(self) -> Array:
+        """Predicted markers (T, M, 3) [m]."""
+        tracks = self._predicted_of(Markers)
+        return (
+            tracks[0].reshape(len(self.t_s), -1, 3) if tracks else np.zeros((len(self.t_s), 0, 3))
+        )
+
+    @property
+    def wrenches(self) -> tuple[Array, ...]:
+        """Predictions (S, 6) of the force–torque sensors [N] and [N m]."""
+        return self._predicted_of(Wrench)
+
+    @property
+    def custom_sensor_values(self) -> tuple[Array, ...]:
+        """Predictions (S, m) of the custom sensors."""
+        return self._predicted_of(CustomSensor)
+
+    def _predicted_of(self, kind: type[Measurement]) -> tuple[Array, ...]:
+        pairs = zip(self.experiment.measurements, self.predicted, strict=True)
+        return tuple(values for measurement, values in pairs if isinstance(measurement, kind))
+
+    @cached_property
+    def branch_change(self) -> BranchChange | None:
+        """First sample of a static experiment that is not on the path of stable equilibria to which
+        its loads lead, see `program.find_branch_change`; None if there is none.
+        """
+        if self.equilibria is None:
+            return None
+        return find_branch_change(self.experiment, self.equilibria, self.sampled.observed.x)
 
 
 def require_steps(experiment: Experiment, step_s: float) -> None:
@@ -171,6 +209,22 @@ def simulate(
         When a step fails even after halvings; names time and element, and where an equilibrium
         ceased to be stable the mode, see `program.find_stability_loss`.
     """
+    motion = simulate_motion(
+        experiment, parameters, integrator, timestep_s, substeps, options, progress
+    )
+    return replace(motion, predicted=_ideal_predictions(motion))
+
+
+def simulate_motion(
+    experiment: Experiment,
+    parameters: Parameters | Mapping[str, float] | Sequence[float] | Array,
+    integrator: str | Scheme = NEWMARK,
+    timestep_s: float | None = None,
+    substeps: int | Literal["auto"] = "auto",
+    options: NewtonOptions | None = None,
+    progress: Progress | None = None,
+) -> Trajectory:
+    """Simulate an experiment without predictions of its measurements; see `simulate`."""
     body = experiment.body
     if experiment.specimen is not None and isinstance(parameters, Mapping):
         parameters = with_undamped(parameters, body.constants)
@@ -197,6 +251,26 @@ def simulate(
         if (reason := explain_failure(experiment, theta, error=error)) is error:
             raise
         raise reason from error
+
+
+def _ideal_predictions(motion: Trajectory) -> tuple[Array, ...]:
+    """Return the predictions of the measurements without nuisance parameters, of markers at the
+    samples; none, (S, 0), of points with correspondences.
+    """
+    stated = motion.experiment
+    experiment = replace(
+        stated, nuisance=Nuisance.none(), markers=replace(stated.markers, offsets_s=None)
+    )
+    grid = MotionGrid.at_samples(experiment, motion.reactions[0])
+    association = Association(MarkerAssociation.from_experiment(experiment))
+    predicted = []
+    for model in measurement_models(grid)[0 if experiment.markers.names else 1 :]:
+        if isinstance(model, CorrespondenceModel):
+            predicted.append(model.measurement.measured_values)
+        else:
+            residual = model.residuals(association, None)[0]
+            predicted.append(residual.simulated(motion.sampled, np.zeros(grid.nuisance.size)))
+    return tuple(predicted)
 
 
 def _steps_per_sample(
@@ -300,7 +374,7 @@ def _with_steps(
     Velocities of a collocation scheme are central differences of its positions.
     """
     sensed = sensed_dofs(experiment)
-    change = None
+    equilibria = None
     if integrator == NEWMARK and not experiment.is_static:
         motion = simulate_newmark(
             experiment,
@@ -321,35 +395,19 @@ def _with_steps(
         )
         grid = simulate_scheme(experiment, dynamics, options=options, progress=progress)
         x = grid[::steps]
-        change = find_branch_change(experiment, dynamics, grid)
+        equilibria = dynamics if experiment.is_static else None
         zeros = np.zeros_like(grid)
         v = zeros if experiment.is_static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
         at = ReactionGrid.from_dynamics(dynamics)
         forced = reactions_at(dynamics, grid, dofs=sensed)
     shape = (len(x), -1, 3)
-    positions = x.reshape(shape)
-    ideal = NuisanceMap.from_experiment(replace(experiment, nuisance=Nuisance.none()))
-    motion = ObservedMotion(x, forced)
-    wrenches, custom = (
-        tuple(
-            sensor.numbers(sensor.predict_motion(motion, np.zeros(ideal.size)))
-            for sensor in sensors
-        )
-        for sensors in (
-            wrench_residuals(experiment, at, nuisance=ideal),
-            custom_sensor_residuals(experiment, experiment.t_s, grid=at, nuisance=ideal),
-        )
-    )
     return Trajectory(
-        experiment.t_s,
-        positions,
+        experiment,
+        x.reshape(shape),
         velocities_m_s=v.reshape(shape),
-        markers_m=experiment.markers.predict_positions(positions),
         reactions=(at, forced),
-        wrenches=wrenches,
-        custom_sensor_values=custom,
         steps_per_sample=steps,
-        branch_change=change,
+        equilibria=equilibria,
     )
 
 

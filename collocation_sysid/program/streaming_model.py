@@ -21,7 +21,7 @@ from ..recording.experiment import Experiment
 from ..recording.poses import Poses, PoseSequence
 from .collocation import Collocation
 from .custom_sensor_residual import NEIGHBOURS as GAUGE_NEIGHBOURS
-from .custom_sensor_residual import observed_points
+from .custom_sensor_residual import CustomSensorResidual, observed_points
 from .forward.newton_solver import NewtonOptions, NewtonSolver
 from .least_squares import SquareRootInformation
 from .markers.marker_residual import NEIGHBOURS, MarkerResidual
@@ -31,6 +31,7 @@ from .reactions.grasp_reactions import DELAY_STEPS, Sensor
 from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionResultant
 from .sweep import Sweep
 from .transcription import Transcription
+from .wrench_residual import WrenchResidual
 
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import FactorMemory
@@ -299,9 +300,10 @@ class StreamingModel:
         place = len(self.experiment.markers.names)
         step_s = self.transcription.dynamics.step_s
         points = iter(self.observed_points)
-        for reading in (*self.transcription.custom_sensors, *self.transcription.sensors):
+        sensors = self.transcription.residuals_of(CustomSensorResidual)
+        for reading in (*sensors, *self.transcription.residuals_of(WrenchResidual)):
             channel = reading.observable
-            is_custom = reading in self.transcription.custom_sensors
+            is_custom = isinstance(reading, CustomSensorResidual)
             stencil = StreamStencil(GAUGE_NEIGHBOURS)
             if isinstance(channel, ReactionResultant):
                 observable = [other for other, _ in self.reaction_sensors].index(channel)

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,9 +23,11 @@ from .association import Association
 from .correspondences import CorrespondenceResidual
 from .local_loss import LocalLoss
 from .markers.marker_residual import MarkerResidual
+from .measurement_model import CorrespondenceModel
 from .measurement_residual import MeasurementResidual
 from .motion_transcription import MotionTranscription, RowWeights, WeightedHistory
-from .unlabelled_points import residuals_of_points
+
+R = TypeVar("R", bound=MeasurementResidual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,48 +43,50 @@ class Transcription(MotionTranscription):
     association: Association
 
     @cached_property
-    def markers(self) -> MarkerResidual:
-        """Measurement model of the markers."""
-        return MarkerResidual.from_markers(
-            self.experiment.markers,
-            np.arange(len(self.experiment.t_s)) * self.substeps,
-            nuisance=self.nuisance,
-            association=self.association.markers,
-            clock_samples=self.association.clock_samples,
-            huber=self.huber,
-            is_initially_at_rest=not self.dynamics.start_velocity_m_s.any(),
-        )
-
-    @cached_property
-    def unlabelled(self) -> tuple[CorrespondenceResidual, ...]:
-        """Measurement models of unlabelled points: one for each of the association's
-        correspondences, in their order, then others at the same correspondences.
-        """
-        return residuals_of_points(
-            self.association.correspondences,
-            self.sensor_models,
-            self.dynamics.t_s,
-            nuisance=self.nuisance,
-            huber=self.huber,
-        )
-
-    @property
-    def reassociable(self) -> tuple[CorrespondenceResidual, ...]:
-        """The first of `unlabelled`, one for each of the association's correspondences."""
-        return self.unlabelled[: len(self.association.correspondences)]
+    def _residuals_by_measurement(self) -> list[Sequence[MeasurementResidual]]:
+        correspondences = iter(self.association.correspondences)
+        return [
+            model.residuals(
+                self.association,
+                next(correspondences) if isinstance(model, CorrespondenceModel) else None,
+            )
+            for model in self.measurement_models
+        ]
 
     @cached_property
     def residuals(self) -> tuple[MeasurementResidual, ...]:
-        """All measurement models: markers, force–torque sensors, custom sensors, unlabelled
-        points.
+        """Measurement residuals: the first one of each measurement in the order of
+        `Experiment.measurements`, those of the markers also if there are none; then other ones,
+        such as outlines.
         """
-        return (self.markers, *self.sensors, *self.custom_sensors, *self.unlabelled)
+        by_measurement = self._residuals_by_measurement
+        return (
+            *(first for first, *_ in by_measurement),
+            *chain.from_iterable(others for _, *others in by_measurement),
+        )
 
     @property
-    def measurement_models(self) -> tuple[MeasurementResidual, ...]:
-        """The measurement model of each of `Experiment.measurements`, in their order."""
-        markers = (self.markers,) * bool(self.experiment.markers.names)
-        return (*markers, *self.sensors, *self.custom_sensors, *self.reassociable)
+    def main_residuals(self) -> tuple[MeasurementResidual, ...]:
+        """The first residual of each of `Experiment.measurements`, which predicts it."""
+        first = 0 if self.experiment.markers.names else 1
+        return self.residuals[first : len(self.measurement_models)]
+
+    def residuals_of(self, kind: type[R]) -> tuple[R, ...]:
+        """Return the residuals of one class, in the order of `residuals`."""
+        return tuple(each for each in self.residuals if isinstance(each, kind))
+
+    @cached_property
+    def markers(self) -> MarkerResidual:
+        """Residual of the markers."""
+        return self.residuals_of(MarkerResidual)[0]
+
+    @property
+    def reassociable(self) -> tuple[CorrespondenceResidual, ...]:
+        """The first residual of each measurement with correspondences, in the order of the
+        association's.
+        """
+        firsts = self.residuals[: len(self.measurement_models)]
+        return tuple(each for each in firsts if isinstance(each, CorrespondenceResidual))
 
     @cached_property
     def local_loss(self) -> LocalLoss:

@@ -11,17 +11,20 @@ motion.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
-from ..model.nuisance_map import NuisanceMap
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import SENSOR_TIME, TARE
 from ..recording.sample_times import TIME_TOLERANCE_S
+from .correspondences import Correspondences
+from .measurement_model import MeasurementModel
 from .measurement_residual import (
     MeasurementResidual,
     RowStencil,
@@ -29,7 +32,10 @@ from .measurement_residual import (
     neighbouring_times,
 )
 from .observables import ObservedMotion
-from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionGrid, ReactionResultant
+from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionResultant
+
+if TYPE_CHECKING:
+    from .association import Association
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +99,11 @@ class WrenchResidual(MeasurementResidual):
             ],
             wrench=wrench,
         )
+
+    @property
+    def measurement(self) -> Wrench:
+        """Measured samples."""
+        return self.wrench
 
     @property
     def first_needed_s(self) -> float:
@@ -196,38 +207,34 @@ def _vector_indices(times: Index) -> Index:
     return (2 * times[..., None] + np.arange(2)).reshape(len(times), 1, -1)
 
 
-def wrench_residuals(
-    experiment: Experiment, grid: ReactionGrid, nuisance: NuisanceMap, huber: float | None = None
-) -> tuple[WrenchResidual, ...]:
-    """Build the measurement models of all grasps of an experiment that have a force–torque sensor,
-    in the order of the grasps.
+class WrenchModel(MeasurementModel):
+    """Force–torque sensor of a grasp; its residual is the same for all associations."""
 
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    grid : ReactionGrid
-        Times at which reaction forces are known.
-    nuisance : NuisanceMap
-        Nuisance parameters of the experiment.
-    huber : float or None
-        Threshold of Huber's loss; None means a quadratic loss.
-    """
-    models = []
-    sensors = [(g, g.wrench) for g in experiment.grasps if g.wrench is not None]
-    for number, (grasp, wrench) in enumerate(sensors):
-        label = "" if len(sensors) == 1 else f" {number + 1}"
-        channel = ReactionResultant.from_experiment(
+    measurement: Wrench
+
+    @cached_property
+    def _residual(self) -> WrenchResidual:
+        experiment = self.grid.experiment
+        sensed = [grasp for grasp in experiment.grasps if grasp.wrench is not None]
+        observable = ReactionResultant.from_experiment(
             experiment,
-            grasp,
-            frame=wrench.frame,
-            point_m=wrench.point_m,
-            grid=grid,
-            nuisance=nuisance,
-            number=number,
+            sensed[self.number],
+            frame=self.measurement.frame,
+            point_m=self.measurement.point_m,
+            grid=self.grid.reaction_grid,
+            nuisance=self.grid.nuisance,
+            number=self.number,
         )
-        models.append(WrenchResidual.from_sensor(channel, wrench, label=label, huber=huber))
-    return tuple(models)
+        label = "" if len(sensed) == 1 else f" {self.number + 1}"
+        return WrenchResidual.from_sensor(
+            observable, self.measurement, label=label, huber=self.grid.huber
+        )
+
+    def residuals(
+        self, association: Association, correspondences: Correspondences | None
+    ) -> tuple[WrenchResidual]:
+        """Return the residual of the sensor."""
+        return (self._residual,)
 
 
 def without_grasp_sensors(experiment: Experiment) -> Experiment:

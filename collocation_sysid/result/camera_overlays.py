@@ -19,7 +19,7 @@ from ..common.array_types import Array
 from ..features.measurements import Predictions, surfaces
 from ..model.nuisance_map import NuisanceMap
 from ..program.depth.depth_camera_model import DepthCameraModel
-from ..program.depth.depth_comparison import SurfaceComparison
+from ..program.depth.surface_comparison import SurfaceComparison
 from ..program.depth.visible_surface import VisibleSurface
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation

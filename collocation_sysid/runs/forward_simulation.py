@@ -12,7 +12,7 @@ from ..common.array_types import Array
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
 from ..features.measurement_results import CopyError, PredictionErrors
-from ..features.measurements import Predictions, instrument_misfits, prediction_error, tracks_m
+from ..features.measurements import Predictions, instrument_misfits, prediction_error
 from ..fem.kernels import map_experiments
 from ..methods.complementarity import with_contact_energy
 from ..methods.reduced_space import ReducedSpace
@@ -20,7 +20,7 @@ from ..methods.solution import Solution
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
 from ..program.measured_motion import residual_changes, simulated_values
-from ..program.simulation import Trajectory, simulate
+from ..program.simulation import Trajectory, simulate_motion
 from ..program.transcription import Transcription
 from ..recording import Experiment
 from ..statistics.assessment import largest_deviation
@@ -264,7 +264,7 @@ def simulate_with_parameters(
     """
     integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
     corrected = with_contact_energy(transcription.corrected_experiment(phi))
-    trajectory = simulate(
+    trajectory = simulate_motion(
         corrected,
         transcription.body.theta_from_values(parameters),
         integrator=integrator,
@@ -277,7 +277,7 @@ def simulate_with_parameters(
     return ForwardSimulation(
         rms_m=error.rms_m or 0.0,
         max_m=error.max_m or 0.0,
-        trajectory=replace(trajectory, markers_m=tracks_m(experiment, predicted)),
+        trajectory=replace(trajectory, predicted=predicted),
         nuisance={},
         places_m={},
         predicted=predicted,

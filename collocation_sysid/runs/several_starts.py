@@ -71,7 +71,7 @@ def robust_loss(solution: Solution) -> float:
     excluded_loss = sum(
         model.excluded_loss
         for part in solution.parts
-        for model in part.transcription.measurement_models
+        for model in part.transcription.main_residuals
     )
     return sum(part.loss for part in solution.parts) + float(prior @ prior) + excluded_loss
 

@@ -17,7 +17,7 @@ from ..methods.solution import Solution, Status
 from ..methods.solve_recorder import Recorder
 from ..problem import Problem
 from ..program.collocation import Collocation
-from ..program.unlabelled_points import declared_points
+from ..program.measurement_models import with_correspondences
 from ..recording.measurement_selection import thinned_experiment
 from .coarse_start import undetermined_names
 
@@ -85,7 +85,7 @@ def collocation_with_all_points(problem: Problem, thinned: Solution) -> Collocat
         correspondences = tuple(
             residual.correspondences_of(measured, iterate.x, phi=iterate.phi)
             for residual, measured in zip(
-                transcription.reassociable, declared_points(given[name]), strict=True
+                transcription.reassociable, with_correspondences(given[name]), strict=True
             )
         )
         associations[name] = replace(transcription.association, correspondences=correspondences)

@@ -17,6 +17,7 @@ from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import box_mesh
 from ..problem.code_loader import CodeLoader
 from ..program.collocation import Collocation
+from ..program.custom_sensor_residual import CustomSensorResidual
 from ..recording.custom_sensor import CustomSensor, Gauge, stack_values
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
@@ -242,7 +243,7 @@ def _check_prediction(
     p = collocation.guess_p
     p[collocation.nq :] = check.rng.standard_normal(collocation.nphi)
     (iterate,) = collocation.iterates_at(p, [x])
-    (residual,) = transcription.custom_sensors
+    (residual,) = transcription.residuals_of(CustomSensorResidual)
     motion = iterate.motion_for(residual.observable)
     found = residual.numbers(residual.predict_motion(motion, iterate.phi))
     unknowns = iterate.phi * np.array([*expression.sensor.unknowns.values()], dtype=float)

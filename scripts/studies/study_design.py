@@ -29,7 +29,6 @@ from collocation_sysid.extras.design import (
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.measured_motion import predict_trajectory
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Nuisance
 from collocation_sysid.statistics.linearised import DerivedModuli
@@ -204,7 +203,7 @@ def twin(design: Design, rng: np.random.Generator) -> dict[str, float] | None:
         problem.scheme,
         substeps=problem.choose_first_substeps(),
     )
-    tracks = predict_trajectory(transcription.markers, motion, phi)
+    tracks = transcription.markers.predict_samples(motion.sampled, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)
     noisy_recording = with_markers(experiment, tracks + noise)
     solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation_of(noisy_recording))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.measured_motion import predict_trajectory
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment
 from kit.problems import GUESS, TRUTH
@@ -21,7 +20,7 @@ def readings(experiment: Experiment, phi: np.ndarray) -> np.ndarray:
     followed, p = collocation.follow_estimates(np.append(GUESS.guess_q, phi))
     (transcription,) = followed.transcriptions
     motion = simulate(transcription.corrected_experiment(phi), TRUTH, "midpoint", substeps=1)
-    return predict_trajectory(transcription.markers, motion, p[followed.nq :])
+    return transcription.markers.predict_samples(motion.sampled, p[followed.nq :])
 
 
 def seen_with(experiment: Experiment, phi: np.ndarray) -> Experiment:

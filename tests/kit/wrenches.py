@@ -10,6 +10,7 @@ import numpy as np
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
+from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, Nuisance, Wrench
 from kit.problems import TRUTH, as_theta, hung_cube, measured_with
 
@@ -83,7 +84,7 @@ def predicted_wrenches(part: ExperimentIterate) -> list[np.ndarray]:
     """What each sensor of an experiment reads by the model."""
     return [
         each.numbers(each.predict_motion(part.motion_for(each.observable), part.phi))
-        for each in part.transcription.sensors
+        for each in part.transcription.residuals_of(WrenchResidual)
     ]
 
 

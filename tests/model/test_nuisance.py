@@ -31,7 +31,6 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.association import Association
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.markers.marker_association import MarkerAssociation
-from collocation_sysid.program.measured_motion import predict_trajectory
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.statistics.uncertainty import uncertainty_at
@@ -94,7 +93,7 @@ def test_a_time_shift_reads_the_motion_at_another_time(share: float):
     cube = replace(hung_cube(20), nuisance=Nuisance.none(time_shift_s=0.01))
     (transcription,) = alone(cube, substeps=10).transcriptions
     grid = simulate(cube, TRUTH, "midpoint", substeps=10)
-    found = predict_trajectory(transcription.markers, grid, np.array([share]))
+    found = transcription.markers.predict_samples(grid.sampled, np.array([share]))
     dense = replace(cube, t_s=np.linspace(0, 0.2, 201), markers=_on(cube, np.linspace(0, 0.2, 201)))
     expected = simulate(dense, TRUTH, "midpoint", substeps=1).markers_m
     moved = np.abs(expected - expected[0]).max()

@@ -169,7 +169,7 @@ def test_slopes_of_outline_residuals_agree_with_differences():
         [experiment], cs.Parameters.from_mapping(unknown)
     ).collocation()
     (transcription,) = collocation.transcriptions
-    (reading,) = (each for each in transcription.unlabelled if isinstance(each, OutlineResidual))
+    (reading,) = transcription.residuals_of(OutlineResidual)
     rng = np.random.default_rng(0)
     values = transcription.body.nodes_m[reading.correspondences.surface.nodes][None]
     phi = 0.1 * rng.normal(size=transcription.nuisance.size)

@@ -24,6 +24,7 @@ from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.program.lifted.lifted_collocation import lifted_count
 from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, Nuisance
 
 
@@ -38,7 +39,7 @@ def test_the_equations_hold_where_the_wrench_follows_from_the_motion(rng):
     np.testing.assert_allclose(rows, 0.0, atol=1e-13)
     assert program.objective(z) == pytest.approx(collocation.objective(given), rel=1e-12)
     np.testing.assert_allclose(convert_variables(z, program, collocation), given, rtol=1e-14)
-    (sensor,) = collocation.transcriptions[0].sensors
+    (sensor,) = collocation.transcriptions[0].residuals_of(WrenchResidual)
     of_reactions = 7 * len(sensor.observable.node_dofs)
     assert lifted_count(program, "reaction") == 12 * sensor.observable.count + of_reactions
 

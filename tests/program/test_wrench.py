@@ -23,6 +23,7 @@ from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.observables import ObservedMotion, ReactionForces
 from collocation_sysid.program.reactions.reaction_resultant import LOW_PASS
 from collocation_sysid.program.simulation import simulate, with_wrenches
+from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, PoseSequence
 
 
@@ -38,7 +39,10 @@ def at_truth(
 
 def total_on_grid(part: ExperimentIterate) -> tuple[np.ndarray, np.ndarray]:
     """Grid times and the wrenches (n, 6) of all grasps together."""
-    forced, channels = (part.reactions, [s.observable for s in part.transcription.sensors])
+    forced, channels = (
+        part.reactions,
+        [s.observable for s in part.transcription.residuals_of(WrenchResidual)],
+    )
     return channels[0].known_rows, np.sum(
         [c.evaluate_without_tool(forced) for c in channels], axis=0
     )
@@ -64,7 +68,8 @@ def test_all_grasps_together_give_weight_and_rate_of_momentum(
     mass = dynamics.mass.inertia_kg[0, ::3]
     stencil = dynamics.combine(dynamics.tables.s, x) / dynamics.step_s**2
     acceleration = stencil[
-        grid + part.transcription.sensors[0].observable.reaction_grid.delay_steps
+        grid
+        + part.transcription.residuals_of(WrenchResidual)[0].observable.reaction_grid.delay_steps
     ].reshape(len(grid), -1, 3)
     pull = mass[:, None] * (acceleration - experiment.gravity_m_s2)
     weight_n = 9.81 * mass.sum()
@@ -116,7 +121,7 @@ def test_the_frame_of_the_grasp_moves_along():
     np.testing.assert_allclose(
         np.einsum("kij,kj->ki", turns, in_grasp[:, :3]), in_world[:, :3], atol=1e-12
     )
-    point = world.transcription.sensors[0].wrench.point_m
+    point = world.transcription.residuals_of(WrenchResidual)[0].wrench.point_m
     arm = shifts + turns @ point - point
     about = np.einsum("kij,kj->ki", turns, in_grasp[:, 3:]) + np.cross(arm, in_world[:, :3])
     np.testing.assert_allclose(about, in_world[:, 3:], atol=1e-12)
@@ -124,7 +129,7 @@ def test_the_frame_of_the_grasp_moves_along():
 
 def test_a_grasp_that_lets_go_has_a_wrench_while_it_holds():
     part = at_truth(sensing(bar_let_go(12)))
-    still, moving = part.transcription.sensors
+    still, moving = part.transcription.residuals_of(WrenchResidual)
     assert still.observable.known_rows[-1] == 11
     # It holds up to the third grid time; the first two rows are those of the start.
     np.testing.assert_array_equal(moving.observable.known_rows, [1])
@@ -213,7 +218,7 @@ def test_platen_plate_and_weight_are_in_equilibrium():
 
 def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
     (transcription,) = fitted(felt(wristed_cube(8, frame="grasp")), GUESS).transcriptions
-    (sensor,) = transcription.sensors
+    (sensor,) = transcription.residuals_of(WrenchResidual)
     grasp, rows, dofs = (
         sensor.observable.grasp,
         transcription.grid_times,

@@ -12,7 +12,6 @@ from scipy.interpolate import CubicSpline
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.measured_motion import predict_trajectory
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import (
     MarkerTable,
@@ -140,7 +139,7 @@ def test_the_model_is_evaluated_at_the_times_of_the_frames(tmp_path: Path) -> No
     (experiment,) = problem.experiments
     trajectory = simulate(experiment, TRUTH, "midpoint", substeps=1)
     (transcription,) = problem.collocation().transcriptions
-    predicted_m = predict_trajectory(transcription.markers, trajectory, np.zeros(0))
+    predicted_m = transcription.markers.predict_samples(trajectory.sampled, np.zeros(0))
     present = experiment.markers.is_present
     miss_m = np.abs(predicted_m - tracks_m)[present]
     ignored_m = np.abs(trajectory.markers_m - tracks_m)[present]

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.serialisation import as_json, read
-from collocation_sysid.program.depth.depth_comparison import DepthError
+from collocation_sysid.program.depth.surface_comparison import DepthError
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
 from collocation_sysid.result.run_summary import run_summary

@@ -15,6 +15,7 @@ from collocation_sysid.features.wrench_causes import wrench_causes, wrench_mista
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
+from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Nuisance, Wrench
 from collocation_sysid.recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from collocation_sysid.runs.check import check_problem
@@ -74,7 +75,7 @@ def with_tool() -> Collocation:
     given = replace(experiment, nuisance=allowed)
     collocation = Collocation([given], GUESS)
     (transcription,) = collocation.transcriptions
-    (sensor,) = transcription.sensors
+    (sensor,) = transcription.residuals_of(WrenchResidual)
     solution = ReducedSpace()(Collocation([experiment], GUESS))
     (part,) = solution.parts
     phi = np.zeros(transcription.nuisance.size)

@@ -22,8 +22,8 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
-from collocation_sysid.program.measured_motion import predict_trajectory
 from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
+from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, Nuisance
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors, shortened_problem
@@ -70,7 +70,10 @@ def test_error_bars_are_those_of_the_slopes():
     markers, sensor = linearise_fit(collocation, solution.z).blocks
     assert (sensor.sigma_key, markers.sigma_key) == ("sigma_n", "sigma_m")
     assert sensor.count_measurements() == int(
-        collocation.transcriptions[0].sensors[0].is_compared.reshape(-1, 6).sum()
+        collocation.transcriptions[0]
+        .residuals_of(WrenchResidual)[0]
+        .is_compared.reshape(-1, 6)
+        .sum()
     )
     rows = [b.jacobian.reshape(-1, 4)[b.is_measured.ravel()] for b in (markers, sensor)]
     of_both = np.linalg.inv(sum(r.T @ r for r in rows))
@@ -107,8 +110,8 @@ def test_tare_clock_lag_and_tool_are_found():
     true[["centre of the tool" in name for name in names]] = (0.0, 0.01, -0.005)
     phi = true / scales
     made = simulate(swung(0, wanted, 60), TRUTH, "midpoint", substeps=1)
-    (sensor,) = transcription.sensors
-    read = sensor.numbers(predict_trajectory(sensor, made, phi))
+    (sensor,) = transcription.residuals_of(WrenchResidual)
+    read = sensor.numbers(sensor.predict_samples(made.sampled, phi))
     measured = with_wrenches(swung(0, wanted, 60), [read])
     collocation = Collocation([with_markers(measured, made.markers_m)], GUESS)
     solution = ReducedSpace()(collocation)

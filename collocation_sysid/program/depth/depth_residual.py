@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from ...common.array_types import Array
 from ...model.nuisance_map import NuisanceMap
@@ -32,17 +33,19 @@ from ..measurement_residual import (
     PooledResiduals,
     ResidualExpression,
     RowStencil,
+    SampledMotion,
     lagrange_weights,
     neighbouring_times,
 )
-from ..observables import PointPositions
+from ..observables import ObservedMotion, PointPositions
 from .depth_outline import Outline
+from .surface_comparison import HUBER, SurfaceComparison
 from .surface_correspondences import SurfaceCorrespondences
 
 # Grid times around an image that it is interpolated from.
 NEIGHBOURS = 4
-# Default threshold of Huber's loss [σ]: depth images contain other things too.
-HUBER = 3.0
+# Fewest samples of a motion that are interpolated by a cubic spline; fewer are by lines.
+FEWEST_FOR_SPLINE = 4
 # Largest number of patches that statistics combine the points into.
 PATCHES = 60
 # Factor by which patches grow until there are few enough.
@@ -133,6 +136,11 @@ class DepthResidual(CorrespondenceResidual):
             correspondences=correspondences,
             observable_s=at_s,
         )
+
+    @property
+    def measurement(self) -> Depth:
+        """Points of the camera."""
+        return self.correspondences.camera.depth
 
     @property
     def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
@@ -382,6 +390,52 @@ class DepthResidual(CorrespondenceResidual):
             values.shape[0] * values.shape[1] * values.shape[2], columns
         )
         return value_rows.reshape(len(counts), counts.shape[1] // GROUP, GROUP, *values.shape[3:])
+
+    # Of motions -------------------------------------------------------------------------------
+
+    def fitted(self, motion: ObservedMotion, phi: Array) -> SurfaceComparison:
+        """Return the comparison with the surface of a fit at its correspondences."""
+        return SurfaceComparison(
+            self.correspondences,
+            self.surface_shapes(motion.x, phi),
+            signed_distances_m=self.signed_distances_m(self.observable.evaluate(motion, phi), phi),
+            phi=phi,
+        )
+
+    def simulated(self, motion: SampledMotion, phi: Array) -> SurfaceComparison:
+        """Associate the points with a motion and compare them; images after its end are compared
+        with its last positions.
+        """
+        shapes_m = self.surface_shapes(self._interpolated(motion), phi)
+        return SurfaceComparison.from_shapes(self.correspondences, shapes_m, phi)
+
+    def _interpolated(self, motion: SampledMotion) -> Array:
+        """Return positions (n, 3n') at the times of the observable, interpolated from those of a
+        motion by a cubic spline, or by lines between fewer than `FEWEST_FOR_SPLINE`; outside its
+        times the end positions.
+        """
+        t_s, x = motion.t_s, motion.observed.x
+        at_s = np.clip(self.observable_s, t_s[0], t_s[-1])
+        if len(t_s) >= FEWEST_FOR_SPLINE:
+            return np.asarray(CubicSpline(t_s, x)(at_s))
+        return np.array([np.interp(at_s, t_s, each) for each in x.T]).T
+
+    def changes(
+        self,
+        values: Array,
+        fitted: SampledMotion,
+        simulated: SampledMotion,
+        phi: Array,
+        share: float,
+    ) -> Array:
+        """Return the changes of the residuals, see `MeasurementResidual.changes`; of first order,
+        at the correspondences of the fit.
+        """
+        change_m = share * (simulated.observed.x - fitted.observed.x)
+        way_m = [np.interp(self.observable_s, fitted.t_s, each) for each in change_m.T]
+        displacements_m = np.transpose(way_m).reshape(len(self.observable_s), -1, 3, 1)
+        nodes = self.correspondences.surface.nodes
+        return self.residual_changes(values, displacements_m[:, nodes], phi=phi)[..., 0]
 
     # In pictures ------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -21,9 +22,14 @@ from ...common.array_types import Array, Index
 from ...model.nuisance_map import NuisanceMap
 from ...recording.markers import Markers
 from ...recording.nuisance import PLACE
+from ..correspondences import Correspondences
+from ..measurement_model import MeasurementModel
 from ..measurement_residual import MeasurementResidual, RowStencil, lagrange_weights
 from ..observables import PointPositions
 from .marker_association import MarkerAssociation
+
+if TYPE_CHECKING:
+    from ..association import Association
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
 NEIGHBOURS = 5
@@ -110,6 +116,11 @@ class MarkerResidual(MeasurementResidual):
             preceding_times=preceding_times,
             clock_samples=clock_samples,
         )
+
+    @property
+    def measurement(self) -> Markers:
+        """Measured tracks."""
+        return self.markers
 
     @property
     def is_present(self) -> NDArray[np.bool_]:
@@ -224,3 +235,24 @@ class MarkerResidual(MeasurementResidual):
         with np.errstate(over="ignore"):
             squares = np.where(self.is_compared[: len(predicted)], (predicted - tracks) ** 2, 0.0)
             return np.sum(squares, axis=2)[present]
+
+
+class MarkerModel(MeasurementModel):
+    """Markers of an experiment, whose places are those of the association."""
+
+    measurement: Markers
+
+    def residuals(
+        self, association: Association, correspondences: Correspondences | None
+    ) -> tuple[MarkerResidual]:
+        """Return the residual of all tracks."""
+        residual = MarkerResidual.from_markers(
+            self.measurement,
+            self.grid.sample_rows,
+            nuisance=self.grid.nuisance,
+            association=association.markers,
+            clock_samples=association.clock_samples,
+            huber=self.grid.huber,
+            is_initially_at_rest=self.grid.is_initially_at_rest,
+        )
+        return (residual,)

@@ -30,6 +30,7 @@ from ...fem.laws.moduli import engineering_constants
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
+from ...program.custom_sensor_residual import CustomSensorResidual
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.homogeneous_deformation import DEFORMATIONS, HomogeneousDeformation
@@ -314,7 +315,7 @@ def _residuals(part: ExperimentIterate) -> list[Array]:
     samples and without NaN.
     """
     rows: list[Array] = []
-    for sensor in part.transcription.custom_sensors:
+    for sensor in part.transcription.residuals_of(CustomSensorResidual):
         motion = part.motion_for(sensor.observable)
         predicted = sensor.numbers(sensor.predict_motion(motion, part.phi))
         residuals = (predicted - sensor.sensor.measured_values) / sensor.sensor.sigma

@@ -1,0 +1,113 @@
+"""Measurements of one experiment in its nonlinear program, before they are associated with the body.
+
+A `MeasurementModel` makes the residuals of one measurement. Models of the kinds of this package and
+of others are listed in `measurement_models`; program, simulation and statistics treat all alike.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.array_types import Array, Index
+from ..model.nuisance_map import NuisanceMap
+from ..recording.experiment import Experiment
+from .correspondences import CorrespondenceResidual, Correspondences
+from .measurement_residual import MeasurementResidual
+from .reactions.reaction_resultant import ReactionGrid
+
+if TYPE_CHECKING:
+    from .association import Association
+
+
+@dataclass(frozen=True, eq=False)
+class MotionGrid:
+    """Times at which the motion of an experiment is known, and what its measurements share.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        The experiment.
+    nuisance : NuisanceMap
+        Its nuisance parameters φ.
+    t_s : (N,) array
+        Times of the rows of x [s].
+    reaction_grid : ReactionGrid
+        Times at which reaction forces are known.
+    sample_rows : (T,) array
+        Rows of x at the samples of the experiment.
+    huber : float or None
+        Threshold of Huber's loss in standard deviations; None for the default of each kind.
+    is_initially_at_rest : bool
+        Whether the body is at rest before the first time.
+    """
+
+    experiment: Experiment
+    nuisance: NuisanceMap
+    t_s: Array
+    reaction_grid: ReactionGrid
+    sample_rows: Index
+    huber: float | None = None
+    is_initially_at_rest: bool = True
+
+    @classmethod
+    def at_samples(cls, experiment: Experiment, grid: ReactionGrid | None = None) -> MotionGrid:
+        """Return the grid of a motion that is known at the samples, with reaction forces at the
+        times of `grid`, by default the same.
+        """
+        grid = grid or ReactionGrid.from_times(experiment.t_s)
+        nuisance = NuisanceMap.from_experiment(experiment)
+        return cls(experiment, nuisance, experiment.t_s, grid, np.arange(len(experiment.t_s)))
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementModel(ABC):
+    """One measurement of an experiment in its nonlinear program, for any association.
+
+    Attributes
+    ----------
+    measurement : Measurement
+        The measurement.
+    number : int
+        Its index among the experiment's markers, wrenches, custom sensors, or depth cameras.
+    grid : MotionGrid
+        Times at which the motion is known.
+    """
+
+    measurement: Any
+    number: int
+    grid: MotionGrid
+
+    @abstractmethod
+    def residuals(
+        self, association: Association, correspondences: Correspondences | None
+    ) -> Sequence[MeasurementResidual]:
+        """Return the residuals of the measurement; the first one predicts its numbers or points.
+
+        Parameters
+        ----------
+        association : Association
+            Association of all measurements of the experiment with the body.
+        correspondences : Correspondences or None
+            Those of this measurement; None unless the model is a `CorrespondenceModel`.
+        """
+
+
+class CorrespondenceModel(MeasurementModel):
+    """Measurement that refers to points of the body which follow the estimates."""
+
+    @abstractmethod
+    def first_correspondences(self) -> Correspondences:
+        """Return the correspondences with the undeformed body in its grasps, after an alignment of
+        the sensor if its pose is estimated.
+        """
+
+    @abstractmethod
+    def residuals(
+        self, association: Association, correspondences: Correspondences | None
+    ) -> Sequence[CorrespondenceResidual]:
+        """Return the residuals at given correspondences, see `MeasurementModel.residuals`."""
