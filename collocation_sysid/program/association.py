@@ -13,11 +13,8 @@ from dataclasses import dataclass, replace
 
 from ..common.array_types import Array
 from ..fem.body import Body
-from ..recording.experiment import Experiment
 from .correspondences import Correspondences
 from .markers.marker_association import MarkerAssociation
-from .measurement_model import CorrespondenceModel, MotionGrid
-from .measurement_models import measurement_models, with_correspondences
 
 # The clock leaves its sample when its shift differs by more than this [samples].
 SAMPLES_OFF = 1.0
@@ -40,31 +37,6 @@ class Association:
     markers: MarkerAssociation
     clock_samples: int = 0
     correspondences: tuple[Correspondences, ...] = ()
-
-    @classmethod
-    def from_experiment(cls, experiment: Experiment) -> Association:
-        """Return the association for the stated places of an experiment's markers and sensors, with
-        a clock that is not shifted.
-        """
-        models = ()
-        if with_correspondences(experiment):
-            models = measurement_models(MotionGrid.at_samples(experiment))
-        return cls(
-            MarkerAssociation.from_experiment(experiment),
-            correspondences=tuple(
-                model.first_correspondences()
-                for model in models
-                if isinstance(model, CorrespondenceModel)
-            ),
-        )
-
-    def matches(self, experiment: Experiment) -> bool:
-        """Return whether the association belongs to the experiment's body (the same object), and
-        has the same priors and unlabelled points.
-        """
-        return self.markers.matches(experiment) and [
-            each.measured for each in self.correspondences
-        ] == with_correspondences(experiment)
 
     def centred_at(self, places_m: Array) -> Association:
         """Return the association with the markers centred at places (M, 3) [m] on the undeformed

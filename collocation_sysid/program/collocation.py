@@ -49,6 +49,7 @@ from ..recording.experiment import Experiment
 from .association import Association
 from .experiment_iterate import ExperimentIterate
 from .linear_algebra.sparse_assembly import SparseAssembly
+from .measurement_models import belongs_to, first_association
 from .motion_transcription import RowWeights, SegmentOffsets, WeightedHistory
 from .shared_nuisances import nuisance_indices, shared_associations
 from .transcription import Transcription
@@ -173,8 +174,8 @@ class Collocation:
         transcriptions = list[Transcription]()
         for experiment, local in zip(fitted, nuisance_indices(fitted, self.nq), strict=True):
             association = self.associations.get(experiment.name)
-            if association is None or not association.matches(experiment):
-                association = Association.from_experiment(experiment)
+            if association is None or not belongs_to(association, experiment):
+                association = first_association(experiment)
             transcriptions.append(
                 Transcription(
                     experiment,

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -23,6 +23,7 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE
 from ..recording.placement import place_markers
 from ..recording.sample_times import TIME_TOLERANCE_S
+from .association import Association
 from .correspondences import Correspondences
 from .markers.marker_association import MarkerAssociation
 from .measurement_model import MeasurementModel
@@ -36,9 +37,6 @@ from .measurement_residual import (
 )
 from .observables import ObservedMotion, PointPositions
 from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
-
-if TYPE_CHECKING:
-    from .association import Association
 
 # Grid times around a sample, for positions, velocities and accelerations.
 NEIGHBOURS = 5
@@ -78,7 +76,8 @@ class CustomSensorResidual(MeasurementResidual):
         nuisance: NuisanceMap,
         huber: float | None,
         static: bool,
-    ) -> CustomSensorResidual:
+        **more: Any,
+    ) -> Self:
         """Build the measurement model of a custom sensor.
 
         Its numbers are padded with NaN to groups of three, and all have the sensor's σ.
@@ -99,6 +98,8 @@ class CustomSensorResidual(MeasurementResidual):
             Threshold of Huber's loss; None means a quadratic loss.
         static : bool
             Whether the experiment is static.
+        **more
+            Further attributes of a subclass.
         """
         count = sensor.measured_values.shape[1]
         groups = -(-count // GROUP)
@@ -119,6 +120,7 @@ class CustomSensorResidual(MeasurementResidual):
             sensor=sensor,
             observable_s=at_s,
             is_static=static,
+            **more,
         )
 
     @property
@@ -133,6 +135,17 @@ class CustomSensorResidual(MeasurementResidual):
         at_s = observable.t_s if isinstance(observable, ReactionResultant) else t_s
         return replace(other, observable_s=at_s)
 
+    @property
+    def point_indices(self) -> NDArray[np.integer]:
+        """Indices (S, P) or (1, P) of the observable's vectors on which each sample depends."""
+        return np.arange(self.observable.vector_count)[None]
+
+    @cached_property
+    def _times(self) -> NDArray[np.int64]:
+        """Indices (S, k) of the observable's times from which each sample is computed."""
+        used = min(STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS, len(self.observable_s))
+        return neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used)
+
     @cached_property
     def _stencil(self) -> RowStencil:
         """Stencil of all samples.
@@ -140,10 +153,9 @@ class CustomSensorResidual(MeasurementResidual):
         Its data are the distances of the neighbouring times from the sample, and the time of the
         sample [s]. A sample beyond the known times uses the nearest ones.
         """
-        used = min(STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS, len(self.observable_s))
-        times = neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used)
-        each = np.arange(self.observable.vector_count)
-        places = (times[..., None] * self.observable.vector_count + each).reshape(len(times), 1, -1)
+        times = self._times
+        vectors = times[..., None] * self.observable.vector_count + self.point_indices[:, None]
+        places = vectors.reshape(len(times), 1, -1)
         data = np.column_stack([self.observable_s[times] - self.t_s[:, None], self.t_s])
         return RowStencil(places, data.T[..., None])
 
@@ -151,8 +163,7 @@ class CustomSensorResidual(MeasurementResidual):
         """Return the stencil of the first samples that depend only on the first `known` times of
         the observable; φ is not used.
         """
-        last = self._stencil.indices[:, 0, -1] // self.observable.vector_count
-        samples = int(np.count_nonzero(last < known))
+        samples = int(np.count_nonzero(self._times[:, -1] < known))
         return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     @property
@@ -179,7 +190,7 @@ class CustomSensorResidual(MeasurementResidual):
         """
         *places, t_s = ca.vertsplit(data)
         late = ca.SX.sym("late")
-        each = self.observable.vector_count
+        each = self.point_indices.shape[1]
         by_time = ca.reshape(values, GROUP * each, -1)
         weights = ca.vertcat(*lagrange_weights(late, places))
         at = []

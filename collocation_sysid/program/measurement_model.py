@@ -9,19 +9,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..common.array_types import Array, Index
 from ..model.nuisance_map import NuisanceMap
 from ..recording.experiment import Experiment
+from .association import Association
 from .correspondences import CorrespondenceResidual, Correspondences
 from .measurement_residual import MeasurementResidual
 from .reactions.reaction_resultant import ReactionGrid
-
-if TYPE_CHECKING:
-    from .association import Association
 
 
 @dataclass(frozen=True, eq=False)

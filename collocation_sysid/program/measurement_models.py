@@ -1,43 +1,29 @@
-"""The kinds of measurements: which `MeasurementModel` belongs to which `Measurement`.
-
-Another package adds a kind by the decorator `measurement_model`.
-"""
+"""The kinds of measurements: which `MeasurementModel` belongs to which `Measurement`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
-
-from ..recording.custom_sensor import CustomSensor
+from ..recording.custom_sensor import CustomSensor, FollowingSensor
 from ..recording.depth_camera import Depth
 from ..recording.experiment import Experiment
 from ..recording.markers import Markers
 from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement, sensor_fields
+from .association import Association
 from .custom_sensor_residual import CustomSensorModel
 from .depth.depth_model import DepthModel
+from .following_sensor import FollowingSensorModel
+from .markers.marker_association import MarkerAssociation
 from .markers.marker_residual import MarkerModel
 from .measurement_model import CorrespondenceModel, MeasurementModel, MotionGrid
 from .wrench_residual import WrenchModel
-
-T = TypeVar("T", bound=type[MeasurementModel])
 
 MODELS: dict[type[Measurement], type[MeasurementModel]] = {
     Markers: MarkerModel,
     Wrench: WrenchModel,
     CustomSensor: CustomSensorModel,
+    FollowingSensor: FollowingSensorModel,
     Depth: DepthModel,
 }
-
-
-def measurement_model(kind: type[Measurement]) -> Callable[[T], T]:
-    """Return a decorator for the model of a kind of measurement, which makes it known."""
-
-    def register(model: T) -> T:
-        MODELS[kind] = model
-        return model
-
-    return register
 
 
 def model_of(measurement: Measurement) -> type[MeasurementModel]:
@@ -62,3 +48,28 @@ def with_correspondences(experiment: Experiment) -> list[Measurement]:
     return [
         each for each in experiment.measurements if issubclass(model_of(each), CorrespondenceModel)
     ]
+
+
+def first_association(experiment: Experiment) -> Association:
+    """Return the association for the stated places of an experiment's markers and sensors, with a
+    clock that is not shifted.
+    """
+    models = ()
+    if with_correspondences(experiment):
+        models = measurement_models(MotionGrid.at_samples(experiment))
+    return Association(
+        MarkerAssociation.from_experiment(experiment),
+        correspondences=tuple(
+            model.first_correspondences()
+            for model in models
+            if isinstance(model, CorrespondenceModel)
+        ),
+    )
+
+
+def belongs_to(association: Association, experiment: Experiment) -> bool:
+    """Return whether an association is one of the experiment's body (the same object), with the
+    same priors and the same measurements with correspondences.
+    """
+    measured = [each.measured for each in association.correspondences]
+    return association.markers.matches(experiment) and measured == with_correspondences(experiment)

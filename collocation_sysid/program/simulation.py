@@ -255,7 +255,7 @@ def simulate_motion(
 
 def _ideal_predictions(motion: Trajectory) -> tuple[Array, ...]:
     """Return the predictions of the measurements without nuisance parameters, of markers at the
-    samples; none, (S, 0), of points with correspondences.
+    samples; none, (S, 0), of unlabelled points.
     """
     stated = motion.experiment
     experiment = replace(
@@ -265,11 +265,13 @@ def _ideal_predictions(motion: Trajectory) -> tuple[Array, ...]:
     association = Association(MarkerAssociation.from_experiment(experiment))
     predicted = []
     for model in measurement_models(grid)[0 if experiment.markers.names else 1 :]:
-        if isinstance(model, CorrespondenceModel):
+        if model.measurement.point_counts:
             predicted.append(model.measurement.measured_values)
-        else:
-            residual = model.residuals(association, None)[0]
-            predicted.append(residual.simulated(motion.sampled, np.zeros(grid.nuisance.size)))
+            continue
+        has_correspondences = isinstance(model, CorrespondenceModel)
+        correspondences = model.first_correspondences() if has_correspondences else None
+        residual = model.residuals(association, correspondences)[0]
+        predicted.append(residual.simulated(motion.sampled, np.zeros(grid.nuisance.size)))
     return tuple(predicted)
 
 

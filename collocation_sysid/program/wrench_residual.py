@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -23,6 +22,7 @@ from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import SENSOR_TIME, TARE
 from ..recording.sample_times import TIME_TOLERANCE_S
+from .association import Association
 from .correspondences import Correspondences
 from .measurement_model import MeasurementModel
 from .measurement_residual import (
@@ -33,9 +33,6 @@ from .measurement_residual import (
 )
 from .observables import ObservedMotion
 from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionResultant
-
-if TYPE_CHECKING:
-    from .association import Association
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,7 @@ part of its measurements, and `node_selection` checks selections of nodes.
 
 from .alignment import align as align
 from .custom_sensor import CustomSensor as CustomSensor
+from .custom_sensor import FollowingSensor as FollowingSensor
 from .custom_sensor import Gauge as Gauge
 from .custom_sensor import GraspQuantities as GraspQuantities
 from .custom_sensor import PointQuantities as PointQuantities

@@ -4,6 +4,7 @@ force.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
@@ -20,6 +21,7 @@ from ..common.files import reason
 from ..common.schema_tables import Vector
 from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
+from ..fem.body import Body
 from .measurement import Measurement
 from .poses import Frame
 from .sample_times import first_unordered_time
@@ -265,6 +267,27 @@ class CustomSensor(Measurement):
                 "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"
             )
         return read.numel()
+
+
+class FollowingSensor(CustomSensor):
+    """Custom sensor whose samples refer to different nodes of the body, which follow the estimates,
+    such as the face that a fixed laser beam hits: base class of such sensors of other packages.
+
+    `predict` is a function of the motion of P nodes, and smooth as long as they are the same;
+    `points_m` are P points with which it is checked before there is a body.
+    """
+
+    @abstractmethod
+    def nodes_of_samples(self, body: Body, positions_m: Array) -> NDArray[np.integer]:
+        """Return the nodes (s, P) to which the first s samples refer.
+
+        Parameters
+        ----------
+        body : Body
+            Has the boundary triangles as `body.mesh.surface`.
+        positions_m : (s, n, 3) array
+            Nodes at the times of the samples [m].
+        """
 
 
 @declaration

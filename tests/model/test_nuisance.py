@@ -28,9 +28,9 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.association import Association
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.markers.marker_association import MarkerAssociation
+from collocation_sysid.program.measurement_models import first_association
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.statistics.uncertainty import uncertainty_at
@@ -314,9 +314,7 @@ def test_a_place_beyond_an_edge_of_the_surface_settles():
 
 def test_a_problem_with_other_places_does_not_keep_the_charts_of_the_old_ones():
     cube = replace(hung_cube(4), nuisance=ONE_OF_EACH["place"])
-    charted = Collocation(
-        [cube], GUESS, associations={cube.name: Association.from_experiment(cube)}
-    )
+    charted = Collocation([cube], GUESS, associations={cube.name: first_association(cube)})
     exact = replace(charted, experiments=[replace(cube, nuisance=IDEAL)])
     assert len(exact.guess_p) == exact.nq
     assert (

@@ -17,6 +17,7 @@ from kit.collocation_kinds import ALL_FIXED, ENGINEERING, LAYOUTS, POISSON_FIXED
 from kit.densities import MADE as DENSE
 from kit.densities import REMEMBERED, remembering_core
 from kit.densities import parameters as free_densities
+from kit.lasers import lit_cube
 from kit.lifted import REGIONS, of_regions
 from kit.lifted_wrenches import ALL_UNKNOWN, felt_memory, free_density, several, weighed
 from kit.memories import TWO, guesses, remembering
@@ -321,6 +322,7 @@ PROGRAMS: dict[str, Make] = {
         for scheme, start, rows, steps in LAYOUTS
     },
     "depth camera": watched,
+    "laser beams": lambda: program(lit_cube(measured=True)),
     "engineering moduli": lambda: program(swung(), parameters=ENGINEERING),
     "some fixed": lambda: program(swung(), parameters=POISSON_FIXED),
     "all fixed": lambda: program(swung(), parameters=ALL_FIXED),

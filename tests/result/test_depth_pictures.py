@@ -27,7 +27,7 @@ from kit.results import a_result
 import collocation_sysid as cs
 from collocation_sysid.features.camera_misspecifications import camera_hypotheses
 from collocation_sysid.pipeline import run
-from collocation_sysid.program.depth.depth_comparison import SurfaceComparison, depth_residuals
+from collocation_sysid.program.depth.depth_comparison import camera_residuals
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording.depth_camera import points_from_image
@@ -226,8 +226,8 @@ def found():
 @pytest.mark.long
 def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(found):
     (part,) = found.collocation.iterates(found.z)
-    ((reading, looked),) = depth_residuals(part)
-    surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
+    (reading,) = camera_residuals(part.transcription)
+    surface = reading.fitted(part.motion_for(reading.observable), part.phi)
     rows = surface_rows(surface, part.transcription.experiment.compute_upward_direction())
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     used = np.isfinite(points[:, 4])
@@ -250,8 +250,8 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(f
 
 def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found):
     (part,) = found.collocation.iterates(found.z)
-    ((reading, looked),) = depth_residuals(part)
-    surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
+    (reading,) = camera_residuals(part.transcription)
+    surface = reading.fitted(part.motion_for(reading.observable), part.phi)
     rows = surface_rows(surface, part.transcription.experiment.compute_upward_direction())
     experiment = part.transcription.experiment
     x = np.repeat(part.x.reshape(1, -1, 3), 3, axis=0)

@@ -15,6 +15,7 @@ from ...methods.stiffness_scan import typical_parameters
 from ...model.point_forces import law_function
 from ...problem import Problem
 from ...program.streaming import StreamingModel
+from ...recording.custom_sensor import FollowingSensor
 from ...recording.experiment import Experiment
 
 # Young's modulus at which a search without a guess starts [Pa].
@@ -85,6 +86,8 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
         "none",
     )
     yield ("depth cameras, because frames do not contain their images", experiment.depths, "none")
+    following = [each for each in experiment.readings if isinstance(each, FollowingSensor)]
+    yield "sensors whose nodes follow the estimates", following, "sensors of fixed points"
     delayed = experiment.obstacles and nuisance.obstacle_time_s
     yield ("an obstacle whose delay is estimated", delayed, "one whose clock is known")
     filtered = nuisance.sensor_lag_s and experiment.sensors_by_grasp

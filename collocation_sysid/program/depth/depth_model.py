@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...recording.depth_camera import Depth
+from ..association import Association
 from ..correspondences import Correspondences
 from ..measurement_model import CorrespondenceModel
 from .depth_camera_model import DepthCameraModel
@@ -15,9 +15,6 @@ from .depth_residual import DepthResidual
 from .outline_residual import OutlineResidual
 from .surface_correspondences import SurfaceCorrespondences
 from .visible_surface import VisibleSurface
-
-if TYPE_CHECKING:
-    from ..association import Association
 
 
 class DepthModel(CorrespondenceModel):

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -22,14 +21,12 @@ from ...common.array_types import Array, Index
 from ...model.nuisance_map import NuisanceMap
 from ...recording.markers import Markers
 from ...recording.nuisance import PLACE
+from ..association import Association
 from ..correspondences import Correspondences
 from ..measurement_model import MeasurementModel
 from ..measurement_residual import MeasurementResidual, RowStencil, lagrange_weights
 from ..observables import PointPositions
 from .marker_association import MarkerAssociation
-
-if TYPE_CHECKING:
-    from ..association import Association
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
 NEIGHBOURS = 5
