@@ -128,7 +128,7 @@ class CustomSensorResidual(MeasurementResidual):
         """The user's sensor with its samples."""
         return self.sensor
 
-    def at_samples(self, t_s: Array, grid: ReactionGrid) -> CustomSensorResidual:
+    def at_samples(self, t_s: Array, grid: ReactionGrid) -> Self:
         """Return the model for a motion known at other times, as `MeasurementResidual.at_samples`."""
         other = super().at_samples(t_s, grid)
         observable = other.observable
