@@ -11,11 +11,12 @@ Transcription
     variables that are otherwise eliminated have equations of their own.
 Measurements
     `observables` are measurable quantities, `observable_response` linearises them along the
-    equations of motion, and `measurement_residual` compares them with data. Residuals of
-    force–torque sensors are in `wrench_residual`, of custom sensors in `custom_sensor_residual`,
-    of other sensors in packages of their own. `correspondences` is the interface of those that
-    measure unlabelled points, and `unlabelled_points` lists them. The package `reactions` contains
-    the reactions of grasps.
+    equations of motion, and `measurement_residual` compares them with data. A `measurement_model`
+    makes the residuals of one measurement, and `measurement_models` is the table of kinds:
+    force–torque sensors in `wrench_residual`, custom sensors in `custom_sensor_residual` and
+    `following_sensor`, others in packages of their own. `correspondences` is the interface of
+    those that refer to points which follow the estimates. The package `reactions` contains the
+    reactions of grasps.
 Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time,
     `least_squares` accumulates normal equations in square-root form, `stopwatch` measures time, and

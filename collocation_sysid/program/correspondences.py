@@ -3,7 +3,7 @@
 Points that a sensor measures without saying which point of the body they are have corresponding
 points on the body, for the current shape. A `CorrespondenceResidual` is the measurement model at
 given `Correspondences`, and finds those of other estimates. Search and transcription need nothing
-else of such a sensor; `unlabelled_points` lists the kinds.
+else of such a sensor.
 """
 
 from __future__ import annotations
