@@ -81,7 +81,7 @@ def sensor_hypotheses(
         for each, values in zip(experiment.measurements, fitted, strict=True)
         if isinstance(values, np.ndarray)
     }
-    models = dict(zip(experiment.measurements, part.transcription.measurement_models, strict=True))
+    models = dict(zip(experiment.measurements, part.transcription.main_residuals, strict=True))
     numbers = {id(each): k for k, each in enumerate(part.transcription.residuals)}
     for sensor in missed:
         own = numbers[id(models[sensor])]
