@@ -18,7 +18,6 @@ from ..program.modes.stability import find_instabilities
 from ..recording.grasp_rotation import DOUBTFUL_ANGLE_RAD
 from ..recording.nuisance import TIME
 from ..statistics.assessment import (
-    WITHIN_BUDGET,
     clock_concerns,
     fit_concerns,
     forward_simulation_concerns,
@@ -92,8 +91,7 @@ def solution_concerns(
     if uncertainty is not None:
         experiments = [each.experiment for each in solution.collocation.transcriptions]
         misfits = fit_concerns(uncertainty, budgeted and budgeted.basis)
-        if {each.code for each in misfits} & {*WITHIN_BUDGET}:
-            yield from hysteresis_concerns(experiments)
+        yield from hysteresis_concerns(experiments, misfits)
         yield from as_specimen_concerns(
             [*misfits, *parameter_concerns(uncertainty, solution.collocation.parameters)],
             experiments,

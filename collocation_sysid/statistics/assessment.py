@@ -456,12 +456,19 @@ def _branch_differences(experiments: Iterable[Experiment]) -> str:
     )
 
 
-def hysteresis_concerns(experiments: Sequence[Experiment]) -> list[Concern]:
-    """Return one concern, as a list, if loading and unloading of bodies on a bench differ clearly;
-    else empty. Specimens name theirs with a drift of the stiffness, see `probe_concerns`.
+def hysteresis_concerns(
+    experiments: Sequence[Experiment], misfits: Iterable[Concern]
+) -> list[Concern]:
+    """Return one concern, as a list, if the fit has misfits of `WITHIN_BUDGET`, and loading and
+    unloading of bodies on a bench differ clearly; else empty. Its grade is that of these misfits,
+    whose cause it is. Specimens name theirs with a drift of the stiffness, see `probe_concerns`.
     """
+    grades = {each.grade for each in misfits if each.code in WITHIN_BUDGET}
+    if not grades:
+        return []
     sizes = _branch_differences(each for each in experiments if each.specimen is None)
-    return concern_if(bool(sizes), False, code="residuals/hysteresis", sizes=sizes)
+    is_doubtful = "doubtful" in grades
+    return concern_if(bool(sizes), is_doubtful, code="residuals/hysteresis", sizes=sizes)
 
 
 def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:

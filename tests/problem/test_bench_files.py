@@ -327,6 +327,7 @@ def test_hysteresis_of_a_bench_is_named_where_the_fit_is_poor(tmp_path, softenin
         assert found.trust.verdict != "good"
         assert re.search(r"in unloading differs from that in loading by -\d+ % in 'press'", *said)
         assert "window_s" in said[0]
+        assert "hysteresis" in found.trust.concerns[0].message  # the cause comes first
 
 
 @pytest.mark.long
