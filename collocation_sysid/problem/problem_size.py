@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..common.display import duration
+from ..common.files import require_size
 from ..common.machine import machine_memory_mb
 from ..errors import InputError
 
@@ -151,12 +152,16 @@ def require_feasible(size: Size, say: Say | None = None) -> None:
 def announce_reading(files: Iterable[Path], say: Say) -> None:
     """Call `say` once with an estimate of how long it takes to read text files, if it exceeds
     `ANNOUNCED_READING_S`; other kinds of files and missing files do not count.
+
+    Raises
+    ------
+    InputError
+        If one of them is too large to be read, see `require_size`.
     """
-    sizes_mb = {
-        file: file.stat().st_size / 1e6
-        for file in files
-        if file.suffix.lower() in TEXT_SUFFIXES and file.is_file()
-    }
+    files = [each for each in files if each.suffix.lower() in TEXT_SUFFIXES and each.is_file()]
+    for file in files:
+        require_size(file)
+    sizes_mb = {file: file.stat().st_size / 1e6 for file in files}
     time_s = sum(sizes_mb.values()) / TEXT_MB_PER_S
     if time_s > ANNOUNCED_READING_S:
         largest = max(sizes_mb, key=lambda file: sizes_mb[file])

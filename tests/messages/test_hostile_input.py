@@ -629,3 +629,35 @@ def test_text_that_no_memory_can_hold_is_refused_before_it_is_read(
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 1e6
+
+
+@pytest.mark.long
+@pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
+@pytest.mark.parametrize("damage", ["sparse table", "sparse result", "blank lines"])
+def test_a_limit_of_the_address_space_ends_in_no_traceback(tiny: Path, damage: str):
+    import resource
+
+    words = ["check", "problem.toml"]
+    if damage == "sparse table":
+        os.truncate(tiny / "swing_markers.csv", 3_000_000_000)
+    elif damage == "blank lines":
+        with (tiny / "swing_markers.csv").open("a") as file:
+            file.write(1_000_000 * "\n")
+    else:
+        words = ["report", "run"]
+        (tiny / "run").mkdir()
+        (tiny / "run" / "result.json").touch()
+        os.truncate(tiny / "run" / "result.json", 3_000_000_000)
+    program = "from collocation_sysid.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        cwd=tiny, capture_output=True, text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30)),
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr
+    if damage == "blank lines":
+        assert done.returncode in (0, 1), done.stderr
+    else:
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert "has 3,000 MB; expected at most" in done.stderr
