@@ -79,6 +79,8 @@ class ScaleReference:
     deviation : float or None
         Relative standard deviation of the mass, which the intervals contain; None if the mass
         counts as exact.
+    is_compared : bool
+        Whether the density of the material is stated as well, with which the mass is compared.
     """
 
     SERIALISED_PROPERTIES: ClassVar = ("sentence",)
@@ -86,6 +88,7 @@ class ScaleReference:
     names: tuple[str, ...]
     density_kg_m3: float
     deviation: float | None
+    is_compared: bool = False
 
     @property
     def sentence(self) -> str:
@@ -95,8 +98,13 @@ class ScaleReference:
         share = "none" if self.deviation is None else f"{100 * self.deviation:.2g} %"
         return (
             f"{symbols} {verb} relative to the stated density of {self.density_kg_m3:.4g} kg/m³, "
-            "because no force was measured: an error of the mass is an equal error of the moduli that "
-            f"no test shows (contained in the intervals: {share})"
+            "because no force was measured: an error of the mass is an equal error of the moduli "
+            f"(contained in the intervals: {share})"
+            + (
+                ", and only that beyond 5 % is seen beside the density of the material"
+                if self.is_compared
+                else ", which no test shows unless object.material_density_kg_m3 is stated"
+            )
         )
 
 
@@ -112,7 +120,8 @@ def scale_reference(
         return None
     bodies = {id(each.body): each.body for each in fitted}.values()
     density = sum(body.mass_kg for body in bodies) / sum(body.mesh.volume_m3 for body in bodies)
-    return ScaleReference(names, float(density), deviation)
+    is_compared = all(body.material_density_kg_m3 is not None for body in bodies)
+    return ScaleReference(names, float(density), deviation, is_compared)
 
 
 def _scaled_parameters(

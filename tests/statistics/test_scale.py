@@ -9,6 +9,7 @@ import pytest
 from kit.problem_files import replace_text, run_command
 from kit.problems import hung_cube, noisy
 
+from collocation_sysid import Body
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.parameters import Tied, Unknown
 from collocation_sysid.pipeline import run
@@ -124,11 +125,19 @@ def test_moduli_relative_to_a_density_as_stated_are_called_so():
     assert scale.density_kg_m3 == pytest.approx(30.0)
     assert scale.sentence == (
         "λ and μ are relative to the stated density of 30 kg/m³, because no force was measured: an "
-        "error of the mass is an equal error of the moduli that no test shows (contained in the "
-        "intervals: 2 %)"
+        "error of the mass is an equal error of the moduli (contained in the intervals: 2 %), which "
+        "no test shows unless object.material_density_kg_m3 is stated"
     )
     exact = scale_reference(found.experiments, found.parameters, None)
-    assert exact.sentence.endswith("(contained in the intervals: none)")
+    assert "(contained in the intervals: none)" in exact.sentence
+    (experiment,) = found.experiments
+    of_mass = Body(
+        experiment.body.mesh, mass_kg=experiment.body.mass_kg, material_density_kg_m3=30.0
+    )
+    known = scale_reference([replace(experiment, body=of_mass)], found.parameters, 0.02)
+    assert known.sentence.endswith(
+        "only that beyond 5 % is seen beside the density of the material"
+    )
     cube = hung_cube()
     loaded = problem(STIFF | DAMPED, masses=[PointMass(tip(cube), 0.01)])
     assert scale_reference(loaded.experiments, loaded.parameters, 0.01) is None

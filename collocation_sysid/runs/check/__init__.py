@@ -35,7 +35,7 @@ from ...statistics.misspecification.misspecification_hypothesis import Hypothesi
 from ...statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
 from ...statistics.misspecification.plausibility import size_and_density_hypotheses
 from ...statistics.misspecification.track_misspecifications import copied_measurements
-from ...statistics.scale_identifiability import scale_concerns, static_concerns
+from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from .body_check import (
     BodyCheck,
@@ -348,6 +348,10 @@ def check_problem(
         )
     notes += [SUBSTEPS_NOTE] * (problem.substeps == "auto" and bool(findings.motions))
     findings = replace(findings, concerns=concerns)
+    rests_on = scale_reference(
+        problem.experiments, problem.parameters, problem.assumed_deviations["mass"]
+    )
+    notes += [] if rests_on is None else [rests_on.sentence]
     known = [note for note in problem.notes if note not in findings.warnings]
     return replace(findings, notes=(*known, *lost, *notes))
 
