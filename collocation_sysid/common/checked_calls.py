@@ -137,7 +137,13 @@ def _converted(value: Any, validator: TypeAdapter[Any], name: str) -> Any:
     except ValidationError as error:
         faults = error.errors(include_url=False)
     what = name + "".join(f"[{k}]" for k in faults[0]["loc"] if isinstance(k, int))
-    found = faults[0]["input"]
+    raise refused(what, faults[0]["input"], faults)
+
+
+def refused(what: str, found: Any, faults: Sequence[Mapping[str, Any]]) -> InputError:
+    """Return the error about a value, `what`, that was `found`, from entries of pydantic's
+    `ValidationError.errors()`, one for each form that would be accepted.
+    """
     shown = f"{found:g}" if isinstance(found, float) else repr(found)
     shown = shown if len(shown) < 80 else f"a {type(found).__name__}"
     choices = [re.findall("'(.*?)'", str(fault.get("ctx", {}).get("expected"))) for fault in faults]
@@ -148,4 +154,4 @@ def _converted(value: Any, validator: TypeAdapter[Any], name: str) -> Any:
         )
     )
     hint = hint_at(str(found), (word for words in choices for word in words))
-    raise InputError(f"{what} is {shown}; expected {expectation}{hint}")
+    return InputError(f"{what} is {shown}; expected {expectation}{hint}")

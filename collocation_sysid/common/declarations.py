@@ -12,15 +12,15 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
-from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin
+from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_origin
 
 import numpy as np
 from pydantic import PlainValidator, ValidatorFunctionWrapHandler, WrapValidator
 
 from ..errors import InputError
-from .checked_calls import form_of
+from .checked_calls import form_of, refused
 from .validated_classes import validate_arguments
-from .validated_types import Finite, expected, faulty_entry
+from .validated_types import Finite, faulty_entry
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -172,24 +172,21 @@ def _refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
     if not field or (converter is not None and get_origin(converter) is not tuple):
         error = fault["ctx"]["error"]
     else:
-        error = _form_refusal(instance, fault, form=field.metadata.get("form"))
+        error = _form_refusal(instance, fault)
     where = getattr(instance, "description", None)
     if where is None or not isinstance(error, InputError):
         return error
     return error.located(where=where).with_traceback(error.__traceback__)
 
 
-def _form_refusal(instance: Any, fault: Mapping[str, Any], form: Any) -> InputError:
+def _form_refusal(instance: Any, fault: Mapping[str, Any]) -> InputError:
     """Return the error for a value that does not have the form of its field."""
     called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
     word = getattr(instance, "description_name", called)
     what, value = faulty_entry(instance, fault)
     whose = f"the {word} {instance.name!r}" if hasattr(instance, "name") else f"a {word}"
     of = what if hasattr(instance, "description") else f"{what} of {whose}"
-    shown = f"{value:g}" if isinstance(value, float) else repr(value)
-    choices = fault["type"] == "literal_error" and get_args(form)
-    expectation = f"one of {', '.join(choices)}" if choices else expected(fault)
-    return InputError(f"{of} is {shown}; expected {expectation}")
+    return refused(of, value, [fault])
 
 
 def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
