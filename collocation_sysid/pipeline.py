@@ -263,8 +263,8 @@ def _with_estimated_fields(problem: Problem, solution: Solution) -> Problem:
 
 
 def _with_problem_notes(answer: Run) -> Run:
-    """Return the run with notes on rotations within time steps, and on material tests of a single
-    kind, before its other notes.
+    """Return the run with notes on rotations within time steps, on time steps for impacts, and on
+    material tests of a single kind, before its other notes.
     """
     problem = answer.problem
     substeps = answer.solution.collocation.substeps
@@ -274,7 +274,13 @@ def _with_problem_notes(answer: Run) -> Run:
         for concern in rotation_step_concerns(experiment, substeps)
     )
     tests = one_kind_notes(problem.experiments, problem.parameters)
-    return replace(answer, notes=(*rotations, *tests, *answer.notes))
+    impacts = ()
+    if problem.substeps == "auto" and problem.choose_first_substeps() > 1:
+        impacts = (
+            f"{substeps} time steps per sample were used, because the body moves by several times "
+            "the noise of its markers from sample to sample and may strike an obstacle",
+        )
+    return replace(answer, notes=(*rotations, *impacts, *tests, *answer.notes))
 
 
 def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:

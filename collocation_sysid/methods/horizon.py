@@ -142,10 +142,11 @@ class Horizon:
         trajectories: Sequence[Any],
         known_iterate: Iterate | None = None,
         accuracy: float = ACCURACY,
+        previous: Iterate | None = None,
     ) -> Iterate:
         """Sweep all experiments at parameters p and trajectories x, and return the iterate.
 
-        Its changes since a previous iterate (`position_change_m` and the measurements' part of
+        Without a `previous` iterate its changes (`position_change_m` and the measurements' part of
         `previous_slopes_residual`) are zero. The times of the sweeps are added to the stopwatch, as
         in `evaluate_step` and `reassociate`.
 
@@ -159,6 +160,8 @@ class Horizon:
             Iterate of the first rows at the same p and positions, which is continued.
         accuracy : float
             Relative accuracy of the solution of each time step, see `Sweep.forward`.
+        previous : Iterate, optional
+            Iterate from which changes are measured.
 
         Raises
         ------
@@ -175,7 +178,7 @@ class Horizon:
             self._by_experiment(p),
             trajectories,
             known,
-            self._repeat(None),
+            previous.trajectories if previous else self._repeat(None),
             self._repeat(accuracy),
         )
         return self._iterate_from(p, sweep_results)

@@ -36,6 +36,9 @@ CONTRACTION = 0.5
 SMALL_STRAIN = 0.1
 # Smallest share of the predicted decrease that a trial must reach.
 DECREASE = 1e-3
+# With impacts, the largest infeasibility of a trial over an edge of the mesh; other trials are
+# simulated. Where a body strikes or slips, forces change within a small part of any step.
+SMALL_IMPACT_STRAIN = 1e-4
 # Infeasibility over the body's size that is due to rounding.
 FEASIBLE = 1e-12
 # Infeasibility over the body's size at which a search ends if steps no longer change the
@@ -166,6 +169,8 @@ class ReducedSearch:
     has_correspondences : bool
         Whether an experiment has measured points that correspond to the nearest surface, as those
         of cameras do.
+    has_impacts : bool
+        Whether a body may strike an obstacle: the trajectory is then not smooth in the parameters.
     is_associated : bool
         Whether cameras of unknown position have been associated with trajectories of
         sufficient length.
@@ -209,6 +214,10 @@ class ReducedSearch:
         self.sweeps = 0
         self.has_correspondences = any(
             transcription.association.correspondences
+            for transcription in collocation.transcriptions
+        )
+        self.has_impacts = any(
+            not transcription.experiment.is_static and transcription.experiment.obstacles
             for transcription in collocation.transcriptions
         )
         self.largest_trust = SEEING if self.has_correspondences else WIDEST
@@ -450,8 +459,9 @@ class ReducedSearch:
 
     def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
         """Return the point after a step (np,) of the parameters from `point`, clipped to the
-        bounds, by one sweep on the horizon, which is counted; None if that fails or is not finite.
-        Nothing else of the search changes.
+        bounds, by one sweep on the horizon, which is counted; with impacts by a simulation if the
+        sweep leaves too much infeasibility. None if that fails or is not finite. Nothing else of
+        the search changes.
         """
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
@@ -459,8 +469,25 @@ class ReducedSearch:
         try:
             trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
         except SimulationError:
+            trial = None
+        if self.has_impacts and not (
+            trial is not None and trial.feasibility_m <= SMALL_IMPACT_STRAIN * self.edge_m
+        ):
+            trial = self._simulated(horizon, p, point)
+        return trial if trial is not None and trial.is_finite else None
+
+    def _simulated(self, horizon: Horizon, p: Array, previous: Iterate) -> Iterate | None:
+        """Return the point at parameters p (np,) with a simulated trajectory, which counts as one
+        sweep; None if the simulation or its sweep fails.
+        """
+        self.sweeps += 1
+        x, failure = horizon.simulate(p, guess=previous)
+        if failure is not None:
             return None
-        return trial if trial.is_finite else None
+        try:
+            return horizon.evaluate(p, x, previous=previous)
+        except SimulationError:
+            return None
 
     def _accuracy_after(self, length: float) -> float:
         """Return the relative accuracy of the time steps' solutions in the sweep after a step of
@@ -534,15 +561,10 @@ class ReducedSearch:
 
         It counts as one sweep.
         """
-        self.sweeps += 1
-        x, failure = horizon.simulate(point.p, guess=point)
-        if failure is not None:
+        resimulated = self._simulated(horizon, point.p, point)
+        if resimulated is None or not resimulated.is_finite:
             return point
-        try:
-            resimulated = horizon.evaluate(point.p, x)
-        except SimulationError:
-            return point
-        return self._accept(horizon, resimulated) if resimulated.is_finite else point
+        return self._accept(horizon, resimulated)
 
     def _are_feasible(self, summaries: list[FitSummary]) -> bool:
         """Return whether the largest residual of the equations of motion of every experiment is at

@@ -26,6 +26,7 @@ from ..program.collocation import Collocation
 from ..program.shared_nuisances import nuisance_indices
 from ..program.simulation import require_steps
 from ..recording import Experiment
+from ..recording.impact_steps import impact_steps
 from ..statistics.misspecification.plausibility import size_and_density_hypotheses
 from ..statistics.scale_identifiability import scale_concerns, static_concerns
 from .problem_options import Origin, RolloutOptions, UncertaintyOptions
@@ -77,7 +78,7 @@ class Problem:
     substeps : int or "auto"
         Grid steps between samples. "auto", the default, solves with one step; if this moves a
         parameter by more than half a standard error, the problem is solved again with as many steps
-        as needed, at most 8.
+        as needed, at most 8. Motions with obstacles have the number of `impact_steps` instead.
     explicit_grasps : bool, default False
         Whether prescribed displacements are constraints instead of bounds.
     huber : float, optional
@@ -270,10 +271,13 @@ class Problem:
         )
 
     def choose_first_substeps(self) -> int:
-        """Return the grid steps between samples in the first solve, and where nothing is solved: 1
-        for "auto".
+        """Return the grid steps between samples in the first solve, and where nothing is solved:
+        for "auto" those of `impact_steps`, 1 without obstacles.
         """
-        return 1 if self.substeps == "auto" else self.substeps
+        if self.substeps != "auto":
+            return self.substeps
+        fitted = (each for each in self.experiments if not each.validation)
+        return max(map(impact_steps, fitted), default=1)
 
     def collocation(self) -> Collocation:
         """Return a new nonlinear program of the problem, with `choose_first_substeps`."""

@@ -397,7 +397,8 @@ class TranscriptionSection(Section):
         Time discretisation: midpoint rule, second-order backward differences, or backward Euler.
     substeps : str
         Number of time steps between samples. "auto": one, or more (up to 8) if one step would
-        change a parameter by more than half a standard error.
+        change a parameter by more than half a standard error; in motions with obstacles as many
+        (up to 16) that the body moves in a step by at most the noise of its markers.
     explicit_grasps : bool
         Whether the positions of grasped nodes are constraints of the program (c^g in the paper)
         instead of bounds.

@@ -77,6 +77,10 @@ SUBSTEPS_NOTE = (
     "check assumes one time step per sample. If transcription.substeps is not given, solve uses "
     f"as many as the error bars require, up to {MOST_SUBSTEPS}"
 )
+IMPACT_NOTE = (
+    "check and solve use {} time steps per sample, because the body moves by several times the noise "
+    "of its markers from sample to sample and may strike an obstacle"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,7 +350,9 @@ def check_problem(
             "only the first samples of the recordings were simulated at the guess; check --full "
             f"simulates all of them, in about {total_s:.2g} s"
         )
-    notes += [SUBSTEPS_NOTE] * (problem.substeps == "auto" and bool(findings.motions))
+    if problem.substeps == "auto" and findings.motions:
+        steps = problem.choose_first_substeps()
+        notes.append(SUBSTEPS_NOTE if steps == 1 else IMPACT_NOTE.format(steps))
     findings = replace(findings, concerns=concerns)
     rests_on = scale_reference(
         problem.experiments, problem.parameters, problem.assumed_deviations["mass"]
