@@ -39,6 +39,9 @@ DECREASE = 1e-3
 # With impacts, the largest infeasibility of a trial over an edge of the mesh; other trials are
 # simulated. Where a body strikes or slips, forces change within a small part of any step.
 SMALL_IMPACT_STRAIN = 1e-4
+# With impacts, the largest decrease of the loss by a full step whose rejection ends the search as
+# converged: simulations repeat a loss to about 1e-9, and the step is within 1e-3 standard errors.
+INSIGNIFICANT = 1e-6
 # Infeasibility over the body's size that is due to rounding.
 FEASIBLE = 1e-12
 # Infeasibility over the body's size at which a search ends if steps no longer change the
@@ -418,7 +421,14 @@ class ReducedSearch:
                 previous = length
                 is_rough = not self._is_final_accuracy(self._accuracy_after(length))
                 continue
-            if is_short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
+            is_insignificant = (
+                self.has_impacts
+                and is_full_step
+                and point.loss - point.predicted_loss(step) <= INSIGNIFICANT
+            )
+            if (is_short or is_insignificant) and (
+                point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
+            ):
                 return Status.CONVERGED  # rounding keeps it from getting better
             if self.has_correspondences and length <= LEAST_DETERMINED_SHARE:
                 # The association changes the loss by more than such a step.

@@ -24,6 +24,7 @@ from kit.problems import (
     released_cube,
 )
 
+import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods.horizon import Horizon, Iterate
@@ -406,3 +407,35 @@ def test_timings_are_parts_of_the_whole():
 def test_nothing_is_printed(capfd):
     ReducedSpace()(cube())
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.long
+def test_the_search_for_the_constants_of_a_falling_block_converges():
+    t_s = np.arange(26) / 120
+    body = cs.Body(cs.box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), density_kg_m3=1000.0)
+    floor = cs.Obstacle(shape=cs.Plane((0, 0, 1), (0, 0, -0.05)), friction=0.3, name="floor")
+    unseen_m = np.zeros((26, len(body.nodes_m), 3))
+    fall = cs.Experiment(
+        body,
+        t_s,
+        [floor],
+        cs.Markers(t_s, unseen_m, 1e-3, places_m=body.nodes_m),
+        start="undeformed",
+        air_density_kg_m3="none",
+        nuisance=cs.Nuisance.none(),
+    )
+    truth = {"young_pa": 2e5, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.1}
+    tracks_m = cs.simulate(fall, truth, "bdf2", substeps=4).markers_m
+    tracks_m = tracks_m + 1e-3 * np.random.default_rng(1).normal(size=tracks_m.shape)
+    guesses = {
+        "young_pa": cs.Unknown(1e6),
+        "poisson": cs.Unknown(0.4),
+        "gamma_r_s": cs.Unknown(0.008),
+    }
+    problem = cs.Problem(
+        [cs.with_markers(fall, tracks_m)], truth | guesses, scheme="bdf2", substeps=4
+    )
+    found = cs.solve(problem)
+    assert found.status is Status.CONVERGED
+    assert found.iterations < 40
+    assert abs(np.log10(found.parameters["young_pa"] / 2e5)) < 0.05
