@@ -193,7 +193,11 @@ def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
         "kinds": [f"{test} ({_young_text(refits[test])})" for test in possible],
     }
     of = listed([f"'{each.name}'" for each in experiments])
-    code = "specimen-kind/likelier" if best >= LIKELIER else "specimen-kind/open"
+    # Where the law is wrong too, correlated residuals remain, and χ² does not tell the kinds apart.
+    is_noise = not any(
+        _is_correlated(row) for p in refits[possible[0]].parts for row in _residuals(p)
+    )
+    code = "specimen-kind/likelier" if best >= LIKELIER and is_noise else "specimen-kind/open"
     return [Hypothesis(code, of, data=data, strength=np.sqrt(stated_loss / min(loss.values())))]
 
 
