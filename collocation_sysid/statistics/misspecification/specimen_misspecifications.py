@@ -76,6 +76,8 @@ DECISIVE = 20.0
 # Decrease of χ², over that of one measurement, from which on one kind of test is likelier than
 # another: a ratio of likelihoods of e^5, which the wrong kind reaches in less than 1 of 100 tests.
 LIKELIER = 10.0
+# Standard deviations of χ² by which that of the stated kind must exceed its mean.
+UNLIKELY = 2.0
 # Samples of each specimen, and most iterations, of the fit that decides.
 DECIDING_SAMPLES = 60
 DECIDING_ITERATIONS = 30
@@ -197,7 +199,10 @@ def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
     is_noise = not any(
         _is_correlated(row) for p in refits[possible[0]].parts for row in _residuals(p)
     )
-    code = "specimen-kind/likelier" if best >= LIKELIER and is_noise else "specimen-kind/open"
+    freedom = max(1, count - stated.collocation.nq)
+    is_unlikely = stated_loss > freedom + UNLIKELY * np.sqrt(2 * freedom)
+    is_likelier = best >= LIKELIER and is_noise and is_unlikely
+    code = "specimen-kind/likelier" if is_likelier else "specimen-kind/open"
     return [Hypothesis(code, of, data=data, strength=np.sqrt(stated_loss / min(loss.values())))]
 
 
