@@ -56,11 +56,11 @@ BRAIN_FILES = tuple(each.format("corona_radiata") for each in BRAIN)
 SHEARED_FILES = tuple(f"Budday_2017_CSS_corona_radiata_lambda_{each}" for each in BRAIN_STRETCHES)
 CURVES = (
     *(
-        (f"Treloar, {KINDS[kind]} ²", (f"Treloar_1944_{kind}",), 1e6, 2e4, RUBBERS)
+        (f"Treloar, {KINDS[kind]}", (f"Treloar_1944_{kind}",), 1e6, 2e4, RUBBERS)
         for kind in ("PS", "ET")
     ),
     (
-        "Treloar, three tests ²",
+        "Treloar, three tests",
         ("Treloar_1944_UT", "Treloar_1944_PS", "Treloar_1944_ET"),
         1e6,
         1e4,
