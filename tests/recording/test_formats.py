@@ -224,6 +224,20 @@ def test_a_plain_wide_file_is_in_metres_unless_a_unit_is_stated(file):
     np.testing.assert_allclose(table.positions_m, TRACKS_M / 1000)
 
 
+@pytest.mark.parametrize("separator", [" ", ":", ".", "_"])
+@pytest.mark.parametrize("time", ["Time (Seconds)", "time (sec)", "t_s"])
+def test_a_plain_wide_file_has_the_headers_of_exports(file, separator, time):
+    header, rows = WIDE.split("\n", 1)
+    names = [name.rsplit("_", 1) for name in header.split(",")[1:]]
+    headers = [f"{marker}{separator}{axis.upper()} (mm)" for marker, axis in names]
+    numbered = "\n".join(f"{k},{row}" for k, row in enumerate(rows.splitlines()))
+    table = read_markers(file(f"Frame,{time},{','.join(headers)}\n{numbered}\n"))
+    expected = read_markers(file(WIDE))
+    assert table.names == expected.names
+    np.testing.assert_allclose(table.positions_m, expected.positions_m / 1000)
+    np.testing.assert_allclose(table.t_s, expected.t_s)
+
+
 @pytest.mark.parametrize("unit", ["Meters", "METRES", "m"])
 def test_units_are_spelled_in_many_ways(file, unit):
     table = read_markers(file(replaced(MOTIVE, "Millimeters", unit)))

@@ -2,14 +2,16 @@
 
 Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres. Long: t_s, marker, and x_m,
 y_m, z_m (or _cm, _mm, _in; or x, y, z and a given unit); a marker without a row at a time is
-missing there. In both, the unit may stand in brackets behind the names, as in "tip_x (mm)", a blank
-cell or NaN is a missing sample, and (0, 0, 0) is a measured place.
+missing there. In both, the unit may stand in brackets behind the names, as in "tip_x (mm)" or "tip X
+(mm)", a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place. A column "Frame" is
+ignored.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +20,15 @@ from ...errors import InputError, listed
 from ..sample_times import first_unordered_time
 from .raw_tracks import LabelChooser, RawTracks, tracks_of_table
 from .text import TextTable, numeric_cells, read_table
-from .units import METRES_PER_UNIT, length_unit_of_spelling
+from .units import METRES_PER_UNIT, length_unit_of_spelling, si_factor
 
 _BRACKETED = re.compile(r"(?P<name>.*?)\s*[(\[](?P<unit>[^()\[\]]+)[)\]]")
+# A column of a marker: the axis behind its name, as in "tip_x", "tip X" or "tip:x".
+_PLACE = re.compile(r"(?P<marker>.+?)[ .:_](?P<axis>[xyz])", re.IGNORECASE)
+# Columns without a measurement.
+_IGNORED = ("Frame", "frame")
+# Number of columns that messages list.
+_LISTED = 8
 # Names of columns of times in other units than seconds.
 _TIME_UNIT = re.compile(r"(?P<name>t|time)_(?P<unit>ms|msec|us|µs|min|minutes)", re.IGNORECASE)
 
@@ -50,10 +58,13 @@ def _without_bracketed_units(table: TextTable) -> tuple[TextTable, str | None]:
         parts = _BRACKETED.fullmatch(column) or _TIME_UNIT.fullmatch(column)
         name, stated = (column, "") if parts is None else (parts["name"], parts["unit"].strip())
         is_time = name.lower() in ("t", "time", "t_s")
+        if place := _PLACE.fullmatch(name):
+            name = f"{place['marker']}_{place['axis'].lower()}"
         is_place = name in ("x", "y", "z") or name[-2:] in ("_x", "_y", "_z")
         known = ("s", "sec") if is_time else METRES_PER_UNIT
-        unit = stated if is_time else length_unit_of_spelling(stated)
-        if stated and (is_time or is_place) and unit not in known:
+        unit = length_unit_of_spelling(stated)
+        is_known = si_factor(stated, "time") == 1.0 if is_time else unit in known
+        if stated and (is_time or is_place) and not is_known:
             raise table.error_at(
                 f"column {column} has the unit {stated}; expected one of {', '.join(known)}: convert "
                 f"its values{', then call it t_s' if is_time else ''}"
@@ -93,7 +104,7 @@ def _wide_labels(table: TextTable) -> list[str]:
     The columns are t_s and, for each marker, <name>_x, <name>_y and <name>_z, in any order and
     without a unit in their names.
     """
-    header = table.columns
+    header = [column for column in table.columns if column not in _IGNORED]
     labels = dict.fromkeys(
         column[:-2] for column in header if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
     )
@@ -105,15 +116,20 @@ def _wide_labels(table: TextTable) -> list[str]:
         "missing": [column for column in expected if column not in counts],
         "repeated": sorted(column for column, count in counts.items() if count > 1),
     }
-    faults = [f"{what} {', '.join(columns)}" for what, columns in faulty.items() if columns]
+    faults = [f"{what} {_first_columns(columns)}" for what, columns in faulty.items() if columns]
     if not faults and labels:
         return list(labels)
     raise InputError(
-        f"the columns are {', '.join(header)} ({'; '.join(faults) or 'no markers'}); expected t_s "
+        f"the columns are {_first_columns(header)} ({'; '.join(faults) or 'no markers'}); expected t_s "
         "and, for each marker, <name>_x, <name>_y, <name>_z; or a C3D, TRC, Qualisys TSV or Motive "
         "CSV file",
         where="line 1",
     )
+
+
+def _first_columns(columns: Sequence[str]) -> str:
+    more = len(columns) - _LISTED
+    return ", ".join(columns[:_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
