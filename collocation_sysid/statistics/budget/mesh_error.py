@@ -228,8 +228,8 @@ def _given_dofs(by_dof: sp.csr_array) -> tuple[NDArray[np.bool_], Index]:
     the given mesh (3n,) that of the finer one.
     """
     is_given = np.diff(by_dof.indptr) == 1
-    given = np.empty(by_dof.shape[1], dtype=np.int64)
     entries = by_dof.tocoo()
+    given = np.empty(int(entries.col.max()) + 1, dtype=np.int64)
     alone = is_given[entries.row]
     given[entries.col[alone]] = entries.row[alone]
     return is_given, given
