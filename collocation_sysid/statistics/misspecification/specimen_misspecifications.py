@@ -78,6 +78,9 @@ DECISIVE = 20.0
 LIKELIER = 10.0
 # Standard deviations of χ² by which that of the stated kind must exceed its mean.
 UNLIKELY = 2.0
+# Change of the logarithm of E from which on another kind of test is more than an error of the gauge
+# length: that of a dogbone between its grips is 10 % too long.
+LEAST_KIND_CHANGE = 0.2
 # Samples of each specimen, and most iterations, of the fit that decides.
 DECIDING_SAMPLES = 60
 DECIDING_ITERATIONS = 30
@@ -201,16 +204,21 @@ def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
     )
     freedom = max(1, count - stated.collocation.nq)
     is_unlikely = stated_loss > freedom + UNLIKELY * np.sqrt(2 * freedom)
-    is_likelier = best >= LIKELIER and is_noise and is_unlikely
+    change = abs(np.log(_young_pa(refits[possible[0]]) / _young_pa(stated)))
+    is_likelier = best >= LIKELIER and is_noise and is_unlikely and change > LEAST_KIND_CHANGE
     code = "specimen-kind/likelier" if is_likelier else "specimen-kind/open"
     return [Hypothesis(code, of, data=data, strength=np.sqrt(stated_loss / min(loss.values())))]
 
 
-def _young_text(solution: Solution) -> str:
-    """Return Young's modulus of small strain at a fit of specimens, with its unit."""
+def _young_pa(solution: Solution) -> float:
     body = solution.parts[0].transcription.body
     theta = body.theta_from_values(solution.parameters)
-    young_pa = max(float(engineering_constants(*lame)[0]) for lame in body.lame(theta).values())
+    return max(float(engineering_constants(*lame)[0]) for lame in body.lame(theta).values())
+
+
+def _young_text(solution: Solution) -> str:
+    """Return Young's modulus of small strain at a fit of specimens, with its unit."""
+    young_pa = _young_pa(solution)
     factor, unit = readable_stress([young_pa])
     return f"E = {factor * young_pa:.3g} {unit}"
 
