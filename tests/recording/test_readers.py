@@ -180,7 +180,7 @@ def test_columns_of_markers_not_asked_for_may_hold_anything(file):
         ("2,2,3", "2,2,3,3", ["line 4", "8 cells", "expected 7"]),
         ("base_z", "base_w", ["line 1", "unknown base_w", "missing base_z"]),
         ("base_x", "tip_x", ["line 1", "missing base_x", "repeated tip_x"]),
-        ("t_s", "frame", ["line 1", "unknown frame", "missing t_s"]),
+        ("t_s", "clock", ["line 1", "unknown clock", "missing t_s"]),
     ],
 )
 def test_a_bad_marker_file_is_named_by_its_line(file, found, replacement, words):
