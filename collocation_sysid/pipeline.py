@@ -25,6 +25,7 @@ from .methods.solution import Method, Solution, Status, Watch
 from .model.schemes import as_scheme
 from .problem import Problem
 from .program.collocation import Collocation
+from .recording.impact_steps import IMPACT_NOTE
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import simulate_experiments, step_error
 from .runs.mesh_resolution import estimate_mesh_error
@@ -276,10 +277,7 @@ def _with_problem_notes(answer: Run) -> Run:
     tests = one_kind_notes(problem.experiments, problem.parameters)
     impacts = ()
     if problem.substeps == "auto" and problem.choose_first_substeps() > 1:
-        impacts = (
-            f"{substeps} time steps per sample were used, because the body moves by several times "
-            "the noise of its markers from sample to sample and may strike an obstacle",
-        )
+        impacts = (IMPACT_NOTE.format(substeps),)
     return replace(answer, notes=(*rotations, *impacts, *tests, *answer.notes))
 
 

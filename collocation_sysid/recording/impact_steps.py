@@ -8,6 +8,11 @@ from .experiment import Experiment
 
 # Largest number of time steps per sample that is chosen for impacts.
 MOST_IMPACT_STEPS = 16
+# Note on this number.
+IMPACT_NOTE = (
+    "{} time steps per sample are used, because the body moves by several times the noise of its "
+    "markers from sample to sample and may strike an obstacle"
+)
 
 
 def impact_steps(experiment: Experiment) -> int:

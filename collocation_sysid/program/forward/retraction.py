@@ -33,7 +33,8 @@ from ...fem.body import Body
 ANCHOR = 1e-10
 # Largest logarithmic strain of an increment, far beyond those that are accepted.
 LARGEST_STRAIN = 20.0
-# Largest entry of the gradient of an increment.
+# Largest entry of the gradient of an increment: steps of a nearly singular matrix may be of any
+# length, and are halved later.
 LONGEST_STEP = 1e6
 
 
@@ -103,7 +104,6 @@ class Retraction:
         """
         deformation = self._deformation(x)
         relative = self._deformation(increment) @ np.linalg.inv(deformation)
-        # Steps of a singular matrix may be of any length; they are rejected or halved later.
         relative = np.nan_to_num(relative).clip(-LONGEST_STEP, LONGEST_STEP)
         strain = (relative + relative.transpose(0, 2, 1)) / 2
         spin = (relative - relative.transpose(0, 2, 1)) / 2
@@ -121,7 +121,6 @@ class Retraction:
 def _exponential(strain: Array) -> Array:
     """Return the exponentials of symmetric matrices (points, 3, 3)."""
     values, vectors = np.linalg.eigh(strain)
-    # Steps of a nearly singular matrix may be of any length; they are halved later.
     values = values.clip(-LARGEST_STRAIN, LARGEST_STRAIN)
     return (vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
 

@@ -3,8 +3,8 @@
 Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres. Long: t_s, marker, and x_m,
 y_m, z_m (or _cm, _mm, _in; or x, y, z and a given unit); a marker without a row at a time is
 missing there. In both, the unit may stand in brackets behind the names, as in "tip_x (mm)" or "tip X
-(mm)", a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place. A column "Frame" is
-ignored.
+(mm)", a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place. A column "Frame" of
+a wide table is ignored.
 """
 
 from __future__ import annotations

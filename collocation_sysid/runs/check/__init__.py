@@ -28,6 +28,7 @@ from ...problem import Problem
 from ...program.collocation import Collocation
 from ...program.lifted.lifted_collocation import lifted_count, with_lifted_variables
 from ...program.modes.stability import Instability, find_instabilities
+from ...recording.impact_steps import IMPACT_NOTE
 from ...statistics.assessment import rotation_step_concerns, stability_concerns
 from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.concerns import Concern
@@ -76,10 +77,6 @@ DERIVATIVE_TOLERANCE = 1e-6
 SUBSTEPS_NOTE = (
     "check assumes one time step per sample. If transcription.substeps is not given, solve uses "
     f"as many as the error bars require, up to {MOST_SUBSTEPS}"
-)
-IMPACT_NOTE = (
-    "check and solve use {} time steps per sample, because the body moves by several times the noise "
-    "of its markers from sample to sample and may strike an obstacle"
 )
 
 

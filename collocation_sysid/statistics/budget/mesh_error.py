@@ -122,9 +122,7 @@ def _effect(
     held[transcription.prescribed_dofs] = True
     is_given, given = _given_dofs(by_dof)
     moving = np.flatnonzero((abs(by_dof) @ ~held > 0) & (at.dynamics.is_static | ~is_given))
-    forces_n, moved_m = _forces_and_motion(at, dynamics, by_dof, moving)
-    if at.dynamics.is_static:
-        forces_n += _stiffness_products(at, moved_m[:, given])
+    forces_n = _equivalent_forces(at, dynamics, by_dof, moving, given)
     return Effect(force_n=at.pad_rows(forces_n - _forces_less_inertia(at.dynamics, iterate.x)))
 
 
@@ -134,11 +132,14 @@ def _forces_less_inertia(dynamics: Dynamics, x: Array) -> Array:
     return dynamics.force(x) - inertia_n[dynamics.first_row :]
 
 
-def _forces_and_motion(
-    at: ExperimentAtAnswer, dynamics: Dynamics, interpolation: sp.csr_array, moving: Index
-) -> tuple[Array, Array]:
-    """Return Iᵀ(F − M a − K e) (N − first row, 3n) [N] at the evaluations, and e of the finer mesh
-    (N − first row, 3m) [m].
+def _equivalent_forces(
+    at: ExperimentAtAnswer,
+    dynamics: Dynamics,
+    interpolation: sp.csr_array,
+    moving: Index,
+    given: Index,
+) -> Array:
+    """Return Iᵀ(F − M a − K e) + k e_g (N − first row, 3n) [N] at the evaluations.
 
     Parameters
     ----------
@@ -149,32 +150,36 @@ def _forces_and_motion(
         Matrix I.
     moving : (k,) array
         Dofs of the finer mesh of which e is sought.
+    given : (3n,) array
+        Dofs of the finer mesh that are those of the given mesh.
     """
     x = np.ascontiguousarray(at.iterate.x @ interpolation.T)
     unbalanced_n = _forces_less_inertia(dynamics, x)
     xi, nu = map(np.ascontiguousarray, dynamics.evaluation_states(x))
-    forces = _forces_by_row(dynamics, x)
-    given = zip(*at.dynamics.evaluation_states(at.iterate.x), strict=True)
+    given_xi, given_nu = map(np.ascontiguousarray, at.dynamics.evaluation_states(at.iterate.x))
     sequence = FactorSequence(
         Factoriser.cached(dynamics.pattern, moving),
         NodeRotation(moving, dynamics.pattern.size // 3),
         accuracy=ACCURACY,
     )
-    relative = np.zeros_like(xi)
-    parents = _forces_by_row(at.dynamics, at.iterate.x)
-    for k, (own, parent) in enumerate(zip(forces, parents, strict=True)):
+    relative = np.zeros((1, dynamics.pattern.size))
+    equivalent_n = np.zeros_like(given_xi)
+    rows = zip(_forces_by_row(dynamics, x), _forces_by_row(at.dynamics, at.iterate.x), strict=True)
+    for k, (forces, given_forces) in enumerate(rows):
         now = slice(k, k + 1)
-        stiffness = -_by_position(own, xi[now], nu[now])
+        stiffness = -forces.linearise(xi[now], nu[now]).by_position
         if dynamics.body.element.mean_dilatation:
-            stress_pa = np.repeat(parent.mean_stresses(*(each[None] for each in next(given))), 8)
-            stress_pa -= own.mean_stresses(xi[now], nu[now])
+            stress_pa = np.repeat(given_forces.mean_stresses(given_xi[now], given_nu[now]), 8)
+            stress_pa -= forces.mean_stresses(xi[now], nu[now])
             lagged = dynamics.body.volume_stiffness(xi[k], stress_pa)
-            stiffness += own.joint_pattern.expand(lagged[None])
+            stiffness += forces.joint_pattern.expand(lagged[None])
         system = ReusedFactor(sequence, Matrix(stiffness[0], NONE), points_m=xi[k].reshape(-1, 3))
-        guess = relative[max(0, k - 1), moving]
-        relative[k, moving] = system.solve(unbalanced_n[k, moving], guess=guess)
-        unbalanced_n[now] -= dynamics.pattern.products(stiffness, relative[now])
-    return unbalanced_n @ interpolation, relative
+        relative[0, moving] = system.solve(unbalanced_n[k, moving], guess=relative[0, moving])
+        unbalanced_n[now] -= dynamics.pattern.products(stiffness, relative)
+        if at.dynamics.is_static:
+            own = -given_forces.linearise(given_xi[now], given_nu[now]).by_position
+            equivalent_n[now] = at.dynamics.pattern.products(own, relative[:, given])
+    return equivalent_n + unbalanced_n @ interpolation
 
 
 def _forces_by_row(dynamics: Dynamics, x: Array) -> Iterator[Forces]:
@@ -182,22 +187,6 @@ def _forces_by_row(dynamics: Dynamics, x: Array) -> Iterator[Forces]:
     histories = dynamics.histories(x)
     for row in range(dynamics.first_row, dynamics.row_count):
         yield dynamics.forces_with_histories(histories, slice(row, row + 1))
-
-
-def _by_position(forces: Forces, xi: Array, nu: Array) -> Array:
-    """Return ∂F/∂ξ (1, m) [N/m]."""
-    return forces.linearise(xi, nu).by_position
-
-
-def _stiffness_products(at: ExperimentAtAnswer, moved_m: Array) -> Array:
-    """Return k e_g (N − first row, 3n) [N] of the given mesh with e_g (N − first row, 3n) [m]."""
-    products_n = np.empty_like(moved_m)
-    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
-    for k, forces in enumerate(_forces_by_row(at.dynamics, at.iterate.x)):
-        now = slice(k, k + 1)
-        stiffness = -_by_position(forces, xi[now], nu[now])
-        products_n[now] = at.dynamics.pattern.products(stiffness, moved_m[now])
-    return products_n
 
 
 def _interpolation(body: Body, finer: Body) -> sp.csr_array:

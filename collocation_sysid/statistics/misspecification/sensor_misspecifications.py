@@ -155,11 +155,8 @@ def _linear_mistakes(
     measured = sensor.measured_values
     t_s = sensor.sample_times_s
     used = np.flatnonzero(np.isfinite(measured).any(axis=0))
-    columns = [
-        np.broadcast_to(np.eye(len(each))[k] / each, measured.shape)
-        for each in (sensor.value_sigmas,)
-        for k in used
-    ]
+    units = np.diag(1 / sensor.value_sigmas)
+    columns = [np.broadcast_to(units[k], measured.shape) for k in used]
     zeros = np.zeros(measured.shape[1])
     zeros[used] = _amplitudes(fit, columns, own)
     whole = np.nanmean((origin.measured_values - measured)[:, used] + zeros[used], axis=0)
