@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from .program.collocation import Collocation
     from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
     from .recording import (
+        Camera,
         Capsule,
         Cuboid,
         CustomSensor,
@@ -86,6 +87,7 @@ __all__ = [
     "Ball",
     "Body",
     "Box",
+    "Camera",
     "Capsule",
     "Collocation",
     "Constant",

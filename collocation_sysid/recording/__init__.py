@@ -9,7 +9,7 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
   state them.
 - `loads`, `tendon`, `pressure`, `actuator`: point masses, forces, tendons and pressures.
 - `markers`, `placement`: tracked markers and where they sit on the body.
-- `depth_camera`: depth cameras and scanners.
+- `camera`: lenses and poses of cameras; `depth_camera`: depth cameras and scanners.
 - `custom_sensor`: custom sensors.
 - `measurement`: what all measurements have in common.
 - `nuisance`: unknowns of a single recording, with their priors.
@@ -29,6 +29,7 @@ part of its measurements, and `node_selection` checks selections of nodes.
 """
 
 from .alignment import align as align
+from .camera import Camera as Camera
 from .custom_sensor import CustomSensor as CustomSensor
 from .custom_sensor import FollowingSensor as FollowingSensor
 from .custom_sensor import Gauge as Gauge

@@ -15,26 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from ..common.array_types import Array
-from ..common.checked_arrays import float_array, read_only_floats, unconverted, unconverted_or_none
+from ..common.checked_arrays import float_array, read_only_floats, unconverted
 from ..common.checked_calls import checked
 from ..common.declarations import declaration, key
-from ..common.schema_tables import Vector
-from ..common.validated_types import AtLeastOne, Finite, Positive
+from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
+from .camera import Camera
 from .measurement import Measurement
 from .node_selection import Nodes, selection_from_section
-from .poses import PoseSequence
 from .sample_times import first_unordered_time
 
-MatrixRow = tuple[Finite, Finite, Finite, Finite]
-PoseMatrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
 # Relative difference of the depths of neighbouring pixels above which they show two surfaces.
 LARGEST_RELATIVE_JUMP = 0.02
-# Fixed-point iterations that invert the distortion; each gains two digits for usual lenses.
-UNDISTORTION_ITERATIONS = 12
-# Error of an inverted distortion above which the iteration counts as not converged [pixels].
-LARGEST_DISTORTION_ERROR_PX = 1.0
 # Points of a cloud nearer to the plane of a camera with a matrix have no viewing direction [m].
 LEAST_DEPTH_M = 1e-6
 # Largest number of images of a recording whose outlines are compared: they are stored in memory,
@@ -50,154 +43,8 @@ OUTLINE_SIGMA_PX = 0.5
 SPACING_FACTOR = 1.2
 
 Background = Literal["auto", "empty", "unknown"]
-
-
-def _require_poses(poses: PoseSequence) -> PoseSequence:
-    """Return `poses` unchanged; an `InputError` if it is no `PoseSequence`."""
-    if not isinstance(poses, PoseSequence):
-        raise InputError(f"poses of a camera is {type(poses).__name__}; expected a PoseSequence")
-    return poses
-
-
-@declaration
-class DepthCamera:
-    """A depth camera, or the frame of a scanner.
-
-    Parameters
-    ----------
-    matrix : (3, 3) array, optional
-        Matrix of the pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels; a cloud needs
-        no matrix. If a cloud has one, an offset and a scale error of the depth are estimated, and
-        surfaces that face away from the camera are not used.
-    distortion : sequence of up to five numbers
-        k1, k2, p1, p2, k3 of the model of Brown and Conrady.
-    pose : (4, 4) array
-        Transform from the frame of the camera to the world or, with `poses`, to the frame whose
-        poses these are (hand–eye transform).
-    poses : PoseSequence, optional
-        Motion of the frame that carries the camera; at rest by default.
-
-    Raises
-    ------
-    InputError
-        If the matrix is not that of a pinhole camera, or the pose is no rigid motion.
-    """
-
-    matrix: Array | None = key(
-        tuple[Vector, Vector, Vector] | None, converter=unconverted_or_none, default=None
-    )
-    distortion: Array = key(list[Finite], converter=unconverted, default=())
-    pose: Array = key(PoseMatrix | None, converter=unconverted, default=None)
-    poses: PoseSequence | None = key(converter=_require_poses, default=None)
-
-    def __post_init__(self) -> None:
-        """Check the camera, and store matrix, distortion and pose as read-only arrays, in place;
-        the pose is the identity by default.
-        """
-        pose = read_only_floats(np.eye(4) if self.pose is None else self.pose, (4, 4), name="pose")
-        turn = pose[:3, :3]
-        rigid = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0
-        if not rigid or not np.allclose(pose[3], [0, 0, 0, 1]):
-            raise InputError(
-                f"pose of a camera is {pose.tolist()}; expected a rigid motion "
-                "[[R, p], [0, 0, 0, 1]] from its frame to the world, in metres"
-            )
-        distortion = read_only_floats(self.distortion, (None,), name="distortion of a camera")
-        if len(distortion) > 5:
-            raise InputError(
-                f"distortion has {len(distortion)} numbers; expected k1, k2, p1, p2, k3"
-            )
-        vars(self).update(pose=pose, distortion=distortion)
-        if self.matrix is not None:
-            matrix = read_only_floats(self.matrix, (3, 3), name="matrix of a camera")
-            lower = matrix[[1, 2, 2, 2], [0, 0, 1, 2]]
-            if not (np.diag(matrix) > 0).all() or not np.allclose(lower, [0, 0, 0, 1]):
-                raise InputError(
-                    f"matrix of a camera is {matrix.tolist()}; expected "
-                    "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-                )
-            vars(self)["matrix"] = matrix
-
-    def require_matrix(self) -> Array:
-        """Return the matrix (3, 3) of the camera, which must have one."""
-        assert self.matrix is not None
-        return self.matrix
-
-    def pose_at(self, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Return rotations R (S, 3, 3) and translations p (S, 3) [m] from the camera's frame to the
-        world, x = R X + p, at times (S,) [s]; the same for all times if the camera does not move.
-
-        Raises
-        ------
-        InputError
-            If the poses of a moving camera do not cover a time, see `PoseSequence.at`.
-        """
-        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        rotation = self.pose[:3, :3]
-        translation = self.pose[:3, 3]
-        if self.poses is None:
-            return np.tile(rotation, (len(times), 1, 1)), np.tile(translation, (len(times), 1))
-        rotations, translations = self.poses.at(times)
-        return rotations @ rotation, rotations @ translation + translations
-
-    def points_at_unit_depth(self, pixels: Array) -> Array:
-        """Return the points (P, 3) at depth z = 1 in the camera's frame that appear at the pixels
-        (P, 2), u and v.
-
-        Distortion is inverted by `UNDISTORTION_ITERATIONS` steps of a fixed-point iteration. The
-        camera must have a matrix.
-
-        Raises
-        ------
-        InputError
-            If the iteration does not converge for a pixel.
-        """
-        rows = np.column_stack([pixels, np.ones(len(pixels))])
-        distorted = np.asarray(np.linalg.solve(self.require_matrix(), rows.T).T, dtype=np.float64)
-        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
-        undistorted = distorted[:, :2].copy()
-        for _ in range(UNDISTORTION_ITERATIONS if len(self.distortion) else 0):
-            x, y = undistorted.T
-            r2 = x**2 + y**2
-            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            across = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
-            down = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-            undistorted = (distorted[:, :2] - np.column_stack([across, down])) / radial[:, None]
-        points = np.column_stack([undistorted, np.ones(len(undistorted))])
-        off_px = np.abs(self.distorted_pixels(points) - pixels) if len(self.distortion) else 0.0
-        if not np.all(off_px <= LARGEST_DISTORTION_ERROR_PX):
-            raise InputError(
-                f"distortion of a camera is {self.distortion.tolist()}, which cannot be inverted "
-                "within the image; expected k1, k2, p1, p2, k3 of a calibration, in this order"
-            )
-        return points
-
-    def distorted_pixels(self, points_m: Array) -> Array:
-        """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, with
-        distortion.
-
-        At z = 1 this is the inverse of `points_at_unit_depth`. Points must be in front of the
-        camera, z > 0, and the camera must have a matrix.
-        """
-        x, y = (points_m[:, :2] / points_m[:, 2:]).T
-        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
-        r2 = x**2 + y**2
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        distorted = np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
-                y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
-                np.ones_like(x),
-            ]
-        )
-        return (self.require_matrix() @ distorted)[:2].T
-
-    def undistorted_pixels(self, points_m: Array) -> Array:
-        """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, without
-        distortion; points must have z > 0, and the camera a matrix.
-        """
-        projected = points_m @ self.require_matrix().T
-        return projected[:, :2] / projected[:, 2:]
+# A depth camera is a camera whose images are depths; the model of the depth is that of `Depth`.
+DepthCamera = Camera
 
 
 def _require_selection(faces: Selection | None) -> Selection | None:
@@ -235,7 +82,7 @@ class Depth(Measurement):
         NaN where missing. An empty cloud is a dropout. `Depth.of_images` makes clouds from images.
     sigma_m : float
         Standard deviation of the noise along the normal of the surface.
-    camera : DepthCamera
+    camera : Camera
     spacing_m : float
         Approximate distance to which the points are thinned, because the noise of neighbouring
         pixels is correlated.
@@ -276,7 +123,7 @@ class Depth(Measurement):
     t_s: Array = key(converter=unconverted)
     clouds: tuple[Array, ...] = key(converter=_unconverted_clouds)
     sigma_m: float = key(Positive)
-    camera: DepthCamera = key(default=DepthCamera())
+    camera: Camera = key(default=Camera())
     spacing_m: float = key(Positive, default=SPACING_M)
     gate_m: float = key(Positive, default=GATE_M)
     faces: Selection | None = key(
@@ -335,7 +182,7 @@ class Depth(Measurement):
         cls,
         name: str,
         images_m: ArrayLike,
-        camera: DepthCamera,
+        camera: Camera,
         sigma_m: float,
         t_s: ArrayLike = (0.0,),
         *,
@@ -356,7 +203,7 @@ class Depth(Measurement):
         name : str
         images_m : array_like
             Zero, negative or NaN where there is no depth.
-        camera : DepthCamera
+        camera : Camera
             Camera with a matrix.
         sigma_m : float
             Standard deviation of the depth [m].
@@ -500,7 +347,7 @@ def samples_with_outlines(count: int) -> set[int]:
     )
 
 
-def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
+def points_from_image(image_m: Array, camera: Camera) -> Array:
     """Return the points (P, 3) [m] in the camera's frame of a depth image (rows, columns) [m], by
     rows; zero, negative values and NaN are no depth.
 
@@ -535,14 +382,12 @@ _ImageSize = Annotated[AtLeastOne, Field(le=20_000)]
 
 
 @checked
-def depth_image(
-    camera: DepthCamera, shape: tuple[_ImageSize, _ImageSize], triangles_m: Array
-) -> Array:
+def depth_image(camera: Camera, shape: tuple[_ImageSize, _ImageSize], triangles_m: Array) -> Array:
     """Render a depth image [m] of opaque triangles, both sides of which are visible.
 
     Parameters
     ----------
-    camera : DepthCamera
+    camera : Camera
         Camera with a matrix; its distortion and pose are ignored.
     shape : (int, int)
         Rows and columns.

@@ -101,17 +101,18 @@ def distortion_coefficients(message: Any, rectified: bool) -> Array:
     Raises
     ------
     InputError
-        If the lens model is not that of Brown and Conrady with at most five coefficients.
+        If the lens model is not that of Brown and Conrady with at most eight coefficients.
     """
     coefficients = np.asarray(_field(message, "d"), dtype=float)
     if rectified or not coefficients.any():
         return np.zeros(0)
     kind = getattr(message, "distortion_model", "plumb_bob")
-    if kind != "plumb_bob" or len(coefficients) > 5:
+    most = {"plumb_bob": 5, "rational_polynomial": 8}.get(kind, -1)
+    if len(coefficients) > most:
         raise InputError(
             f"the camera info has the distortion model {kind} with {len(coefficients)} "
-            "coefficients; expected plumb_bob with at most five: use the topic of rectified "
-            "images, or state camera.distortion"
+            "coefficients; expected plumb_bob with at most five or rational_polynomial with eight: "
+            "use the topic of rectified images, or state camera.distortion"
         )
     return coefficients
 

@@ -1,0 +1,351 @@
+"""Calibrations of cameras in the files of other programs, recognised by their content.
+
+| program | form | keys |
+|---|---|---|
+| OpenCV | YAML with `%YAML:1.0`, JSON | `camera_matrix`, `distortion_coefficients`, `image_width` |
+| ROS `camera_info` | YAML | `camera_matrix`, `distortion_model`; messages `k`, `d`, `width` |
+| Kalibr | YAML | `cam0`: `intrinsics`, `distortion_model`, `resolution` |
+| Anipose | TOML | `[cam_0]`: `name`, `matrix`, `distortions`, `rotation`, `translation` |
+| COLMAP | text `cameras.txt` | `CAMERA_ID MODEL WIDTH HEIGHT PARAMS` |
+
+Poses are those of Anipose alone, in the unit of length in which its board was measured: Kalibr states
+poses of cameras relative to each other, and the world of COLMAP has no scale.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array
+from ...common.files import require_size
+from ...errors import InputError, listed
+from ..camera import Lens
+
+# Largest size of a file [bytes]: far more than the cameras of a laboratory need.
+LARGEST_BYTES = 1_000_000
+# Names of a quantity in files of OpenCV and ROS, in lower case without underscores.
+MATRIX_KEYS = ("cameramatrix", "matrix", "mtx", "intrinsicmatrix", "k", "m1", "m")
+DISTORTION_KEYS = (
+    "distortioncoefficients",
+    "distcoeffs",
+    "distcoeff",
+    "distortion",
+    "distortions",
+    "dist",
+    "d",
+    "d1",
+)
+WIDTH_KEYS = ("imagewidth", "width", "w")
+HEIGHT_KEYS = ("imageheight", "height", "h")
+SIZE_KEYS = ("imagesize", "size", "resolution", "imgsize")
+# Lenses by the name of the model in a file, in lower case.
+LENSES: dict[str, Lens] = {
+    "plumb_bob": "pinhole",
+    "rational_polynomial": "pinhole",
+    "radtan": "pinhole",
+    "none": "pinhole",
+    "": "pinhole",
+    "equidistant": "fisheye",
+    "equi": "fisheye",
+    "fisheye": "fisheye",
+    "kannala_brandt": "fisheye",
+}
+# Models of COLMAP: indices of fx, fy, cx, cy among the parameters, and where those of the
+# distortion go in the order of OpenCV.
+COLMAP_MODELS: dict[str, tuple[tuple[int, int, int, int], tuple[int, ...], Lens]] = {
+    "SIMPLE_PINHOLE": ((0, 0, 1, 2), (), "pinhole"),
+    "PINHOLE": ((0, 1, 2, 3), (), "pinhole"),
+    "SIMPLE_RADIAL": ((0, 0, 1, 2), (3,), "pinhole"),
+    "RADIAL": ((0, 0, 1, 2), (3, 4), "pinhole"),
+    "OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7), "pinhole"),
+    "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11), "pinhole"),
+    "OPENCV_FISHEYE": ((0, 1, 2, 3), (4, 5, 6, 7), "fisheye"),
+}
+# COLMAP counts pixels from the corner of the image, OpenCV from the centre of the first pixel.
+CORNER_OF_PIXEL = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Calibration of one camera.
+
+    Attributes
+    ----------
+    name : str
+        Name in the file; "" without one.
+    matrix : (3, 3) array
+    distortion : (k,) array
+        In the order of OpenCV.
+    model : {"pinhole", "fisheye"}
+    size_px : (int, int) or None
+        Columns and rows of the images; None if the file does not state them.
+    pose : (4, 4) array or None
+        Transform from the camera to the world of the file; None if it states none.
+    """
+
+    name: str
+    matrix: Array
+    distortion: Array
+    model: Lens = "pinhole"
+    size_px: tuple[int, int] | None = None
+    pose: Array | None = None
+
+
+def read_calibration(path: str | Path, camera: str | None = None) -> Calibration:
+    """Read the calibration of one camera.
+
+    Parameters
+    ----------
+    path : path
+    camera : str, optional
+        Name or number of the camera in a file of several; not needed for a file of one.
+
+    Raises
+    ------
+    InputError
+        If the file is not recognised, a key is missing or has another form, or the file has several
+        cameras and none is chosen. The message names file and key.
+    """
+    file = Path(path)
+    require_size(file, LARGEST_BYTES)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"cannot be read as text ({error}); expected a calibration of OpenCV, ROS, Kalibr, "
+            "Anipose or COLMAP",
+            where=str(file),
+        ) from error
+    cameras = _cameras_of(text, file)
+    if camera is None and len(cameras) == 1:
+        return cameras[0]
+    chosen = [c for k, c in enumerate(cameras) if camera in (c.name, str(k))]
+    if len(chosen) == 1:
+        return chosen[0]
+    names = listed([c.name or str(k) for k, c in enumerate(cameras)])
+    found = "several cameras" if camera is None else f"no camera {camera!r}"
+    raise InputError(f"found {found}; expected the name of one of {names}", where=str(file))
+
+
+def _cameras_of(text: str, file: Path) -> list[Calibration]:
+    if _is_colmap(text):
+        return _colmap_cameras(text, file)
+    content = _parsed(text, file)
+    cameras = {
+        key: each
+        for key, each in content.items()
+        if isinstance(each, Mapping) and {"intrinsics", "distortions"} & each.keys()
+    }
+    if any("intrinsics" in each for each in cameras.values()):
+        return [_kalibr_camera(key, each, file) for key, each in cameras.items()]
+    if cameras:
+        return [_anipose_camera(key, each, file) for key, each in cameras.items()]
+    return [_opencv_camera(content, file)]
+
+
+def _parsed(text: str, file: Path) -> Mapping[str, Any]:
+    """Return the table of a TOML, JSON or YAML file."""
+    # OpenCV writes a directive and tags that other readers of YAML refuse.
+    plain = re.sub(r"^%YAML[: ][^\n]*\n", "", text.lstrip("\ufeff")).replace("!!opencv-matrix", "")
+    readers: tuple[Callable[[str], Any], ...] = (json.loads, tomllib.loads, yaml.safe_load)
+    for read in readers:
+        try:
+            content = read(plain)
+        except (ValueError, yaml.YAMLError, RecursionError):
+            continue
+        if isinstance(content, Mapping):
+            return content
+    raise InputError(
+        "found neither YAML, JSON, TOML nor cameras.txt; expected a calibration of OpenCV, ROS, "
+        "Kalibr, Anipose or COLMAP",
+        where=str(file),
+    )
+
+
+def _numbers(value: Any, file: Path, key: str) -> Array:
+    """Return a list of numbers, or a matrix of OpenCV and ROS (a table with `data`), as an array."""
+    data = value.get("data") if isinstance(value, Mapping) else value
+    try:
+        numbers = np.asarray(data, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if not np.isfinite(numbers).all():
+        raise InputError(f"found {value!r}; expected numbers", where=f"{file}: {key}")
+    return numbers
+
+
+def _matrix(value: Any, file: Path, key: str) -> Array:
+    numbers = _numbers(value, file, key)
+    if numbers.size != 9:
+        raise InputError(
+            f"found {numbers.size} numbers; expected the nine of a camera matrix",
+            where=f"{file}: {key}",
+        )
+    return numbers.reshape(3, 3)
+
+
+def _coefficients(numbers: Array, model: Lens, file: Path, key: str) -> Array:
+    """Return distortion coefficients (k,), without zeros beyond those that the model has."""
+    flat = numbers.ravel()
+    most = 4 if model == "fisheye" else 8
+    if flat[most:].any():
+        raise InputError(
+            f"found {len(flat)} coefficients; expected at most {most} that are not zero: those of "
+            "thin prisms and tilted sensors are not supported",
+            where=f"{file}: {key}",
+        )
+    flat = flat[:most]
+    if model == "pinhole" and len(flat) > 5:
+        return np.append(flat, np.zeros(8 - len(flat))) if flat[5:].any() else flat[:5]
+    return flat
+
+
+def _lens(name: Any, file: Path, key: str) -> Lens:
+    lens = LENSES.get(str(name or "").lower())
+    if lens is None:
+        known = listed([repr(each) for each in LENSES if each])
+        raise InputError(f"found {name!r}; expected one of {known}", where=f"{file}: {key}")
+    return lens
+
+
+def _value(content: Mapping[str, Any], names: tuple[str, ...]) -> tuple[str, Any]:
+    """Return key and value of the first of some names that a table has; "" and None for none."""
+    plain = {re.sub(r"[_\s-]", "", str(key)).lower(): key for key in content}
+    found = next((plain[name] for name in names if name in plain), None)
+    return ("", None) if found is None else (str(found), content[found])
+
+
+def _size(content: Mapping[str, Any], file: Path) -> tuple[int, int] | None:
+    width_key, width = _value(content, WIDTH_KEYS)
+    _, height = _value(content, HEIGHT_KEYS)
+    size_key, size = _value(content, SIZE_KEYS)
+    if width is None or height is None:
+        if size is None:
+            return None
+        numbers = _numbers(size, file, size_key)
+    else:
+        numbers = _numbers([width, height], file, width_key)
+    if numbers.shape != (2,) or (numbers < 1).any():
+        raise InputError(
+            f"found {numbers.tolist()}; expected columns and rows of the images",
+            where=f"{file}: {size_key or width_key}",
+        )
+    return int(numbers[0]), int(numbers[1])
+
+
+def _opencv_camera(content: Mapping[str, Any], file: Path) -> Calibration:
+    """Return the camera of a file of OpenCV or ROS."""
+    matrix_key, matrix = _value(content, MATRIX_KEYS)
+    if matrix is None:
+        raise InputError(
+            f"found the keys {listed(list(map(str, content))) or 'none'}; expected the matrix of a "
+            "camera as camera_matrix or K, or the cameras of Kalibr or Anipose",
+            where=str(file),
+        )
+    model_key, model = _value(content, ("distortionmodel", "cameramodel", "model"))
+    lens = _lens(model, file, model_key)
+    if content.get("fisheye") is True:
+        lens = "fisheye"
+    key, distortion = _value(content, DISTORTION_KEYS)
+    numbers = np.zeros(0) if distortion is None else _numbers(distortion, file, key)
+    name = _value(content, ("cameraname", "name"))[1]
+    return Calibration(
+        str(name or ""),
+        _matrix(matrix, file, matrix_key),
+        _coefficients(numbers, lens, file, key),
+        lens,
+        _size(content, file),
+    )
+
+
+def _kalibr_camera(name: str, content: Mapping[str, Any], file: Path) -> Calibration:
+    key = f"{name}.intrinsics"
+    kind = content.get("camera_model", "pinhole")
+    if kind != "pinhole":
+        raise InputError(
+            f'found {kind!r}; expected "pinhole"', where=f"{file}: {name}.camera_model"
+        )
+    intrinsics = _numbers(content.get("intrinsics"), file, key)
+    if intrinsics.shape != (4,):
+        raise InputError(
+            f"found {intrinsics.size}; expected fu, fv, pu, pv", where=f"{file}: {key}"
+        )
+    fu, fv, pu, pv = intrinsics.tolist()
+    lens = _lens(content.get("distortion_model"), file, f"{name}.distortion_model")
+    key = f"{name}.distortion_coeffs"
+    numbers = _numbers(content.get("distortion_coeffs", ()), file, key)
+    return Calibration(
+        name,
+        np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1]]),
+        _coefficients(numbers, lens, file, key),
+        lens,
+        _size(content, file),
+    )
+
+
+def _anipose_camera(key: str, content: Mapping[str, Any], file: Path) -> Calibration:
+    """Return a camera of Anipose, whose rotation and translation are from world to camera."""
+    lens: Lens = "fisheye" if content.get("fisheye") else "pinhole"
+    distortion = _numbers(content["distortions"], file, f"{key}.distortions")
+    pose = None
+    if {"rotation", "translation"} <= content.keys():
+        turn = _numbers(content["rotation"], file, f"{key}.rotation")
+        shift = _numbers(content["translation"], file, f"{key}.translation")
+        if turn.shape != (3,) or shift.shape != (3,):
+            raise InputError(
+                "found other than three numbers; expected a rotation vector and a translation",
+                where=f"{file}: {key}.rotation",
+            )
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix().T
+        pose[:3, 3] = -pose[:3, :3] @ shift
+    return Calibration(
+        str(content.get("name", key)),
+        _matrix(content.get("matrix"), file, f"{key}.matrix"),
+        _coefficients(distortion, lens, file, f"{key}.distortions"),
+        lens,
+        _size(content, file),
+        pose,
+    )
+
+
+def _is_colmap(text: str) -> bool:
+    lines = [line for line in text.splitlines() if line.strip() and line[:1] != "#"]
+    return bool(lines) and all(
+        re.match(rf"\s*\d+\s+({'|'.join(COLMAP_MODELS)}|[A-Z_]+)\s+\d+\s+\d+\s", f"{line} ")
+        for line in lines
+    )
+
+
+def _colmap_cameras(text: str, file: Path) -> list[Calibration]:
+    cameras = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        name, kind, width, height, *rest = words
+        where = f"{file}: line {number}"
+        if kind not in COLMAP_MODELS:
+            raise InputError(f"found {kind}; expected one of {listed(COLMAP_MODELS)}", where=where)
+        (fx, fy, cx, cy), places, lens = COLMAP_MODELS[kind]
+        parameters = _numbers(rest, file, f"line {number}")
+        if len(parameters) != max(fx, fy, cx, cy, *places) + 1:
+            raise InputError(
+                f"found {len(parameters)} parameters; expected those of {kind}", where=where
+            )
+        matrix = np.eye(3)
+        matrix[0, 0], matrix[1, 1] = parameters[fx], parameters[fy]
+        matrix[:2, 2] = parameters[[cx, cy]] - CORNER_OF_PIXEL
+        coefficients = parameters[list(places)]
+        cameras.append(Calibration(name, matrix, coefficients, lens, (int(width), int(height))))
+    return cameras
