@@ -7,9 +7,14 @@ resembles a drift.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
+
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.time_dependence import at_times
+from ..errors import listed
 from .experiment import Experiment
 from .specimen import STRESS_NAME
 from .specimen_checks import cycle_starts
@@ -78,6 +83,37 @@ def unloading_difference(experiment: Experiment) -> float | None:
     return difference / mean if mean else None
 
 
+def loading_branch(experiment: Experiment, most_samples: int) -> Experiment | None:
+    """Return a test on a bench with the samples of the loading branch of its last cycle alone, every
+    k-th of them if there are more than `most_samples`.
+
+    None for any other experiment, and if the branch has fewer than `FEWEST_SAMPLES` samples.
+    """
+    travel_m = bench_travel(experiment) if experiment.is_static else None
+    if travel_m is None:
+        return None
+    axis = int(np.argmax(np.ptp(travel_m, axis=0)))
+    branch = loading_rows(np.abs(travel_m[:, axis] - travel_m[0, axis]))
+    every = -(-(branch.stop - branch.start) // most_samples)
+    rows = np.arange(branch.stop - 1, branch.start - 1, -every)[::-1]  # the peak is kept
+    if len(rows) < FEWEST_SAMPLES:
+        return None
+    is_kept = np.isin(np.arange(len(experiment.t_s)), rows)
+    return replace(
+        experiment, t_s=experiment.t_s[rows], markers=at_times(experiment.markers, is_kept)
+    )
+
+
+def branch_differences(experiments: Iterable[Experiment]) -> str:
+    """Return the clear differences of unloading and loading as text, such as "-12 % in 'press'"; ""
+    if there are none.
+    """
+    differences = {each.name: unloading_difference(each) for each in experiments}
+    return listed(
+        [f"{100 * d:+.2g} % in '{name}'" for name, d in differences.items() if d is not None]
+    )
+
+
 def _specimen_curve(experiment: Experiment) -> tuple[Array, Array, float] | None:
     """Return size of the strain (T,), stress (T,) [Pa] and its σ; None without a stress of each."""
     sensors = [each for each in experiment.readings if each.name == STRESS_NAME]
@@ -89,7 +125,8 @@ def _specimen_curve(experiment: Experiment) -> tuple[Array, Array, float] | None
 
 def _bench_curve(experiment: Experiment) -> tuple[Array, Array, float] | None:
     """Return size of the displacement (S,) [m], force along it (S,) [N] and its σ, of the part that
-    is modelled; None without a force in a static test along a line.
+    is modelled, both from their first values on, because a force may contain a weight; None without
+    a force in a static test along a line.
     """
     travel_m = bench_travel(experiment) if experiment.is_static else None
     if travel_m is None:
@@ -100,7 +137,9 @@ def _bench_curve(experiment: Experiment) -> tuple[Array, Array, float] | None:
         return None
     moved_m = np.abs(travel_m[:, axis] - travel_m[0, axis])
     at_sensor_m = np.interp(sensors[0].t_s, experiment.t_s, moved_m)
-    return at_sensor_m, sensors[0].values[:, axis], float(sensors[0].value_sigmas[axis])
+    load_n = sensors[0].values[:, axis]
+    measured_n = load_n[np.isfinite(load_n)]
+    return at_sensor_m, load_n - measured_n[:1].sum(), float(sensors[0].value_sigmas[axis])
 
 
 def bench_travel(experiment: Experiment) -> Array | None:

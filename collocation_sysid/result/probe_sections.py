@@ -110,9 +110,16 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
     concerns = result.trust.concerns
     if not result.budget or not is_routine(result):
         return False
-    if any(concern.topic in FIRST_TO_CORRECT for concern in concerns):
+    if is_first_to_correct(result):
         return False
     return any(concern.code in EXPLICABLE_CONCERNS for concern in concerns)
+
+
+def is_first_to_correct(result: Result) -> bool:
+    """Return whether the verdict has a reason that is to be corrected before assumptions are relaxed:
+    the description, or the search.
+    """
+    return any(concern.topic in FIRST_TO_CORRECT for concern in result.trust.concerns)
 
 
 def _shown_estimates(result: Result) -> list[str]:

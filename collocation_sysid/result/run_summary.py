@@ -20,6 +20,7 @@ from .precision_sentences import alternative_sentences
 from .probe_sections import (
     STIFFNESS_NAMES,
     is_deeper_check_worthwhile,
+    is_first_to_correct,
     is_routine,
     probe_lines,
     probe_section,
@@ -102,13 +103,15 @@ def next_step(result: Result, folder: Path, solve_command: str) -> str:
 def _brief(result: Result) -> list[Shown]:
     outcome = [] if result.converged else [outcome_section(result)]
     probes = probe_lines(result)
-    if is_routine(result) and not any(probe.sentences for probe in result.probes):
+    is_found = any(probe.sentences for probe in result.probes)
+    # A mistake of the description or the search is corrected before an assumption is relaxed.
+    if is_routine(result) and (not is_found or is_first_to_correct(result)):
         probes = []
     sections = (*outcome, verdict_section(result.trust))
     return [
         *flattened_parts(sections),
         *remedy_command(result.trust.concerns),
-        *(Line(note, "quiet") for note in result.notes if note == NO_CAUSE),
+        *(Line(note, "quiet") for note in result.notes if note.startswith(NO_CAUSE)),
         *_estimates(result),
         *_limit(result),
         *alternative_sentences(result),

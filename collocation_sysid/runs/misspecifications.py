@@ -14,10 +14,12 @@ from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 from ..statistics.misspecification.specimen_misspecifications import find_specimen_misspecifications
 
 # Note on tests of hypotheses without a result.
-NO_CAUSE = (
-    "possible causes of the misfit were tested (clock, slip in the grasp, gravity, layer of the "
-    "grasp): none explains it"
-)
+NO_CAUSE = "possible causes of the misfit were tested: none explains it"
+# The same for tests on benches and for motions.
+TESTED = {
+    True: "hysteresis, layer of the grasp, sensors, the law of the material",
+    False: "clock, slip in the grasp, gravity, layer of the grasp, sensors, the laws of the material",
+}
 
 
 def find_misspecifications(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
@@ -54,4 +56,7 @@ def cause_notes(solution: Solution, causes: Sequence[Hypothesis]) -> tuple[str, 
     """
     if causes:
         return tuple(each.message for each in causes if each.is_open)
-    return (NO_CAUSE,) if measurements_miss(solution) else ()
+    if not measurements_miss(solution):
+        return ()
+    is_static = all(each.experiment.is_static for each in solution.collocation.transcriptions)
+    return (f"{NO_CAUSE} ({TESTED[is_static]})",)

@@ -21,7 +21,6 @@ from ..statistics.assessment import (
     clock_concerns,
     fit_concerns,
     forward_simulation_concerns,
-    hysteresis_concerns,
     nuisance_concerns,
     onset_concerns,
     outlier_share_concerns,
@@ -91,7 +90,6 @@ def solution_concerns(
     if uncertainty is not None:
         experiments = [each.experiment for each in solution.collocation.transcriptions]
         misfits = fit_concerns(uncertainty, budgeted and budgeted.basis)
-        yield from hysteresis_concerns(experiments, misfits)
         yield from as_specimen_concerns(
             [*misfits, *parameter_concerns(uncertainty, solution.collocation.parameters)],
             experiments,

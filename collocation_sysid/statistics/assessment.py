@@ -21,7 +21,7 @@ from ..model.parameters import Parameters, is_default_bound
 from ..program.modes.stability import Instability
 from ..recording.experiment import Experiment
 from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
-from ..recording.hysteresis import unloading_difference
+from ..recording.hysteresis import branch_differences
 from ..recording.nuisance import NuisanceRow, in_readable_unit
 from .budget.discretisation_error import Refinement
 from .budget.uncertainty_budget import source_label
@@ -439,36 +439,13 @@ def _hysteresis_text(experiments: Iterable[Experiment]) -> str:
     """Return the addition to a message on a drift of the stiffness that names the specimens whose
     branches differ clearly, with the remedy; "" if there are none.
     """
-    sizes = _branch_differences(experiments)
+    sizes = branch_differences(experiments)
     if not sizes:
         return ""
     return (
         f"; hysteresis resembles such a drift: the stress in unloading differs from that in "
         f'loading by {sizes}. To fit the loading alone, set branch = "loading"'
     )
-
-
-def _branch_differences(experiments: Iterable[Experiment]) -> str:
-    """Return the clear differences of unloading and loading as text; "" if there are none."""
-    differences = {each.name: unloading_difference(each) for each in experiments}
-    return listed(
-        [f"{100 * d:+.2g} % in '{name}'" for name, d in differences.items() if d is not None]
-    )
-
-
-def hysteresis_concerns(
-    experiments: Sequence[Experiment], misfits: Iterable[Concern]
-) -> list[Concern]:
-    """Return one concern, as a list, if the fit has misfits of `WITHIN_BUDGET`, and loading and
-    unloading of bodies on a bench differ clearly; else empty. Its grade is that of these misfits,
-    whose cause it is. Specimens name theirs with a drift of the stiffness, see `probe_concerns`.
-    """
-    grades = {each.grade for each in misfits if each.code in WITHIN_BUDGET}
-    if not grades:
-        return []
-    sizes = _branch_differences(each for each in experiments if each.specimen is None)
-    is_doubtful = "doubtful" in grades
-    return concern_if(bool(sizes), is_doubtful, code="residuals/hysteresis", sizes=sizes)
 
 
 def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:

@@ -116,6 +116,9 @@ TOPICS: dict[str, Topic] = {
             "markers.labels or reference_m",
             "markers-exchanged/later": "the names of markers are exchanged {when}: {names}; "
             "correct them there, or remove these samples",
+            "hysteresis": "the force in unloading differs from that in loading by {sizes}, and an elastic "
+            "law is fitted between both branches: this is hysteresis of the material. To fit the loading "
+            "alone, end window_s at the largest displacement",
             "law": "the material deforms by another law than stated, such as {material}: compare laws "
             "with compare-models --materials",
             "law/damping": "the material is damped by another law than stated, such as {damping}: "
@@ -249,9 +252,6 @@ TOPICS: dict[str, Topic] = {
             "persist": "the residuals are not independent noise: consecutive samples are "
             "correlated (autocorrelation {autocorrelation:.2f}). The model or the description of "
             "the experiment lacks an effect: look at the residuals over time",
-            "hysteresis": "the force in unloading differs from that in loading by {sizes}: this is "
-            "hysteresis, and the elastic law is fitted between both branches. To fit the loading "
-            "alone, end window_s at the largest displacement",
             "shared": "the residuals are not independent noise: they are correlated between "
             "markers or axes. The model or the description of the experiment lacks an effect: "
             "look at the residuals over time",

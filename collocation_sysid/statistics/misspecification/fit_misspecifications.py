@@ -28,6 +28,8 @@ from ...program.collocation import ExperimentIterate
 from ...program.modes.modal_prediction import DeclaredMotion
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
+from ...recording.hysteresis import branch_differences, loading_branch, unloading_difference
+from ...recording.measurement_selection import measured_count
 from ...recording.nuisance import GRASP_SHIFT, GRASP_TURN, TILT, TIME
 from ...recording.poses import PoseSequence
 from ..distributions import normal_isf
@@ -200,8 +202,11 @@ def _refit_hypotheses(
     is_far = max(map(_pose_deviation, solution.parts)) > FAR
     bodies = [*screened_bodies(solution, first, is_far=is_far)]
     alone.near_answer.update(each.corrected for each in bodies)
+    # The first samples may end before the unloading: the complete fit is what must improve.
+    whole = replace(trial, misfit=discrepancy)
     tested = [
         *sensors,
+        *whole.accepted(_hysteresis_hypotheses(solution, experiment)),
         *trial.accepted(
             [
                 *lags,
@@ -298,6 +303,19 @@ def _grasp_layer_hypotheses(declared: Experiment, of: str) -> Iterator[Hypothesi
             yield Hypothesis("grasp-layer", of, data={"deep": deep}, corrected=layered)
 
 
+def _hysteresis_hypotheses(solution: Solution, declared: Experiment) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that the material unloads below its loading curve, if the branches of
+    an experiment on a bench differ so; `corrected` is its loading branch.
+
+    The message has the differences of all experiments on a bench that are fitted.
+    """
+    branch = loading_branch(declared, MOST_SAMPLES)
+    if branch is not None and (unloading_difference(declared) or 0.0) < 0.0:
+        fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
+        sizes = branch_differences(each for each in fitted if not each.specimen)
+        yield Hypothesis("hysteresis", data={"sizes": sizes}, corrected=branch)
+
+
 def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator[Hypothesis]:
     """Yield the hypothesis that the marker whose residuals change most abruptly slipped;
     `corrected` is the experiment without it.
@@ -388,11 +406,16 @@ class _Refitter:
         return None if fitted is None else _discrepancy(fitted) * float(np.sqrt(share))
 
     def loss_after_refit(self, corrected: Experiment | LinearCorrection) -> float:
-        """Return the loss with priors after a refit, or with a linear correction; infinite if there
-        is no fit.
+        """Return the loss with priors after a refit, or with a linear correction, with the expected
+        loss of measurements that the corrected experiment leaves out; infinite if there is no fit.
         """
         fitted, share = self._fit_and_share(corrected)
-        return np.inf if fitted is None else fitted.history[-1].loss * share
+        if fitted is None:
+            return np.inf
+        loss = fitted.history[-1].loss * share
+        if isinstance(corrected, Experiment):  # what it leaves out counts as noise
+            loss += measured_count(self.declared) - measured_count(corrected)
+        return loss
 
     def _fit_and_share(
         self, corrected: Experiment | LinearCorrection
