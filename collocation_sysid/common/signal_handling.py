@@ -19,19 +19,21 @@ from typing import NoReturn
 COMMAND = "collocation-sysid"
 # Name of a thread that is left in a library's code, which no signal reaches.
 ABANDONED_THREAD = "left behind"
-# File of the frames of an import.
-IMPORTING = "<frozen importlib._bootstrap>"
+# Files in whose functions an exception may be lost: the importer, and the wrappers of CasADi, whose
+# conversions of arguments call functions of Python and clear their errors.
+LOSING = ("<frozen importlib._bootstrap>", os.path.join("casadi", "casadi.py"))
 # Time after which a deferred signal tries again [s]: a person does not notice it.
 RETRY_S = 0.05
 
 
 class Interrupts:
-    """Handler of signals that raises `KeyboardInterrupt`, but not within imports and `deferred`.
+    """Handler of signals that raises `KeyboardInterrupt`, but not within imports, functions of CasADi
+    and `deferred`.
 
-    Libraries convert an exception within their imports into an error of their own. There the first
-    signal is deferred until the import has ended: it is sent again every `RETRY_S`. A second signal
-    in this time raises at once. At the end of a `deferred` block `KeyboardInterrupt` is raised if a
-    signal came meanwhile.
+    Libraries convert an exception within their imports into an error of their own, and CasADi drops
+    one within its conversions. There the first signal is deferred until the import or the function
+    has ended: it is sent again every `RETRY_S`. A second signal in this time raises at once. At the
+    end of a `deferred` block `KeyboardInterrupt` is raised if a signal came meanwhile.
     """
 
     def __init__(self) -> None:
@@ -42,11 +44,11 @@ class Interrupts:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise `KeyboardInterrupt`, or defer the signal if `frame`, which it interrupted, is
-        within an import or a `deferred` block.
+        within an import, a function of CasADi or a `deferred` block.
         """
         is_second = self._timer is not None and not self._tries_again
         self._tries_again = False
-        if not is_second and (self._deferring or _is_importing(frame)):
+        if not is_second and (self._deferring or _is_losing(frame)):
             self._repeat(number)
             return
         self.forget()
@@ -166,10 +168,10 @@ def leave(code: object) -> NoReturn:
     os._exit(code if isinstance(code, int) else 1)
 
 
-def _is_importing(frame: FrameType | None) -> bool:
-    """Return whether a frame, or one that called it, is of an import."""
+def _is_losing(frame: FrameType | None) -> bool:
+    """Return whether a frame, or one that called it, is of the files `LOSING`."""
     while frame is not None:
-        if frame.f_code.co_filename == IMPORTING:
+        if frame.f_code.co_filename.endswith(LOSING):
             return True
         frame = frame.f_back
     return False

@@ -16,6 +16,7 @@ import pytest
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import EDGES
+from collocation_sysid.fem.meshes import mesh_files
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Named
 from collocation_sysid.fem.meshes.structured import box_mesh
@@ -178,7 +179,7 @@ def test_centres_are_the_means_of_the_corners(box):
 # --- files
 
 
-@pytest.mark.parametrize("ending", ["vtu", "vtk", "msh", "mesh", "inp"])
+@pytest.mark.parametrize("ending", ["vtu", "vtk", "msh", "mesh", "inp", "xdmf"])
 def test_a_written_mesh_reads_back(tmp_path, ending, box):
     box.write(tmp_path / f"box.{ending}")
     again = TetMesh.read(tmp_path / f"box.{ending}")
@@ -488,6 +489,16 @@ def test_unreadable_files_give_one_error_and_print_nothing(tmp_path, capfd, name
         TetMesh.read(path)
     assert caught.value.source == path
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_format_that_needs_another_package_names_it(tmp_path, monkeypatch):
+    def read_content(path):
+        raise InputError("ModuleNotFoundError: No module named 'h5py'")
+
+    monkeypatch.setattr(mesh_files, "read_content", read_content)
+    (tmp_path / "beam.xdmf").write_text("<Xdmf/>")
+    with pytest.raises(InputError, match=r"\.xdmf needs the package h5py.*pip install h5py"):
+        TetMesh.read(tmp_path / "beam.xdmf")
 
 
 def test_refusals_of_a_files_mesh_name_the_file(tmp_path):

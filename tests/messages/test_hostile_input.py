@@ -14,7 +14,9 @@ import weakref
 import zipfile
 from functools import partial
 from pathlib import Path
+from types import FrameType
 
+import casadi as ca
 import numpy as np
 import pytest
 from kit.problem_files import REFERENCES, replace_cell, replace_text, run_command, settings
@@ -22,7 +24,7 @@ from kit.problem_files import REFERENCES, replace_cell, replace_text, run_comman
 from collocation_sysid.common import files, machine
 from collocation_sysid.common.files import read_json
 from collocation_sysid.common.isolated_process import Failed, ProcessLimits, run_isolated
-from collocation_sysid.common.signal_handling import IMPORTING, INTERRUPTS, heed_interrupts
+from collocation_sysid.common.signal_handling import INTERRUPTS, LOSING, heed_interrupts
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import (
@@ -547,9 +549,32 @@ def test_a_signal_within_a_weak_reference_callback_is_not_lost(capsys: pytest.Ca
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_signal_within_a_conversion_of_casadi_is_not_lost():
+    sent = []
+
+    def send_once(frame: FrameType, event: str, _: object) -> None:
+        if not sent and (event, frame.f_code.co_name) == ("call", "DM_from_array"):
+            sent.append(signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
+
+    restore = heed_interrupts()
+    profiled = sys.getprofile()
+    try:
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+            sys.setprofile(send_once)
+            _ = ca.SX.sym("x") * np.array([2.0])  # in which CasADi ignores exceptions
+            sys.setprofile(profiled)
+            time.sleep(5)
+    finally:
+        sys.setprofile(profiled)
+        restore()
+    assert sent
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_signal_that_is_still_deferred_at_the_end_is_not_lost():
     restore = heed_interrupts()
-    code = compile("import signal; signal.raise_signal(signal.SIGINT)", IMPORTING, "exec")
+    code = compile("import signal; signal.raise_signal(signal.SIGINT)", LOSING[0], "exec")
     exec(code)
     with pytest.raises(KeyboardInterrupt):
         restore()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -254,6 +255,13 @@ def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
 
 def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
     """Return the error for a file that cannot be read or written as a mesh."""
+    if missing := re.search(r"No module named '(\w+)'", reason):
+        package = missing[1]
+        return InputError(
+            f"the format {Path(path).suffix} needs the package {package}, which is not installed: "
+            f"pip install {package}; or convert the mesh to .vtu",
+            path,
+        )
     return InputError(
         f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, .mesh "
         "and .inp are known, recognised by the file's ending",
