@@ -28,6 +28,7 @@ from .figure_style import own_settings
 from .pictures.album import save_pictures, with_unique_names
 from .pictures.camera_pictures import KIND, depth_picture
 from .pictures.projection import ParallelCamera
+from .replay import image_unit
 
 # Description of the pictures of `save_overlays`, for the terminal.
 OVERLAY_TEXT = "depth over the undeformed body"
@@ -277,8 +278,12 @@ def save_overlays(experiments: Iterable[Experiment], folder: Path) -> list[Path]
     return save_pictures(
         folder,
         with_unique_names(
-            (f"{KIND}_{experiment.name}_{name}", depth_picture(rows))
+            (
+                f"{KIND}_{experiment.name}_{depth.name}",
+                depth_picture(rows[depth.name], image_unit(depth.camera.matrix is not None)),
+            )
             for experiment in experiments
-            for name, rows in undeformed_rows(experiment).items()
+            if (rows := undeformed_rows(experiment))
+            for depth in experiment.depths
         ),
     )

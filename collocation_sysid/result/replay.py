@@ -80,6 +80,16 @@ ARRAYS_WITH_NAN = ARRAY_LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_pl
 LARGEST_NUMBER = 1e100
 
 
+def image_key(camera: str) -> str:
+    """Return the key of the unit of a camera's image coordinates in `MotionRecord.reading_units`."""
+    return f"image of {camera}"
+
+
+def image_unit(has_matrix: bool) -> str:
+    """Return the unit of image coordinates: of a camera with a matrix, and of a point cloud without."""
+    return "pixels" if has_matrix else "mm"
+
+
 @dataclass(frozen=True, eq=False)
 class MotionRecord:
     """Measured, fitted and simulated motion of an experiment at T samples of n nodes and M markers.
@@ -141,7 +151,7 @@ class MotionRecord:
         surface [m] (NaN for points that do not count) in column 4 and the position in the world [m]
         from column 5, and rows of outlines; `camera_overlays` describes them completely.
     reading_units : mapping of name to str
-        Units of the custom sensors that state one.
+        Units of the custom sensors that state one, and of image coordinates, see `image_key`.
     strain : (T,), or None
         Strain of a specimen without a mesh; None for other experiments.
     travel_m : (T, 3), or None
@@ -237,7 +247,11 @@ class MotionRecord:
             static=experiment.is_static,
             tendons_m=_join_polylines([tendon.points_m for tendon in experiment.tendons]),
             obstacles_m=_obstacle_outlines(experiment),
-            reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit},
+            reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit}
+            | {
+                image_key(camera.name): image_unit(camera.camera.matrix is not None)
+                for camera in experiment.depths
+            },
             strain=specimen_strains(experiment)[0] if experiment.specimen else None,
             travel_m=bench_travel(experiment),
             **recorded,
@@ -329,7 +343,7 @@ class MotionRecord:
             }
         stored["reading_units"] = {
             name: str(arrays[at])
-            for name in stored["readings"]
+            for name in (*stored["readings"], *map(image_key, stored["visible_points"]))
             if (at := f"{prefix}{UNIT_PREFIX}{name}") in arrays
         }
         stored["static"] = bool(arrays.get(f"{prefix}static", False))

@@ -34,7 +34,7 @@ from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.result.animation import FilmFigure
 from collocation_sysid.result.camera_overlays import save_overlays, surface_rows, undeformed_rows
 from collocation_sysid.result.pictures.album import all_pictures
-from collocation_sysid.result.pictures.camera_pictures import depth_picture
+from collocation_sysid.result.pictures.camera_pictures import camera_pictures, depth_picture
 from collocation_sysid.result.replay import MotionRecord
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
@@ -188,6 +188,24 @@ def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures
     assert (tmp_path / "run" / "depth_experiment_front.png").is_file()
     (text,) = depth_picture(np.zeros((0, 8))).axes[0].texts
     assert text.get_text() == "no point is near enough to the body to be compared"
+
+
+@pytest.mark.parametrize(("matrix", "unit"), [(MATRIX, "pixels"), (None, "mm")])
+def test_image_coordinates_have_their_unit(tmp_path, matrix, unit):
+    """Those of an image are pixels, those of a cloud without a matrix millimetres."""
+    (depth,) = seeing(POSE).depths
+    camera = cs.DepthCamera(matrix, pose=POSE)
+    images_m = depth.images_m if matrix is not None else ()
+    experiment = replace(seeing(POSE), depths=(replace(depth, camera=camera, images_m=images_m),))
+    rows = undeformed_rows(experiment)
+    shape_m = bar().nodes_m[None], np.zeros((1, 0, 3))
+    record = MotionRecord.from_experiment(experiment, shape_m)
+    kept = MotionRecord.from_arrays("hanging", replace(record, visible_points=rows).to_arrays())
+    ((_, figure),) = camera_pictures(kept)
+    assert figure.axes[0].get_xlabel() == f"u [{unit}]"
+    assert figure.axes[0].get_ylabel() == f"v [{unit}]"
+    with pictures_drawn():
+        assert save_overlays([experiment], tmp_path)
 
 
 def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path):

@@ -60,6 +60,7 @@ from collocation_sysid.result.pictures.album import experiment_pictures, with_un
 from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse_outline
 from collocation_sysid.result.pictures.jacobian import RASTER_SIZE, SHOWN_STEPS
 from collocation_sysid.result.pictures.mesh_pictures import spread_levels
+from collocation_sysid.result.pictures.over_time import sensor_picture
 from collocation_sysid.result.pictures.projection import ParallelCamera
 from collocation_sysid.result.pictures.scene import BodyDrawing, SheetView, sheet
 from collocation_sysid.result.pictures.shapes import FIELD_COLOURS, SurfaceField
@@ -241,6 +242,28 @@ def test_error_over_time_is_the_rms_distance_of_the_markers_seen():
     assert error[0] == pytest.approx(np.sqrt((9 + 16) / 2))
     assert error[3] == pytest.approx(4.0)
     assert np.isnan(error[4])
+
+
+@pytest.mark.parametrize(("friction", "titles"), [(0.0, ["fz"]), (0.3, ["fx", "fy", "fz"])])
+def test_components_that_vanish_have_no_panel(friction, titles):
+    """Noise about a force that an obstacle without friction does not have is none; friction is."""
+    rng = np.random.default_rng(0)
+    t_s = np.linspace(0.0, 1.0, 50)
+    force_n = np.outer(t_s, [friction, friction, 1.0]) + 1e-12
+    columns = [t_s, force_n + rng.normal(0, 5e-3, (50, 3)), force_n, np.full((50, 3), np.nan)]
+    figure = sensor_picture(np.column_stack(columns), ["fx", "fy", "fz"], ["N", "N", "N"])
+    assert [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()] == titles
+
+
+def test_measurements_about_a_prediction_of_zero_are_drawn_if_they_are_no_noise():
+    t_s = np.linspace(0.0, 1.0, 50)
+    measured = np.outer(t_s, [0.2, 1.0])
+    fitted = np.outer(t_s, [0.0, 1.0])
+    columns = [t_s, measured, fitted, fitted]
+    figure = sensor_picture(np.column_stack(columns), ["fx", "fz"], ["N", "N"])
+    assert len(figure.axes) == 2
+    alone = sensor_picture(np.column_stack([t_s, *[0 * t_s] * 3]), ["fx"], ["N"])
+    assert len(alone.axes) == 1  # nothing else could be drawn
 
 
 def test_errors_far_apart_get_a_logarithmic_axis():

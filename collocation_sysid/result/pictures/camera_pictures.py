@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
-from ..replay import MotionRecord
+from ..replay import MotionRecord, image_key
 
 # Beginning of the names of pictures; `features.camera_feature` has their caption.
 KIND = "depth"
@@ -42,10 +42,11 @@ OUTLINE_MARGIN = 0.5
 def camera_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     """Yield name and picture of the images of each camera, named "depth_<experiment>_<camera>"."""
     for name, rows in replay.visible_points.items():
-        yield f"{KIND}_{replay.name}_{name}", depth_picture(rows)
+        unit = replay.reading_units.get(image_key(name), "")
+        yield f"{KIND}_{replay.name}_{name}", depth_picture(rows, unit)
 
 
-def depth_picture(rows: Array) -> Figure:
+def depth_picture(rows: Array, unit: str = "") -> Figure:
     """Return a figure of depth images with outlines of the surface, and below them of the distances
     from the surface.
 
@@ -58,6 +59,8 @@ def depth_picture(rows: Array) -> Figure:
     rows : (k, 8)
         Rows of `MotionRecord.visible_points`; if it has points, also the outlines of at least one
         sample.
+    unit : str
+        Unit of the image coordinates; not written if empty.
     """
     times = np.unique(rows[np.isnan(rows[:, 3]), 0])
     points = rows[np.isfinite(rows[:, 3])]
@@ -101,9 +104,9 @@ def depth_picture(rows: Array) -> Figure:
         bar = row[0].figure.colorbar(scale, ax=row)
         bar.set_label(label, fontsize=SMALL_PT)
         bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
-        row[0].set_ylabel("v", fontsize=SMALL_PT)
+        row[0].set_ylabel(f"v [{unit}]" if unit else "v", fontsize=SMALL_PT)
     for panel in axes[-1]:
-        panel.set_xlabel("u", fontsize=SMALL_PT)
+        panel.set_xlabel(f"u [{unit}]" if unit else "u", fontsize=SMALL_PT)
     return axes[0, 0].figure
 
 

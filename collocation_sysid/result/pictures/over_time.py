@@ -272,13 +272,18 @@ def rms_over_markers(squares: Array) -> Array:
 
 # Height of a row of three panels [mm].
 HEIGHT_MM = 42.0
+# Largest prediction, and largest root mean square of the measurements, of a number that vanishes,
+# over the largest of those of the same unit: an identity up to rounding, and noise.
+VANISHING_PREDICTION = 1e-6
+VANISHING_MEASUREMENT = 0.02
 
 
 def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = ()) -> Figure:
     """Return a figure of the numbers of a sensor over time, three in a row, as the force above the
     torque.
 
-    Numbers without any measurement are left out; at least one must be measured.
+    Numbers without any measurement are left out, and those that vanish, as the tangential force of
+    an obstacle without friction does; at least one must be measured.
 
     Parameters
     ----------
@@ -292,8 +297,7 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
     t_s, measured, fitted, rolled_out = np.split(
         samples, [1, *np.cumsum([len(names)] * 2) + 1], axis=1
     )
-    there = np.asarray(np.isfinite(measured).any(axis=0))
-    shown = [k for k in range(len(names)) if there[k]]
+    shown = _shown_numbers(measured, np.vstack([fitted, rolled_out]), units)
     columns = min(3, len(shown))
     size = PAGE_MM / 25.4, HEIGHT_MM * -(-len(shown) // columns) / 25.4
     figure = NotebookFigure(figsize=size, layout="constrained")
@@ -318,3 +322,27 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
         each.set_visible(False)
     add_figure_legend(figure, 3)
     return figure
+
+
+def _shown_numbers(measured: Array, predicted: Array, units: Sequence[str]) -> list[int]:
+    """Return which of the numbers of a sensor are drawn: those that are measured (S, m) and do not
+    vanish in both the measurements and the predictions (k, m), beside others of the same unit.
+    """
+    is_measured = np.isfinite(measured).any(axis=0)
+    squares = np.nansum(measured**2, axis=0) / np.maximum(1, np.isfinite(measured).sum(axis=0))
+    rms = np.sqrt(squares)
+    largest = np.max(np.abs(np.nan_to_num(predicted)), axis=0, initial=0.0)
+    is_predicted = np.isfinite(predicted).any(axis=0)
+    of_unit = np.array(units or [""] * len(rms))
+    shown = []
+    for k in np.flatnonzero(is_measured):
+        same = is_measured & (of_unit == of_unit[k])
+        vanishes = (
+            is_predicted[k]
+            and largest[k] <= VANISHING_PREDICTION * largest[same].max()
+            and rms[k] <= VANISHING_MEASUREMENT * rms[same].max()
+            and rms[k] < rms[same].max()
+        )
+        if not vanishes:
+            shown.append(int(k))
+    return shown
