@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .errors import InputError, SimulationError
     from .extras import live
     from .extras.studies.model_comparison import ModelComparison, compare_models
+    from .features.image_tracks.tracks import ImageTracks, PoseSigma
     from .fem.body import Body
     from .fem.laws.constants import Constant
     from .fem.laws.materials import DampingLaw, Material, Prony
@@ -107,6 +108,7 @@ __all__ = [
     "Gauge",
     "Grasp",
     "GraspQuantities",
+    "ImageTracks",
     "Indices",
     "InputError",
     "InteriorPoint",
@@ -127,6 +129,7 @@ __all__ = [
     "PointMass",
     "PointQuantities",
     "PoseSequence",
+    "PoseSigma",
     "Pressure",
     "Problem",
     "Prony",

@@ -337,7 +337,9 @@ class Solution:
                 known.append(full)
                 names = {full, entry.label, entry.label.rpartition(" [")[0], entry.row.name}
                 if entry.row == GAUGE:
-                    names.add([*readings[entry.number].unknowns][entry.axis])
+                    sensor = readings[entry.number]
+                    own = {sensor.unknown_label(each): each for each in sensor.unknowns}
+                    names.add(own[entry.label])
                 if name in names:
                     estimates[full] = value
         if len(estimates) == 1:

@@ -27,12 +27,10 @@ import numpy as np
 from ..common.array_types import Array, Index
 from ..common.files import reason
 from ..errors import InputError
-from ..fem.laws.constants import unit_of, without_unit
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, prescribed_nodes
 from ..recording.loads import Force, LoadTime, PointMass
 from ..recording.nuisance import (
-    GAUGE,
     GRASP_SHIFT,
     GRASP_TURN,
     JOINING,
@@ -280,6 +278,11 @@ class NuisanceMap(RecordingQuantities):
             Number of the instance, such as the index of a camera; None for all.
         """
         return self._indices_where(lambda e: e.row in rows and component in (None, e.number))
+
+    def indices_of_labels(self, labels: Iterable[str]) -> Index:
+        """Return the indices in φ of the parameters with some labels, in their order."""
+        places = {entry.label: k for k, entry in enumerate(self.entries)}
+        return np.array([places[label] for label in labels], dtype=np.int64)
 
     def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
         """Return the indices in φ, ascending, of the entries for which a function is true; empty if
@@ -620,10 +623,12 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
                     yield NuisanceEntry(
                         row, number, axis=axis, label=f"{label} [{unit}]", sigma=sigma
                     )
-    for number, gauge in enumerate(experiment.readings):
-        for axis, (name, sigma) in enumerate(gauge.unknowns.items()):
-            label = f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
-            yield NuisanceEntry(GAUGE, number, axis=axis, label=label, sigma=sigma)
+    declared: set[str] = set()
+    for number, sensor in enumerate(experiment.readings):
+        for axis, (row, label, sigma) in enumerate(sensor.unknown_rows(experiment)):
+            if label not in declared:
+                yield NuisanceEntry(row, number, axis=axis, label=label, sigma=sigma)
+            declared.add(label)
 
 
 def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, str]]:

@@ -28,6 +28,10 @@ from .named_files import existing_file
 # Group of the entry points of other packages: the key of a list of tables within
 # [[experiment]], and the class of the tables, a `MeasurementSection`.
 ENTRY_POINTS = "collocation_sysid.measurements"
+# The same of the features of this package, which it imports when a table is read.
+OWN_TABLES = {
+    "image_tracks": "collocation_sysid.features.image_tracks.tracks_table:ImageTracksSection"
+}
 
 
 def require_file_name(name: str) -> str:
@@ -146,10 +150,17 @@ class MeasurementSection(NamedSection):
 
 
 @cache
-def registered_tables() -> type[Section] | None:
-    """Return a table of the lists of tables of other packages, by their keys; None without any."""
-    lists: dict[str, Any] = {e.name: (_type_of(e), []) for e in entry_points(group=ENTRY_POINTS)}
-    return create_model("RegisteredTables", __base__=Section, **lists) if lists else None
+def registered_tables() -> type[Section]:
+    """Return a table of the lists of tables of features and of other packages, by their keys."""
+    own = [EntryPoint(name, value, ENTRY_POINTS) for name, value in OWN_TABLES.items()]
+    entries = [*own, *entry_points(group=ENTRY_POINTS)]
+    lists: dict[str, Any] = {entry.name: (_type_of(entry), []) for entry in entries}
+    return create_model("RegisteredTables", __base__=Section, **lists)
+
+
+def own_tables() -> dict[str, type[MeasurementSection]]:
+    """Return the classes of the tables of features of this package by their keys."""
+    return {name: EntryPoint(name, value, "").load() for name, value in OWN_TABLES.items()}
 
 
 def _type_of(entry: EntryPoint) -> Any:

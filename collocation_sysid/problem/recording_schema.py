@@ -6,7 +6,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, GetJsonSchemaHandler, TypeAdapter, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
@@ -26,7 +28,7 @@ from ..recording import (
 )
 from ..recording.markers import Places
 from .camera_section import DepthSection
-from .measurement_section import MeasurementSection, NamedSection, registered_tables
+from .measurement_section import MeasurementSection, NamedSection, own_tables, registered_tables
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
 # Fields of `Experiment` by the key of the tables that read themselves.
@@ -520,15 +522,34 @@ class ExperimentSection(NamedSection, of=Experiment):
             tables |= dict(self._registered)
         return {key: listed for key, listed in tables.items() if listed}
 
-    # Tables of other packages.
+    # Tables of features and of other packages.
     _registered: Section | None = None
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """Return the schema of the table with the tables of features."""
+        schema = handler(core_schema)
+        properties = handler.resolve_ref_schema(schema)["properties"]
+        for key, table in own_tables().items():
+            summary = (table.__doc__ or "").partition("\n")[0]
+            properties[key] = {
+                "default": [],
+                "description": f"[[experiment.{key}]] tables: {summary[:1].lower()}{summary[1:]}",
+                "items": handler(TypeAdapter(table).core_schema),
+                "type": "array",
+            }
+        return schema
 
     @model_validator(mode="wrap")
     @classmethod
     def _with_registered_tables(cls, table: Any, validated: Any) -> Any:
-        """Return the section with the tables of other packages, validated by their own classes."""
+        """Return the section with the tables of features and of other packages, validated by their
+        own classes.
+        """
         registered = registered_tables()
-        if registered is None or not isinstance(table, dict):
+        if not isinstance(table, dict):
             return validated(table)
         of_others = {key: table[key] for key in registered.model_fields.keys() & table.keys()}
         section = validated({k: each for k, each in table.items() if k not in of_others})

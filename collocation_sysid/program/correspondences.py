@@ -30,6 +30,12 @@ class Correspondences(ABC):
         for which the correspondences were found.
         """
 
+    def continued(self, phi: Array, previous: Correspondences) -> Array:
+        """Return φ (k,), relative to the previous correspondences of the sensor, relative to these;
+        here φ itself.
+        """
+        return phi
+
 
 @dataclass(frozen=True, eq=False)
 class CorrespondenceResidual(MeasurementResidual):

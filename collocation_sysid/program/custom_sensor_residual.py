@@ -20,7 +20,6 @@ from ..common.array_types import Array
 from ..model.nuisance_map import NuisanceMap
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
-from ..recording.nuisance import GAUGE
 from ..recording.placement import place_markers
 from ..recording.sample_times import TIME_TOLERANCE_S
 from .association import Association
@@ -105,7 +104,7 @@ class CustomSensorResidual(MeasurementResidual):
         groups = -(-count // GROUP)
         padded = np.full((len(sensor.sample_times_s), 1, GROUP * groups), np.nan)
         padded[:, 0, :count] = sensor.measured_values
-        is_compared = np.isfinite(padded) & _is_within(sensor.sample_times_s, at_s)[:, None, None]
+        is_compared = np.isfinite(padded) & is_within(sensor.sample_times_s, at_s)[:, None, None]
         which = [f" {k + 1}" if groups > 1 else "" for k in range(groups)]
         return cls(
             observable=observable,
@@ -116,7 +115,9 @@ class CustomSensorResidual(MeasurementResidual):
             sigmas=np.full(groups, sensor.sigma),
             measured=padded,
             is_compared=is_compared.reshape(len(padded), groups, GROUP),
-            own_parameters=nuisance.indices_of_rows(GAUGE, component=number)[None],
+            own_parameters=nuisance.indices_of_labels(map(sensor.unknown_label, sensor.unknowns))[
+                None
+            ],
             sensor=sensor,
             observable_s=at_s,
             is_static=static,
@@ -225,14 +226,14 @@ class CustomSensorResidual(MeasurementResidual):
         NaN for samples outside these times.
         """
         predicted = super().predict_motion(motion, phi)
-        return np.where(_is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
+        return np.where(is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
 
     def numbers(self, predicted: Array) -> Array:
         """Return predictions (S, G, 3) as the numbers (S, m) of the sensor, without padding."""
         return super().numbers(predicted)[:, : self.sensor.measured_values.shape[1]]
 
 
-def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
+def is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
     """Return the mask (S,) of samples at times `t_s` (S,) within the range of ascending times
     `at_s`, ends included with `TIME_TOLERANCE_S`; all false if there are no times.
     """

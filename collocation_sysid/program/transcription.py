@@ -152,6 +152,7 @@ class Transcription(MotionTranscription):
             np.append(phi, 0.0)[places]
         )
         correspondences = []
+        continued = phi
         for residual, present in zip(
             self.reassociable, self.association.correspondences, strict=True
         ):
@@ -159,10 +160,11 @@ class Transcription(MotionTranscription):
             # The measurement model has a copy, with its own model of the sensor.
             is_same = updated is residual.correspondences
             correspondences.append(present if is_same else updated)
+            continued = updated.continued(continued, residual.correspondences)
         association = self.association.updated(
             markers, float(shifts_s.sum()) / self.experiment.timestep_s, correspondences
         )
-        return association, self._with_marker_places(phi, place_coordinates)
+        return association, self._with_marker_places(continued, place_coordinates)
 
     def place_unknown_markers(
         self, phi: Array, x: Array, only_poses: bool = False

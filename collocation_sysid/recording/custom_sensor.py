@@ -5,10 +5,10 @@ force.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import ClassVar, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import casadi as ca
 import numpy as np
@@ -22,7 +22,9 @@ from ..common.schema_tables import Vector
 from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
 from ..fem.body import Body
+from ..fem.laws.constants import unit_of, without_unit
 from .measurement import Measurement
+from .nuisance import GAUGE, NuisanceRow
 from .poses import Frame
 from .sample_times import first_unordered_time
 
@@ -202,6 +204,19 @@ class CustomSensor(Measurement):
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with other samples (S, m) at the times `t_s` (S,) [s]."""
         return replace(self, t_s=t_s, values=values)
+
+    # Its unknowns -----------------------------------------------------------------------------
+
+    def unknown_label(self, name: str) -> str:
+        """Return the label of an unknown, with its unit."""
+        return f"{without_unit(name)} of {self.name} [{unit_of(name) or '1'}]"
+
+    def unknown_rows(self, experiment: Any) -> Iterator[tuple[NuisanceRow, str, float]]:
+        """Yield row, label and prior standard deviation of each unknown in an experiment. Unknowns
+        with the same label are shared by all sensors of the experiment that have them.
+        """
+        for name, sigma in self.unknowns.items():
+            yield GAUGE, self.unknown_label(name), sigma
 
     # The expression ---------------------------------------------------------------------------
 

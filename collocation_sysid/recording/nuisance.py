@@ -794,6 +794,16 @@ DEPTH_EDGE = NuisanceRow(
 KINDS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
 GAUGE = NuisanceRow("reading", "", sigma=None, of="gauge", changes=())
+# Coordinates of places on the surface that sensors refer to, and other unknowns of single points.
+SURFACE_PLACE = NuisanceRow(
+    "surface_place",
+    "",
+    sigma=None,
+    of="gauge",
+    changes=(),
+    reach=UNLIMITED_REACH,
+    step=_largest_place_step_m,
+)
 
 
 def nuisances_called(word: str) -> list[NuisanceRow]:

@@ -1,0 +1,162 @@
+"""Rays of pixels on a surface of triangles, and the pose of a camera from known points."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array, Index
+
+# Barycentric coordinate below zero at which a ray still hits a triangle: no gaps at the edges.
+EDGE_TOLERANCE = 1e-9
+# Most pairs of a ray and a triangle at a time, for the memory.
+MOST_PAIRS = 2_000_000
+# Fewest points that determine the pose of a camera.
+FEWEST_POINTS = 4
+# Difference of rotations [rad] below which two poses are the same.
+SAME_TURN_RAD = 1e-3
+
+
+def ray_hits(
+    origins: Array, directions: Array, triangles: Array
+) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Intersect P rays with F triangles.
+
+    Parameters
+    ----------
+    origins, directions : (P, 3) arrays
+    triangles : (F, 3, 3) array
+        Corners.
+
+    Returns
+    -------
+    (P, F) bool, (P, F) array, (P, F, 3) array
+        Whether a ray hits a triangle in front of its origin, the distance in lengths of the
+        direction, and the barycentric coordinates of the hit.
+    """
+    first = triangles[:, 0]
+    ab, ac = triangles[:, 1] - first, triangles[:, 2] - first
+    across = np.cross(directions[:, None], ac)
+    determinant = np.einsum("pfi,fi->pf", across, ab)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / determinant
+        away = origins[:, None] - first
+        in_b = np.einsum("pfi,pfi->pf", away, across) * inverse
+        other = np.cross(away, ab)
+        in_c = np.einsum("pi,pfi->pf", directions, other) * inverse
+        distance = np.einsum("fi,pfi->pf", ac, other) * inverse
+        least = np.minimum(np.minimum(in_b, in_c), 1 - in_b - in_c)
+        is_hit = (least >= -EDGE_TOLERANCE) & (distance > 0) & np.isfinite(inverse)
+        return is_hit, distance, np.stack([1 - in_b - in_c, in_b, in_c], axis=2)
+
+
+def points_on_surface(
+    origins: Array, directions: Array, nodes_m: Array, surface: Index
+) -> tuple[Array, Array, Array]:
+    """Return where rays first meet a surface.
+
+    Parameters
+    ----------
+    origins, directions : (P, 3) arrays
+    nodes_m : (n, 3) array
+        Nodes in the shape that the rays meet.
+    surface : (F, 3) array
+        Corners of its triangles.
+
+    Returns
+    -------
+    (P,) array of int, (P, 3) array, (P,) array
+        Triangle, barycentric coordinates in it, and sine of the angle by which the ray misses the
+        surface: zero for a hit; of a miss, triangle and coordinates of the nearest corner.
+    """
+    triangles = nodes_m[surface]
+    is_hit, distance, shares = ray_hits(origins, directions, triangles)
+    faces = np.where(is_hit, distance, np.inf).argmin(axis=1)
+    coordinates = np.clip(shares[np.arange(len(faces)), faces], 0.0, 1.0)
+    missed = np.zeros(len(faces))
+    for k in np.flatnonzero(~is_hit.any(axis=1)):
+        direction = directions[k] / np.linalg.norm(directions[k])
+        away = triangles.reshape(-1, 3) - origins[k]
+        sines = np.linalg.norm(np.cross(away, direction), axis=1) / np.linalg.norm(away, axis=1)
+        sines[away @ direction <= 0] = 1.0
+        nearest = int(sines.argmin())
+        faces[k], corner = divmod(nearest, 3)
+        coordinates[k] = np.eye(3)[corner]
+        missed[k] = sines[nearest]
+    coordinates[~np.isfinite(coordinates).all(axis=1)] = 1 / 3
+    coordinates /= coordinates.sum(axis=1, keepdims=True)
+    return faces, coordinates, missed
+
+
+def is_occluded(
+    points_m: Array, eyes_m: Array, triangles: Array, margin_m: float
+) -> NDArray[np.bool_]:
+    """Return which points (P, 3) on a surface are hidden from eyes (P, 3) by triangles (F, 3, 3)
+    that are at least `margin_m` in front of them.
+    """
+    hidden = np.zeros(len(points_m), dtype=bool)
+    batch = max(1, MOST_PAIRS // max(1, len(triangles)))
+    for first in range(0, len(points_m), batch):
+        part = slice(first, first + batch)
+        to_eye = eyes_m[part] - points_m[part]
+        length = np.linalg.norm(to_eye, axis=1)
+        is_hit, distance, _ = ray_hits(points_m[part], to_eye, triangles)
+        is_between = (distance < 1) & (distance * length[:, None] > margin_m)
+        hidden[part] = (is_hit & is_between).any(axis=1)
+    return hidden
+
+
+def poses_from_points(points_m: Array, rays: Array) -> list[tuple[Array, float]]:
+    """Return the poses of a camera from which known points appear in known directions, best first.
+
+    A set of points seen from one side has two poses with similar errors, mirror images of each
+    other, and more where the points are in a plane. The search therefore begins at the 24 rotations
+    of a cube, and all minima that it finds are returned.
+
+    Parameters
+    ----------
+    points_m : (P, 3) array
+        Points in the world, at least four.
+    rays : (P, 3) array
+        Points at depth z = 1 in the frame of the camera in the directions of their images.
+
+    Returns
+    -------
+    list of ((4, 4) array, float)
+        Transform from the camera to the world, and the RMS of the differences at depth one; of
+        poses with all points in front of the camera.
+    """
+    middle = points_m.mean(axis=0)
+    centred = points_m - middle
+    seen = rays[:, :2]
+    spread = np.sqrt(np.sum((seen - seen.mean(axis=0)) ** 2))
+    depth = np.sqrt(np.sum(centred**2) * 2 / 3) / max(spread, 1e-9)
+    start = depth * np.append(seen.mean(axis=0), 1.0)
+
+    def differences(pose: Array) -> Array:
+        at = Rotation.from_rotvec(pose[:3]).apply(centred) + pose[3:]
+        front = np.maximum(at[:, 2:], 1e-3 * depth)
+        return (at[:, :2] / front - seen).ravel()
+
+    found: list[tuple[Array, float]] = []
+    for turn in Rotation.create_group("O"):
+        fit = least_squares(differences, np.append(turn.as_rotvec(), start), x_scale="jac")
+        to_camera = Rotation.from_rotvec(fit.x[:3])
+        if (to_camera.apply(centred)[:, 2] + fit.x[5] <= 0).any():
+            continue
+        pose = np.eye(4)
+        pose[:3, :3] = to_camera.as_matrix().T
+        pose[:3, 3] = middle - pose[:3, :3] @ fit.x[3:]
+        error = float(np.sqrt(np.mean(fit.fun**2)))
+        same = [
+            k
+            for k, (other, _) in enumerate(found)
+            if Rotation.from_matrix(other[:3, :3].T @ pose[:3, :3]).magnitude() < SAME_TURN_RAD
+        ]
+        if not same:
+            found.append((pose, error))
+        elif error < found[same[0]][1]:
+            found[same[0]] = pose, error
+    return sorted(found, key=lambda each: each[1])

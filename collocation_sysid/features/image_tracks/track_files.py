@@ -1,0 +1,360 @@
+"""Tracks of points in images from the files of trackers, recognised by their content.
+
+| program | file | content |
+|---|---|---|
+| any | .csv, wide | `t_s` or `frame`; `NAME_u`, `NAME_v` and perhaps `NAME_likelihood` of each point |
+| any | .csv, long | `t_s` or `frame`, `point`, `u`, `v` and perhaps `likelihood` |
+| DeepLabCut | .csv, .h5 | rows scorer, (individuals,) bodyparts, coords; frame, then x, y, likelihood |
+| SLEAP | analysis .h5 | `tracks` (tracks, 2, nodes, frames), `node_names`, `point_scores` |
+| CoTracker | .npz | `pred_tracks` (1, T, N, 2), `pred_visibility` (1, T, N) |
+| TAPIR | .npz | `tracks` (N, T, 2), `visibles` (N, T) |
+
+Only tables with a column `t_s`, and archives with `t_s` or `fps`, state times.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...errors import InputError, listed
+from ...recording.formats.text import (
+    Row,
+    TextTable,
+    decode,
+    names_file_in_errors,
+    numeric_cells,
+    read_bytes,
+    read_table,
+    separated_rows,
+    table_of_rows,
+    times_in_column,
+)
+
+# Names of the columns of long tables.
+POINT_COLUMNS = ("point", "name", "bodypart", "track", "keypoint")
+FRAME_COLUMNS = ("frame", "frame_index", "frame_idx")
+# First bytes of an HDF5 file.
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# Names of arrays in archives: tracks by time, tracks by point, visibility.
+BY_TIME = ("pred_tracks",)
+VISIBILITY = ("pred_visibility", "visibility", "pred_vis", "vis")
+BY_POINT_VISIBILITY = ("visibles", "visible", "pred_occ", "occluded")
+EXPECTED = "a table with NAME_u and NAME_v, or a file of DeepLabCut, SLEAP, CoTracker or TAPIR"
+
+
+@dataclass(frozen=True, eq=False)
+class TrackFile:
+    """Content of a file of tracks.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names (N,) of the points.
+    pixels : (S, N, 2) array
+        Pixels u and v; NaN where missing.
+    likelihood : (S, N) array or None
+        Confidence of the tracker, from 0 to 1; None if the file has none.
+    t_s : (S,) array or None
+        Times [s]; None if the file states none.
+    frames : (S,) array
+        Numbers of the images.
+    """
+
+    names: tuple[str, ...]
+    pixels: Array
+    likelihood: Array | None
+    t_s: Array | None
+    frames: Array
+
+    def confident(self, least: float) -> Array:
+        """Return the pixels (S, N, 2), NaN where the likelihood is below `least`."""
+        if self.likelihood is None:
+            return self.pixels
+        is_low = ~(self.likelihood >= least)
+        return np.where(is_low[..., None], np.nan, self.pixels)
+
+
+@names_file_in_errors
+def read_tracks(path: str | Path) -> TrackFile:
+    """Read the tracks of all points of a file.
+
+    Raises
+    ------
+    InputError
+        If the file is not recognised, or its content is inconsistent; file and key or line are
+        named.
+    """
+    file = Path(path)
+    content = read_bytes(file)
+    if content.startswith(HDF5_SIGNATURE):
+        return _read_hdf5(file)
+    if zipfile.is_zipfile(io.BytesIO(content)):
+        return _read_archive(file)
+    return _read_text(decode(content))
+
+
+# Tables -------------------------------------------------------------------------------------------
+
+
+def _read_text(text: str) -> TrackFile:
+    rows = separated_rows(text)
+    if rows[0].cells[0].lower() == "scorer":
+        return _deeplabcut_table(rows)
+    grid = read_table(text)
+    t_s, frames = _times_of(grid)
+    wide = [name[:-2] for name in grid.columns if name.endswith("_u")]
+    if wide:
+        return _wide_table(grid, wide, t_s, frames)
+    point = next((name for name in POINT_COLUMNS if name in grid.columns), None)
+    if point is not None and {"u", "v"} <= set(grid.columns):
+        return _long_table(grid, grid.columns.index(point), t_s, frames)
+    shown = ", ".join(grid.columns[:8])
+    raise grid.error_at(f"found the columns {shown}; expected {EXPECTED}")
+
+
+def _times_of(grid: TextTable) -> tuple[Array | None, Array]:
+    """Return the times of the rows, None without, and the numbers of their images."""
+    frame = next((name for name in FRAME_COLUMNS if name in grid.columns), None)
+    if frame is not None:
+        column = grid.columns.index(frame)
+        frames = np.asarray(numeric_cells(grid, [column], blank_allowed=False))[:, 0]
+    else:
+        frames = np.arange(float(len(grid.rows)))
+    t_s = None
+    if "t_s" in grid.columns:
+        column = grid.columns.index("t_s")
+        is_long = any(name in grid.columns for name in POINT_COLUMNS)
+        if is_long:
+            t_s = np.asarray(numeric_cells(grid, [column], blank_allowed=False))[:, 0]
+        else:
+            t_s = times_in_column(grid, column)
+    return t_s, frames
+
+
+def _numbers(grid: TextTable, names: Sequence[str]) -> Array:
+    for name in names:
+        if grid.columns.count(name) != 1:
+            count = grid.columns.count(name)
+            found = f"{count} columns are called" if count else "there is no column"
+            raise grid.error_at(f"{found} {name!r}; expected one, with the pixels of this point")
+    columns = [grid.columns.index(name) for name in names]
+    return np.asarray(numeric_cells(grid, columns, blank_allowed=True))
+
+
+def _wide_table(grid: TextTable, names: list[str], t_s: Array | None, frames: Array) -> TrackFile:
+    pixels = _numbers(grid, [f"{name}_{axis}" for name in names for axis in "uv"])
+    scores = [f"{name}_likelihood" for name in names]
+    likelihood = None
+    if any(name in grid.columns for name in scores):
+        likelihood = np.ones((len(pixels), len(names)))
+        for k, name in enumerate(scores):
+            if name in grid.columns:
+                likelihood[:, k] = _numbers(grid, [name])[:, 0]
+    return TrackFile(tuple(names), pixels.reshape(len(pixels), -1, 2), likelihood, t_s, frames)
+
+
+def _long_table(grid: TextTable, point: int, t_s: Array | None, frames: Array) -> TrackFile:
+    labels = [row.cells[point] for row in grid.rows]
+    names = tuple(dict.fromkeys(labels))
+    at = frames if t_s is None else t_s
+    times, sample = np.unique(at, return_inverse=True)
+    column = np.array([names.index(label) for label in labels])
+    pairs = sample * len(names) + column
+    if len(np.unique(pairs)) < len(pairs):
+        seen: set[int] = set()
+        for k, pair in enumerate(pairs.tolist()):
+            if pair in seen:
+                raise grid.error_at(f"{labels[k]} appears twice in this image; expected once", k)
+            seen.add(pair)
+    pixels = np.full((len(times), len(names), 2), np.nan)
+    pixels[sample, column] = _numbers(grid, ["u", "v"])
+    likelihood = None
+    if "likelihood" in grid.columns:
+        likelihood = np.zeros(pixels.shape[:2])
+        likelihood[sample, column] = _numbers(grid, ["likelihood"])[:, 0]
+    return TrackFile(
+        names,
+        pixels,
+        likelihood,
+        None if t_s is None else times,
+        times if t_s is None else np.arange(float(len(times))),
+    )
+
+
+def _deeplabcut_table(rows: list[Row]) -> TrackFile:
+    """Return the tracks of a table of DeepLabCut, whose names are in three or four header rows."""
+    heads: dict[str, list[str]] = {}
+    while rows and rows[0].cells[0].lower() in ("scorer", "individuals", "bodyparts", "coords"):
+        row = rows.pop(0)
+        heads[row.cells[0].lower()] = row.cells[1:]
+    if not {"bodyparts", "coords"} <= heads.keys():
+        raise InputError(
+            f"found the header rows {listed(heads)}; expected those of DeepLabCut: scorer, "
+            "bodyparts, coords"
+        )
+    individuals = heads.get("individuals", [""] * len(heads["bodyparts"]))
+    columns = list(zip(individuals, heads["bodyparts"], heads["coords"], strict=True))
+    grid = table_of_rows(["frame", *map(str, range(len(columns)))], rows)
+    values = np.asarray(numeric_cells(grid, range(1, 1 + len(columns)), blank_allowed=True))
+    try:
+        frames = np.asarray(numeric_cells(grid, [0], blank_allowed=False))[:, 0]
+    except InputError:  # names of the images of a folder
+        frames = np.arange(float(len(rows)))
+    return _by_columns(columns, values, frames)
+
+
+def _by_columns(columns: Sequence[tuple[str, str, str]], values: Array, frames: Array) -> TrackFile:
+    """Return tracks from values (S, c) with individual, body part and coordinate of each column."""
+    several = len({individual for individual, _, _ in columns}) > 1
+    labels = [f"{i}_{part}" if several else part for i, part, _ in columns]
+    names = tuple(dict.fromkeys(labels))
+    parts = {"x": np.full((len(values), len(names)), np.nan)}
+    parts["y"], parts["likelihood"] = parts["x"].copy(), np.ones_like(parts["x"])
+    for k, (label, (_, _, coordinate)) in enumerate(zip(labels, columns, strict=True)):
+        if coordinate not in parts:
+            raise InputError(f"found the coordinate {coordinate!r}; expected x, y or likelihood")
+        parts[coordinate][:, names.index(label)] = values[:, k]
+    has_score = any(coordinate == "likelihood" for _, _, coordinate in columns)
+    pixels = np.stack([parts["x"], parts["y"]], axis=2)
+    return TrackFile(names, pixels, parts["likelihood"] if has_score else None, None, frames)
+
+
+# Archives and HDF5 --------------------------------------------------------------------------------
+
+
+def _read_archive(file: Path) -> TrackFile:
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            arrays = {name: np.asarray(archive[name]) for name in archive.files}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"this archive cannot be read ({error}); expected arrays") from error
+    return tracks_of_arrays(arrays)
+
+
+def tracks_of_arrays(arrays: Mapping[str, Any]) -> TrackFile:
+    """Return the tracks of CoTracker or TAPIR from their arrays by name."""
+    by_time = next((name for name in BY_TIME if name in arrays), None)
+    key = by_time or ("tracks" if "tracks" in arrays else None)
+    if key is None:
+        raise InputError(f"found the arrays {listed(arrays)}; expected pred_tracks or tracks")
+    tracks = np.asarray(arrays[key], dtype=float)
+    if tracks.ndim == 4 and len(tracks) == 1:
+        tracks = tracks[0]
+    if tracks.ndim != 3 or tracks.shape[2] != 2:
+        raise InputError(
+            f"{key} has the shape {tracks.shape}; expected (T, N, 2), (1, T, N, 2) or, for TAPIR, "
+            "(N, T, 2)"
+        )
+    of_points = next((name for name in BY_POINT_VISIBILITY if name in arrays), None)
+    if by_time is None and of_points is not None:
+        tracks = tracks.transpose(1, 0, 2)
+    likelihood = None
+    name = of_points if by_time is None and of_points else None
+    name = name or next((each for each in VISIBILITY if each in arrays), None)
+    if name is not None:
+        seen = np.asarray(arrays[name], dtype=float)
+        seen = seen[0] if seen.ndim == 3 and len(seen) == 1 else seen
+        seen = seen[..., 0] if seen.ndim == 3 and seen.shape[2] == 1 else seen
+        seen = seen.T if name == of_points else seen
+        if seen.shape != tracks.shape[:2]:
+            raise InputError(
+                f"{name} has the shape {np.shape(arrays[name])}; expected one value for each of the "
+                f"{tracks.shape[0]} images and {tracks.shape[1]} points"
+            )
+        likelihood = 1.0 - seen if "occ" in name else seen
+    stated = np.ravel(arrays["names"]) if "names" in arrays else ()
+    names = tuple(map(str, stated)) or tuple(f"p{k + 1}" for k in range(tracks.shape[1]))
+    if len(names) != tracks.shape[1]:
+        raise InputError(f"names has {len(names)} names for {tracks.shape[1]} points")
+    frames = np.arange(float(len(tracks)))
+    t_s = np.asarray(arrays["t_s"], dtype=float).ravel() if "t_s" in arrays else None
+    if t_s is None and "fps" in arrays:
+        t_s = frames / float(np.ravel(arrays["fps"])[0])
+    if t_s is not None and len(t_s) != len(tracks):
+        raise InputError(f"t_s has {len(t_s)} times for {len(tracks)} images")
+    return TrackFile(names, tracks, likelihood, t_s, frames)
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    """Reads lists, tuples, texts and numbers; refuses everything that could execute code."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        raise pickle.UnpicklingError(f"{module}.{name} is not allowed")
+
+
+def _read_hdf5(file: Path) -> TrackFile:
+    try:
+        import h5py
+    except ImportError as error:
+        raise InputError(
+            "this is an HDF5 file, for which the library h5py is missing; expected pip install "
+            "'collocation-sysid[tracks]', or the tracks as .csv"
+        ) from error
+    with h5py.File(file) as content:
+        if "tracks" in content and "node_names" in content:
+            return _sleap_tracks(content)
+        for name, group in content.items():
+            if isinstance(group, h5py.Group) and "table" in group:
+                return _deeplabcut_hdf5(name, group)
+        raise InputError(
+            f"found the groups {listed(content)}; expected those of DeepLabCut (in table format) or "
+            "of an analysis file of SLEAP"
+        )
+
+
+def _sleap_tracks(content: Any) -> TrackFile:
+    tracks = np.asarray(content["tracks"], dtype=float)
+    nodes = [_text(each) for each in content["node_names"][()]]
+    if tracks.ndim != 4 or tracks.shape[1] != 2 or tracks.shape[2] != len(nodes):
+        raise InputError(
+            f"tracks has the shape {tracks.shape}; expected (tracks, 2, {len(nodes)} nodes, frames)"
+        )
+    of = [_text(each) for each in content["track_names"][()]] if "track_names" in content else []
+    of = of if len(of) == len(tracks) else [f"track_{k + 1}" for k in range(len(tracks))]
+    names = [f"{track}_{node}" if len(tracks) > 1 else node for track in of for node in nodes]
+    pixels = tracks.transpose(3, 0, 2, 1).reshape(tracks.shape[3], -1, 2)
+    likelihood = None
+    if "point_scores" in content:
+        scores = np.asarray(content["point_scores"], dtype=float)
+        if scores.shape == (len(tracks), len(nodes), tracks.shape[3]):
+            likelihood = scores.transpose(2, 0, 1).reshape(len(pixels), -1)
+    return TrackFile(tuple(names), pixels, likelihood, None, np.arange(float(len(pixels))))
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def _deeplabcut_hdf5(name: str, group: Any) -> TrackFile:
+    """Return the tracks of a table of pandas, whose column names are pickled lists of texts."""
+    table = group["table"]
+    values = np.concatenate(
+        [
+            np.asarray(table[block], dtype=float).reshape(len(table), -1)
+            for block in sorted(b for b in table.dtype.names if b.startswith("values_block"))
+        ],
+        axis=1,
+    )
+    try:
+        axes = _PlainUnpickler(io.BytesIO(bytes(group.attrs["non_index_axes"]))).load()
+        columns = [tuple(map(str, each)) for each in axes[0][1]]
+    except (pickle.UnpicklingError, KeyError, IndexError, TypeError, ValueError) as error:
+        raise InputError(
+            f"the column names of {name} cannot be read ({error}); expected the tracks as .csv"
+        ) from error
+    if len(columns) != values.shape[1] or any(len(each) not in (3, 4) for each in columns):
+        raise InputError(
+            f"{name} has {values.shape[1]} columns and {len(columns)} names; expected scorer, body "
+            "part and coordinate of each: write the tracks as .csv"
+        )
+    triples = [(each[1] if len(each) == 4 else "", each[-2], each[-1]) for each in columns]
+    return _by_columns(triples, values, np.asarray(table["index"], dtype=float))

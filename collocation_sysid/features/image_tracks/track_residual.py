@@ -1,0 +1,293 @@
+"""Pixels of tracked points, from node positions x and nuisance parameters φ:
+
+    y = π(R(a) T(t)⁻¹ Σ_i ℓ_i(τ) h(x_i) + d) + b(t),
+
+with the place h(x_i) of the point on the body at neighbouring grid times, Lagrange weights ℓ at the
+time of the image row shifted by τ, the stated pose T of the camera, the rotation R(a) about its
+centre and the translation d by which the pose is off, and the projection π with the errors of the
+focal length and of the principal point. τ is the delay of the clock, the error of the frame rate,
+and the line delay times the row in which the point appears. The drift b of the tracker is the sum
+of the first terms of the Karhunen–Loève series of a random walk.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ...program.association import Association
+from ...program.correspondences import CorrespondenceResidual, Correspondences
+from ...program.custom_sensor_residual import CustomSensorResidual, is_within
+from ...program.measurement_model import CorrespondenceModel
+from ...program.measurement_residual import GROUP, ResidualExpression, RowStencil, lagrange_weights
+from ...program.observables import PointPositions
+from ...recording.experiment import Experiment
+from ...recording.nuisance import cayley_rotation
+from .tracked_places import TrackedPlaces
+from .tracks import POSE_UNKNOWNS, WALK_TERMS, ImageTracks, place_labels
+
+# Threshold of Huber's loss in standard deviations, if the problem states none.
+HUBER = 3.0
+# Depth at which points near or behind the camera are projected in trial motions [m].
+LEAST_DEPTH_M = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTrackResidual(CustomSensorResidual, CorrespondenceResidual):
+    """Residual of the tracks of one camera; its entities are the points, its observable their
+    positions.
+    """
+
+    sensor: ImageTracks
+    observable: PointPositions
+    correspondences: TrackedPlaces
+    experiment: Experiment
+
+    sigma_key = "sigma_px"
+    is_compiled = True
+
+    @cached_property
+    def _stencil(self) -> RowStencil:
+        """Stencil of all images and points.
+
+        Its data are the distances of the neighbouring times from the image [s], the time since the
+        first image over that of the last one, and the duration [s], the row of the point in the
+        image, and the pose of the camera: R by rows, then the translation [m].
+        """
+        times = self._times
+        count = self.observable.vector_count
+        samples = len(times)
+        places = times[:, None] * count + np.arange(count)[:, None]
+        since_s = self.t_s - self.t_s[0]
+        duration_s = max(float(since_s[-1]), 1e-12)
+        rows = np.nan_to_num(self.measured[..., 1])
+        common = np.column_stack(
+            [
+                self.observable_s[times] - self.t_s[:, None],
+                since_s / duration_s,
+                np.full(samples, duration_s),
+                self.correspondences.rotations.reshape(samples, 9),
+                self.correspondences.translations,
+            ]
+        )
+        data = np.broadcast_to(common.T[..., None], (common.shape[1], samples, count))
+        return RowStencil(places, np.concatenate([data, rows[None]]))
+
+    def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Return the pixel (u, v) of one point, and zero.
+
+        Parameters
+        ----------
+        values : (3, times) SX
+            Positions of the point at the neighbouring grid times [m].
+        phi : SX
+            Nuisance parameters of the camera and of the track, in prior standard deviations.
+        data : SX
+            Data of the sample, see `_stencil`.
+        """
+        count = values.shape[1]
+        offsets, share, duration, rotation, translation, row = ca.vertsplit(
+            data, np.cumsum([0, count, 1, 1, 9, 3, 1]).tolist()
+        )
+        tracks = self.sensor
+        own = phi * self.nuisance.scales[self.own_parameters[0]][:, None]
+        names = tracks.camera_unknowns(self.is_static)
+        unknown = dict(zip(names, ca.vertsplit(own[: len(names)]), strict=True)) if names else {}
+        drift = own[len(names) :]
+
+        def known(*which: str) -> ca.SX:
+            return ca.vertcat(*(unknown.get(name, ca.SX(0)) for name in which))
+
+        line_s = tracks.line_delay_s + known("line_delay_error_s")
+        late = known("delay_s") + known("clock_rate") * share * duration + line_s * row
+        weights = lagrange_weights(late, ca.vertsplit(offsets))
+        # Stored by rows, so that this is the transpose: from the world to the camera.
+        to_camera = ca.reshape(rotation, 3, 3)
+        point = to_camera @ (values @ ca.vertcat(*weights) - translation)
+        if any(name.startswith("turn") for name in names):
+            point = cayley_rotation(known("turn_x_rad", "turn_y_rad", "turn_z_rad")) @ point
+        point = point + known("shift_x_m", "shift_y_m", "shift_z_m")
+        point = ca.vertcat(point[:2], ca.fmax(point[2], LEAST_DEPTH_M))
+        pixel = tracks.camera.pixel_expression(
+            point, known("focal_error"), known("centre_u_px", "centre_v_px")
+        )
+        if drift.numel():
+            pixel = pixel + self._walk(drift, share, duration)
+        return ca.vertcat(pixel, 0)
+
+    @staticmethod
+    def _walk(drift: ca.SX, share: ca.SX, duration: ca.SX) -> ca.SX:
+        """Return the drift (2,) of a track from its terms, u first, at a share of the duration."""
+        angles = [(k + 0.5) * np.pi for k in range(WALK_TERMS)]
+        terms = [np.sqrt(2) / angle * ca.sin(angle * share) for angle in angles]
+        walk = ca.sqrt(duration) * ca.vertcat(*terms)
+        return ca.vertcat(ca.dot(walk, drift[:WALK_TERMS]), ca.dot(walk, drift[WALK_TERMS:]))
+
+    def numbers(self, predicted: Array) -> Array:
+        """Return predictions (S, N, 3) as pixels (S, 2N)."""
+        return predicted[..., :2].reshape(len(predicted), -1)
+
+    @property
+    def first_needed_s(self) -> float:
+        """Time [s] of the last row of the motion on which the first compared image depends."""
+        first = int(self.is_compared.any(axis=(1, 2)).argmax())
+        return float(self.observable_s[self._times[first, -1]])
+
+    @property
+    def observable_sigmas(self) -> Array:
+        """Standard deviations (3N,) of the positions as one pixel determines them, along any axis:
+        σ times the distance of the body from the camera over the focal length.
+        """
+        rest_m = self.observable.association.prior_places_m
+        away_m = np.linalg.norm(rest_m - self.correspondences.translations[0], axis=1)
+        focal_px = self.sensor.camera.require_matrix()[0, 0]
+        return np.repeat(self.sigmas * away_m / focal_px, GROUP)
+
+    # Correspondences --------------------------------------------------------------------------
+
+    @property
+    def first_row(self) -> int:
+        """Index of the last time of the observable from which the first image is computed."""
+        return int(self._times[0, -1])
+
+    def _shapes(self, x: Array) -> Array:
+        """Return the nodes (s, n, 3) [m] at those first images that rows x (rows, 3n) reach."""
+        known = int(np.count_nonzero(self._times[:, -1] < len(x)))
+        nodes_m = x.reshape(len(x), -1, 3)
+        distances_s = self.observable_s[self._times] - self.t_s[:, None]
+        shapes = [
+            np.tensordot(lagrange_weights(0.0, late_s.tolist()), nodes_m[times], 1)
+            for times, late_s in zip(self._times[:known], distances_s[:known], strict=True)
+        ]
+        return np.reshape(shapes, (known, *nodes_m.shape[1:]))
+
+    def reassociated(self, x: Array, phi: Array) -> TrackedPlaces:
+        """Return places and visible points for the shapes that the first rows reach."""
+        return self.correspondences.followed(phi, self._shapes(x))
+
+    def aligned_correspondences(
+        self, x: Array, phi: Array, only_pose: bool = False
+    ) -> TrackedPlaces:
+        """Find unknown places and poses with the first rows of a motion; later images keep the
+        body rigid.
+        """
+        places = self.correspondences
+        tracks = self.sensor
+        if only_pose or (tracks.is_place_known.all() and tracks.has_known_pose):
+            return places
+        experiment = self.experiment
+
+        def shape_at(t_s: float) -> Array:
+            last_s = self.observable_s[len(x) - 1]
+            if t_s > last_s and self.t_s[0] <= last_s:
+                return experiment.rigid_positions(np.array([t_s]))[0]
+            late = np.abs(self.observable_s[: len(x)] - t_s)
+            return x[int(late.argmin())].reshape(-1, 3)
+
+        return TrackedPlaces.from_shapes(
+            experiment, tracks, shape_at, places.coordinate_parameters, places.pose_parameters
+        )
+
+    def correspondences_of(self, measured: ImageTracks, x: Array, phi: Array) -> TrackedPlaces:
+        """Return the correspondences of the same tracks in another experiment."""
+        return replace(self.correspondences, tracks=measured).followed(phi, self._shapes(x))
+
+
+class ImageTracksModel(CorrespondenceModel):
+    """Tracks of one camera, whose places on the body follow the estimates."""
+
+    measurement: ImageTracks
+
+    @cached_property
+    def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
+        """Generated functions, which are the same for all correspondences."""
+        return {}
+
+    @cached_property
+    def _coordinate_parameters(self) -> Index:
+        """Indices in φ (N, 2) of the coordinates of the places; −1 for exact ones."""
+        tracks, nuisance = self.measurement, self.grid.nuisance
+        indices = np.full((len(tracks.names), 2), -1)
+        for k in np.flatnonzero(tracks.place_sigmas_m(self.grid.experiment)).tolist():
+            indices[k] = nuisance.indices_of_labels(place_labels(tracks.names[k]))
+        return indices
+
+    @cached_property
+    def _pose_parameters(self) -> Index:
+        """Indices in φ (6,) of the pose if it is unknown; empty if it is stated."""
+        tracks = self.measurement
+        names = () if tracks.has_known_pose else POSE_UNKNOWNS
+        return self.grid.nuisance.indices_of_labels(map(tracks.unknown_label, names))
+
+    @cached_property
+    def _own_parameters(self) -> Index:
+        """Indices in φ (N, f) on which the pixels of each point depend besides its place."""
+        tracks, nuisance = self.measurement, self.grid.nuisance
+        static = self.grid.experiment.is_static
+        labels = [tracks.unknown_label(name) for name in tracks.camera_unknowns(static)]
+        drifts = tracks.drift_sigma_px and not static
+        return np.array(
+            [
+                nuisance.indices_of_labels([*labels, *(tracks.drift_labels(p) if drifts else ())])
+                for p in tracks.names
+            ]
+        ).reshape(len(tracks.names), -1)
+
+    def first_correspondences(self) -> TrackedPlaces:
+        """Return the correspondences with the undeformed body in its grasps."""
+        experiment = self.grid.experiment
+
+        def shape_at(t_s: float) -> Array:
+            at_s = np.clip([t_s], *experiment.t_s[[0, -1]])
+            return experiment.rigid_positions(at_s)[0]
+
+        return TrackedPlaces.from_shapes(
+            experiment,
+            self.measurement,
+            shape_at,
+            self._coordinate_parameters,
+            self._pose_parameters,
+        )
+
+    def residuals(
+        self, association: Association, correspondences: Correspondences | None
+    ) -> tuple[ImageTrackResidual]:
+        """Return the residual of the tracks."""
+        assert isinstance(correspondences, TrackedPlaces)
+        tracks, grid = self.measurement, self.grid
+        places = replace(
+            correspondences,
+            coordinate_parameters=self._coordinate_parameters,
+            pose_parameters=self._pose_parameters,
+        )
+        count = len(tracks.names)
+        at_s = tracks.sample_times_s
+        measured = np.full((len(at_s), count, GROUP), np.nan)
+        if tracks.pixels is not None:
+            measured[..., :2] = tracks.pixels
+        seen = tracks.is_seen & places.is_visible & places.is_placed
+        seen &= is_within(at_s, grid.t_s)[:, None]
+        residual = ImageTrackResidual(
+            observable=PointPositions(
+                np.arange(len(grid.t_s)), places.association, self._coordinate_parameters
+            ),
+            nuisance=grid.nuisance,
+            huber=HUBER if grid.huber is None else grid.huber,
+            names=tuple(f"{name} in {tracks.name}" for name in tracks.names),
+            t_s=at_s,
+            sigmas=np.full(count, tracks.sigma_px),
+            measured=measured,
+            is_compared=np.isfinite(measured) & seen[..., None],
+            own_parameters=self._own_parameters,
+            correspondences=places,
+            sensor=tracks,
+            observable_s=grid.t_s,
+            is_static=grid.experiment.is_static,
+            experiment=grid.experiment,
+        )
+        vars(residual)["_expressions"] = self._expressions
+        return (residual,)

@@ -1,0 +1,362 @@
+"""Places of tracked points on the body, poses of cameras, and which points are visible.
+
+Places and poses that are not stated are found with a shape of the body at the first image: a pose
+from the points with a stated place, a place from the ray of its pixel. Cameras share the places of
+points with the same name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array, Index
+from ...errors import InputError
+from ...fem.body import Body
+from ...program.correspondences import Correspondences
+from ...program.markers.marker_association import MarkerAssociation
+from ...recording.experiment import Experiment
+from ...recording.placement import LocatedBody
+from .rays import FEWEST_POINTS, is_occluded, points_on_surface, poses_from_points
+from .tracks import ImageTracks, stated_places
+
+# Sine of the angle by which a ray may miss the body if the pose of the camera is exact, and in
+# standard deviations of the pose.
+LEAST_MISS = 5e-3
+MISSES = 3.0
+# Cosine between normal and view below which a point that was hidden becomes visible, and below which
+# a visible one becomes hidden: trackers follow points at grazing angles.
+TURNS_VISIBLE = 0.05
+TURNS_HIDDEN = -0.1
+# Distance in mean edges in front of a point at which another part of the surface hides it.
+OCCLUSION_EDGES = 0.3
+
+ShapeAt = Callable[[float], Array]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPlaces:
+    """Poses of all cameras and places of all points of an experiment.
+
+    Attributes
+    ----------
+    poses : mapping of str to (4, 4) array
+        Pose of each camera by its name, in the frame that carries it.
+    mirrored : mapping of str to float
+        Of cameras whose pose was found: the RMS of the second best pose over that of the best one.
+    places_m : mapping of str to (3,) array
+        Place of each point on the undeformed body; NaN if no ray meets the body.
+    """
+
+    poses: Mapping[str, Array]
+    mirrored: Mapping[str, float]
+    places_m: Mapping[str, Array]
+
+
+def find_places(experiment: Experiment, shape_at: ShapeAt) -> FoundPlaces:
+    """Return the poses of the cameras and the places of the points of an experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    shape_at : callable
+        ``shape_at(t_s)``, nodes (n, 3) of the body at a time [m].
+
+    Raises
+    ------
+    InputError
+        If the pose of a camera is unknown, and fewer than four points of it have a stated place.
+    """
+    cameras = [each for each in experiment.readings if isinstance(each, ImageTracks)]
+    rest = LocatedBody(experiment.body.nodes_m, experiment.body)
+    stated = {name: place for name, (place, _) in stated_places(experiment).items()}
+    poses, mirrored = {}, {}
+    for tracks in cameras:
+        poses[tracks.name] = tracks.camera.pose
+        if not tracks.has_known_pose and tracks.pixels is not None:
+            found = _poses_of(tracks, stated, rest, shape_at)
+            poses[tracks.name] = found[0][0]
+            mirrored[tracks.name] = found[1][1] / found[0][1] if len(found) > 1 else np.inf
+    places = dict(stated)
+    for tracks in cameras:
+        _add_places(places, tracks, poses[tracks.name], experiment.body, shape_at)
+    return FoundPlaces(poses, mirrored, places)
+
+
+def _poses_of(
+    tracks: ImageTracks, stated: Mapping[str, Array], rest: LocatedBody, shape_at: ShapeAt
+) -> list[tuple[Array, float]]:
+    """Return the possible poses of a camera in the first image with the most known points."""
+    known = np.array([name in stated for name in tracks.names])
+    counts = (tracks.is_seen & known).sum(axis=1)
+    sample = int(counts.argmax())
+    if counts[sample] < FEWEST_POINTS:
+        raise InputError(
+            f"the pose of the camera '{tracks.name}' is unknown, and {counts[sample]} of its points "
+            f"have a stated place in one image; expected at least {FEWEST_POINTS} points with "
+            "places_m, or the pose"
+        )
+    assert tracks.pixels is not None
+    used = np.flatnonzero(tracks.is_seen[sample] & known)
+    nodes_m = shape_at(float(tracks.sample_times_s[sample]))
+    points = [_moved(stated[tracks.names[k]], rest, nodes_m) for k in used.tolist()]
+    rays = tracks.camera.points_at_unit_depth(np.asarray(tracks.pixels)[sample, used])
+    found = poses_from_points(np.array(points), rays)
+    if not found:
+        raise InputError(
+            f"no pose of the camera '{tracks.name}' shows the points with places_m where they "
+            "appear; expected their places on the undeformed body, and pixels of this camera"
+        )
+    if tracks.camera.poses is None:
+        return found
+    rotations, translations = tracks.camera.poses.at(tracks.sample_times_s[[sample]])
+    carrier = np.eye(4)
+    carrier[:3, :3], carrier[:3, 3] = rotations[0], translations[0]
+    return [(np.linalg.inv(carrier) @ pose, error) for pose, error in found]
+
+
+def _moved(place_m: Array, rest: LocatedBody, nodes_m: Array) -> Array:
+    """Return where a place (3,) of the undeformed body is in a shape (n, 3) [m]."""
+    nodes, weights = rest.weights_at_nearest_point(place_m)
+    return np.asarray(weights @ nodes_m[nodes])
+
+
+def _add_places(
+    places: dict[str, Array], tracks: ImageTracks, pose: Array, body: Body, shape_at: ShapeAt
+) -> None:
+    """Add the places of the points that have none and are seen by this camera, in place."""
+    seen = tracks.is_seen
+    if tracks.pixels is None:
+        for name in tracks.names:
+            places.setdefault(name, np.full(3, np.nan))
+        return
+    pixels = np.asarray(tracks.pixels)
+    camera = replace(tracks.camera, pose=pose)
+    tolerance = max(LEAST_MISS, MISSES * np.deg2rad(tracks.pose_sigma.turn_deg))
+    firsts = seen.argmax(axis=0)
+    for sample in np.unique(firsts):
+        chosen = [
+            k
+            for k in np.flatnonzero((firsts == sample) & seen[sample]).tolist()
+            if tracks.names[k] not in places or not np.isfinite(places[tracks.names[k]]).all()
+        ]
+        if not chosen:
+            continue
+        t_s = float(tracks.sample_times_s[sample])
+        rotations, translations = camera.pose_at(t_s)
+        rays = camera.points_at_unit_depth(pixels[sample, chosen])
+        origins = np.tile(translations[0], (len(chosen), 1))
+        nodes_m = shape_at(t_s)
+        faces, shares, missed = points_on_surface(
+            origins, rays @ rotations[0].T, nodes_m, body.mesh.surface
+        )
+        at_m = np.einsum("pc,pci->pi", shares, body.nodes_m[body.mesh.surface[faces]])
+        own_m = np.einsum("pc,pci->pi", shares, nodes_m[body.mesh.surface[faces]])
+        distance = np.linalg.norm(own_m - origins, axis=1)
+        allowed = tolerance + MISSES * tracks.pose_sigma.shift_m / np.maximum(distance, 1e-9)
+        for k, place, miss, most in zip(chosen, at_m, missed, allowed, strict=True):
+            places[tracks.names[k]] = place if miss <= most else np.full(3, np.nan)
+    for name in tracks.names:
+        places.setdefault(name, np.full(3, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPlaces(Correspondences):
+    """Places of the points of one camera, its pose, and which points are compared.
+
+    Attributes
+    ----------
+    tracks : ImageTracks
+    association : MarkerAssociation
+        Places of the points, which move on the surface.
+    rotations, translations : (S, 3, 3) and (S, 3) arrays
+        Pose of the camera at each image, from its frame to the world.
+    is_placed : (N,) array of bool
+        Points that are on the body.
+    is_visible : (S, N) array of bool
+        Points that are not hidden.
+    coordinate_parameters : (N, 2) array
+        Indices in φ of the coordinates of the places; −1 for exact ones.
+    pose_parameters : (6,) array
+        Indices in φ of the pose if it was found; empty if it is stated.
+    mirror_ratio : float
+        Of a pose that was found: the error of the second best pose over that of the best one.
+    """
+
+    tracks: ImageTracks
+    association: MarkerAssociation
+    rotations: Array
+    translations: Array
+    is_placed: NDArray[np.bool_]
+    is_visible: NDArray[np.bool_]
+    coordinate_parameters: Index
+    pose_parameters: Index
+    mirror_ratio: float = np.inf
+
+    @classmethod
+    def from_shapes(
+        cls,
+        experiment: Experiment,
+        tracks: ImageTracks,
+        shape_at: ShapeAt,
+        coordinate_parameters: Index,
+        pose_parameters: Index,
+    ) -> TrackedPlaces:
+        """Find places and pose with the shapes of the body, see `find_places`."""
+        found = find_places(experiment, shape_at)
+        body = experiment.body
+        places = np.array([found.places_m[name] for name in tracks.names])
+        is_placed = np.isfinite(places).all(axis=1)
+        places[~is_placed] = body.nodes_m[body.mesh.surface[0, 0]]
+        sigmas = np.where(is_placed, tracks.place_sigmas_m(experiment), 0.0)
+        camera = replace(tracks.camera, pose=found.poses[tracks.name])
+        rotations, translations = camera.pose_at(tracks.sample_times_s)
+        correspondences = cls(
+            tracks,
+            surface_association(body, places, sigmas),
+            rotations,
+            translations,
+            is_placed,
+            is_visible=np.ones(tracks.is_seen.shape, dtype=bool),
+            coordinate_parameters=coordinate_parameters,
+            pose_parameters=pose_parameters,
+            mirror_ratio=found.mirrored.get(tracks.name, np.inf),
+        )
+        shapes = [shape_at(float(t)) for t in tracks.sample_times_s]
+        return correspondences.with_visibility(np.array(shapes))
+
+    @property
+    def measured(self) -> ImageTracks:
+        """The tracks."""
+        return self.tracks
+
+    def with_start_values(self, phi: Array) -> Array:
+        """Return a copy of φ with the coordinates of the places, and without an error of a pose
+        that was found.
+        """
+        started = self._with_places(phi)
+        started[self.pose_parameters] = 0.0
+        return started
+
+    def continued(self, phi: Array, previous: Correspondences) -> Array:
+        """Return φ with the coordinates of places that have left their elements."""
+        assert isinstance(previous, TrackedPlaces)
+        return phi if self.association is previous.association else self._with_places(phi)
+
+    def _with_places(self, phi: Array) -> Array:
+        changed = phi.copy()
+        estimated = self.association.estimated
+        changed[self.coordinate_parameters[estimated]] = self.association.centre_coordinates[
+            estimated
+        ]
+        return changed
+
+    def coordinates(self, phi: Array) -> Array:
+        """Return the coordinates (N, 2) of the places at φ (k,); zero for exact ones."""
+        return np.append(phi, 0.0)[self.coordinate_parameters]
+
+    def places_m(self, phi: Array) -> Array:
+        """Return the places (N, 3) on the undeformed body at φ (k,) [m]."""
+        return self.association.places_m(self.coordinates(phi))
+
+    # Visibility -------------------------------------------------------------------------------
+
+    @cached_property
+    def _faces(self) -> tuple[Index, Array]:
+        """Surface triangles (N,) of the places at the centre of the association, and barycentric
+        coordinates (N, 3) in them.
+        """
+        body = self.association.body
+        corners = body.nodes_m[body.mesh.surface]
+        ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        normals = np.cross(ab, ac)
+        squares = np.einsum("fi,fi->f", normals, normals)
+        faces, shares = [], []
+        for place in self.association.centre_places_m:
+            away = place - corners[:, 0]
+            in_c = np.einsum("fi,fi->f", np.cross(ab, away), normals) / squares
+            in_b = np.einsum("fi,fi->f", np.cross(away, ac), normals) / squares
+            off = np.einsum("fi,fi->f", away, normals) / np.sqrt(squares)
+            least = np.minimum(np.minimum(in_b, in_c), 1 - in_b - in_c)
+            face = int(np.argmin(np.abs(off) / np.sqrt(np.sqrt(squares)) - np.minimum(least, 0.0)))
+            share = np.clip([1 - in_b[face] - in_c[face], in_b[face], in_c[face]], 0.0, None)
+            faces.append(face)
+            shares.append(share / share.sum())
+        return np.array(faces, dtype=np.int64), np.array(shares)
+
+    def with_visibility(self, shapes_m: Array) -> TrackedPlaces:
+        """Return the correspondences with the points that are visible in the first s shapes (s, n,
+        3) [m]; self if they are the same.
+
+        A point is hidden if its face looks away from the camera, or another part of the body is in
+        front of it; not by obstacles.
+        """
+        count = len(shapes_m)
+        if not count:
+            return self
+        body = self.association.body
+        surface = body.mesh.surface
+        faces, shares = self._faces
+        corners = shapes_m[:, surface[faces]]
+        points = np.einsum("nc,snci->sni", shares, corners)
+        normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-30)
+        to_eye = self.translations[:count, None] - points
+        to_eye /= np.maximum(np.linalg.norm(to_eye, axis=2, keepdims=True), 1e-30)
+        cosines = np.einsum("sni,sni->sn", normals, to_eye)
+        before = self.is_visible[:count]
+        visible = np.where(before, cosines > TURNS_HIDDEN, cosines > TURNS_VISIBLE)
+        margin_m = OCCLUSION_EDGES * self._mean_edge_m
+        for k in range(count):
+            candidates = np.flatnonzero(visible[k] & self.tracks.is_seen[k] & self.is_placed)
+            eyes = np.tile(self.translations[k], (len(candidates), 1))
+            triangles = shapes_m[k][surface]
+            hidden = is_occluded(points[k, candidates], eyes, triangles, margin_m)
+            visible[k, candidates[hidden]] = False
+        if np.array_equal(visible, before):
+            return self
+        return replace(self, is_visible=np.concatenate([visible, self.is_visible[count:]]))
+
+    @cached_property
+    def _mean_edge_m(self) -> float:
+        return float(self.association.body.mesh.quality().edge_mean_m)
+
+    def followed(self, phi: Array, shapes_m: Array) -> TrackedPlaces:
+        """Return the correspondences at other estimates φ (k,) with the first s shapes (s, n, 3)
+        [m]; self if nothing has changed.
+        """
+        association, _ = self.association.follow_estimates(self.coordinates(phi))
+        other = self
+        if association is not self.association:
+            other = replace(self, association=association)
+        return other.with_visibility(shapes_m)
+
+
+def surface_association(body: Body, places_m: Array, sigmas_m: Array) -> MarkerAssociation:
+    """Return the association of points whose places (N, 3) [m] move on the surface with prior
+    standard deviations (N,) [m], zero for exact ones.
+    """
+    located = LocatedBody(body.nodes_m, body)
+    attached: Sequence[tuple[Index, Array]] = [
+        located.weights_at_nearest_point(place) for place in places_m
+    ]
+    count = len(places_m)
+    none = np.zeros(count, dtype=np.int64)
+    association = MarkerAssociation(
+        body,
+        sigmas_m,
+        prior_places_m=places_m,
+        on_surface=True,
+        nodes=np.array([nodes for nodes, _ in attached]),
+        weights=np.array([weights for _, weights in attached]),
+        cells=none,
+        centre_places_m=places_m,
+        axes=np.zeros((count, 3, 2)),
+        crossed_edges=np.full((count, 2, 3), np.nan),
+        crossing_counts=none,
+    )
+    return association.centred_at(places_m)

@@ -1,0 +1,288 @@
+"""Tracks of points in images of ordinary cameras: predictions, derivatives, places and poses."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from kit.depth import looking
+from kit.filmed import (
+    EYES_M,
+    MATRIX,
+    NAMES,
+    NOISE_PX,
+    PLACES_M,
+    T_S,
+    TRUTH,
+    filming,
+    motion_m,
+    projected,
+    swung,
+    tracks_of,
+    unknown_young,
+)
+from scipy.spatial.transform import Rotation
+
+import collocation_sysid as cs
+from collocation_sysid.features.image_tracks.rays import (
+    is_occluded,
+    points_on_surface,
+    poses_from_points,
+)
+from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
+from collocation_sysid.methods.solution import Solution
+from collocation_sysid.program.observables import ObservableDerivatives
+
+EXACT: dict[str, Any] = {
+    "pose_sigma": cs.PoseSigma(turn_deg=0.0, shift_m=0.0),
+    "focal_sigma": 0.0,
+    "centre_sigma_px": 0.0,
+    "clock_sigma_s": 0.0,
+    "place_sigma_m": 0.0,
+}
+# Every deviation is estimated.
+FREE: dict[str, Any] = {
+    "clock_rate_sigma": 1e-3,
+    "line_delay_s": 2e-5,
+    "line_delay_sigma_s": 5e-6,
+    "drift_sigma_px": 1.0,
+}
+
+
+def residual_of(*tracks: cs.ImageTracks) -> ImageTrackResidual:
+    program = cs.Problem([swung(tracks)], parameters=unknown_young()).collocation()
+    return program.transcriptions[0].residuals_of(ImageTrackResidual)[-1]
+
+
+def simulated_m() -> np.ndarray:
+    """Positions of all nodes, flat."""
+    motion = cs.simulate(swung(), TRUTH, "midpoint", substeps=1)
+    return motion.positions_m.reshape(len(T_S), -1)
+
+
+def test_predicted_pixels_are_the_projections_of_the_markers() -> None:
+    tracks = tracks_of(**EXACT)
+    simulated = cs.simulate(swung([tracks]), TRUTH, "midpoint", substeps=1)
+    pixels = simulated.custom_sensor_values[0].reshape(len(T_S), -1, 2)
+    np.testing.assert_allclose(pixels, projected(filming("front"), motion_m()), atol=1e-9)
+
+
+def test_images_between_the_samples_are_interpolated() -> None:
+    at_s = T_S[:-1:2] + 0.004
+    tracks = tracks_of(**EXACT).with_samples(at_s, np.zeros((len(at_s), 2 * len(NAMES))))
+    fine = cs.simulate(swung([tracks]), TRUTH, "midpoint", substeps=1)
+    around = cs.simulate(swung([tracks_of(**EXACT)]), TRUTH, "midpoint", substeps=1)
+    for k, t_s in enumerate(at_s[2:-2], start=2):
+        first = 2 * k - 2
+        places, values = T_S[first : first + 5], around.custom_sensor_values[0][first : first + 5]
+        expected = np.polyval(np.polyfit(places - t_s, values[:, 0], 4), 0.0)
+        # The projection of interpolated positions differs from interpolated projections slightly.
+        assert abs(fine.custom_sensor_values[0][k, 0] - expected) < 0.02
+
+
+@pytest.mark.parametrize("changes", [{}, FREE, {"known": False} | FREE])
+def test_derivatives_of_residuals_agree_with_differences(changes: dict) -> None:
+    residual = residual_of(tracks_of(**changes))
+    x = simulated_m()
+    rng = np.random.default_rng(3)
+    start = residual.correspondences.with_start_values(np.zeros(residual.nuisance.size))
+    phi = start + 0.01 * rng.normal(size=residual.nuisance.size)
+    direction = rng.normal(size=x.shape) * 1e-3
+
+    def at(step: float, step_phi: np.ndarray) -> np.ndarray:
+        values = residual.observable.evaluate_positions(x + step * direction, phi + step_phi)
+        return residual.residuals(values, phi + step_phi)
+
+    still = np.zeros_like(phi)
+    points = residual.observable
+    shape = points.shape_functions(phi)
+    by_x = (points.operator(phi) @ direction.T).T[..., None]
+    slopes: ObservableDerivatives = points.derivatives_from(x, shape, np.array([0]), by_x)
+    values = points.evaluate_positions(x, phi)
+    found, by = residual.linearise(values, slopes, phi, 1 + len(phi))
+    np.testing.assert_allclose(found, at(0.0, still), atol=1e-10)
+    step = 1e-5
+    differences = (at(step, still) - at(-step, still)) / (2 * step)
+    np.testing.assert_allclose(by[..., 0], differences, rtol=1e-5, atol=1e-5)
+    for k in range(len(phi)):
+        unit = np.where(np.arange(len(phi)) == k, step, 0.0)
+        differences = (at(0.0, unit) - at(0.0, -unit)) / (2 * step)
+        np.testing.assert_allclose(by[..., 1 + k], differences, rtol=1e-4, atol=1e-4)
+
+
+def solved(*tracks: cs.ImageTracks, **changes: Any) -> Solution:
+    problem = cs.Problem([swung(tracks, **changes)], parameters=unknown_young())
+    return cs.solve(problem)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("known", [True, False])
+def test_youngs_modulus_is_found_from_one_camera(known: bool) -> None:
+    solution = solved(tracks_of(rng=np.random.default_rng(1), known=known))
+    assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.01
+
+
+@pytest.mark.long
+def test_a_wrong_pose_is_estimated() -> None:
+    rng = np.random.default_rng(2)
+    off = np.array(filming("front").pose)
+    off[:3, :3] = off[:3, :3] @ Rotation.from_rotvec([0.02, -0.03, 0.02]).as_matrix()
+    off[:3, 3] += [0.006, -0.012, 0.008]
+    loose = cs.PoseSigma(turn_deg=3.0, shift_m=0.02)
+    tracks = tracks_of(rng=rng, camera=filming("front", pose=off), pose_sigma=loose)
+    solution = solved(tracks)
+    assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.01
+    trusted = solved(
+        tracks_of(rng=np.random.default_rng(2), camera=filming("front", pose=off), **EXACT)
+    )
+    assert abs(trusted.parameters["young_pa"] / TRUTH["young_pa"] - 1) > 0.02
+
+
+@pytest.mark.long
+def test_an_unknown_pose_is_found_from_the_body_at_rest() -> None:
+    camera = filming("front", pose=np.eye(4))
+    tracks = tracks_of(rng=np.random.default_rng(4), camera=camera, has_known_pose=False)
+    solution = solved(tracks)
+    assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.02
+    places = solution.parts[0].transcription.residuals_of(ImageTrackResidual)[0].correspondences
+    true = filming("front").pose
+    away_m = np.linalg.norm(places.translations[0] - true[:3, 3])
+    assert away_m < 0.02  # 4 % of the distance of the camera
+
+
+@pytest.mark.long
+def test_a_late_clock_is_estimated() -> None:
+    pixels = projected(filming("front"), motion_m())
+    # The images of a camera that is 6 ms late show the motion 6 ms later.
+    from scipy.interpolate import CubicSpline
+
+    late = CubicSpline(T_S, pixels)(T_S + 0.006)
+    rng = np.random.default_rng(5)
+    late = late + NOISE_PX * rng.normal(size=late.shape)
+    tracks = tracks_of().with_samples(T_S[:-1], late[:-1].reshape(len(T_S) - 1, -1))
+    solution = solved(tracks)
+    assert abs(solution.nuisance("delay_s") - 0.006) < 5e-4
+    assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.01
+
+
+def test_cameras_share_the_places_of_points_with_the_same_name() -> None:
+    residual = residual_of(tracks_of("front", known=False), tracks_of("top", known=False))
+    labels = [entry.label for entry in residual.nuisance.entries]
+    assert len(labels) == len(set(labels))
+    assert sum(label.startswith("place of tip_top on") for label in labels) == 2
+    assert sum(label.startswith("delay of") for label in labels) == 2
+    one, two = swung([tracks_of("front")]), swung([tracks_of("front"), tracks_of("top")])
+    count = [cs.Problem([e], unknown_young()).collocation().transcriptions[0] for e in (one, two)]
+    assert count[1].nuisance.size - count[0].nuisance.size == 10  # of the second camera alone
+
+
+def test_a_place_that_one_camera_states_is_known_to_the_others() -> None:
+    places = residual_of(tracks_of("front"), tracks_of("top", known=False)).correspondences
+    np.testing.assert_allclose(
+        places.association.prior_places_m, list(PLACES_M.values()), atol=1e-12
+    )
+    np.testing.assert_allclose(places.association.sigma_m, 1e-3)
+
+
+def test_unknown_places_are_where_the_first_rays_meet_the_surface() -> None:
+    residual = residual_of(tracks_of(known=False))
+    still = np.zeros(residual.nuisance.size)
+    found = residual.aligned_correspondences(simulated_m(), still)
+    at = dict(zip(NAMES, found.places_m(found.with_start_values(still)), strict=True))
+    for name in set(NAMES) - {"tip_end"}:  # which the camera does not see
+        np.testing.assert_allclose(at[name], PLACES_M[name], atol=1e-5)
+
+
+def test_hidden_points_are_not_compared() -> None:
+    residual = residual_of(tracks_of("front"))
+    compared = dict(zip(NAMES, residual.is_compared[..., :2].all(axis=(0, 2)), strict=True))
+    assert not compared["tip_end"]  # its face looks away from the camera
+    assert compared["tip_front"]
+    assert compared["near_top"]
+    eyes = np.tile([0.0, 0.0, 1.0], (2, 1))
+    roof = np.array([[[-1.0, -1.0, 0.5], [1.0, -1.0, 0.5], [0.0, 1.0, 0.5]]])
+    points = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+    assert is_occluded(points, eyes, roof, 0.01).tolist() == [True, False]
+    assert is_occluded(points + np.array([0, 0, 0.495]), eyes, roof, 0.01).tolist() == [
+        False,
+        False,
+    ]
+
+
+def test_points_off_the_body_are_excluded() -> None:
+    tracks = tracks_of(known=False)
+    assert tracks.pixels is not None
+    pixels = np.array(tracks.pixels)
+    pixels[:, 0] = [40.0, 40.0]  # the background
+    residual = residual_of(tracks.with_samples(T_S, pixels.reshape(len(T_S), -1)))
+    assert residual.correspondences.is_placed.tolist() == [False] + [True] * (len(NAMES) - 1)
+    assert not residual.is_compared[:, 0].any()
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_poses_are_found_from_points(flat: bool) -> None:
+    rng = np.random.default_rng(6)
+    points = rng.uniform(-0.05, 0.05, (8, 3)) * ([1, 1, 0] if flat else [1, 1, 1])
+    true = looking(np.array(EYES_M["front"]), np.zeros(3))
+    rays = (points - true[:3, 3]) @ true[:3, :3]
+    rays /= rays[:, 2:]
+    rays[:, :2] += 1e-4 * rng.normal(size=(8, 2))
+    poses = poses_from_points(points, rays)
+    (best, error), *others = poses
+    assert error < 2e-4
+    assert np.linalg.norm(best[:3, 3] - true[:3, 3]) < 0.02
+    if flat:  # the mirror image fits second best
+        assert others
+        assert error <= others[0][1]
+
+
+def test_rays_find_the_nearest_of_several_triangles() -> None:
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [-1, -1, 1], [1, -1, 1], [0, 1, 1]])
+    surface = np.array([[0, 1, 2], [3, 4, 5]])
+    up, down = np.array([[0.0, 0, -1]]), np.array([[0.0, 0, 3]])
+    assert points_on_surface(up, np.array([[0.0, 0, 1]]), corners, surface)[0][0] == 0
+    faces, shares, missed = points_on_surface(down, np.array([[0.0, 0, -1]]), corners, surface)
+    assert (faces[0], missed[0]) == (1, 0.0)
+    np.testing.assert_allclose(shares[0] @ corners[surface[1]], [0, 0, 1], atol=1e-12)
+    assert points_on_surface(down, np.array([[1.0, 1, -1]]), corners, surface)[2][0] > 0.1
+
+
+def test_tracks_can_be_pickled_and_shortened() -> None:
+    tracks = pickle.loads(pickle.dumps(tracks_of()))
+    assert tracks.columns[:2] == ("tip_front_u", "tip_front_v")
+    half = tracks.without_later_values(0.2)
+    assert np.isnan(half.measured_values[21:]).all()
+    assert np.isfinite(half.measured_values[:21]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"camera": cs.Camera()}, "has no matrix"),
+        ({"names": ("a",) * 7}, "expected different names"),
+        ({"t_s": T_S[::-1]}, "t_s of the image tracks 'front'"),
+        ({"pixels": np.zeros((3, 7, 2))}, "pixels of the image tracks 'front'"),
+        ({"pixels": np.full((41, 7, 2), np.nan)}, "all pixels of .* are missing"),
+        ({"places_m": np.zeros((2, 3))}, "places_m of the image tracks 'front'"),
+        ({"sigma_px": 0.0}, "sigma_px"),
+    ],
+)
+def test_impossible_tracks_are_refused(changes: dict, message: str) -> None:
+    arguments: dict[str, Any] = {
+        "camera": cs.Camera(MATRIX),
+        "t_s": T_S,
+        "pixels": np.zeros((41, 7, 2)),
+        "names": NAMES,
+    }
+    with pytest.raises(cs.InputError, match=message):
+        cs.ImageTracks("front", **arguments | changes)
+
+
+def test_an_unknown_pose_needs_four_known_places() -> None:
+    places = np.array(list(PLACES_M.values()))
+    places[3:] = np.nan
+    tracks = tracks_of(places_m=places, has_known_pose=False, known=False)
+    with pytest.raises(cs.InputError, match=r"3 of its points .* expected at least 4"):
+        residual_of(tracks)

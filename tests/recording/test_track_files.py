@@ -1,0 +1,156 @@
+"""Files of trackers, and tables of image tracks in a problem file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.features.image_tracks.track_files import read_tracks
+
+RNG = np.random.default_rng(7)
+PIXELS = np.round(RNG.uniform(10, 600, (5, 2, 2)), 3)
+SCORES = np.array([[0.9, 1.0], [0.2, 0.8], [0.7, 0.9], [1.0, 0.1], [0.95, 0.99]])
+NAMES = ("tip", "hook")
+T_S = np.array([0.0, 0.033, 0.067, 0.1, 0.133])
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def wide() -> str:
+    lines = ["t_s,tip_u,tip_v,tip_likelihood,hook_u,hook_v,hook_likelihood"]
+    for t, pixels, scores in zip(T_S, PIXELS, SCORES, strict=True):
+        cells = [f"{u},{v},{s}" for (u, v), s in zip(pixels, scores, strict=True)]
+        lines.append(",".join([str(t), *cells]))
+    return "\n".join(lines) + "\n"
+
+
+def long() -> str:
+    lines = ["frame,point,u,v,likelihood"]
+    for k in range(5):
+        for name, (u, v), s in zip(NAMES, PIXELS[k], SCORES[k], strict=True):
+            lines.append(f"{k},{name},{u},{v},{s}")
+    return "\n".join([lines[0], *reversed(lines[1:])]) + "\n"
+
+
+def deeplabcut() -> pd.DataFrame:
+    columns = pd.MultiIndex.from_product(
+        [["net"], NAMES, ["x", "y", "likelihood"]], names=["scorer", "bodyparts", "coords"]
+    )
+    values = np.concatenate([PIXELS, SCORES[..., None]], axis=2).reshape(5, -1)
+    return pd.DataFrame(values, columns=columns)
+
+
+def require_same(read: Any, has_times: bool = False) -> None:
+    assert read.names == NAMES
+    np.testing.assert_allclose(read.pixels, PIXELS, atol=1e-9)
+    np.testing.assert_allclose(read.likelihood, SCORES, atol=1e-9)
+    assert (read.t_s is not None) == has_times
+    confident = read.confident(0.6)
+    assert np.isnan(confident[1, 0]).all()
+    assert np.isfinite(confident[1, 1]).all()
+
+
+def test_wide_and_long_tables_are_read(tmp_path: Path) -> None:
+    read = read_tracks(write(tmp_path, "wide.csv", wide()))
+    require_same(read, has_times=True)
+    np.testing.assert_allclose(read.t_s, T_S)
+    read = read_tracks(write(tmp_path, "long.csv", long()))
+    order = [read.names.index(name) for name in NAMES]
+    np.testing.assert_allclose(read.pixels[:, order], PIXELS)
+    np.testing.assert_allclose(read.frames, np.arange(5))
+
+
+def test_tables_of_deeplabcut_are_read(tmp_path: Path) -> None:
+    deeplabcut().to_csv(tmp_path / "dlc.csv")
+    require_same(read_tracks(tmp_path / "dlc.csv"))
+
+
+def test_hdf5_files_of_deeplabcut_are_read_without_executing_what_they_contain(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("tables")
+    pytest.importorskip("h5py")
+    deeplabcut().to_hdf(tmp_path / "dlc.h5", key="df_with_missing", format="table", mode="w")
+    require_same(read_tracks(tmp_path / "dlc.h5"))
+
+
+def test_animals_of_deeplabcut_are_part_of_the_names(tmp_path: Path) -> None:
+    text = (
+        "scorer,net,net,net,net,net,net\nindividuals,a,a,a,b,b,b\n"
+        "bodyparts,tip,tip,tip,tip,tip,tip\ncoords,x,y,likelihood,x,y,likelihood\n"
+        "0,1,2,0.9,3,4,0.8\n1,1,2,0.9,,,\n"
+    )
+    read = read_tracks(write(tmp_path, "dlc.csv", text))
+    assert read.names == ("a_tip", "b_tip")
+    np.testing.assert_allclose(read.pixels[0], [[1, 2], [3, 4]])
+    assert np.isnan(read.confident(0.6)[1, 1]).all()
+
+
+def test_analysis_files_of_sleap_are_read(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "analysis.h5", "w") as file:
+        file["tracks"] = PIXELS.transpose(2, 1, 0)[None]
+        file["node_names"] = np.array(NAMES, dtype="S")
+        file["track_names"] = np.array(["bar"], dtype="S")
+        file["point_scores"] = SCORES.T[None]
+    require_same(read_tracks(tmp_path / "analysis.h5"))
+
+
+def test_archives_of_cotracker_and_tapir_are_read(tmp_path: Path) -> None:
+    names = np.array(NAMES)
+    np.savez(
+        tmp_path / "co.npz", pred_tracks=PIXELS[None], pred_visibility=SCORES[None], names=names
+    )
+    require_same(read_tracks(tmp_path / "co.npz"))
+    np.savez(
+        tmp_path / "tapir.npz",
+        tracks=PIXELS.transpose(1, 0, 2),
+        visibles=SCORES.T,
+        names=names,
+        fps=30.0,
+    )
+    read = read_tracks(tmp_path / "tapir.npz")
+    require_same(read, has_times=True)
+    np.testing.assert_allclose(read.t_s, np.arange(5) / 30)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t_s,a,b\n0,1,2\n", r"tracks.csv: line 1: found the columns t_s, a, b; expected a table"),
+        ("t_s,tip_u\n0,1\n", "there is no column 'tip_v'"),
+        ("t_s,tip_u,tip_v\n0,x,2\n", "line 2"),
+        ("frame,point,u,v\n0,tip,1,2\n0,tip,3,4\n", "line 3: tip appears twice in this image"),
+        ("scorer,n,n\ncoords,x,y\n0,1,2\n", "expected those of DeepLabCut"),
+    ],
+)
+def test_faulty_tables_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(cs.InputError, match=message):
+        read_tracks(write(tmp_path, "tracks.csv", text))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"a": np.zeros(3)}, "found the arrays a; expected pred_tracks or tracks"),
+        ({"pred_tracks": np.zeros((5, 2))}, r"pred_tracks has the shape \(5, 2\)"),
+        (
+            {"pred_tracks": PIXELS, "pred_visibility": np.ones((2, 5))},
+            r"pred_visibility has the shape \(2, 5\)",
+        ),
+        ({"pred_tracks": PIXELS, "names": np.array(["a"])}, "names has 1 names for 2 points"),
+        ({"pred_tracks": np.array([None])}, "cannot be read"),
+    ],
+)
+def test_faulty_archives_are_refused(arrays: dict, message: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "tracks.npz", **arrays)
+    with pytest.raises(cs.InputError, match=rf"tracks.npz: .*{message}"):
+        read_tracks(tmp_path / "tracks.npz")
