@@ -7,7 +7,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 T = TypeVar("T")
 _HEADING = "Attributes\n----------\n"
@@ -41,26 +41,47 @@ def documented(kind: type) -> dict[str, str]:
     }
 
 
-def with_attributes(entries: Mapping[str, tuple[str, str]]) -> Callable[[type[T]], type[T]]:
-    """Return a decorator that inserts entries at the beginning of the section "Attributes" of a
-    class's docstring.
+class FieldOfRow(NamedTuple):
+    """Field of a class that has one for each row of a table.
 
-    Parameters
+    Attributes
     ----------
-    entries : mapping of name to (str, str)
-        Type and description of each field.
+    annotation : type
+        Type of the values.
+    default : object
+        Default value.
+    form : str
+        Type in the documentation.
+    description : str
+        Description in the documentation.
     """
 
-    def described(kind: type[T]) -> type[T]:
+    annotation: Any
+    default: Any
+    form: str
+    description: str
+
+
+def with_fields(rows: Mapping[str, FieldOfRow]) -> Callable[[type[T]], type[T]]:
+    """Return a decorator that adds fields, by name, before those of a class that is not yet a
+    dataclass, and their descriptions to the section "Attributes" of its docstring.
+    """
+
+    def with_rows(kind: type[T]) -> type[T]:
         summary, _, others = inspect.cleandoc(kind.__doc__ or "").partition(_HEADING)
         section = "".join(
-            f"{name} : {form}\n{textwrap.fill(text, 96, initial_indent=_IN, subsequent_indent=_IN)}\n"
-            for name, (form, text) in entries.items()
+            f"{name} : {row.form}\n"
+            f"{textwrap.fill(row.description, 96, initial_indent=_IN, subsequent_indent=_IN)}\n"
+            for name, row in rows.items()
         )
         kind.__doc__ = f"{summary.rstrip()}\n\n{_HEADING}{section}{others}"
+        annotations = {name: row.annotation for name, row in rows.items()}
+        kind.__annotations__ = annotations | inspect.get_annotations(kind)
+        for name, row in rows.items():
+            setattr(kind, name, row.default)
         return kind
 
-    return described
+    return with_rows
 
 
 def sentence(text: str) -> str:

@@ -106,12 +106,15 @@ class SymmetricPattern:
         order = np.lexsort((rows, columns))
         return FullEntries(rows[order], columns[order], source=source[order])
 
-    def matrix(self, values: NDArray[np.float64]) -> sp.csc_array:
-        """Return the full symmetric matrix, sparse (3n, 3n) with both triangles, with the
-        lower-triangle values (m,).
+    def matrix(self, values: NDArray[np.float64], skew: Array | None = None) -> sp.csc_array:
+        """Return the full matrix, sparse (3n, 3n) with both triangles, with the lower triangles
+        (m,) of its symmetric part and of its skew part, which is zero by default.
         """
         rows, columns, source = self.full
-        return sp.csc_array((values[source], (rows, columns)), shape=(self.size, self.size))
+        entries = values[source]
+        if skew is not None and skew.size:
+            entries = entries + np.sign(rows - columns) * skew[source]
+        return sp.csc_array((entries, (rows, columns)), shape=(self.size, self.size))
 
     def products(self, values: Array, vectors: Array) -> Array:
         """Return for each t the product of the symmetric matrix with lower-triangle values (T, m)

@@ -33,6 +33,7 @@ from .point_forces import (
     air_drag_terms,
     custom_force_terms,
 )
+from .stiffness_change import stiffness_change_terms
 from .weight import DofMasses, Weight
 
 
@@ -97,6 +98,7 @@ class Forces:
             *potentials,
             *contact_terms(experiment, step_s),
             *air_drag_terms(experiment, times),
+            *stiffness_change_terms(experiment, times),
             *custom_force_terms(experiment.body, times),
         )
         unknown = np.full(len(experiment.body.constants), np.nan)

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
+from ..recording.deviation import Deviation
 from ..recording.experiment import Experiment
 from ..recording.grasp import prescribed_dofs
-from ..recording.nuisance import OBSTACLE_TILT, OBSTACLE_TIME, NuisanceRow
+from ..recording.nuisance import OBSTACLE_TILT, OBSTACLE_TIME
 from ..recording.obstacle import Obstacle
 from .nuisance_map import NuisanceMap
 
@@ -175,9 +176,7 @@ class GraspConstraint:
                 derivatives[:, columns, column] = self.nuisance.scales[place] * rate
         return derivatives
 
-    def _iterate_obstacle_parameters(
-        self,
-    ) -> Iterator[tuple[Index, Obstacle, NuisanceRow, int, int]]:
+    def _iterate_obstacle_parameters(self) -> Iterator[tuple[Index, Obstacle, Deviation, int, int]]:
         """Return the for each nuisance parameter of an obstacle, yield the positions of the
         obstacle's dofs in `dofs`, the obstacle, the row, the axis and the index in φ.
         """

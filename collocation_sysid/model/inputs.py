@@ -2,7 +2,8 @@
 
 The entries of u at each evaluation are, in this order: the constants θ of the body; gravity (3), if
 a nuisance parameter rotates it; the share of each load whose time is estimated; the amplitude of
-each tendon and pressure. The parameters p are those that affect the motion: the shared coordinates
+each tendon and pressure; the relative change of the stiffness, if a deviation changes it. The
+parameters p are those that affect the motion: the shared coordinates
 q, then the nuisance parameters φ of `NuisanceMap.motion_indices`. Every force provides its
 derivatives by u (see `forces`); this module generates ∂u/∂p and Σ w ∂²u/∂p².
 """
@@ -211,4 +212,16 @@ def inputs_from_experiment(
     joining = zip(nuisance.indices_of_rows(JOINING).tolist(), nuisance.timed_loads, strict=True)
     groups += [share(phi, timed) for phi, timed in joining]
     groups += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
+    if rows := experiment.list_stiffness_deviations():
+        changing = nuisance.stiffness_indices.tolist()
+        slopes = {row.name: row.stiffness(experiment, evaluated_s) for row in rows if row.stiffness}
+        data = [slopes[nuisance.entries[phi].row.name] for phi in changing]
+
+        def stiffness(p: ca.SX, data: ca.SX) -> ca.SX:
+            """Return the relative change of the stiffness: the known one, and the estimated ones."""
+            estimated = (value(p, phi) * data[k + 1] for k, phi in enumerate(changing))
+            return data[0] + sum(estimated, ca.SX(0))
+
+        known = experiment.known_stiffness_change(evaluated_s)
+        groups.append(Input(1, stiffness, data=np.array([known, *data])))
     return Inputs(groups, nq + len(nuisance.motion_indices), time_count=len(evaluated_s))

@@ -27,6 +27,7 @@ import numpy as np
 from ..common.array_types import Array, Index
 from ..common.files import reason
 from ..errors import InputError
+from ..recording.deviation import Component, Deviation, RecordingQuantities
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, prescribed_nodes
 from ..recording.loads import Force, LoadTime, PointMass
@@ -47,9 +48,6 @@ from ..recording.nuisance import (
     TILT,
     TIME,
     ZERO,
-    Component,
-    NuisanceRow,
-    RecordingQuantities,
     cayley_rotation,
 )
 from ..recording.obstacle import Obstacle
@@ -65,8 +63,8 @@ LARGEST_DELAY_FRACTION = 0.25
 LARGEST_JOINING_DELAY_SIGMAS = 4.0
 # Factor that keeps a joining load inside the recording: at its ends it would join at once or never.
 INSIDE_RECORDING_FACTOR = 1 - 1e-9
-# What a row must change (see `NuisanceRow.changes`) to affect the motion.
-CHANGES_OF_MOTION = {"gravity", "grasps", "loads", "drives"}
+# What a row must change (see `Deviation.changes`) to affect the motion.
+CHANGES_OF_MOTION = {"gravity", "grasps", "loads", "drives", "stiffness"}
 
 
 class TimedLoad(NamedTuple):
@@ -112,7 +110,7 @@ class NuisanceEntry:
 
     Attributes
     ----------
-    row : NuisanceRow
+    row : Deviation
         Row of the table of nuisance parameters.
     number : int
         Index of the component among those of the kind `row.of`: marker, grasp, actuator (tendons,
@@ -126,7 +124,7 @@ class NuisanceEntry:
         Prior standard deviation, in the unit of the label.
     """
 
-    row: NuisanceRow
+    row: Deviation
     number: int
     axis: int
     label: str
@@ -223,10 +221,11 @@ class NuisanceMap(RecordingQuantities):
             strain_shifts_m=_strain_shifts_m(experiment),
         )
         for row in experiment.nuisance.own:
-            nuisance_map._require_valid_expression(row)
+            if row.stiffness is None:
+                nuisance_map._require_valid_expression(row)
         return nuisance_map
 
-    def _require_valid_expression(self, row: NuisanceRow) -> None:
+    def _require_valid_expression(self, row: Deviation) -> None:
         """Check that the reading or clock of a custom kind can be evaluated and differentiated."""
         y = ca.SX.sym("y", 3)
         t_s = ca.SX.sym("t_s")
@@ -265,7 +264,7 @@ class NuisanceMap(RecordingQuantities):
             if entry.row != PLACE:
                 yield entry, name, float(value)
 
-    def indices_of_rows(self, *rows: NuisanceRow, component: int | None = None) -> Index:
+    def indices_of_rows(self, *rows: Deviation, component: int | None = None) -> Index:
         """Return the indices in φ of some rows, of all components or of one, ascending.
 
         Their order is that of φ, whatever the order of `rows`. Rows that are not estimated have no
@@ -273,7 +272,7 @@ class NuisanceMap(RecordingQuantities):
 
         Parameters
         ----------
-        *rows : NuisanceRow
+        *rows : Deviation
         component : int, optional
             Number of the instance, such as the index of a camera; None for all.
         """
@@ -405,7 +404,7 @@ class NuisanceMap(RecordingQuantities):
         """Indices in φ of the zero of the strain of a specimen; empty if it is not estimated."""
         return self.indices_of_rows(STRAIN_ZERO)
 
-    def obstacle_parameters(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
+    def obstacle_parameters(self, number: int) -> list[tuple[Deviation, int, int]]:
         """Return row, axis and index in φ of every nuisance parameter of an obstacle, ascending in
         φ; empty for a gripper.
 
@@ -436,7 +435,7 @@ class NuisanceMap(RecordingQuantities):
     def _with_grasp(self, number: int, grasp: Grasp, motion: Array, phi: Array) -> Grasp:
         """Return one grasp or obstacle at its pose at φ."""
         if isinstance(grasp, Obstacle):
-            deviations: dict[NuisanceRow, Array] = {}
+            deviations: dict[Deviation, Array] = {}
             for row, axis, place in self.obstacle_parameters(number):
                 deviations.setdefault(row, np.zeros(2))[axis] = phi[place] * self.scales[place]
             zeros = np.zeros(2)
@@ -507,6 +506,19 @@ class NuisanceMap(RecordingQuantities):
         return replace(experiment, masses=masses, forces=forces)
 
     @cached_property
+    def stiffness_indices(self) -> Index:
+        """Indices in φ of the parameters that change the stiffness."""
+        return self._indices_where(lambda e: "stiffness" in e.row.changes)
+
+    def with_stiffness(self, experiment: Experiment, phi: Array) -> Experiment:
+        """Return the experiment with the changes of its stiffness that φ (k,) estimates known."""
+        known = dict(experiment.known_deviations)
+        for k in self.stiffness_indices.tolist():
+            name = self.entries[k].row.name
+            known[name] = known.get(name, 0.0) + float(phi[k] * self.scales[k])
+        return replace(experiment, known_deviations=known) if known else experiment
+
+    @cached_property
     def grasp_indices(self) -> Index:
         """Indices in φ of rotation and shift of the body in its grasp."""
         return self.indices_of_rows(GRASP_TURN, GRASP_SHIFT)
@@ -564,7 +576,7 @@ class NuisanceMap(RecordingQuantities):
             gravity = cayley_rotation(values[POSE_TURN]).T @ gravity
         return ca.SX(gravity)
 
-    def values_by_row(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
+    def values_by_row(self, phi: ca.SX, places: Index) -> dict[Deviation, ca.SX]:
         """Return parameters with units by row, each a column vector; rows without an index are left
         out.
 
@@ -663,7 +675,7 @@ def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, st
 
 
 def _component_axes(
-    experiment: Experiment, row: NuisanceRow, number: int
+    experiment: Experiment, row: Deviation, number: int
 ) -> list[tuple[int, str, str, float]]:
     """Return index, name, unit and prior deviation of each estimated axis of a component.
 

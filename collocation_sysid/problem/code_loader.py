@@ -17,8 +17,8 @@ from ..common.files import reason
 from ..errors import InputError, hint_at, located
 from ..fem.laws.materials import Energy, Material
 from ..fem.node_force import NodeForce
+from ..recording.deviation import Deviation
 from ..recording.node_selection import selection_from_section
-from ..recording.nuisance import NuisanceRow
 from .named_files import existing_file
 from .nuisance_schema import CustomNuisanceSection
 from .schema import CodeSection, NodeForceSection
@@ -110,17 +110,17 @@ class CodeLoader:
                 loaded, nodes=nodes, name=name, on=section.on, carries=carries
             )
 
-    def nuisance_row(self, section: CustomNuisanceSection) -> NuisanceRow:
-        """Return the `NuisanceRow` that a Python file defines under the name `row` of the section;
+    def nuisance_row(self, section: CustomNuisanceSection) -> Deviation:
+        """Return the `Deviation` that a Python file defines under the name `row` of the section;
         see `function` for the errors.
         """
 
         def is_row(value: Any) -> bool:
             """Whether a value of the file is a nuisance parameter."""
-            return isinstance(value, NuisanceRow)
+            return isinstance(value, Deviation)
 
         key = "nuisance.own.file"
-        return self._load(section.file, section.row, key, "NuisanceRow", is_row)[1]
+        return self._load(section.file, section.row, key, "Deviation", is_row)[1]
 
     def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
         """Run a Python file, and return its path and the function in it that has a name.

@@ -16,7 +16,8 @@ from ..common.field_descriptions import sentence
 from ..common.schema_tables import ByForm, Section, used_keys
 from ..common.validated_types import Positive, Text
 from ..recording import Nuisance
-from ..recording.nuisance import KINDS, SCOPE, SCOPE_TEXT, NuisanceRow
+from ..recording.deviation import Deviation
+from ..recording.nuisance import KINDS, SCOPE, SCOPE_TEXT
 
 KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)}
 
@@ -45,14 +46,14 @@ class Scoped(Section):
 
 
 class CustomNuisanceSection(Scoped):
-    """A custom nuisance parameter: a NuisanceRow in a Python file.
+    """A custom nuisance parameter: a Deviation in a Python file.
 
     Attributes
     ----------
     file : str
         Python file; it is executed, for which commands need the option --allow-code.
     row : str
-        Name of the NuisanceRow in the file.
+        Name of the Deviation in the file.
     """
 
     file: Text
@@ -79,7 +80,7 @@ class NuisancePriorSection(Scoped):
         return self
 
 
-def _prior_section(key: str, rows: Sequence[NuisanceRow]) -> type[NuisancePriorSection]:
+def _prior_section(key: str, rows: Sequence[Deviation]) -> type[NuisancePriorSection]:
     """Return the class of the table of a key of [experiment.nuisance]."""
     # A prior that refers to another one needs it.
     missing = ... if any(row.reference is not None for row in rows) else None
@@ -102,7 +103,7 @@ def _prior_section(key: str, rows: Sequence[NuisanceRow]) -> type[NuisancePriorS
     return made
 
 
-def _prior_key(key: str, rows: Sequence[NuisanceRow]) -> tuple[Any, Any]:
+def _prior_key(key: str, rows: Sequence[Deviation]) -> tuple[Any, Any]:
     """Return annotation and default of a key of [experiment.nuisance]."""
     form: Any = Annotated[Literal["none"] | _prior_section(key, rows), ByForm(str)]
     defaults = ["" if row.sigma is None else f", {row.usual} by default" for row in rows]
@@ -135,8 +136,7 @@ NuisanceOrNone = Annotated[Literal["none"] | NuisanceSection, ByForm(str)]
 
 
 def nuisance_from_section(
-    section: NuisanceSection | Literal["none"],
-    row_of: Callable[[CustomNuisanceSection], NuisanceRow],
+    section: NuisanceSection | Literal["none"], row_of: Callable[[CustomNuisanceSection], Deviation]
 ) -> Nuisance:
     """Return the nuisance parameters of a recording: the defaults with the changes of the table.
 

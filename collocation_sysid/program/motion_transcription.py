@@ -387,7 +387,7 @@ class MotionTranscription:
         )
 
     def corrected_experiment(self, phi: Array) -> Experiment:
-        """Return the experiment with gravity, grasps, loads, actuators and their times as estimated
+        """Return the experiment with gravity, stiffness, grasps, loads, actuators and times as estimated
         by φ (k,), in the body's frame; the experiment itself if no nuisance parameter changes the
         motion.
         """
@@ -408,6 +408,7 @@ class MotionTranscription:
             tendons=tendons,
             pressures=pressures,
         )
+        changed = self.nuisance.with_stiffness(changed, phi)
         return self.nuisance.with_times(changed, phi)
 
     def with_prescribed_positions(self, x: Array, phi: Array) -> Array:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from ..common.array_types import Array, Index
 from ..errors import InputError
 from ..model.nuisance_map import NuisanceEntry, NuisanceMap
+from ..recording.deviation import Deviation
 from ..recording.experiment import Experiment
-from ..recording.nuisance import PLACE, POSE_TURN, NuisanceRow
+from ..recording.nuisance import PLACE, POSE_TURN
 from .association import Association
 from .markers.marker_association import MarkerAssociation
 
@@ -99,7 +100,7 @@ def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[Nuis
     return indices
 
 
-def _require_same_objects(leader: Experiment, experiment: Experiment, row: NuisanceRow) -> None:
+def _require_same_objects(leader: Experiment, experiment: Experiment, row: Deviation) -> None:
     """Check that the objects on which a shared nuisance parameter depends are the same in two
     experiments.
     """
@@ -152,7 +153,7 @@ def _declared_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
 
 
 def _sharing_error(
-    experiment: Experiment, row: NuisanceRow, result: str, expected: str
+    experiment: Experiment, row: Deviation, result: str, expected: str
 ) -> InputError:
     """Return the error for a parameter that cannot be shared."""
     key = row.key or row.name

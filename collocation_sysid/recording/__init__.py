@@ -38,6 +38,8 @@ from .custom_sensor import PointQuantities as PointQuantities
 from .depth_camera import Depth as Depth
 from .depth_camera import DepthCamera as DepthCamera
 from .depth_camera import depth_image as depth_image
+from .deviation import Deviation as Deviation
+from .deviation import NuisanceRow as NuisanceRow
 from .experiment import Experiment as Experiment
 from .grasp import Grasp as Grasp
 from .grasp import prescribed_dofs as prescribed_dofs
@@ -53,7 +55,6 @@ from .measured_wrench import Wrench as Wrench
 from .measured_wrench import read_wrench as read_wrench
 from .measured_wrench import write_wrench_csv as write_wrench_csv
 from .nuisance import Nuisance as Nuisance
-from .nuisance import NuisanceRow as NuisanceRow
 from .obstacle import Obstacle as Obstacle
 from .obstacle_solids import Capsule as Capsule
 from .obstacle_solids import Cuboid as Cuboid

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import KW_ONLY, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..common.array_types import Array, Index
 from ..common.checked_arrays import float_converter, read_only_floats
 from ..common.declarations import declaration, key
-from ..common.schema_tables import Vector
-from ..common.validated_types import Flag, NotNegative
+from ..common.schema_tables import ByForm, Vector
+from ..common.validated_types import Finite, Flag, NotNegative
 from ..errors import InputError, listed
 from .actuator import Actuator
 from .custom_sensor import CustomSensor
 from .depth_camera import Depth
+from .deviation import Deviation
 from .environment import air_density, usual_air_density
 from .grasp import Grasp, free_rigid_motions, prescribed_dofs
 from .homogeneous_deformation import HomogeneousDeformation
@@ -56,6 +57,15 @@ def _state(name: str) -> Callable[[ArrayLike], Array]:
     ``start_<name>``, which raises an `InputError` for another shape or values that are not finite.
     """
     return float_converter((None, 3), f"start_{name}")
+
+
+Temperature = Annotated[list[tuple[Finite, Finite]] | Finite, ByForm(list)]
+
+
+def _temperature(value: ArrayLike) -> Array:
+    """Return times [s] and temperature differences [K] as (k, 2), from a table or one number."""
+    table = [[0.0, value]] if np.ndim(value) == 0 else value
+    return float_converter((None, 2), "temperature_difference_k")(table)
 
 
 @declaration
@@ -121,6 +131,12 @@ class Experiment:
     nuisance : Nuisance
         Standard deviations of the unknowns of this recording alone, which are estimated too: by
         default those of a careful laboratory; `Nuisance.none` for ideal data.
+    temperature_difference_k : float or (k, 2) array, optional
+        Temperature of the body less that at which its constants are reported [K]: a number, or
+        times [s] and differences, between which it is linear. None if it is not known.
+    known_deviations : mapping of str to float
+        Known values of deviations that change the stiffness, by name, such as
+        ``{"stiffness_per_kelvin": -0.01}``.
     specimen : HomogeneousDeformation, optional
         Homogeneous deformation of a material test without a mesh, see `Specimen`; None for a body
         with a mesh.
@@ -164,6 +180,10 @@ class Experiment:
     depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=(), metadata=SENSORS)
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
+    temperature_difference_k: Array | None = key(
+        Temperature | None, converter=_temperature, default=None
+    )
+    known_deviations: Mapping[str, float] = key(dict[str, Finite], default_factory=dict)
     specimen: HomogeneousDeformation | None = None
 
     def __post_init__(self) -> None:
@@ -477,6 +497,31 @@ class Experiment:
         forces = self.declared_node_forces_n(self.t_s).reshape(tied.shape)
         return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
 
+    def temperature_difference_at(self, t_s: Array) -> Array:
+        """Return the temperature (T,) at times (T,), less that of the constants of the body [K]."""
+        assert self.temperature_difference_k is not None
+        return np.interp(t_s, *self.temperature_difference_k.T)
+
+    def list_stiffness_deviations(self) -> list[Deviation]:
+        """Return the deviations that change the stiffness in this experiment: those that are known,
+        or estimated.
+        """
+        return [
+            row
+            for row in self.nuisance.list_kinds()
+            if row.stiffness is not None
+            and row.applies(self)
+            and (self.nuisance.sigma(row) or row.name in self.known_deviations)
+        ]
+
+    def known_stiffness_change(self, t_s: Array) -> Array:
+        """Return the relative change (T,) of the stiffness by known deviations at times (T,)."""
+        change = np.zeros(len(t_s))
+        for row in self.list_stiffness_deviations():
+            assert row.stiffness is not None
+            change += self.known_deviations.get(row.name, 0.0) * row.stiffness(self, t_s)
+        return change
+
     @property
     def has_air_drag(self) -> bool:
         """Whether air drag acts: false in a vacuum and in static experiments."""
@@ -494,6 +539,7 @@ class Experiment:
         couplings = [each.require_measure().couplings for each in self.actuators]
         couplings += [each.couplings_with(self.body) for each in self.obstacles]
         couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag
+        couplings += [self.body.pattern] * bool(self.list_stiffness_deviations())
         return self.body.joint_pattern_with(couplings)
 
     @property

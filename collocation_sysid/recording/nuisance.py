@@ -7,18 +7,18 @@ each kind, and [experiment.nuisance] of the problem file a key.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from ..common.array_types import Array
 from ..common.checked_calls import validate_as
-from ..common.field_descriptions import sentence, with_attributes
+from ..common.field_descriptions import FieldOfRow, sentence, with_fields
 from ..common.validated_types import Finite
 from ..errors import InputError, listed
+from .deviation import WIDENING, Deviation, RecordingQuantities
 
 DEGREE = float(np.pi / 180)
 # Reach of parameters on which predictions depend linearly, which need no trust region [σ].
@@ -29,174 +29,10 @@ EDGES_A_STEP = 2.0
 SAMPLES_A_STEP = 2.0
 # Shift of a depth camera in a step of the solver [m]: correspondences stay about the same.
 CAMERA_SHIFT_A_STEP_M = 0.02
-
-Component = Literal[
-    "recording",
-    "place",
-    "marker",
-    "grasp",
-    "obstacle",
-    "tendon",
-    "pressure",
-    "load",
-    "sensor",
-    "camera",
-    "gauge",
-]
-ModelPart = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth"]
+FILM_A_RULER = "film a ruler where the body moves"
 # Scope of parameters that recordings share, as a pattern and in words for messages.
 SCOPE = r"shared( \S+)?"
 SCOPE_TEXT = '"shared", or "shared" followed by the name of a group of recordings'
-# Readable units: factor and text by SI unit.
-READABLE_UNITS = {
-    "m": (1e3, " mm"),
-    "s": (1e3, " ms"),
-    "rad": (180 / np.pi, "°"),
-    "kg": (1e3, " g"),
-}
-READABLE_UNITS |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
-
-
-@dataclass(frozen=True, eq=False)
-class RecordingQuantities:
-    """Quantities of a recording on which nuisance parameters may depend.
-
-    Attributes
-    ----------
-    recorded_s : (float, float)
-        First and last time of the recording.
-    interval_s : float
-        Time between samples.
-    duration_s : float
-        Duration of the recording.
-    gravity_m_s2 : (3,)
-        Gravity as stated.
-    pivot_m : (3,)
-        Pivot c of the rigid motion in the frame of the markers.
-    """
-
-    recorded_s: tuple[float, float]
-    interval_s: float
-    duration_s: float
-    gravity_m_s2: Array
-    pivot_m: Array
-
-
-@dataclass(frozen=True)
-class NuisanceRow:
-    """A kind of nuisance parameter of a recording; its values have normal priors with mean zero.
-
-    A recording has one value for each component (marker, grasp, …) and axis. Custom kinds state
-    what they do to a marker's predicted position (`reading`) or to its time (`clock`), and go into
-    `Nuisance(own=[…])`.
-
-    Attributes
-    ----------
-    name : str
-        Field of `Nuisance`; free choice for a custom kind.
-    unit : str
-        Unit of the values: "m", "s", "rad", …
-    sigma : float or None
-        Standard deviation of the prior; None where it is not estimated by default.
-    description : str
-        Description, for documentation.
-    label : str
-        Name in tables of results, with {which} for the component and {axis}; the name by default.
-    key : str
-        Key of [experiment.nuisance] in the problem file.
-    reference : float or None
-        Standard deviation if the key's table states other priors only.
-    of : str
-        Component that has values of its own: the recording, or each marker, grasp, …; "recording"
-        or "marker" for a custom kind.
-    axes : str
-        Names of the components of a vector, separated by blanks; empty for a single number.
-    changes : tuple of str
-        Parts of the model that depend on the values.
-    applies : callable
-        ``applies(experiment)``, whether the experiment has such parameters.
-    applies_to : callable
-        ``applies_to(experiment, index)``, whether the component with this index has such
-        parameters, in an experiment that has them; see `of`.
-    low, high : float
-        Limits, in prior standard deviations.
-    reach : float
-        Largest change in a step of the solver, in prior standard deviations.
-    step : callable, optional
-        ``step(experiment)``, largest change in a step of the solver, in `unit`.
-    sentence : str
-        Sentence in the terminal, with {size}, {way} and {which}.
-    by : {"length", "worst", "each"}
-        Values that the terminal shows: the longest vector, the value farthest from its prior, or
-        each value.
-    same : callable
-        ``same(experiment)``, what must agree in recordings that share the values, by its name.
-    reading : callable, optional
-        ``reading(y, values, t_s, data) -> y``, the corrected position of a marker from its
-        predicted position y (3,) [m], as CasADi expressions. `values` are one or as many as `axes`,
-        `t_s` is the time, and `data` has `pivot_m`, the middle of the undeformed body in its first
-        pose, `gravity_m_s2`, `interval_s` and `duration_s` of the recording.
-    clock : callable, optional
-        ``clock(values, t_s, data)``, by how much later than `t_s` a marker was seen [s]; samples up
-        to two away are interpolated.
-    considered : float, optional
-        Standard deviation in the uncertainty budget where the parameter is not estimated.
-    largest : float
-        Largest absolute value that is possible in a laboratory, in `unit`.
-    """
-
-    # Functions of an `Experiment`, which has nuisance parameters itself: the module of its class
-    # imports this one, so that their argument has no type here.
-    name: str
-    unit: str
-    sigma: float | None
-    description: str = ""
-    label: str = ""
-    _: KW_ONLY
-    key: str = ""
-    reference: float | None = None
-    of: Component = "recording"
-    axes: str = ""
-    changes: tuple[ModelPart, ...] = ("reading",)
-    applies: Callable[..., bool] = lambda experiment: True
-    applies_to: Callable[..., bool] = lambda experiment, index: True
-    low: float = -np.inf
-    high: float = np.inf
-    reach: float = 1.0
-    step: Callable[..., float] | None = None
-    sentence: str = ""
-    by: Literal["length", "worst", "each"] = "each"
-    same: Callable[..., dict[str, object]] = lambda experiment: {}
-    reading: Callable[[ca.SX, ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
-    clock: Callable[[ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
-    considered: float | None = None
-    largest: float = np.inf
-
-    def __post_init__(self) -> None:
-        """Set the default label, in place: the name, with the component of marker parameters and
-        the axis of vectors.
-        """
-        if not self.label:
-            which = " of {which}" * (self.of == "marker")
-            axis = ", {axis}" * bool(self.axes)
-            vars(self)["label"] = self.name.replace("_", " ") + which + axis
-
-    def prior_key(self) -> str:
-        """Return the key of the prior standard deviation in the problem file: "prior", an
-        underscore and the unit in lower case, such as "prior_m".
-
-        It is "prior" for the unit "1", "prior_sigmas" for "σ" and "prior_1_m2" for "1/m²".
-        """
-        unit = {"1": "", "σ": "_sigmas", "1/m²": "_1_m2"}.get(self.unit, f"_{self.unit.lower()}")
-        return f"prior{unit}"
-
-    @property
-    def usual(self) -> str:
-        """Default standard deviation as text in a readable unit, such as "5 ms"; zero where `sigma`
-        is None.
-        """
-        size, unit = in_readable_unit(self.sigma or 0.0, self.unit)
-        return f"{size:.4g}{unit}"
 
 
 def cayley_rotation(rotation_vector: ca.SX) -> ca.SX:
@@ -207,16 +43,6 @@ def cayley_rotation(rotation_vector: ca.SX) -> ca.SX:
     """
     half = ca.skew(rotation_vector / 2)
     return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(rotation_vector) / 4) * (half + half @ half)
-
-
-def in_readable_unit(value: float, unit: str) -> tuple[float, str]:
-    """Return a value in a readable unit, and that unit as text to print directly behind the value.
-
-    Units of `READABLE_UNITS` are converted (m to " mm", s to " ms", rad to "°", kg to " g", N m to
-    " mN m", 1 to " %"), and "σ" is not printed (""). Another unit is kept, with a blank in front.
-    """
-    factor, shown = READABLE_UNITS.get(unit, (1.0, f" {unit}"))
-    return factor * value, shown
 
 
 def _rotate_position(y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities) -> ca.SX:
@@ -313,7 +139,7 @@ def _hand_eye_sharing_key(experiment: Any) -> dict[str, object]:
     return {"body": id(experiment.body), "set of nodes in its grasps": nodes}
 
 
-PLACE = NuisanceRow(
+PLACE = Deviation(
     "marker_offset_m",
     "m",
     sigma=1e-3,
@@ -331,7 +157,7 @@ PLACE = NuisanceRow(
         "value of places (on_surface in Python)": e.markers.on_surface,
     },
 )
-OFFSET = NuisanceRow(
+OFFSET = Deviation(
     "camera_offset_m",
     "m",
     sigma=None,
@@ -345,24 +171,26 @@ OFFSET = NuisanceRow(
     description="a constant offset of each marker in the cameras' frame",
     reading=_shift_position,
 )
-CALIBRATION_SCALE = NuisanceRow(
+CALIBRATION_SCALE = Deviation(
     "calibration_scale",
     "1",
     sigma=None,
     key="calibration_scale",
     considered=2e-3,
+    remedy=FILM_A_RULER,
     label="scale of the cameras",
     sentence="scale error of the cameras: {signed}",
     description="scale error of all lengths that the cameras measure: the factor minus one",
     applies=_has_markers,
     reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)),
 )
-CALIBRATION_DISTORTION = NuisanceRow(
+CALIBRATION_DISTORTION = Deviation(
     "calibration_distortion_1_m2",
     "1/m²",
     sigma=None,
     key="calibration_distortion",
     considered=0.02,
+    remedy=FILM_A_RULER,
     applies=_has_markers,
     label="distortion of the cameras",
     sentence="distortion of the cameras: {signed}",
@@ -370,7 +198,7 @@ CALIBRATION_DISTORTION = NuisanceRow(
     "middle of the body are multiplied by 1 + k r²",
     reading=_distort_position,
 )
-TIME = NuisanceRow(
+TIME = Deviation(
     "time_shift_s",
     "s",
     sigma=5e-3,
@@ -383,12 +211,15 @@ TIME = NuisanceRow(
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values,
 )
-CLOCK_RATE = NuisanceRow(
+CLOCK_RATE = Deviation(
     "clock_rate",
     "1",
     sigma=None,
     key="clock_rate",
     considered=1e-4,
+    widening=WIDENING,
+    assumed="the clocks of cameras and robot run at the same rate",
+    remedy="trigger robot and cameras by one clock",
     changes=("clock",),
     applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
     label="rate of the markers' clock",
@@ -396,7 +227,7 @@ CLOCK_RATE = NuisanceRow(
     description="how much slower the clock of the markers runs than the clock of the grasps",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]),
 )
-POSE_TURN = NuisanceRow(
+POSE_TURN = Deviation(
     "pose_turn_rad",
     "rad",
     sigma=None,
@@ -410,7 +241,7 @@ POSE_TURN = NuisanceRow(
     "gravity in the body's frame",
     reading=_rotate_position,
 )
-POSE_SHIFT = NuisanceRow(
+POSE_SHIFT = Deviation(
     "pose_shift_m",
     "m",
     sigma=None,
@@ -423,7 +254,7 @@ POSE_SHIFT = NuisanceRow(
     description="a constant translation of grasps and body in the cameras' frame",
     reading=_shift_position,
 )
-TILT = NuisanceRow(
+TILT = Deviation(
     "gravity_rad",
     "rad",
     sigma=DEGREE,
@@ -438,7 +269,7 @@ TILT = NuisanceRow(
     description="a tilt of the direction of gravity",
     same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
 )
-GRASP_TURN = NuisanceRow(
+GRASP_TURN = Deviation(
     "hand_eye_rad",
     "rad",
     sigma=0.5 * DEGREE,
@@ -453,7 +284,7 @@ GRASP_TURN = NuisanceRow(
     description="a constant rotation of the body in its grasps",
     same=_hand_eye_sharing_key,
 )
-GRASP_SHIFT = NuisanceRow(
+GRASP_SHIFT = Deviation(
     "hand_eye_m",
     "m",
     sigma=1e-3,
@@ -470,7 +301,7 @@ GRASP_SHIFT = NuisanceRow(
     "markers",
     same=_hand_eye_sharing_key,
 )
-STRAIN_ZERO = NuisanceRow(
+STRAIN_ZERO = Deviation(
     "strain_zero",
     "1",
     sigma=None,
@@ -481,7 +312,7 @@ STRAIN_ZERO = NuisanceRow(
     sentence="offset of the strain: {size}",
     description="a constant offset of the strains of a specimen",
 )
-ZERO = NuisanceRow(
+ZERO = Deviation(
     "displacement_zero_m",
     "m",
     sigma=1e-4,
@@ -494,7 +325,7 @@ ZERO = NuisanceRow(
     sentence="zero error of a displacement: up to {size}",
     description="a constant offset of each prescribed displacement along each of its axes",
 )
-OBSTACLE_OFFSET = NuisanceRow(
+OBSTACLE_OFFSET = Deviation(
     "obstacle_offset_m",
     "m",
     sigma=1e-4,
@@ -509,7 +340,7 @@ OBSTACLE_OFFSET = NuisanceRow(
     "its displacement; it changes the time at which the obstacle touches the "
     "body",
 )
-OBSTACLE_TILT = NuisanceRow(
+OBSTACLE_TILT = Deviation(
     "obstacle_tilt_rad",
     "rad",
     sigma=None,
@@ -526,7 +357,7 @@ OBSTACLE_TILT = NuisanceRow(
     description="a constant tilt of each obstacle that is a plane or a box, about the "
     "point of the plane or the middle of the box",
 )
-OBSTACLE_TIME = NuisanceRow(
+OBSTACLE_TIME = Deviation(
     "obstacle_time_s",
     "s",
     sigma=None,
@@ -541,7 +372,7 @@ OBSTACLE_TIME = NuisanceRow(
     sentence="delay of an obstacle: up to {size}",
     description="delay of each obstacle's motion, to first order",
 )
-TENSION_FACTOR = NuisanceRow(
+TENSION_FACTOR = Deviation(
     "tension_factor",
     "1",
     sigma=None,
@@ -552,7 +383,7 @@ TENSION_FACTOR = NuisanceRow(
     sentence="{which} by {signed}",
     description="scale error of the tension of each tendon: the factor minus one",
 )
-TENSION_OFFSET = NuisanceRow(
+TENSION_OFFSET = Deviation(
     "tension_lost_n",
     "N",
     sigma=None,
@@ -563,7 +394,7 @@ TENSION_OFFSET = NuisanceRow(
     sentence="{which} {signed}",
     description="tension of each tendon that is lost by friction",
 )
-PRESSURE_FACTOR = NuisanceRow(
+PRESSURE_FACTOR = Deviation(
     "pressure_factor",
     "1",
     sigma=None,
@@ -574,7 +405,7 @@ PRESSURE_FACTOR = NuisanceRow(
     sentence="{which} by {signed}",
     description="scale error of each pressure: the factor minus one",
 )
-PRESSURE_OFFSET = NuisanceRow(
+PRESSURE_OFFSET = Deviation(
     "pressure_lost_pa",
     "Pa",
     sigma=None,
@@ -585,7 +416,7 @@ PRESSURE_OFFSET = NuisanceRow(
     sentence="{which} {signed}",
     description="amount by which each pressure is lower than stated",
 )
-PRESSURE_LAG = NuisanceRow(
+PRESSURE_LAG = Deviation(
     "pressure_lag",
     "1",
     sigma=None,
@@ -597,7 +428,7 @@ PRESSURE_LAG = NuisanceRow(
     sentence="{which}: log of lag over stated lag {signed}",
     description="logarithm of the ratio of the true lag of each pressure to the stated lag_s",
 )
-JOINING = NuisanceRow(
+JOINING = Deviation(
     "joining_s",
     "s",
     sigma=1e-2,
@@ -610,7 +441,22 @@ JOINING = NuisanceRow(
     description="delay of the time at which each point mass or force begins or ends, if "
     "this time is within the recording",
 )
-TARE = NuisanceRow(
+TEMPERATURE = Deviation(
+    "stiffness_per_kelvin",
+    "1/K",
+    key="stiffness_per_kelvin",
+    considered=5e-3,
+    widening=WIDENING,
+    assumed="the stiffness does not depend on the temperature",
+    remedy="record at one temperature, or estimate it from recordings at several",
+    applies=lambda e: e.temperature_difference_k is not None and not e.body.has_memory,
+    label="change of the stiffness per kelvin",
+    sentence="change of the stiffness per kelvin: {signed}",
+    description="relative change of the stiffness per kelvin of temperature_difference_k, in a body "
+    "without memory",
+    stiffness=lambda experiment, t_s: experiment.temperature_difference_at(t_s),
+)
+TARE = Deviation(
     "tare",
     "σ",
     sigma=10.0,
@@ -623,7 +469,7 @@ TARE = NuisanceRow(
     sentence="tare: up to {size}",
     description="a constant offset of each component of a force sensor, in multiples of its sigma",
 )
-SENSOR_TIME = NuisanceRow(
+SENSOR_TIME = Deviation(
     "sensor_time_s",
     "s",
     sigma=5e-3,
@@ -638,7 +484,7 @@ SENSOR_TIME = NuisanceRow(
     sentence="delay of the sensor: {size}",
     description="delay of the force sensors, limited to three standard deviations of its prior",
 )
-SENSOR_LAG = NuisanceRow(
+SENSOR_LAG = Deviation(
     "sensor_lag_s",
     "s",
     sigma=None,
@@ -654,7 +500,7 @@ SENSOR_LAG = NuisanceRow(
     description="time constant of a first-order low-pass in the sensor, limited to values "
     "between zero and three standard deviations of its prior",
 )
-TOOL_MASS = NuisanceRow(
+TOOL_MASS = Deviation(
     "tool_kg",
     "kg",
     sigma=None,
@@ -667,7 +513,7 @@ TOOL_MASS = NuisanceRow(
     sentence="mass of the tool: {size}",
     description="mass of the tool between a sensor and the body",
 )
-TOOL_CENTRE = NuisanceRow(
+TOOL_CENTRE = Deviation(
     "tool_m",
     "m",
     sigma=None,
@@ -683,7 +529,7 @@ TOOL_CENTRE = NuisanceRow(
     description="centre of the tool relative to the point of the sensor; in the frame of "
     "the world, relative to the centre of the grasped nodes",
 )
-DEPTH_TURN = NuisanceRow(
+DEPTH_TURN = Deviation(
     "depth_turn_rad",
     "rad",
     sigma=5 * DEGREE,
@@ -701,7 +547,7 @@ DEPTH_TURN = NuisanceRow(
     "the axes of the camera",
     same=_camera_sharing_key,
 )
-DEPTH_SHIFT = NuisanceRow(
+DEPTH_SHIFT = Deviation(
     "depth_shift_m",
     "m",
     sigma=0.02,
@@ -721,7 +567,7 @@ DEPTH_SHIFT = NuisanceRow(
     "begins by aligning the first image with the body",
     same=_camera_sharing_key,
 )
-DEPTH_BIAS = NuisanceRow(
+DEPTH_BIAS = Deviation(
     "depth_bias_m",
     "m",
     sigma=5e-3,
@@ -739,7 +585,7 @@ DEPTH_BIAS = NuisanceRow(
     sentence="offset of the depth: {size}",
     description="offset that is added to each depth of an image",
 )
-DEPTH_SCALE = NuisanceRow(
+DEPTH_SCALE = Deviation(
     "depth_scale",
     "1",
     sigma=5e-3,
@@ -756,7 +602,7 @@ DEPTH_SCALE = NuisanceRow(
     sentence="scale error of the depth: {size}",
     description="scale error of each depth of an image: the factor minus one",
 )
-DEPTH_TIME = NuisanceRow(
+DEPTH_TIME = Deviation(
     "depth_time_s",
     "s",
     sigma=5e-3,
@@ -771,7 +617,7 @@ DEPTH_TIME = NuisanceRow(
     sentence="delay of a depth camera: {size}",
     description="delay of a depth camera, limited to three standard deviations of its prior",
 )
-DEPTH_EDGE = NuisanceRow(
+DEPTH_EDGE = Deviation(
     "depth_edge_px",
     "px",
     sigma=2.0,
@@ -791,11 +637,11 @@ DEPTH_EDGE = NuisanceRow(
 )
 
 # In the order of φ; neighbours of one component stand together.
-KINDS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
+KINDS = tuple(row for row in [*vars().values()] if isinstance(row, Deviation))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
-GAUGE = NuisanceRow("reading", "", sigma=None, of="gauge", changes=())
+GAUGE = Deviation("reading", "", sigma=None, of="gauge", changes=())
 # Coordinates of places on the surface that sensors refer to, and other unknowns of single points.
-SURFACE_PLACE = NuisanceRow(
+SURFACE_PLACE = Deviation(
     "surface_place",
     "",
     sigma=None,
@@ -806,7 +652,7 @@ SURFACE_PLACE = NuisanceRow(
 )
 
 
-def nuisances_called(word: str) -> list[NuisanceRow]:
+def nuisances_called(word: str) -> list[Deviation]:
     """Return the kinds of nuisance parameters with a name, key, label, or beginning of their
     sentence in the terminal; empty for none.
     """
@@ -824,8 +670,13 @@ def nuisances_called(word: str) -> list[NuisanceRow]:
     ]
 
 
+def _field_of(row: Deviation) -> FieldOfRow:
+    """Return the field of `Nuisance` for a row."""
+    return FieldOfRow("float | None", row.sigma, "float or None", sentence(row.description))
+
+
 @dataclass(frozen=True, kw_only=True)
-@with_attributes({row.name: ("float or None", sentence(row.description)) for row in KINDS})
+@with_fields({row.name: _field_of(row) for row in KINDS})
 class Nuisance:
     """Standard deviations of an experiment's nuisance parameters; None: not estimated.
 
@@ -837,45 +688,23 @@ class Nuisance:
     scope : mapping of name to str
         "shared", or "shared" and a word, for parameters with the same value in all recordings that
         have the word, by field; other parameters have a value of each recording.
-    own : sequence of NuisanceRow
+    own : sequence of Deviation
         Custom parameters, which change the predicted positions or the times of markers.
     """
 
-    marker_offset_m: float | None = PLACE.sigma
-    camera_offset_m: float | None = OFFSET.sigma
-    calibration_scale: float | None = CALIBRATION_SCALE.sigma
-    calibration_distortion_1_m2: float | None = CALIBRATION_DISTORTION.sigma
-    time_shift_s: float | None = TIME.sigma
-    clock_rate: float | None = CLOCK_RATE.sigma
-    pose_turn_rad: float | None = POSE_TURN.sigma
-    pose_shift_m: float | None = POSE_SHIFT.sigma
-    gravity_rad: float | None = TILT.sigma
-    hand_eye_rad: float | None = GRASP_TURN.sigma
-    hand_eye_m: float | None = GRASP_SHIFT.sigma
-    strain_zero: float | None = STRAIN_ZERO.sigma
-    displacement_zero_m: float | None = ZERO.sigma
-    obstacle_offset_m: float | None = OBSTACLE_OFFSET.sigma
-    obstacle_tilt_rad: float | None = OBSTACLE_TILT.sigma
-    obstacle_time_s: float | None = OBSTACLE_TIME.sigma
-    tension_factor: float | None = TENSION_FACTOR.sigma
-    tension_lost_n: float | None = TENSION_OFFSET.sigma
-    pressure_factor: float | None = PRESSURE_FACTOR.sigma
-    pressure_lost_pa: float | None = PRESSURE_OFFSET.sigma
-    pressure_lag: float | None = PRESSURE_LAG.sigma
-    joining_s: float | None = JOINING.sigma
-    tare: float | None = TARE.sigma
-    sensor_time_s: float | None = SENSOR_TIME.sigma
-    sensor_lag_s: float | None = SENSOR_LAG.sigma
-    tool_kg: float | None = TOOL_MASS.sigma
-    tool_m: float | None = TOOL_CENTRE.sigma
-    depth_turn_rad: float | None = DEPTH_TURN.sigma
-    depth_shift_m: float | None = DEPTH_SHIFT.sigma
-    depth_bias_m: float | None = DEPTH_BIAS.sigma
-    depth_scale: float | None = DEPTH_SCALE.sigma
-    depth_time_s: float | None = DEPTH_TIME.sigma
-    depth_edge_px: float | None = DEPTH_EDGE.sigma
     scope: Mapping[str, str] = field(default_factory=dict, hash=False)
-    own: Sequence[NuisanceRow] = field(default=(), hash=False)
+    own: Sequence[Deviation] = field(default=(), hash=False)
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            scope: Mapping[str, str] = ...,
+            own: Sequence[Deviation] = (),
+            **deviations: float | None,
+        ) -> None: ...
+        def __getattr__(self, name: str) -> float | None: ...
 
     def __post_init__(self) -> None:
         """Check custom kinds, deviations and scopes."""
@@ -905,11 +734,11 @@ class Nuisance:
             if not re.fullmatch(SCOPE, word):
                 raise InputError(f"the scope of {name} is {word!r}; expected {SCOPE_TEXT}")
 
-    def list_kinds(self) -> tuple[NuisanceRow, ...]:
+    def list_kinds(self) -> tuple[Deviation, ...]:
         """Return all kinds of nuisance parameters that may be estimated: `KINDS`, then custom ones."""
         return (*KINDS, *self.own)
 
-    def sigma(self, row: NuisanceRow) -> float | None:
+    def sigma(self, row: Deviation) -> float | None:
         """Return the standard deviation of a kind's prior, in its unit; None where it is not
         estimated.
 
@@ -922,7 +751,7 @@ class Nuisance:
         cls,
         *,
         scope: Mapping[str, str] | None = None,
-        own: Sequence[NuisanceRow] = (),
+        own: Sequence[Deviation] = (),
         **deviations: float | None,
     ) -> Nuisance:
         """Return a `Nuisance` that estimates only the fields given by name, with their standard
@@ -934,9 +763,9 @@ class Nuisance:
         return Nuisance(**(nothing | deviations), scope=scope or {}, own=own)
 
 
-def _check_custom_kind(row: NuisanceRow) -> None:
+def _check_custom_kind(row: Deviation) -> None:
     """Raise an `InputError` if a custom kind is of a component other than "recording" or "marker",
-    has no sigma, or does not have exactly one of `reading` and `clock`.
+    has no sigma, or does not have exactly one effect.
     """
     if row.of not in ("recording", "marker"):
         raise InputError(
@@ -948,9 +777,10 @@ def _check_custom_kind(row: NuisanceRow) -> None:
             f"the nuisance parameter {row.name!r} has no sigma; expected the standard deviation "
             "of its prior"
         )
-    if (row.reading is None) == (row.clock is None):
+    functions = ("reading", "clock", "stiffness")
+    stated = [name for name in functions if getattr(row, name) is not None]
+    if len(stated) != 1:
         raise InputError(
-            f"the nuisance parameter {row.name!r} has "
-            f"{'a reading and a clock' if row.reading else 'neither a reading nor a clock'}; "
-            "expected exactly one of these two functions"
+            f"the nuisance parameter {row.name!r} has {' and '.join(stated) or 'no effect'}; "
+            f"expected exactly one of the functions {listed(functions)}"
         )

@@ -34,7 +34,7 @@ from ..common.serialisation import content, copy_fields
 from ..errors import listed
 from ..features.measurement_results import PredictionErrors, SimulatedExperiment
 from ..fem.laws.constants import symbol_of, symbol_with_unit, unit_of
-from ..recording.nuisance import in_readable_unit
+from ..recording.deviation import in_readable_unit
 from ..runs.result_content import Elapsed, Result
 from ..statistics.assessment import Assessment
 from ..statistics.budget.uncertainty_budget import main_sources, source_label

@@ -31,8 +31,9 @@ from ..model.contact.contact_summary import friction_summaries
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
+from ..recording.deviation import in_readable_unit
 from ..recording.experiment import Experiment
-from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE, in_readable_unit
+from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE
 from ..statistics.field_estimates import FieldEstimate
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.scale_identifiability import ScaleReference, scale_reference
@@ -393,7 +394,7 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
     """Yield sentences on the nuisance parameters of an experiment except the places, with estimate
     and prior.
 
-    `NuisanceRow.by` decides for each kind: "length" gives one sentence on the longest of its
+    `Deviation.by` decides for each kind: "length" gives one sentence on the longest of its
     vectors, "worst" one on the value farthest from its prior, in standard deviations, anything else
     one on each value.
     """

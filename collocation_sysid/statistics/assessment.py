@@ -19,11 +19,12 @@ from ..errors import listed
 from ..fem.laws.constants import symbol_of, unit_of
 from ..model.parameters import Parameters, is_default_bound
 from ..program.modes.stability import Instability
+from ..recording.deviation import Deviation, in_readable_unit
 from ..recording.experiment import Experiment
 from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
 from ..recording.hysteresis import branch_differences
-from ..recording.nuisance import NuisanceRow, in_readable_unit
 from .budget.discretisation_error import Refinement
+from .budget.systematic_effects import DEVIATIONS
 from .budget.uncertainty_budget import source_label
 from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
@@ -374,16 +375,6 @@ def numerical_concerns(
     return [Concern(code, data={"name": worst, "percent": percent, "errors": largest})]
 
 
-# What is assumed, by the name of the relaxed assumption, for messages.
-RELAXED = {
-    DRIFT: "the stiffness is constant during a recording",
-    MEMORY: "the material has no viscoelastic memory",
-    ANISOTROPY: "the material is equally stiff along all axes",
-    "clock_rate": "the clocks of cameras and robot run at the same rate",
-    "time_scale": "all clocks run at the right rate",
-}
-
-
 def probe_concerns(
     probes: Iterable[Probe],
     corrections: Mapping[str, float],
@@ -412,7 +403,7 @@ def probe_concerns(
     label = source_label(worst.name)
     instead = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others)
     data = {
-        "assumption": RELAXED.get(assumption_name(worst.name), f"{label} is as stated"),
+        "assumption": DEVIATIONS[assumption_name(worst.name)].assumed or f"{label} is as stated",
         "name": label,
         "size": short(worst.size or 0.0),
         "size_error": short(worst.size_error or 0.0),
@@ -475,7 +466,7 @@ def nuisance_concerns(
     high: Iterable[float],
     *,
     is_specimen: bool = False,
-    rows: Sequence[NuisanceRow] = (),
+    rows: Sequence[Deviation] = (),
     scales: Sequence[float] = (),
 ) -> list[Concern]:
     """Return concerns about nuisance parameters far from their priors or at their limits; of the
@@ -491,7 +482,7 @@ def nuisance_concerns(
         Limits of the estimates, likewise.
     is_specimen : bool
         Whether they are those of a specimen, whose page explains them.
-    rows : sequence of NuisanceRow
+    rows : sequence of Deviation
         Their kinds; empty if these are not known.
     scales : sequence of float
         Standard deviations of their priors, in the units of the kinds.

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from .budget.systematic_effects import ASSUMPTIONS
+from .budget.systematic_effects import DEVIATIONS
 from .budget.uncertainty_budget import BETWEEN, MESH, NOISE, NUISANCES, NUMERICAL
 
 LAW = "law"
 
 # One remedy per source of the budget, as an imperative phrase that ends a sentence.
 REMEDIES: Mapping[str, str] = {
-    **{each.name: each.remedy for each in ASSUMPTIONS},
+    **{name: row.remedy for name, row in DEVIATIONS.items() if row.remedy},
     NOISE: "record longer, more often, or a motion or test that depends more on this parameter",
     NUISANCES: "measure clocks, marker positions and the grip, or the area and unloaded length of "
     "a specimen, and state tighter priors",
@@ -19,9 +19,6 @@ REMEDIES: Mapping[str, str] = {
     MESH: "solve on a finer mesh, or run refine",
     BETWEEN: "find out what differs between the recordings, such as temperature or clamping",
     LAW: "record larger strains, which distinguish the material laws",
-    "calibration_scale": "film a ruler where the body moves",
-    "calibration_distortion_1_m2": "film a ruler where the body moves",
-    "clock_rate": "trigger robot and cameras by one clock",
 }
 
 

@@ -17,8 +17,9 @@ from ..problem.code_loader import CodeLoader
 from ..problem.nuisance_schema import CustomNuisanceSection
 from ..program.collocation import Collocation
 from ..program.markers.marker_residual import MarkerResidual
+from ..recording.deviation import Deviation
 from ..recording.experiment import Experiment
-from ..recording.nuisance import KINDS, Nuisance, NuisanceRow
+from ..recording.nuisance import KINDS, Nuisance
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
 from .round_trip import check_pickling, check_problem_file
@@ -34,7 +35,7 @@ FIRST_INNER_SAMPLE = 2
 
 
 def check_nuisance(
-    row: NuisanceRow,
+    row: Deviation,
     *,
     experiment: Experiment | None = None,
     file: str | Path | None = None,
@@ -50,7 +51,7 @@ def check_nuisance(
 
     Parameters
     ----------
-    row : NuisanceRow
+    row : Deviation
         Parameter of your own, or one of the package.
     experiment : Experiment, optional
         Recording that has the parameter; by default a swung box with markers. Other parameters of
@@ -90,7 +91,7 @@ def check_nuisance(
     check_program(check, collocation)
 
 
-def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:
+def _with_row(experiment: Experiment, row: Deviation) -> Experiment:
     """Return the experiment in which the parameter of a row is estimated; the argument is not
     modified.
 
@@ -104,14 +105,14 @@ def _with_row(experiment: Experiment, row: NuisanceRow) -> Experiment:
     return replace(experiment, nuisance=replace(nuisance, **{row.name: sigma}))
 
 
-def _value_count(row: NuisanceRow) -> int:
+def _value_count(row: Deviation) -> int:
     """Return the number of values of one component of a row: the number of its axes, 1 without
     axes.
     """
     return len(row.axes.split()) or 1
 
 
-def _read(row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceMap) -> Array:
+def _read(row: Deviation, y: Array, values: Array, t_s: float, data: NuisanceMap) -> Array:
     """Return the reading (3,) of a row, or the delay (1,) of its clock if it has no reading, by
     calling its function with numbers.
     """
@@ -124,7 +125,7 @@ def _read(row: NuisanceRow, y: Array, values: Array, t_s: float, data: NuisanceM
     return np.ravel(ca.evalf(ca.SX(result)).full())
 
 
-def _check_reading(check: PropertyCheck, row: NuisanceRow, collocation: Collocation) -> None:
+def _check_reading(check: PropertyCheck, row: Deviation, collocation: Collocation) -> None:
     """Require that zero has no effect, that derivatives are right, and that predicted markers are
     the reading.
 
@@ -179,7 +180,7 @@ def _marker_residual(collocation: Collocation) -> MarkerResidual:
 
 
 def _check_predicted_reading(
-    check: PropertyCheck, row: NuisanceRow, collocation: Collocation
+    check: PropertyCheck, row: Deviation, collocation: Collocation
 ) -> None:
     """Require that predicted markers are the reading of those without the parameter, at every
     sample.
@@ -207,7 +208,7 @@ def _check_predicted_reading(
             )
 
 
-def _check_clock(check: PropertyCheck, row: NuisanceRow, collocation: Collocation) -> None:
+def _check_clock(check: PropertyCheck, row: Deviation, collocation: Collocation) -> None:
     """Require no delay at zero, and the first marker of a known motion at the later time, at all
     samples from `FIRST_INNER_SAMPLE` on.
     """
@@ -249,7 +250,7 @@ def _smooth_motion(check: PropertyCheck, collocation: Collocation, shift_s: floa
     return np.einsum("tij,nj->tni", np.eye(3) + steps, nodes_m).reshape(len(t_s), -1)
 
 
-def _check_messages(check: PropertyCheck, row: NuisanceRow, experiment: Experiment) -> None:
+def _check_messages(check: PropertyCheck, row: Deviation, experiment: Experiment) -> None:
     """Require that a repeated name and a prior without width are refused by the name of the row."""
     nuisance = experiment.nuisance
     check.require_refusal(
@@ -266,7 +267,7 @@ def _check_messages(check: PropertyCheck, row: NuisanceRow, experiment: Experime
 
 def _check_round_trips(
     check: PropertyCheck,
-    row: NuisanceRow,
+    row: Deviation,
     data: NuisanceMap,
     file: str | Path | None,
     name_in_file: str | None,
@@ -278,7 +279,7 @@ def _check_round_trips(
     values = (row.sigma or USUAL_SIGMA) * np.linspace(0.3, 0.5, _value_count(row))
     t_s = float(np.mean(data.recorded_s))
 
-    def evaluate(each: NuisanceRow) -> Array:
+    def evaluate(each: Deviation) -> Array:
         """Return prior standard deviation (0 if None), limits (0 if infinite) and effect of a row
         at one state; a row without reading and clock has no effect.
         """
@@ -288,7 +289,7 @@ def _check_round_trips(
         limits = np.where(np.isfinite(limits), limits, 0.0)
         return np.concatenate([[each.sigma or 0.0], limits, effect])
 
-    def load(loader: CodeLoader, table: Mapping[str, Any]) -> NuisanceRow:
+    def load(loader: CodeLoader, table: Mapping[str, Any]) -> Deviation:
         """Return the row of a table of a problem file."""
         return loader.nuisance_row(CustomNuisanceSection.model_validate(table))
 

@@ -40,12 +40,13 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
+from collocation_sysid.recording.deviation import Deviation
 from collocation_sysid.recording.nuisance import CALIBRATION_SCALE
 from collocation_sysid.statistics.budget.consider_analysis import (
     changed_residuals,
     changes_of_assumptions,
 )
-from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumption
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
 from collocation_sysid.statistics.budget.uncertainty_budget import (
     BudgetLine,
     VarianceSources,
@@ -170,14 +171,14 @@ def positions_m() -> Array:
 
 
 def identified(
-    experiment: Experiment, assumed: Sequence[Assumption] | None = ()
+    experiment: Experiment, assumed: Sequence[Deviation] | None = ()
 ) -> tuple[Uncertainty, Array, Array, bool]:
     """Identify an experiment with default options, starting from the truth.
 
     Parameters
     ----------
     experiment : Experiment
-    assumed : sequence of Assumption or None
+    assumed : sequence of Deviation or None
         Rows of the uncertainty budget; None for the default budget.
 
     Returns
@@ -203,7 +204,7 @@ def identified(
     return fit.uncertainty, contained, np.array(half_widths), fit.converged
 
 
-def fit_from_truth(experiment: Experiment, assumed: Sequence[Assumption] | None) -> BudgetedFit:
+def fit_from_truth(experiment: Experiment, assumed: Sequence[Deviation] | None) -> BudgetedFit:
     """Return the fit of an experiment from the truth, with a budget of some assumptions, or of all
     for None.
     """
@@ -215,7 +216,7 @@ def fit_from_truth(experiment: Experiment, assumed: Sequence[Assumption] | None)
     if assumed is None:
         changes = changes_of_assumptions(collocation, z, {})
     else:
-        deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
+        deviations = [(row, row.considered) for row in assumed if row.considered is not None]
         changes = changed_residuals(collocation, z, deviations)
     fit = linearise_fit(collocation, z)
     sources = VarianceSources.from_fit(
@@ -357,7 +358,7 @@ def _errors(names: Sequence[str], rng: Generator) -> dict[str, float]:
     errors = {}
     for row in (row for row in ASSUMPTIONS if row.name in names):
         for name in row.list_components():
-            error = (row.sigma or 0.0) * rng.standard_normal()
+            error = (row.considered or 0.0) * rng.standard_normal()
             # Coefficients of the air are not negative, and a negative share of another damping law
             # would add energy where the body is stretched.
             errors[name] = max(error, -0.99) if row.name in AIR else error

@@ -68,8 +68,8 @@ def with_time_every(count: int, live: LiveEstimator, frames: list[Frame]) -> Liv
 
 OF_THE_USER = Nuisance.none(
     own=[
-        cs.NuisanceRow("growth", "1", 0.02, reading=lambda y, k, t_s, data: (1 + k * t_s) * y),
-        cs.NuisanceRow("clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s),
+        cs.Deviation("growth", "1", 0.02, reading=lambda y, k, t_s, data: (1 + k * t_s) * y),
+        cs.Deviation("clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s),
     ]
 )
 

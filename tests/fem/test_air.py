@@ -187,7 +187,7 @@ def estimated(described: Problem, deviations: Mapping[str, float] | None = None)
     solution = ReducedSpace(tolerance=1e-6)(described.collocation())
     collocation, z = solution.collocation, solution.z
     rows = [row for row in ASSUMPTIONS if row.name in OF_AIR]
-    sizes = [(row, (deviations or {}).get(row.name, row.sigma)) for row in rows]
+    sizes = [(row, (deviations or {}).get(row.name, row.considered)) for row in rows]
     changes, found = (changed_residuals(collocation, z, sizes), uncertainty_at(collocation, z))
     fit = linearise_fit(collocation, z)
     sources = VarianceSources.from_fit(fit, changes, collocation.parameters, solution.q, found)

@@ -6,16 +6,14 @@ import casadi as ca
 
 import collocation_sysid as cs
 
-SCALE = cs.NuisanceRow(
-    "camera_scale", "1", 0.02, reading=lambda y, scale, t_s, data: (1 + scale) * y
-)
+SCALE = cs.Deviation("camera_scale", "1", 0.02, reading=lambda y, scale, t_s, data: (1 + scale) * y)
 
 
-DRIFT = cs.NuisanceRow("clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s)
+DRIFT = cs.Deviation("clock_drift", "1", 0.05, clock=lambda drift, t_s, data: drift * t_s)
 
 
 # Cameras that sag while they warm up, each marker's lens by a vector of its own.
-SAG = cs.NuisanceRow(
+SAG = cs.Deviation(
     "sag",
     "m",
     0.003,

@@ -25,7 +25,7 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.result.run_summary import run_summary
 
 
-def only(*rows: cs.NuisanceRow, **others) -> cs.Nuisance:
+def only(*rows: cs.Deviation, **others) -> cs.Nuisance:
     return cs.Nuisance.none(own=rows, **others)
 
 
@@ -97,7 +97,7 @@ def test_without_it_the_answer_is_wrong():
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ({"reading": None}, "'extra' has neither a reading nor a clock; expected exactly one"),
+        ({"reading": None}, "'extra' has no effect; expected exactly one"),
         ({"sigma": None}, "'extra' has no sigma; expected the standard deviation of its prior"),
         ({"sigma": 0.0}, "'extra' is 0; expected a value above 0"),
         ({"name": "tare"}, "two nuisance parameters are named 'tare'"),
@@ -120,16 +120,16 @@ def test_without_it_the_answer_is_wrong():
 def test_a_row_that_cannot_be_is_refused(row, message: str):
     given = {"name": "extra", "unit": "1", "sigma": 0.1, "reading": lambda y, v, t, d: y + v} | row
     with pytest.raises(InputError, match=message):
-        cs.Problem([replace(hung_cube(4), nuisance=only(cs.NuisanceRow(**given)))], GUESS)
+        cs.Problem([replace(hung_cube(4), nuisance=only(cs.Deviation(**given)))], GUESS)
 
 
 # Problem files
 
 ALLOWED = ("--allow-code",)
 CAMERAS = """
-from collocation_sysid import NuisanceRow
+from collocation_sysid import Deviation
 
-SCALE = NuisanceRow(
+SCALE = Deviation(
     "camera_scale", "1", 0.02, reading=lambda y, scale, t_s, data: (1 + scale) * y
 )
 """
@@ -171,7 +171,7 @@ def test_a_file_gives_a_row_where_that_is_allowed(scaled: Path):
     ("edit", "options", "message"),
     [
         (lambda folder: None, (), "nuisance.own: found the file cameras.py, which would be run"),
-        (replace_text('"SCALE"', '"SCAL"'), ALLOWED, "no NuisanceRow 'SCAL'; expected one of"),
+        (replace_text('"SCALE"', '"SCAL"'), ALLOWED, "no Deviation 'SCAL'; expected one of"),
         (write("cameras.py", "SCALE = 3"), ALLOWED, "expected one of none"),
         (write("cameras.py", CAMERAS.replace("* y", "* y[:1]")), ALLOWED, "has the shape (1, 1)"),
     ],

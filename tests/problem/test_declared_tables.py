@@ -14,9 +14,8 @@ from collocation_sysid.problem.nuisance_schema import KEYS, NuisanceSection
 from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
-    OF_KNOWN_SIGN,
     Assumptions,
-    Deviation,
+    Deviated,
     KnownDeviation,
 )
 
@@ -49,27 +48,28 @@ def test_the_table_has_a_key_for_each_kind():
 
 
 def test_assumptions_have_a_field_for_each_row():
-    defaults = {row.name: row.sigma for row in ASSUMPTIONS}
+    defaults = {row.name: row.considered for row in ASSUMPTIONS}
     defaults |= {row.name: row.considered for row in KINDS}
     assert [field.name for field in fields(Assumptions)] == list(defaults)
     assert Assumptions().collect_deviations() == defaults
 
 
-BY_ORIGIN = {row.name for row in ASSUMPTIONS if row.usual}
+BY_ORIGIN = {row.name for row in ASSUMPTIONS if row.by_origin}
+ONE_SIDED = {"grip_layer_m", "machine_compliance_m_n", "marker_mass_kg"}
 
 
 def test_defaults_by_origin_name_ways_of_making_a_body_or_origins_of_its_mesh():
     ways, origins = set(get_args(Made)), set(get_args(MeshOrigin))
     for row in ASSUMPTIONS:
-        assert set(row.usual) <= ways or set(row.usual) <= origins
-        assert row.sigma not in row.usual.values()
+        assert set(row.by_origin) <= ways or set(row.by_origin) <= origins
+        assert row.considered not in row.by_origin.values()
 
 
 def test_only_effects_of_known_sign_have_a_mean():
     forms = get_type_hints(Assumptions, include_extras=True)
     for field in fields(Assumptions):
-        known = field.name in OF_KNOWN_SIGN
-        usual = Deviation | None if field.name in BY_ORIGIN else Deviation
+        known = field.name in ONE_SIDED
+        usual = Deviated | None if field.name in BY_ORIGIN else Deviated
         assert forms[field.name] == (KnownDeviation if known else usual)
 
 

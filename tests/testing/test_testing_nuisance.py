@@ -12,13 +12,7 @@ from kit.problems import bar_loaded, driven_bar, hung_cube, pressed_cube
 from kit.wrenches import wristed_cube
 
 import collocation_sysid as cs
-from collocation_sysid.recording.nuisance import (
-    DEPTH_EDGE,
-    KINDS,
-    STRAIN_ZERO,
-    TOOL_CENTRE,
-    NuisanceRow,
-)
+from collocation_sysid.recording.nuisance import DEPTH_EDGE, KINDS, STRAIN_ZERO, TOOL_CENTRE
 from collocation_sysid.testing import check_nuisance
 
 
@@ -67,7 +61,7 @@ CHECKED = [row for row in KINDS if row != DEPTH_EDGE]
 
 
 @pytest.mark.parametrize("row", CHECKED, ids=lambda row: row.name)
-def test_every_parameter_of_the_package_passes(row: NuisanceRow):
+def test_every_parameter_of_the_package_passes(row: cs.Deviation):
     experiment = RECORDINGS[row.of]() if row.of in RECORDINGS else None
     if row == STRAIN_ZERO:
         experiment = replace(pulled_specimen(), nuisance=cs.Nuisance.none())
@@ -82,9 +76,9 @@ def scaled(y, values, t_s, data):
 
 
 ROWS = {
-    "scale": cs.NuisanceRow("camera_scale", "1", 0.02, reading=scaled),
-    "drift": cs.NuisanceRow("drift", "1", 0.05, clock=lambda values, t_s, data: values * t_s),
-    "sag": cs.NuisanceRow(
+    "scale": cs.Deviation("camera_scale", "1", 0.02, reading=scaled),
+    "drift": cs.Deviation("drift", "1", 0.05, clock=lambda values, t_s, data: values * t_s),
+    "sag": cs.Deviation(
         "sag",
         "m",
         0.003,
@@ -122,7 +116,7 @@ def test_parameters_of_a_user_pass(name: str):
     ],
 )
 def test_a_fault_is_one_sentence(change: dict, sentence: str):
-    row = replace(cs.NuisanceRow("mine", "m", 0.01, reading=scaled), **change)
+    row = replace(cs.Deviation("mine", "m", 0.01, reading=scaled), **change)
     with pytest.raises(AssertionError, match=sentence):
         check_nuisance(row)
 
@@ -133,7 +127,7 @@ import collocation_sysid as cs
 def scaled(y, values, t_s, data):
     return (1 + values) * y
 
-scale = cs.NuisanceRow("camera_scale", "1", 0.02, reading=scaled)
+scale = cs.Deviation("camera_scale", "1", 0.02, reading=scaled)
 """
 
 

@@ -14,6 +14,7 @@ from ...common.array_types import Array, Index
 from ...model.generated_functions import GeneratedFunction
 from ...model.nuisance_map import NuisanceMap
 from ...recording.depth_camera import Depth
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.nuisance import (
     DEPTH_BIAS,
@@ -22,7 +23,6 @@ from ...recording.nuisance import (
     DEPTH_SHIFT,
     DEPTH_TIME,
     DEPTH_TURN,
-    NuisanceRow,
     cayley_rotation,
 )
 
@@ -125,7 +125,7 @@ class DepthCameraModel:
             vars(self)["alignment_clouds"] = other.alignment_clouds
 
     def corrected_expression(
-        self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]
+        self, point: ca.SX, ray: ca.SX, values: Mapping[Deviation, ca.SX]
     ) -> ca.SX:
         """Return the expression (3,) of a point in the camera's stated frame [m], corrected by the
         estimated errors.
@@ -139,7 +139,7 @@ class DepthCameraModel:
             Measured point [m].
         ray : (3,) SX
             Direction of its depth.
-        values : mapping of NuisanceRow to SX
+        values : mapping of Deviation to SX
             Errors in physical units; missing ones are zero.
         """
         point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(DEPTH_BIAS, 0) * ray
@@ -235,7 +235,7 @@ class DepthCameraModel:
             return None
         return self.to_world(phi, np.zeros((1, 3)), rays=np.zeros((1, 3)), image=sample)[0]
 
-    def prior_weights(self, row: NuisanceRow) -> Array:
+    def prior_weights(self, row: Deviation) -> Array:
         """Return one over the prior standard deviations (3,) of the camera's rotation [1/rad] or
         translation [1/m], for `row` DEPTH_TURN or DEPTH_SHIFT; `EXACT` if it is not estimated.
         """

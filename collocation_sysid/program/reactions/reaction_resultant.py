@@ -27,16 +27,10 @@ from ...model.dynamics import Dynamics
 from ...model.generated_functions import GeneratedFunction
 from ...model.nuisance_map import NuisanceMap
 from ...model.recursion import Recursion, RecursionTrajectory, relaxation_coefficients
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
-from ...recording.nuisance import (
-    SENSOR_LAG,
-    SENSOR_TIME,
-    TOOL_CENTRE,
-    TOOL_MASS,
-    NuisanceRow,
-    cayley_rotation,
-)
+from ...recording.nuisance import SENSOR_LAG, SENSOR_TIME, TOOL_CENTRE, TOOL_MASS, cayley_rotation
 from ...recording.poses import Frame
 from ..observables import (
     ObservableDerivatives,
@@ -194,7 +188,7 @@ class ReactionResultant:
         """
         return int(np.count_nonzero(self.known_rows + self.reaction_grid.delay_steps < rows))
 
-    def parameter_indices(self, row: NuisanceRow) -> Index:
+    def parameter_indices(self, row: Deviation) -> Index:
         """Return the indices in φ of this sensor's nuisance parameters of one kind; empty if it has
         none.
         """

@@ -156,7 +156,7 @@ def origin_answers(
     stated : Assumptions
         Stated deviations.
     """
-    rows = [row for row in ASSUMPTIONS if row.usual and vars(stated)[row.name] is None]
+    rows = [row for row in ASSUMPTIONS if row.by_origin and vars(stated)[row.name] is None]
     for key, words, own, other in (
         ("made", get_args(Made), body.made, body.mesh_from),
         ("mesh_from", get_args(MeshOrigin), body.mesh_from, body.made),
@@ -164,7 +164,7 @@ def origin_answers(
         if own is not None or (key == "mesh_from" and body.rest_shape is not None):
             continue
         for word in words:
-            if not any(word in row.usual for row in rows):
+            if not any(word in row.by_origin for row in rows):
                 continue
             half_widths = {}
             for name, line in lines.items():
@@ -174,8 +174,8 @@ def origin_answers(
                 counted = sources.variances_of_assumptions(name, by_q)
                 variance = (line.combined_std_error * at.derivative(line.value)) ** 2
                 for row in rows:
-                    now = row.usual.get(other or "", row.sigma)
-                    then = row.usual.get(word, now)
+                    now = row.usual_considered(other)
+                    then = row.by_origin.get(word, now)
                     if then is None or then == now:
                         continue
                     if now is not None:

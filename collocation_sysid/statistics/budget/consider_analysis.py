@@ -23,11 +23,12 @@ from ...program.observable_response import ObservableResponse
 from ...program.observables import ObservedMotion
 from ...program.reactions.reaction_forces import GraspForces
 from ...program.sweep import ForwardSubstitution, PrescribedColumns, Sweep, SweepColumns
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.nuisance import KINDS
 from ..linearised import linearise_fit
 from .shape_error import CORRELATION
-from .systematic_effects import ASSUMPTIONS, CORRELATION_KEY, Assumption, Effect, ExperimentAtAnswer
+from .systematic_effects import ASSUMPTIONS, CORRELATION_KEY, Effect, ExperimentAtAnswer
 
 # A threshold of Huber's loss that no residual reaches.
 UNWEIGHTED = 1e9
@@ -113,7 +114,7 @@ def changes_of_assumptions(
     left out. The entry for `CORRELATION_KEY` is the correlation length of the surface's error, by
     default `CORRELATION`. Columns of `ASSUMPTIONS` come first, then those of nuisance parameters.
     """
-    rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
+    rows = [(row, deviations.get(row.name, row.considered)) for row in ASSUMPTIONS]
     assumptions = [(row, s) for row, s in rows if s is not None]
     correlation = deviations.get(CORRELATION_KEY) or CORRELATION
     of_bodies = changed_residuals(
@@ -183,7 +184,7 @@ def changes_of_nuisances(
 def changed_residuals(
     collocation: Collocation,
     z: Array,
-    assumptions: Sequence[tuple[Assumption, float]],
+    assumptions: Sequence[tuple[Deviation, float]],
     *,
     surface_correlation: float = CORRELATION,
 ) -> ResidualChanges:
@@ -199,7 +200,7 @@ def changed_residuals(
         The program.
     z : (variables,) array
         Variables that satisfy the equations of motion.
-    assumptions : sequence of (Assumption, float)
+    assumptions : sequence of (Deviation, float)
         Assumptions with their standard deviations, in the unit of each.
     surface_correlation : float
         Correlation length of the surface's error over the longest extent of the body.
@@ -217,7 +218,10 @@ def changed_residuals(
         )
         is_specimen = part.transcription.experiment.specimen is not None
         effects = [
-            (None if is_specimen and not row.of_specimens else row.effect(at, axis), sigma)
+            (
+                row.effect(at, axis) if row.effect and is_specimen <= row.of_specimens else None,
+                sigma,
+            )
             for row, sigma in assumptions
             for axis in range(len(row.list_components()))
         ]

@@ -48,12 +48,13 @@ from ...program.linear_algebra.reused_factor import (
     NodeRotation,
     ReusedFactor,
 )
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.experiment_refinement import refined_experiment
 from ..linearised import LinearisedFit
 from .consider_analysis import changed_residuals
 from .discretisation_error import estimate_changes
-from .systematic_effects import Assumption, Effect, ExperimentAtAnswer
+from .systematic_effects import Effect, ExperimentAtAnswer
 
 # Largest number of nodes of a body whose error of the mesh is estimated in every solve: with more,
 # the search starts on a coarser mesh, and a note compares both meshes.
@@ -87,14 +88,14 @@ def mesh_change(collocation: Collocation, z: Array, fit: LinearisedFit) -> Array
     return estimate_changes(fit, changes.blocks)[: collocation.nq, 0]
 
 
-def finer_mesh_row(collocation: Collocation) -> Assumption:
+def finer_mesh_row(collocation: Collocation) -> Deviation:
     """Return the assumption that the meshes are fine enough: its effect is that of meshes with every
     tetrahedron split into eight.
     """
     bodies = dict.fromkeys(t.body for t in collocation.transcriptions if _has_mesh(t.experiment))
     finer = {id(body): refine_body(body) for body in bodies}
     effect = partial(_effect, scheme=collocation.scheme, finer=finer)
-    return Assumption("mesh", "", None, "", remedy="", effect=effect)
+    return Deviation("mesh", "", effect=effect)
 
 
 def _has_mesh(experiment: Experiment) -> bool:

@@ -1,19 +1,18 @@
 """Systematic effects (type B): assumptions that are not estimated, and what changes if they are
 wrong.
 
-An assumption is a row of `ASSUMPTIONS`: its standard deviation, and its effect on the equations of
-motion, c = Σ w F − M a, or on the prescribed displacements; `consider_analysis` propagates effects
-to the residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance
-parameters, see `recording.nuisance`. `Assumptions` is the table of the problem file in which users
-state standard deviations.
+An assumption is a `Deviation` of the table `ASSUMPTIONS` with an effect on the equations of motion,
+c = Σ w F − M a, or on the prescribed displacements; `consider_analysis` propagates effects to the
+residuals. Deviations that change only the measurements (cameras, clocks) are in `recording.nuisance`.
+`Assumptions` is the table of the problem file in which users state standard deviations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from ...common.array_types import Array, Index
-from ...common.field_descriptions import sentence, with_attributes
+from ...common.field_descriptions import FieldOfRow, sentence, with_fields
 from ...common.schema_tables import ByForm, Section
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive
@@ -36,9 +35,10 @@ from ...model.force_term import States
 from ...model.parameters import Parameters
 from ...program.collocation import ExperimentIterate
 from ...program.reactions.reaction_forces import forces_on_dofs, reaction_forces
+from ...recording.deviation import WIDENING, Deviation
 from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
-from ...recording.nuisance import DEGREE, KINDS
+from ...recording.nuisance import KINDS
 from ...recording.placement import place_markers
 from ...recording.specimen_files import specimen_strains
 from .memory_effect import (
@@ -72,6 +72,11 @@ AIR_DENSITY_DEVIATION = 0.03
 # Relative standard deviation of the added mass and of the drag coefficient of a given body: they
 # depend on its shape, on edges, on amplitude and on frequency.
 AIR_COEFFICIENT_DEVIATION = 0.4
+# Deviation of the share of a branch of memory in its test: it is not in the budget by default.
+MEMORY_SHARE = 0.1
+# Smaller than `WIDENING`: across the axis of bending hardly anything depends on the anisotropy, so
+# that any error of the model needs an impossible one (0.7 to 0.9 in twins without any).
+WIDENING_OF_ANISOTROPY = 4.0
 _AXES = "xyz"
 # Poisson's ratio of an incompressible material.
 INCOMPRESSIBLE_POISSON = 0.5
@@ -377,62 +382,6 @@ def _dof_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
     mask = np.zeros(3 * nodes, dtype=bool)
     mask[dofs] = True
     return mask.reshape(nodes, 3)
-
-
-@dataclass(frozen=True)
-class Assumption:
-    """Quantity that is taken as stated instead of being estimated.
-
-    Attributes
-    ----------
-    name : str
-        Name, as in problem files and budgets.
-    unit : str
-        Unit of its deviation.
-    sigma : float or None
-        Default standard deviation, as in a careful laboratory; None if the effect counts only where
-        a problem states its deviation.
-    description : str
-        Description.
-    remedy : str
-        What to measure or state in order to reduce the effect, as an imperative phrase without a
-        full stop.
-    effect : callable
-        Returns the effect of one unit, from an experiment at the answer and the index of the
-        component, from 0; None if there is no effect in this experiment.
-    component_names : str
-        Names of components with independent errors, separated by spaces; empty if there is one.
-    of_specimens : bool
-        Whether it concerns homogeneous specimens too, which have neither a mesh nor grips.
-    usual : mapping of str to float
-        Default standard deviations in place of `sigma`, by `Body.made` or `Body.mesh_from`.
-    redefines : tuple of str
-        Constants, without a region, that another answer to the assumption would define differently.
-        Their intervals are conditional on the assumption, and do not contain its effect; the values
-        under the alternative are reported instead.
-    alternative : str
-        Condition under which the assumption is wrong by one unit, with the placeholder "component",
-        for an assumption whose alternative is reported. An alternative is also evaluated if the
-        budget does not contain the assumption, unless the assumption is stated to be exact.
-    """
-
-    name: str
-    unit: str
-    sigma: float | None
-    description: str
-    remedy: str
-    effect: Callable[[ExperimentAtAnswer, int], Effect | None]
-    component_names: str = ""
-    of_specimens: bool = False
-    usual: Mapping[str, float] = field(default_factory=dict)
-    redefines: tuple[str, ...] = ()
-    alternative: str = ""
-
-    def list_components(self) -> tuple[str, ...]:
-        """Return the names of the components, each after that of the assumption and a space; the
-        name alone if there is one component.
-        """
-        return tuple(f"{self.name} {a}" for a in self.component_names.split()) or (self.name,)
 
 
 # What each changes ------------------------------------------------------------------------------
@@ -905,124 +854,130 @@ def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
 
 
 ASSUMPTIONS = (
-    Assumption(
+    Deviation(
         "body_scale",
         "1",
-        sigma=0.01,
+        considered=0.01,
         description="relative error of the size of the mesh",
         remedy="measure two lengths of the real body and scale the mesh to them",
         effect=_size,
-        usual={"cast": 0.005, "printed": 0.005, "tissue": 0.02},
+        by_origin={"cast": 0.005, "printed": 0.005, "tissue": 0.02},
     ),
-    Assumption(
+    Deviation(
         "rest_shape",
         "1",
-        sigma=None,
         description="share of the weight of the body under which the mesh was deformed when "
         "it was made, along each axis, if object.rest_shape is not stated",
         remedy="state object.rest_shape: whether the mesh is free of stress, or the shape in "
         "which the body hung or stood during its scan",
         effect=_rest_shape,
-        component_names="x y z",
-        usual={"scan": UNKNOWN_ORIENTATION},
+        axes="x y z",
+        by_origin={"scan": UNKNOWN_ORIENTATION},
         alternative="if the mesh was scanned while the body hung along its {component} axis",
     ),
-    Assumption(
+    Deviation(
         "surface",
         "1",
-        sigma=0.005,
+        considered=0.005,
         description="displacement of the surface of the body from that of the mesh along its "
         "normal, relative to the thickness",
         remedy="measure the thickness of the real body at several places",
         effect=_surface,
-        component_names=_MODES,
-        usual={"scan": 0.01},
+        axes=_MODES,
+        by_origin={"scan": 0.01},
     ),
-    Assumption(
+    Deviation(
         "mass",
         "1",
-        sigma=0.01,
+        considered=0.01,
         description="relative error of the mass of the body, if the mass is not estimated",
         remedy="weigh the body",
         effect=_mass,
     ),
-    Assumption(
+    Deviation(
         "marker_mass_kg",
         "kg",
-        sigma=None,
+        is_one_sided=True,
         description="mass of each marker, which is not part of the mass of the body",
         remedy="weigh the markers and state "
         "marker_mass_kg = { mean = …, deviation = … } in [uncertainty.assumptions], "
         "or add them as point masses",
         effect=_marker_mass,
     ),
-    Assumption(
+    Deviation(
         "density_gradient",
         "1",
-        sigma=0.05,
+        considered=0.05,
         description="relative difference of the density at one end of the body from that in "
         "its middle",
         remedy="weigh two halves of a specimen",
         effect=_density_gradient,
-        component_names="x y z",
-        usual={"cast": 0.01, "printed": 0.02, "tissue": 0.02},
+        axes="x y z",
+        by_origin={"cast": 0.01, "printed": 0.02, "tissue": 0.02},
     ),
-    Assumption(
+    Deviation(
         "stiffness_gradient",
         "1",
-        sigma=0.05,
+        considered=0.05,
         description="relative difference of the stiffness at one end of the body from that in "
         "its middle",
         remedy="press specimens from both ends of the body, or estimate a field of the stiffness",
         effect=_stiffness_gradient,
-        component_names="x y z",
-        usual={"cast": 0.015, "foam": 0.1, "printed": 0.03, "tissue": 0.15},
+        axes="x y z",
+        by_origin={"cast": 0.015, "foam": 0.1, "printed": 0.03, "tissue": 0.15},
     ),
-    Assumption(
+    Deviation(
         "anisotropy",
         "1",
-        sigma=0.05,
+        widening=WIDENING_OF_ANISOTROPY,
+        considered=0.05,
         description="relative difference of the stiffness along one axis from that across it",
+        assumed="the material is equally stiff along all axes",
         remedy="record a second motion with the body held the other way round, or test specimens "
         "cut along each axis",
         effect=_anisotropy,
-        component_names="x y z",
+        axes="x y z",
         of_specimens=True,
-        usual={"cast": 0.015, "foam": 0.2, "printed": 0.15, "tissue": 0.3},
+        by_origin={"cast": 0.015, "foam": 0.2, "printed": 0.15, "tissue": 0.3},
     ),
-    Assumption(
+    Deviation(
         "stiffness_drift",
         "1",
-        sigma=0.02,
+        widening=WIDENING,
+        considered=0.02,
         description="relative change of the stiffness from the beginning to the end of a recording",
+        assumed="the stiffness is constant during a recording",
         remedy="repeat the first recording at the end",
         effect=_drift,
         of_specimens=True,
-        usual={"tissue": 0.05},
+        by_origin={"tissue": 0.05},
     ),
-    Assumption(
+    Deviation(
         "memory_share",
         "1",
-        sigma=None,
+        widening=WIDENING,
+        tested=MEMORY_SHARE,
         description="share of a branch of viscoelastic memory (Prony term) that the material lacks, for "
         "each relaxation time that the recording can show",
+        assumed="the material has no viscoelastic memory",
         remedy="add a branch of memory to the material, and estimate its share",
         effect=_memory,
-        component_names=" ".join(f"{RELAXATION_TIME}{tau_s:g}s" for tau_s in RELAXATION_TIMES_S),
+        axes=" ".join(f"{RELAXATION_TIME}{tau_s:g}s" for tau_s in RELAXATION_TIMES_S),
         redefines=(GAMMA_R.name, GAMMA_M.name),
     ),
-    Assumption(
+    Deviation(
         "time_scale",
         "1",
-        sigma=1e-4,
+        considered=1e-4,
         description="relative error of the rate of all clocks",
+        assumed="all clocks run at the right rate",
         remedy="compare all clocks with a reference clock",
         effect=_time_scale,
     ),
-    Assumption(
+    Deviation(
         "poisson",
         "",
-        sigma=0.02,
+        considered=0.02,
         description="error of a stated Poisson's ratio",
         remedy="measure Poisson's ratio in a tension test, or estimate it; if it is known "
         "better, state its deviation, poisson = …, in [uncertainty.assumptions]: the bulk modulus of "
@@ -1030,23 +985,22 @@ ASSUMPTIONS = (
         effect=_poisson,
         of_specimens=True,
     ),
-    Assumption(
+    Deviation(
         "damping_law",
         "1",
-        sigma=1.0,
+        considered=1.0,
         description="effect of another objective damping law, as a fraction of the complete "
         "difference of its damping force from that of the stated law",
         remedy="compare the laws with compare-models --damping on faster and slower motions, "
         'or state damping_law = "none" where the law is known',
         effect=_objective_damping,
-        component_names=" ".join(OBJECTIVE_DAMPINGS),
+        axes=" ".join(OBJECTIVE_DAMPINGS),
         redefines=(GAMMA_R.name, GAMMA_M.name),
         alternative="with the damping law {component}",
     ),
-    Assumption(
+    Deviation(
         "rayleigh_damping",
         "1",
-        sigma=None,
         description="effect of Rayleigh damping, as a fraction of the complete difference of "
         "its damping force from that of the stated law",
         remedy="compare the laws with compare-models --damping on motions that rotate the body",
@@ -1054,28 +1008,30 @@ ASSUMPTIONS = (
         redefines=(GAMMA_R.name, GAMMA_M.name),
         alternative="with the damping law rayleigh",
     ),
-    Assumption(
+    Deviation(
         "grip_layer_m",
         "m",
-        sigma=2e-4,
+        is_one_sided=True,  # what gives way does not push
+        considered=2e-4,
         description="compliance of grip and skin, as the thickness of a layer of the body's material",
         remedy="glue the body to a stiff plate, or attach markers to the body beside the grip",
         effect=_grip,
     ),
-    Assumption(
+    Deviation(
         "grasp_edge_m",
         "m",
-        sigma=5e-4,
+        considered=5e-4,
         description="distance by which the gripper holds more or less of the body than the "
         "grasped nodes",
         remedy="measure where the gripper ends on the body, and place the edge of the grasped nodes "
         "there",
         effect=_grasp_edge,
     ),
-    Assumption(
+    Deviation(
         "machine_compliance_m_n",
         "m/N",
-        sigma=1e-6,
+        is_one_sided=True,  # what gives way does not push
+        considered=1e-6,
         description="compliance of the test bench",
         remedy="press the platens against each other without a specimen and state "
         "the slope of displacement over force as machine_compliance_m_n = { mean = …, deviation = … } "
@@ -1083,20 +1039,20 @@ ASSUMPTIONS = (
         effect=_machine,
         of_specimens=True,
     ),
-    Assumption(
+    Deviation(
         "gauge_length",
         "1",
-        sigma=0.01,
+        considered=0.01,
         description="relative error of the length to which the strains of a specimen refer",
         remedy="measure the length between the marks or grips of the unloaded specimen, or the strain "
         "with a calibrated extensometer",
         effect=_gauge_length,
         of_specimens=True,
     ),
-    Assumption(
+    Deviation(
         "effective_length",
         "1",
-        sigma=0.05,
+        considered=0.05,
         description="relative error of length_m as the effective length of a specimen that is pulled "
         "by its grips, because the shoulders of a dogbone stretch less than its narrow part",
         remedy="measure the strain of the narrow part with marks or an extensometer, or state the "
@@ -1104,18 +1060,18 @@ ASSUMPTIONS = (
         effect=_effective_length,
         of_specimens=True,
     ),
-    Assumption(
+    Deviation(
         "platen_friction",
         "",
-        sigma=0.1,
+        considered=0.1,
         description="coefficient of friction of platens between which nodes slide",
         remedy="lubricate the platens, or glue the specimen to them",
         effect=_platen_friction,
     ),
-    Assumption(
+    Deviation(
         "platen_slip",
         "1",
-        sigma=1.0,
+        considered=1.0,
         description="slip of faces that are pressed by platens and held along all axes, as a fraction of "
         "that without friction, if only loads are measured",
         remedy="measure the bulge, by markers on the side or depth images; or state "
@@ -1123,40 +1079,43 @@ ASSUMPTIONS = (
         "they slide",
         effect=_platen_slip,
     ),
-    Assumption(
+    Deviation(
         "contact_stiffness",
         "1",
-        sigma=1.0,
+        considered=1.0,
         description="compliance of the contact with obstacles, as a fraction of that of the pressure law",
         remedy="refine the mesh at the contact, or state a larger stiffness_pa_m and a "
         "smaller width_m of the obstacle",
         effect=_contact_stiffness,
     ),
-    Assumption(
+    Deviation(
         "buoyancy",
         "1",
-        sigma=AIR_DENSITY_DEVIATION,
+        considered=AIR_DENSITY_DEVIATION,
         description="relative error of the buoyancy, because of the density of the air",
         remedy="state the density of the air",
         effect=_buoyancy,
     ),
-    Assumption(
+    Deviation(
         "added_mass",
         "1",
-        sigma=AIR_COEFFICIENT_DEVIATION,
+        considered=AIR_COEFFICIENT_DEVIATION,
         description="relative error of the added mass of the air",
         remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_added_mass,
     ),
-    Assumption(
+    Deviation(
         "air_drag",
         "1",
-        sigma=AIR_COEFFICIENT_DEVIATION,
+        considered=AIR_COEFFICIENT_DEVIATION,
         description="relative error of the drag of the air",
         remedy="repeat the motion more slowly, or with a heavier specimen",
         effect=_air_drag,
     ),
 )
+
+# Every deviation, by its name.
+DEVIATIONS = {row.name: row for row in (*ASSUMPTIONS, *KINDS)}
 
 
 def usual_deviations(bodies: Iterable[Body]) -> dict[str, float | None]:
@@ -1165,12 +1124,9 @@ def usual_deviations(bodies: Iterable[Body]) -> dict[str, float | None]:
     """
     origins = {(body.made, body.mesh_from) for body in bodies} or {(None, None)}
 
-    def usual(row: Assumption) -> float | None:
+    def usual(row: Deviation) -> float | None:
         """Return the largest default of an assumption."""
-        known = [
-            next((row.usual[each] for each in origin if each and each in row.usual), row.sigma)
-            for origin in origins
-        ]
+        known = [row.usual_considered(*origin) for origin in origins]
         return max((each for each in known if each is not None), default=None)
 
     return {row.name: usual(row) for row in ASSUMPTIONS}
@@ -1191,94 +1147,38 @@ class KnownEffect(Section):
     deviation: Positive
 
 
-Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
-# A deviation whose default follows from how the body and its mesh were made, see `Assumption.usual`.
-UsualDeviation = Deviation | None
-KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
-# Rows that are never negative, of which a mean may be stated: what gives way does not push.
-OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n", "marker_mass_kg")
+Deviated = Annotated[Literal["none"] | Positive, ByForm(str)]
+KnownDeviation = Annotated[KnownEffect | Deviated, ByForm((dict, KnownEffect))]
 
 
-def _assumption_entries() -> dict[str, tuple[str, str]]:
-    """Return type and description of each field of `Assumptions`, by name."""
-    entries = {}
-    for row in (*ASSUMPTIONS, *KINDS):
-        form = 'float, "none" or table' if row.name in OF_KNOWN_SIGN else 'float or "none"'
-        optional = ", optional" if isinstance(row, Assumption) and row.usual else ""
-        entries[row.name] = (form + optional, sentence(f"{row.description} [{row.unit or 1}]"))
-    return entries
+def _field_of(row: Deviation) -> FieldOfRow:
+    """Return the field of `Assumptions` for a row; None is the default of bodies that were made
+    like those of the problem, see `Deviation.by_origin`.
+    """
+    default = "none" if row.considered is None else row.considered
+    annotation: Any = KnownDeviation if row.is_one_sided else Deviated
+    form = 'float, "none" or table' if row.is_one_sided else 'float or "none"'
+    text = sentence(f"{row.description} [{row.unit or 1}]")
+    if row.by_origin:
+        return FieldOfRow(annotation | None, None, f"{form}, optional", text)
+    return FieldOfRow(annotation, default, form, text)
 
 
 @validated(kw_only=True)
-@with_attributes(_assumption_entries())
+@with_fields({name: _field_of(row) for name, row in DEVIATIONS.items()})
 class Assumptions:
     """Standard deviations of systematic effects; "none" for an effect that is exactly zero.
 
     An effect that is known to exist, such as the compliance of a machine, has a table of mean and
     deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
-    There is a field for each row of `ASSUMPTIONS` and of `recording.nuisance.KINDS`. Fields that are
-    None have the default of bodies that were made like those of the problem, see
-    `usual_deviations`.
+    There is a field for each of `DEVIATIONS`. Fields that are None have the default of bodies that
+    were made like those of the problem, see `usual_deviations`.
     """
 
-    body_scale: UsualDeviation = None
-    rest_shape: UsualDeviation = None
-    surface: UsualDeviation = None
-    mass: Deviation = 0.01
-    marker_mass_kg: KnownDeviation = "none"
-    density_gradient: UsualDeviation = None
-    stiffness_gradient: UsualDeviation = None
-    anisotropy: UsualDeviation = None
-    stiffness_drift: UsualDeviation = None
-    memory_share: Deviation = "none"
-    time_scale: Deviation = 0.0001
-    poisson: Deviation = 0.02
-    damping_law: Deviation = 1.0
-    rayleigh_damping: Deviation = "none"
-    grip_layer_m: KnownDeviation = 0.0002
-    grasp_edge_m: Deviation = 0.0005
-    machine_compliance_m_n: KnownDeviation = 1e-06
-    gauge_length: Deviation = 0.01
-    effective_length: Deviation = 0.05
-    platen_friction: Deviation = 0.1
-    platen_slip: Deviation = 1.0
-    contact_stiffness: Deviation = 1.0
-    buoyancy: Deviation = AIR_DENSITY_DEVIATION
-    added_mass: Deviation = AIR_COEFFICIENT_DEVIATION
-    air_drag: Deviation = AIR_COEFFICIENT_DEVIATION
-    marker_offset_m: Deviation = "none"
-    camera_offset_m: Deviation = "none"
-    calibration_scale: Deviation = 0.002
-    calibration_distortion_1_m2: Deviation = 0.02
-    time_shift_s: Deviation = "none"
-    clock_rate: Deviation = 0.0001
-    pose_turn_rad: Deviation = "none"
-    pose_shift_m: Deviation = "none"
-    gravity_rad: Deviation = "none"
-    hand_eye_rad: Deviation = "none"
-    hand_eye_m: Deviation = "none"
-    strain_zero: Deviation = "none"
-    displacement_zero_m: Deviation = "none"
-    obstacle_offset_m: Deviation = "none"
-    obstacle_tilt_rad: Deviation = 0.2 * DEGREE
-    obstacle_time_s: Deviation = 0.001
-    tension_factor: Deviation = "none"
-    tension_lost_n: Deviation = "none"
-    pressure_factor: Deviation = "none"
-    pressure_lost_pa: Deviation = "none"
-    pressure_lag: Deviation = "none"
-    joining_s: Deviation = "none"
-    tare: Deviation = "none"
-    sensor_time_s: Deviation = "none"
-    sensor_lag_s: Deviation = "none"
-    tool_kg: Deviation = "none"
-    tool_m: Deviation = "none"
-    depth_turn_rad: Deviation = "none"
-    depth_shift_m: Deviation = "none"
-    depth_bias_m: Deviation = "none"
-    depth_scale: Deviation = "none"
-    depth_time_s: Deviation = "none"
-    depth_edge_px: Deviation = "none"
+    if TYPE_CHECKING:
+
+        def __init__(self, **deviations: float | Literal["none"] | KnownEffect | None) -> None: ...
+        def __getattr__(self, name: str) -> Any: ...
 
     @classmethod
     def exact(cls) -> Assumptions:

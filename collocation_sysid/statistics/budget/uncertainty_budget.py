@@ -27,7 +27,7 @@ from .combined_intervals import NORMAL_95, Interval, combine, widened_interval
 from .consider_analysis import ResidualChanges
 from .discretisation_error import DiscretisationError, estimate_changes
 from .memory_effect import RELAXATION_TIME
-from .systematic_effects import ASSUMPTIONS
+from .systematic_effects import ASSUMPTIONS, DEVIATIONS
 
 NOISE = "noise"
 NUISANCES = "nuisance parameters"
@@ -36,14 +36,14 @@ MESH = "mesh"
 BETWEEN = "between recordings"
 # Rows of assumptions whose alternative is reported, by name.
 ALTERNATIVES = {row.name: row for row in ASSUMPTIONS if row.alternative}
-REDEFINED = {row.name: row.redefines for row in ASSUMPTIONS}
 
 
 def is_definition(row: str, estimate: str) -> bool:
     """Return whether an assumption, by its name, defines an estimate: under the alternative the
-    constant would be another quantity, see `Assumption.redefines`.
+    constant would be another quantity, see `Deviation.redefines`.
     """
-    return without_region(estimate) in REDEFINED.get(row, ())
+    deviation = DEVIATIONS.get(row)
+    return deviation is not None and without_region(estimate) in deviation.redefines
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class VarianceSources:
     means : mapping of str to float
         Known effects over their standard deviations, for which estimates are corrected.
     alternatives : mapping of str to (nq,) array
-        Changes of q if an assumption with an alternative (`Assumption.alternative`) is wrong by one
+        Changes of q if an assumption with an alternative (`Deviation.alternative`) is wrong by one
         unit, by its name with its component.
     """
 

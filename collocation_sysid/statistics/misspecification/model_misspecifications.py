@@ -24,11 +24,12 @@ from ...fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
 from ...fem.meshes.mesh import TetMesh
 from ...fem.rest_shape import UnderGravity
 from ...methods.solution import Solution
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ..budget.consider_analysis import changed_residuals
 from ..budget.mesh_error import LARGEST_NODE_COUNT, finer_mesh_row
 from ..budget.shape_error import GRAVITY_M_S2, sag_m
-from ..budget.systematic_effects import Assumption, Effect, ExperimentAtAnswer
+from ..budget.systematic_effects import Effect, ExperimentAtAnswer
 from ..linearised import LinearisedFit, linearise_fit
 from .misspecification_hypothesis import Hypothesis
 
@@ -162,13 +163,13 @@ def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
     return Effect(at.force_change_by_reference(sag))
 
 
-def _list_changes(body: Body) -> tuple[list[Assumption], list[_Change]]:
+def _list_changes(body: Body) -> tuple[list[Deviation], list[_Change]]:
     """Return the columns of the linearised fit, and the changes of the body that consist of them."""
-    rows: list[Assumption] = []
+    rows: list[Deviation] = []
     changes: list[_Change] = []
 
     def add(name: str, effect: object) -> int:
-        rows.append(Assumption(name, "1", 1.0, "", "", effect))  # type: ignore[arg-type]
+        rows.append(Deviation(name, "1", effect=effect))  # type: ignore[arg-type]
         return len(rows) - 1
 
     materials = other_materials(body)

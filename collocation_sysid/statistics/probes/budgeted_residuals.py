@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..budget.uncertainty_budget import REDEFINED, source_label
+from ..budget.systematic_effects import DEVIATIONS
+from ..budget.uncertainty_budget import source_label
 from ..distributions import chi2_isf, normal_isf
 from ..linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..uncertainty import ErrorBasis
@@ -116,6 +117,6 @@ def _with_budget(solved_fit: SolvedFit, budgeted: Mapping[str, float | None]) ->
     has_effect = np.any([block.any(axis=(0, 1, 2)) for block in changes.blocks], axis=0)
     for name in dict.fromkeys(np.array(changes.names)[has_effect].tolist()):
         row = assumption_name(name)
-        if budgeted.get(row) and not REDEFINED.get(row):
+        if budgeted.get(row) and not DEVIATIONS[row].redefines:
             fit = with_relaxed_assumption(fit, changes, name=name)
     return fit

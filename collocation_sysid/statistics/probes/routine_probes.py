@@ -24,14 +24,11 @@ from dataclasses import replace
 import numpy as np
 
 from ...model.parameters import FieldCoefficients
-from ...recording.nuisance import CLOCK_RATE
 from ..budget.consider_analysis import ResidualChanges
-from ..budget.systematic_effects import ASSUMPTIONS
+from ..budget.systematic_effects import DEVIATIONS
 from ..distributions import normal_isf
 from ..linearised import gauss_newton_step
 from .relaxed_assumptions import (
-    ANISOTROPY,
-    DRIFT,
     MEMORY,
     Probe,
     SolvedFit,
@@ -40,21 +37,13 @@ from .relaxed_assumptions import (
     with_relaxed_assumption,
 )
 
-# Assumptions that are probed in every solve: each can be wrong while the residuals look white,
+# Deviations that are tested in every solve, by name: each can occur while the residuals look white,
 # biases the estimates, and is determined by a single recording.
-ROUTINE = (DRIFT, MEMORY, CLOCK_RATE.name, ANISOTROPY)
-# Unit of the share of a branch of memory, which is not in the budget by default.
-MEMORY_SHARE = 0.1
+ROUTINE = {name: row for name, row in DEVIATIONS.items() if "test" in row.modes}
 # Probability that any routine probe of a faultless run is significant, as of every other test of
 # the verdict. The first order that a probe rests on is not exact: at a level of 1/200 one of six
 # draws of the noise of one faultless recording was significant.
 FALSE_ALARMS = 1e-4
-# Standard deviation of the prior of a probe's amplitude, in deviations of the budget: it must not
-# shrink towards the assumption that it tests, and stay bounded where the data say nothing. That of
-# anisotropy is smaller: across the axis of bending hardly anything depends on it, so that any error of
-# the model needs an impossible anisotropy (0.7 to 0.9 in twins without any).
-WIDENING = 10.0
-WIDENING_OF_ANISOTROPY = 4.0
 # Factor on the standard deviations of the coefficients of fields for which a probe must be
 # significant, too: hardly anything is smoothed then, and what the data do not determine stays bounded.
 WIDENING_OF_FIELDS = 100.0
@@ -75,11 +64,8 @@ def probed_deviations(deviations: Mapping[str, float | None]) -> dict[str, float
     deviations : mapping of str to float or None
         Standard deviation of each assumption or nuisance parameter; None if exact.
     """
-    usual = {row.name: row.sigma for row in ASSUMPTIONS}
-    usual[MEMORY] = MEMORY_SHARE
-    usual[CLOCK_RATE.name] = CLOCK_RATE.considered or 0.0
-    exact = [name for name in ROUTINE if deviations.get(name) is None]
-    return {**deviations, **{name: usual[name] for name in exact}}
+    exact = [row for row in ROUTINE.values() if deviations.get(row.name) is None]
+    return {**deviations, **{row.name: row.considered or row.tested for row in exact}}
 
 
 def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
@@ -146,11 +132,10 @@ def one_step_probes(solved_fit: SolvedFit, names: Iterable[str]) -> Iterator[Pro
 
 def prior_widening(name: str) -> float:
     """Return the standard deviation of an assumption's prior, in deviations of the budget, for its
-    name with component: `WIDENING` or `WIDENING_OF_ANISOTROPY` for routine assumptions, else 1.
+    name with component: `Deviation.widening` of routine assumptions, else 1.
     """
-    if assumption_name(name) == ANISOTROPY:
-        return WIDENING_OF_ANISOTROPY
-    return WIDENING if is_routine_assumption(name) else 1.0
+    row = ROUTINE.get(assumption_name(name))
+    return row.widening or 1.0 if row else 1.0
 
 
 def is_routine_assumption(name: str) -> bool:
