@@ -23,8 +23,9 @@ from ..common.validated_types import AtLeastOne, Positive, Text
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.laws.constants import unit_of, without_unit
+from .deviation import Deviation
 from .measurement import Measurement
-from .nuisance import GAUGE, NuisanceRow
+from .nuisance import GAUGE
 from .poses import Frame
 from .sample_times import first_unordered_time
 
@@ -211,7 +212,7 @@ class CustomSensor(Measurement):
         """Return the label of an unknown, with its unit."""
         return f"{without_unit(name)} of {self.name} [{unit_of(name) or '1'}]"
 
-    def unknown_rows(self, experiment: Any) -> Iterator[tuple[NuisanceRow, str, float]]:
+    def unknown_rows(self, experiment: Any) -> Iterator[tuple[Deviation, str, float]]:
         """Yield row, label and prior standard deviation of each unknown in an experiment. Unknowns
         with the same label are shared by all sensors of the experiment that have them.
         """

@@ -16,8 +16,9 @@ from ...common.validated_types import NotNegative, Positive
 from ...errors import InputError
 from ...recording.camera import Camera
 from ...recording.custom_sensor import CustomSensor
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
-from ...recording.nuisance import DEGREE, GAUGE, SURFACE_PLACE, UNLIMITED_REACH, NuisanceRow
+from ...recording.nuisance import DEGREE, GAUGE, SURFACE_PLACE, UNLIMITED_REACH
 from ...recording.sample_times import first_unordered_time
 
 # Directions in which a place may move on the surface.
@@ -38,7 +39,7 @@ UNKNOWN_TEXTS = {
 POSE_UNKNOWNS = tuple(UNKNOWN_TEXTS)[:6]
 OF_TIME = ("delay_s", "clock_rate", "line_delay_error_s")
 # A term of the drift of a track; predictions are linear in it.
-TRACK_DRIFT = NuisanceRow(
+TRACK_DRIFT = Deviation(
     "track_drift", "", sigma=None, of="gauge", changes=(), reach=UNLIMITED_REACH
 )
 # Prior of the pose of a camera that is found from the body at rest [rad, m]: it is not a statement.
@@ -283,7 +284,7 @@ class ImageTracks(CustomSensor):
         stated = stated_places(experiment)
         return np.array([stated[name][1] if name in stated else body_m for name in self.names])
 
-    def unknown_rows(self, experiment: Experiment) -> Iterator[tuple[NuisanceRow, str, float]]:
+    def unknown_rows(self, experiment: Experiment) -> Iterator[tuple[Deviation, str, float]]:
         """Yield row, label and prior standard deviation of each unknown: of the camera, of the
         drift of the tracks, and of the places, which cameras share by the names of the points.
         """
