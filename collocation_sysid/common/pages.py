@@ -32,7 +32,8 @@ def page_files() -> dict[str, Path]:
     Pages for Sphinx alone (`_FOR_SPHINX`) are left out. The dictionary is empty where neither a
     wheel nor a checkout is installed.
     """
-    files = (*documentation_folder().glob("howto/*.md"), *documentation_folder().glob("*.md"))
+    folders = ("", "howto/", "studies/")
+    files = [each for name in folders for each in documentation_folder().glob(f"{name}*.md")]
     return {
         file.stem: file for file in sorted(files, key=_topic) if _topic(file) not in _FOR_SPHINX
     }
