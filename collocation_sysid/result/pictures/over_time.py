@@ -328,11 +328,11 @@ def _shown_numbers(measured: Array, predicted: Array, units: Sequence[str]) -> l
     """Return which of the numbers of a sensor are drawn: those that are measured (S, m) and do not
     vanish in both the measurements and the predictions (k, m), beside others of the same unit.
     """
-    is_measured = np.isfinite(measured).any(axis=0)
+    is_measured = np.asarray(np.isfinite(measured).any(axis=0))
     squares = np.nansum(measured**2, axis=0) / np.maximum(1, np.isfinite(measured).sum(axis=0))
     rms = np.sqrt(squares)
     largest = np.max(np.abs(np.nan_to_num(predicted)), axis=0, initial=0.0)
-    is_predicted = np.isfinite(predicted).any(axis=0)
+    is_predicted = np.asarray(np.isfinite(predicted).any(axis=0))
     of_unit = np.array(units or [""] * len(rms))
     shown = []
     for k in np.flatnonzero(is_measured):
