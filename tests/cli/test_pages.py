@@ -8,9 +8,12 @@ from email.message import Message
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 import pytest
+from kit import depth
 from kit.problem_files import run_command
 
+import collocation_sysid as cs
 from collocation_sysid import Problem, run
 from collocation_sysid.cli.markdown import TerminalPage
 from collocation_sysid.cli.texts import _key_table, _word_table
@@ -23,6 +26,7 @@ from collocation_sysid.problem.new_problem import create_problem
 from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_sections import remedy_command, remedy_lines
 from collocation_sysid.result.run_summary import run_summary
+from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
 from collocation_sysid.statistics.budget.uncertainty_budget import source_label
 from collocation_sysid.statistics.concerns import TOPICS, Concern
@@ -176,15 +180,33 @@ def test_every_kind_of_nuisance_parameter_is_explained():
                 assert (row.key or row.name) in names, word
 
 
+def _problem_of_kind(folder: Path, kind: str) -> Problem:
+    """A template, or a bar that a depth camera sees."""
+    if kind != "depth":
+        create_problem(folder / "strip", kind)
+        return Problem.read(folder / "strip" / "problem.toml")
+    camera = cs.DepthCamera(depth.MATRIX, pose=depth.POSE)
+    image_m = depth.noisy(np.random.default_rng(3))
+    seen = depth.hanging((cs.Depth.of_images("front", image_m, camera, depth.NOISE_M),))
+    parameters = depth.TRUTH | {"young_pa": cs.Unknown(2e5)}
+    return Problem([seen], cs.Parameters.from_mapping(parameters))
+
+
+def _lines(result: Result, details: bool) -> list[str]:
+    """The lines of the summary of a solve that are no tables."""
+    shown = run_summary(result, details=details)
+    return plain_text([e for e in shown if not isinstance(e, Table)], width=10_000).splitlines()
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["specimen", "compression", "swing"])
+@pytest.mark.parametrize("kind", ["specimen", "compression", "swing", "depth"])
 def test_every_word_that_a_solve_prints_is_explained(tmp_path, kind: str):
-    create_problem(tmp_path / "strip", kind)
-    found = run(Problem.read(tmp_path / "strip" / "problem.toml"), seek_causes=False)
+    """Heads and rows of tables, labels at the beginning of a line, and keys."""
+    found = run(_problem_of_kind(tmp_path, kind), seek_causes=False)
     shown = run_summary(found.result, details=True, budget=True)
     tables = [each for each in shown if isinstance(each, Table)]
     assert len(tables) > 1
-    words = {cell for table in tables for cell in table.heads} - {"", "value", "% of the variance"}
+    words = {cell for table in tables for cell in table.heads} - {"", "value"}
     rows = [row[0] for table in tables for row in table.rows]
     words |= {re.sub(r" (Pa|kPa|MPa|GPa|s|1/s)$", "", row) for row in rows}
     for each in found.result.fit.experiments.values():
@@ -192,6 +214,13 @@ def test_every_word_that_a_solve_prints_is_explained(tmp_path, kind: str):
     for each in found.result.nuisance.values():
         words |= {label.rpartition(" [")[0] for label in each}
     words |= {"fit", "forward simulation", "reduced χ²", found.trust.verdict}
+    texts = [text for each in (False, True) for text in _lines(found.result, details=each)]
+    labels = {label[1] for text in texts if (label := re.match(r"([^:;.,()']{1,40}): ", text))}
+    assert {"Verdict", "note"} <= labels
+    words |= {label.split(" of ")[0] for label in labels}
+    # Markers and files of the examples have names of the same form.
+    keys = {key for text in texts for key in re.findall(r"(?<![\w/])[a-z]+(?:_[a-z0-9]+)+\b", text)}
+    words |= {key for key in keys if not re.fullmatch(r"(run|end)_\d", key)}
     unknown = [word for word in sorted(words) if run_command("explain", word).code]
     assert unknown == []
 
