@@ -12,5 +12,6 @@ recording belong into the packages `program`, `model` and `recording`.
   and by the simulation at the guess.
 - `camera_misspecifications`, `camera_image_misspecifications`, `camera_clock_misspecifications`:
   likely errors in the description of cameras, their images and times.
+- `image_tracks`: tracks of points in the images of ordinary cameras, with all their parts.
 - `contact_feature`: contact with obstacles.
 """

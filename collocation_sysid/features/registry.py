@@ -6,9 +6,10 @@ from ..statistics.concerns import declare_messages, declare_topics
 from .camera_feature import CAMERAS
 from .contact_feature import CONTACT
 from .feature import Feature
+from .image_tracks.track_feature import IMAGE_TRACKS
 from .wrench_feature import WRENCH
 
-FEATURES: tuple[Feature, ...] = (WRENCH, CONTACT, CAMERAS)
+FEATURES: tuple[Feature, ...] = (WRENCH, CONTACT, CAMERAS, IMAGE_TRACKS)
 for _feature in FEATURES:
     declare_topics(_feature.topics)
     declare_messages(_feature.messages)

@@ -657,7 +657,7 @@ class MeasurementResidual(ABC):
         neighbouring = values.reshape(-1, GROUP)[window.indices].reshape(
             samples, each, GROUP * vectors
         )
-        if self.own_parameters.size:
+        if self.own_parameters.shape[1]:
             own = np.broadcast_to(phi[self.own_parameters], (samples, *self.own_parameters.shape))
             neighbouring = np.concatenate([neighbouring, own], axis=2)
         change = (by_u @ neighbouring[..., None])[..., 0]

@@ -642,13 +642,7 @@ KINDS = tuple(row for row in [*vars().values()] if isinstance(row, Deviation))
 GAUGE = Deviation("reading", "", sigma=None, of="gauge", changes=())
 # Coordinates of places on the surface that sensors refer to, and other unknowns of single points.
 SURFACE_PLACE = Deviation(
-    "surface_place",
-    "",
-    sigma=None,
-    of="gauge",
-    changes=(),
-    reach=UNLIMITED_REACH,
-    step=_largest_place_step_m,
+    "surface_place", "", sigma=None, of="gauge", changes=(), reach=3.0, step=_largest_place_step_m
 )
 
 

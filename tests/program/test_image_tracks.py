@@ -167,6 +167,16 @@ def test_a_late_clock_is_estimated() -> None:
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.01
 
 
+def test_a_clock_of_markers_needs_no_markers() -> None:
+    experiment = swung([tracks_of()], nuisance=cs.Nuisance())
+    program = cs.Problem([experiment], parameters=unknown_young()).collocation()
+    markers = program.transcriptions[0].markers
+    slopes = ObservableDerivatives.without_own(np.array([0]), np.zeros((len(T_S), 0, 3, 1)))
+    phi = np.zeros(markers.nuisance.size)
+    residual, by = markers.linearise(np.zeros((len(T_S), 0, 3)), slopes, phi, 1 + len(phi))
+    assert residual.shape[1] == by.shape[1] == 0
+
+
 def test_cameras_share_the_places_of_points_with_the_same_name() -> None:
     residual = residual_of(tracks_of("front", known=False), tracks_of("top", known=False))
     labels = [entry.label for entry in residual.nuisance.entries]

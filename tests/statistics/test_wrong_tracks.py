@@ -1,184 +1,141 @@
-"""Copies of tracks and filtered tracks are named, and which corrections are named."""
+"""What a check and a fit say about image tracks that are described wrongly or lost."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from kit.problems import GUESS, hung_cube, measured
-from scipy.signal import butter, sosfiltfilt
-from study_hidden_errors import TRUTH, twin
-
-from collocation_sysid import Problem, Unknown
-from collocation_sysid.fem.laws.materials import DAMPINGS
-from collocation_sysid.pipeline import solve
-from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.runs.misspecifications import find_misspecifications
-from collocation_sysid.statistics.misspecification.fit_misspecifications import (
-    _named_alone_or_together,
-    _Refitter,
-)
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
-from collocation_sysid.statistics.misspecification.model_misspecifications import (
-    LinearCorrection,
-    mirror_images,
-    other_materials,
-    screened_bodies,
-    with_body,
-    with_laws,
-    with_shape,
-)
-from collocation_sysid.statistics.misspecification.track_misspecifications import (
-    _amplitudes,
-    _cutoff,
-    same_tracks,
+from kit.filmed import (
+    NAMES,
+    NOISE_PX,
+    SIZE_PX,
+    T_S,
+    filming,
+    motion_m,
+    projected,
+    swung,
+    tracks_of,
+    unknown_young,
 )
 
-STEP_S = 0.01
+import collocation_sysid as cs
+from collocation_sysid.features.image_tracks.track_feature import hypotheses, track_hypotheses
+from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
+
+Change = Callable[[cs.ImageTracks], cs.ImageTracks]
 
 
-def recorded(copied: bool):
-    """A cube with noisy tracks of its markers at their places; the second may copy the first."""
-    hung = hung_cube(20)
-    places_m = hung.markers.predict_positions(hung.body.nodes_m)
-    sigma_m = hung.markers.sigma_m[0]
-    noise = np.random.default_rng(0).normal(scale=sigma_m, size=(21, *places_m.shape))
-    tracks_m = places_m + noise
-    if copied:
-        tracks_m[:, 1] = tracks_m[:, 0]
-    return with_markers(hung, tracks_m)
+def pixels_of(tracks: cs.ImageTracks) -> np.ndarray:
+    assert tracks.pixels is not None
+    return np.array(tracks.pixels)
 
 
-def test_two_markers_with_one_track_are_named():
-    assert not [*same_tracks(recorded(copied=False))]
-    (cause,) = same_tracks(recorded(copied=True))
-    first, second, *_ = recorded(copied=True).markers.names
-    assert f"markers {first} and {second}" in cause.message
+def with_pixels(tracks: cs.ImageTracks, pixels: np.ndarray) -> cs.ImageTracks:
+    return tracks.with_samples(T_S, pixels.reshape(len(T_S), -1))
 
 
-def residuals(rng: np.random.Generator, noise: float) -> np.ndarray:
-    """White noise, and the slow error of a wrong model."""
-    t_s = STEP_S * np.arange(120)
-    error = 3 * np.sin(2 * np.pi * 2 * t_s)[:, None] * rng.normal(size=12)
-    return noise * rng.normal(size=(120, 12)) + error
+def with_pose(tracks: cs.ImageTracks, pose: np.ndarray) -> cs.ImageTracks:
+    return replace(tracks, camera=filming("front", pose=pose))
 
 
-@pytest.mark.parametrize("cutoff_hz", [6.0, 10.0, 15.0])
-def test_the_cutoff_of_filtered_tracks_is_found(cutoff_hz: float):
-    rng = np.random.default_rng(1)
-    sections = butter(2, cutoff_hz, output="sos", fs=1 / STEP_S)
-    smooth = sosfiltfilt(sections, residuals(rng, 1.0), axis=0)
-    frequency_hz, amplitude = _amplitudes(smooth, STEP_S)
-    cutoff = _cutoff(amplitude)
-    assert cutoff is not None
-    assert abs(frequency_hz[cutoff] / cutoff_hz - 1) < 0.25
+def turned_frame(tracks: cs.ImageTracks) -> cs.ImageTracks:
+    pose = np.array(tracks.camera.pose)
+    pose[:3, :3] = pose[:3, :3] @ np.diag([1, -1, -1])
+    return with_pose(tracks, pose)
 
 
-@pytest.mark.parametrize("noise", [1.0, 0.2, 0.01])
-def test_white_noise_with_a_wrong_model_is_not_filtered(noise: float):
-    assert _cutoff(_amplitudes(residuals(np.random.default_rng(2), noise), STEP_S)[1]) is None
+def in_millimetres(tracks: cs.ImageTracks) -> cs.ImageTracks:
+    pose = np.array(tracks.camera.pose)
+    pose[:3, 3] *= 1e3
+    return with_pose(tracks, pose)
 
 
-def test_a_cause_is_named_alone_only_if_it_suffices_and_no_other_does():
-    lag = Hypothesis("gripper-frame", "'a'", corrected=1, strength=1.8, remaining=1.4)
-    law = Hypothesis("poses-inverted", "'a'", corrected=2, strength=3.0, remaining=0.9)
-    other = Hypothesis("camera-frame", "'a'", corrected=3, strength=2.9, remaining=0.95)
-    losses = {1: 500.0, 2: 100.0, 3: 105.0}
-    assert _named_alone_or_together([lag, law], losses.__getitem__) == [law]
-    (either,) = _named_alone_or_together([lag, law, other], losses.__getitem__)
-    assert either.code == "several"
-    assert "inverted" in either.message
-    assert "world frames" in either.message
-    (partial,) = _named_alone_or_together([lag], losses.__getitem__)
-    assert partial.code == "insufficient"
-    assert _named_alone_or_together([law, other], {2: 100.0, 3: 150.0}.__getitem__) == [law]
+MISTAKES: dict[str, tuple[Change, str]] = {
+    "row and column": (lambda t: with_pixels(t, pixels_of(t)[..., ::-1]), "u and v are exchanged"),
+    "v upwards": (
+        lambda t: with_pixels(t, pixels_of(t) * [1, -1] + [0, SIZE_PX[1] - 1]),
+        "v points upwards",
+    ),
+    "mirrored": (
+        lambda t: with_pixels(t, pixels_of(t) * [-1, 1] + [SIZE_PX[0] - 1, 0]),
+        "u points to the left",
+    ),
+    "half the resolution": (lambda t: with_pixels(t, pixels_of(t) / 2), "0.5 times the resolution"),
+    "twice the resolution": (lambda t: with_pixels(t, pixels_of(t) * 2), "2 times the resolution"),
+    "pose inverted": (
+        lambda t: with_pose(t, np.linalg.inv(t.camera.pose)),
+        "from the world to the camera",
+    ),
+    "frame of a renderer": (turned_frame, "y up, z backwards"),
+    "millimetres": (in_millimetres, "in millimetres"),
+}
 
 
-def test_of_laws_that_fit_equally_well_the_smaller_change_is_named():
-    both = Hypothesis("law/both", "'a'", corrected=1, strength=3.1, remaining=0.9)
-    material = Hypothesis("law", "'a'", corrected=2, strength=3.0, remaining=0.9)
-    assert _named_alone_or_together([both, material], {1: 100.0, 2: 103.0}.get) == [material]
-    assert _named_alone_or_together([both, material], {1: 100.0, 2: 150.0}.get) == [both]
-
-
-def test_a_coarse_mesh_is_named_if_its_error_to_first_order_explains_most():
-    data = {"sigmas": 3.0, "remedy": "refine the mesh"}
-
-    def mesh(strength: float) -> Hypothesis:
-        corrected = LinearCorrection(strength**-2)
-        return Hypothesis("mesh-coarse", "", data, corrected, strength=strength, remaining=3.0)
-
-    (named,) = _named_alone_or_together([mesh(2.5)], lambda _: 100.0)
-    assert named.code == "mesh-coarse"
-    lag = Hypothesis("gripper-frame", "'a'", corrected=1, strength=1.8, remaining=1.4)
-    (partial,) = _named_alone_or_together([lag, mesh(1.6)], lambda _: 100.0)
-    assert partial.code == "insufficient"
-    assert "the mesh is too coarse" in partial.message
-    assert "gripper" not in partial.message
-
-
-def test_a_mesh_that_is_known_to_be_coarse_comes_before_what_also_explains_its_error():
-    law = Hypothesis("law", "'a'", {"material": "x"}, corrected=1, strength=3.0, remaining=0.9)
-
-    def mesh(strength: float) -> Hypothesis:
-        data = {"sigmas": 3.0, "remedy": "refine the mesh"}
-        corrected = LinearCorrection(strength**-2)
-        return Hypothesis("mesh-coarse", "", data, corrected, strength=strength, remaining=1.4)
-
-    losses = {1: 100.0}
-    (named,) = _named_alone_or_together([law, mesh(2.2)], lambda each: losses.get(each, 1e3))
-    assert named.code == "mesh-coarse"
-    (several,) = _named_alone_or_together([law, mesh(1.5)], lambda each: losses.get(each, 1e3))
-    assert several.code == "several"
-    assert several.strength == law.strength
-    assert several.message.index("the mesh is too coarse") < several.message.index("another law")
-
-
-def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():
-    hung = hung_cube(5)
-    assert not [*mirror_images(hung)]
-    wider = with_shape(hung, np.array([1.1, 1.0, 1.0]))
-    assert wider is not None
-    assert np.isclose(np.ptp(wider.body.nodes_m[:, 0]), 1.1 * np.ptp(hung.body.nodes_m[:, 0]))
-    assert len(wider.grasps[0].nodes) == len(hung.grasps[0].nodes)
-    assert np.isclose(wider.body.mass_kg, hung.body.mass_kg)
-
-
-def test_a_refit_begins_at_an_answer_that_rounding_puts_beyond_a_bound():
-    described = measured(hung_cube(8))
-    solution = solve(Problem([described], GUESS, substeps=1), "reduced-space")
-    (experiment,) = (each.experiment for each in solution.collocation.transcriptions)
-    changed = with_body(experiment, with_laws(experiment.body, None, DAMPINGS["rayleigh"]))
-    refits = _Refitter(solution, experiment, sweeps=20)
-    refits.answer["gamma_m_1_s"] = solution.collocation.parameters.free[-1].lower * (1 - 1e-14)
-    refits.near_answer.add(changed)
-    assert refits.fit(changed) is not None
-
-
-def test_far_from_the_stated_pose_materials_are_tested_whatever_a_linear_step_says():
-    solution = solve(Problem([measured(hung_cube(8))], GUESS, substeps=1), "reduced-space")
-    (experiment,) = (each.experiment for each in solution.collocation.transcriptions)
-    assert not [*screened_bodies(solution, experiment)]
-    tested = [*screened_bodies(solution, experiment, is_far=True)]
-    assert {each.code for each in tested} == {"law"}
-    assert {each.data["material"] for each in tested} <= {*other_materials(experiment.body)}
-
-
-@pytest.mark.slow
+# The rays of a mirrored image of a symmetric body meet the body, so that only places contradict it.
 @pytest.mark.parametrize(
-    ("error", "cause"),
-    [
-        ("mirrored", "mesh-mirrored"),
-        ("wide", "mesh-width"),
-        ("hanging", "rest-shape"),
-        ("filtered", "tracks-filtered"),
-        ("twice", "markers-same"),
-        ("law", "law"),
-        ("coarse", "mesh-coarse"),
-    ],
+    ("mistake", "known"),
+    [(m, k) for m in MISTAKES for k in (True, False) if (m, k) != ("mirrored", False)],
 )
-def test_hidden_errors_of_a_bent_bar_are_named(error: str, cause: str):
-    near = {name: Unknown(1.3 * value) for name, value in TRUTH.items()}
-    problem = replace(twin(error, 0, near), substeps=2)
-    assert find_misspecifications(solve(problem))[0].cause == cause
+def test_wrong_descriptions_of_a_camera_are_named(mistake: str, known: bool) -> None:
+    change, words = MISTAKES[mistake]
+    found = [*hypotheses(swung([change(tracks_of(known=known))]))]
+    assert [each.code for each in found] == ["image-tracks/likely"]
+    assert words in found[0].message
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("camera", ["front", "side", "top"])
+def test_a_right_description_is_not_doubted(camera: str, known: bool) -> None:
+    assert [*hypotheses(swung([tracks_of(camera, known=known)]))] == []
+
+
+def test_tracks_of_another_scene_are_doubted() -> None:
+    pixels = np.random.default_rng(8).uniform(0, 300, (len(T_S), len(NAMES), 2))
+    found = [*hypotheses(swung([with_pixels(tracks_of(), pixels)]))]
+    assert [each.cause for each in found] == ["image-tracks"]
+
+
+def exchanged(pixels: np.ndarray) -> np.ndarray:
+    order = [2, 1, 0, 3, 4, 5, 6]
+    return pixels[:, order]
+
+
+def stuck(pixels: np.ndarray) -> np.ndarray:
+    pixels[:, 2] = pixels[0, 2] + 0.1 * (pixels[:, 2] - pixels[0, 2])
+    return pixels
+
+
+def jumping(pixels: np.ndarray) -> np.ndarray:
+    pixels[25:, 3] += [20.0, -8.0]
+    return pixels
+
+
+FAULTS = {
+    "exchanged": (exchanged, "the tracks tip_front and tip_top fit each other's places"),
+    "stuck": (stuck, "the track tip_top hardly moves"),
+    "jumps": (jumping, "the track middle_front jumps by 21.5 pixels at 0.25 s"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_lost_tracks_are_named(fault: str) -> None:
+    change, words = FAULTS[fault]
+    true = projected(filming("front"), motion_m())
+    rng = np.random.default_rng(9)
+    pixels = change(true + NOISE_PX * rng.normal(size=true.shape))
+    experiment = swung([with_pixels(tracks_of(), pixels)])
+    program = cs.Problem([experiment], parameters=unknown_young()).collocation()
+    (residual,) = program.transcriptions[0].residuals_of(ImageTrackResidual)
+    found = [*track_hypotheses(residual, true, "'front'")]
+    assert [each.code for each in found] == [f"image-track/{fault}"]
+    assert words in found[0].message
+
+
+def test_good_tracks_are_not_doubted() -> None:
+    tracks = tracks_of(rng=np.random.default_rng(10))
+    program = cs.Problem([swung([tracks])], parameters=unknown_young()).collocation()
+    (residual,) = program.transcriptions[0].residuals_of(ImageTrackResidual)
+    true = projected(filming("front"), motion_m())
+    assert [*track_hypotheses(residual, true, "'front'")] == []

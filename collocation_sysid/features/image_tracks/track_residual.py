@@ -176,10 +176,9 @@ class ImageTrackResidual(CustomSensorResidual, CorrespondenceResidual):
         body rigid.
         """
         places = self.correspondences
-        tracks = self.sensor
-        if only_pose or (tracks.is_place_known.all() and tracks.has_known_pose):
+        tracks, experiment = self.sensor, self.experiment
+        if only_pose:
             return places
-        experiment = self.experiment
 
         def shape_at(t_s: float) -> Array:
             last_s = self.observable_s[len(x) - 1]
@@ -218,9 +217,9 @@ class ImageTracksModel(CorrespondenceModel):
 
     @cached_property
     def _pose_parameters(self) -> Index:
-        """Indices in φ (6,) of the pose if it is unknown; empty if it is stated."""
+        """Indices in φ of the errors of the pose that are estimated, rotation first."""
         tracks = self.measurement
-        names = () if tracks.has_known_pose else POSE_UNKNOWNS
+        names = [name for name in POSE_UNKNOWNS if name in tracks.unknowns]
         return self.grid.nuisance.indices_of_labels(map(tracks.unknown_label, names))
 
     @cached_property

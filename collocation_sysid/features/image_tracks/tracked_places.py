@@ -8,11 +8,13 @@ points with the same name.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...errors import InputError
@@ -20,9 +22,9 @@ from ...fem.body import Body
 from ...program.correspondences import Correspondences
 from ...program.markers.marker_association import MarkerAssociation
 from ...recording.experiment import Experiment
-from ...recording.placement import LocatedBody
+from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from .rays import FEWEST_POINTS, is_occluded, points_on_surface, poses_from_points
-from .tracks import ImageTracks, stated_places
+from .tracks import POSE_UNKNOWNS, ImageTracks, stated_places
 
 # Sine of the angle by which a ray may miss the body if the pose of the camera is exact, and in
 # standard deviations of the pose.
@@ -32,8 +34,16 @@ MISSES = 3.0
 # a visible one becomes hidden: trackers follow points at grazing angles.
 TURNS_VISIBLE = 0.05
 TURNS_HIDDEN = -0.1
+# Cosine of the angle between two faces up to which a place may move from one to the other: beyond it,
+# the edge is a crease, and places stay in the plane of their face.
+SMOOTH = 0.7
+# Iterations that align a camera with the first image.
+ALIGNMENT_EVALUATIONS = 60
 # Distance in mean edges in front of a point at which another part of the surface hides it.
 OCCLUSION_EDGES = 0.3
+
+# Distance in mean edges by which another face must be nearer to a place than its own.
+SAME_FACE = 1e-3
 
 ShapeAt = Callable[[float], Array]
 
@@ -181,8 +191,10 @@ class TrackedPlaces(Correspondences):
         Points that are not hidden.
     coordinate_parameters : (N, 2) array
         Indices in φ of the coordinates of the places; −1 for exact ones.
-    pose_parameters : (6,) array
-        Indices in φ of the pose if it was found; empty if it is stated.
+    pose_parameters : (p,) array
+        Indices in φ of the errors of the pose that are estimated, rotation first.
+    start_pose : (p,) array
+        Their values with which the first image fits best, in prior standard deviations.
     mirror_ratio : float
         Of a pose that was found: the error of the second best pose over that of the best one.
     """
@@ -196,6 +208,7 @@ class TrackedPlaces(Correspondences):
     coordinate_parameters: Index
     pose_parameters: Index
     mirror_ratio: float = np.inf
+    start_pose: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def from_shapes(
@@ -215,6 +228,7 @@ class TrackedPlaces(Correspondences):
         sigmas = np.where(is_placed, tracks.place_sigmas_m(experiment), 0.0)
         camera = replace(tracks.camera, pose=found.poses[tracks.name])
         rotations, translations = camera.pose_at(tracks.sample_times_s)
+        shapes = np.array([shape_at(float(t)) for t in tracks.sample_times_s])
         correspondences = cls(
             tracks,
             surface_association(body, places, sigmas),
@@ -224,10 +238,10 @@ class TrackedPlaces(Correspondences):
             is_visible=np.ones(tracks.is_seen.shape, dtype=bool),
             coordinate_parameters=coordinate_parameters,
             pose_parameters=pose_parameters,
+            start_pose=np.zeros(len(pose_parameters)),
             mirror_ratio=found.mirrored.get(tracks.name, np.inf),
         )
-        shapes = [shape_at(float(t)) for t in tracks.sample_times_s]
-        return correspondences.with_visibility(np.array(shapes))
+        return correspondences.with_visibility(shapes)._aligned(shapes)
 
     @property
     def measured(self) -> ImageTracks:
@@ -235,11 +249,9 @@ class TrackedPlaces(Correspondences):
         return self.tracks
 
     def with_start_values(self, phi: Array) -> Array:
-        """Return a copy of φ with the coordinates of the places, and without an error of a pose
-        that was found.
-        """
+        """Return a copy of φ with the coordinates of the places and the aligned pose."""
         started = self._with_places(phi)
-        started[self.pose_parameters] = 0.0
+        started[self.pose_parameters] = self.start_pose
         return started
 
     def continued(self, phi: Array, previous: Correspondences) -> Array:
@@ -325,15 +337,92 @@ class TrackedPlaces(Correspondences):
     def _mean_edge_m(self) -> float:
         return float(self.association.body.mesh.quality().edge_mean_m)
 
+    # Alignment --------------------------------------------------------------------------------
+
+    def _aligned(self, shapes_m: Array) -> TrackedPlaces:
+        """Return the correspondences with the errors of the pose that fit the first image best,
+        weighted by their priors; of a pose that is off by many pixels, every residual would be
+        beyond the threshold of Huber's loss.
+        """
+        tracks, size = self.tracks, len(self.pose_parameters)
+        used = self.is_visible & tracks.is_seen & self.is_placed
+        if not size or tracks.pixels is None or not used.any():
+            return self
+        sample = int(used.any(axis=1).argmax())
+        points = np.flatnonzero(used[sample])
+        nodes, weights = self._corner_weights
+        at_m = np.einsum("pc,pci->pi", weights[points], shapes_m[sample][nodes[points]])
+        own_m = (at_m - self.translations[sample]) @ self.rotations[sample]
+        pixels = np.asarray(tracks.pixels)[sample, points]
+        names = [name for name in POSE_UNKNOWNS if name in tracks.unknowns]
+        scales = np.array([tracks.unknowns[name] for name in names])
+        places = [POSE_UNKNOWNS.index(name) for name in names]
+
+        def differences(pose: Array) -> Array:
+            errors = np.zeros(6)
+            errors[places] = pose * scales
+            moved = own_m @ Rotation.from_rotvec(errors[:3]).as_matrix().T + errors[3:]
+            moved[:, 2] = np.maximum(moved[:, 2], 1e-3)
+            off = tracks.camera.distorted_pixels(moved) - pixels
+            return np.concatenate([off.ravel() / tracks.sigma_px, pose])
+
+        fit = least_squares(
+            differences, np.zeros(size), loss="soft_l1", max_nfev=ALIGNMENT_EVALUATIONS
+        )
+        return replace(self, start_pose=fit.x)
+
+    @cached_property
+    def _corner_weights(self) -> tuple[Index, Array]:
+        """Corners (N, 3) of the faces of the places, and their weights (N, 3)."""
+        faces, shares = self._faces
+        return self.association.body.mesh.surface[faces], shares
+
     def followed(self, phi: Array, shapes_m: Array) -> TrackedPlaces:
         """Return the correspondences at other estimates φ (k,) with the first s shapes (s, n, 3)
         [m]; self if nothing has changed.
         """
-        association, _ = self.association.follow_estimates(self.coordinates(phi))
+        association = self._followed_association(self.places_m(phi))
         other = self
         if association is not self.association:
             other = replace(self, association=association)
         return other.with_visibility(shapes_m)
+
+    def _followed_association(self, points_m: Array) -> MarkerAssociation:
+        """Return the association with places at points (N, 3) [m] in the planes of their faces; the
+        present one if each is on its face, or beyond a crease.
+        """
+        association = self.association
+        body = association.body
+        corners = body.nodes_m[body.mesh.surface]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        faces, _ = self._faces
+        centres = association.centre_places_m.copy()
+        axes = association.axes.copy()
+        cells = association.cells.copy()
+        has_left = False
+        for m in association.estimated:
+            point = points_m[m]
+            smooth = np.flatnonzero(normals @ normals[faces[m]] > SMOOTH)
+            nearest = nearest_points_of_triangles(point, corners[smooth])
+            away = np.linalg.norm(nearest - point, axis=1)
+            k = int(away.argmin())
+            own = int(np.flatnonzero(smooth == faces[m])[0])
+            if away[own] <= away[k] + SAME_FACE * self._mean_edge_m:
+                centres[m] = point
+                continue
+            face = int(smooth[k])
+            off = nearest[k] - point
+            # Beyond the end of the smooth part, the place stays in the plane of its last face.
+            along = off - normals[face] * (off @ normals[face])
+            centres[m] = nearest[k] - along
+            sides = corners[face, 1:] - corners[face, 0]
+            axes[m] = np.linalg.qr(sides.T)[0]
+            cells[m] = body.mesh.surface_cells[face]
+            has_left = True
+        if not has_left:
+            return association
+        return replace(association, centre_places_m=centres, axes=axes, cells=cells)
 
 
 def surface_association(body: Body, places_m: Array, sigmas_m: Array) -> MarkerAssociation:
