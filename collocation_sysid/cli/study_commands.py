@@ -29,6 +29,7 @@ from ..extras.studies.model_variants import models, parse_branches, parse_dampin
 from ..extras.studies.study_arguments import parse_methods, parse_varied_keys, read_truth
 from ..extras.studies.study_kinds import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
 from ..extras.studies.study_rows import SuccessCriterion
+from ..fem.kernels import available_threads
 from ..problem import Problem
 from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
 from .common import error_console, interruption_exit, print_result
@@ -149,6 +150,7 @@ def compare_models(options: CompareModelsCommand) -> None:
     """
     if not options.with_ and {options.materials, options.damping, options.prony} == {None}:
         raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
+    from ..extras.studies.study_progress import expected_study_s
     from ..result.solve_progress import SolveProgress
     from ..runs.check import expected_search_s
 
@@ -176,11 +178,14 @@ def compare_models(options: CompareModelsCommand) -> None:
             complete_steps(StepUnit.PROBLEM)
     planned = plan_models(problem, variants, method=method, allow_code=options.allow_code)
     if is_announced:
-        known_s = [each for each in searches_s if each is not None]
+        workers = 1 if options.limits.scheduler else options.limits.workers or available_threads()
+        total_s = expected_study_s(searches_s, len(planned), worker_count=workers)
         about = "the first fit shows how long they take"
-        if known_s:
-            total_s = len(planned) * sum(known_s) / len(known_s)
-            about = f"the searches take about {duration(total_s)} (rough estimate, without checks)"
+        if total_s is not None:
+            about = (
+                f"they take about {duration(total_s)} (rough estimate; a law that fits badly takes "
+                "several times as long)"
+            )
         error_console.print(
             f"{len(planned)} fits: {len(variants)} models, each to all data and without held-out "
             f"data; {about}",

@@ -22,6 +22,11 @@ from collocation_sysid.common.serialisation import as_json
 from collocation_sysid.extras.studies import run_execution
 from collocation_sysid.extras.studies import study_progress as display
 from collocation_sysid.extras.studies.study_plots import sweep_plots
+from collocation_sysid.extras.studies.study_progress import (
+    FIT_FACTOR,
+    RUN_START_S,
+    expected_study_s,
+)
 from collocation_sysid.methods.solution import Iteration
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
@@ -148,6 +153,13 @@ def test_progress_tells_the_time_left(compared):
     assert lines[0].startswith("1/4 runs: ")
     assert lines[0].endswith(" left")
     assert "; about" not in lines[-1]
+
+
+def test_the_announced_time_has_the_start_of_each_run_and_the_number_of_runs_at_once():
+    alone = expected_study_s([1.0, None, 3.0], 6, worker_count=1)
+    assert alone == pytest.approx(6 * (RUN_START_S + 2 * FIT_FACTOR))
+    assert expected_study_s([1.0, 3.0], 6, worker_count=3) == pytest.approx(alone / 3)
+    assert expected_study_s([None], 6, worker_count=1) is None
 
 
 @pytest.mark.long

@@ -46,6 +46,7 @@ from collocation_sysid.fem.laws.materials import MATERIALS
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.problem import Problem
+from collocation_sysid.problem.new_problem import create_problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.recording import Experiment, Markers, Wrench, write_poses_csv
@@ -637,6 +638,21 @@ def test_a_comparison_in_python_has_the_estimates_of_a_solve():
     assert young.get_xlabel().endswith("[kPa]")
     with pytest.raises(cs.InputError, match="two or more"):
         cs.compare_models({"yeoh": problems["yeoh"]})
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["specimen", "compression", "swing"])
+def test_a_complete_fit_has_the_estimates_and_intervals_of_the_command_solve(tmp_path, kind):
+    create_problem(tmp_path / "example", kind)
+    problem = Problem.read(tmp_path / "example" / "problem.toml")
+    record = fit_record(problem, "reduced-space", "")
+    solved = cs.run(problem)
+    assert record["parameters"].keys() >= solved.parameters.keys()
+    for name, estimate in (solved.result.parameters | solved.result.derived).items():
+        assert record["parameters"][name] == pytest.approx(estimate.value, rel=1e-9), name
+        if estimate.combined95 is not None:
+            combined95 = record["budget"][name]["combined95"]
+            assert combined95 == pytest.approx(estimate.combined95, rel=1e-9), name
 
 
 def test_the_law_is_a_source_of_the_chosen_ones_budget():

@@ -17,6 +17,11 @@ from .study_planning import PlannedRun
 
 # Number of motions between two lines of a search whose output is no terminal.
 EVERY = 20
+# Processor time of a run before its search [s]: start of its process, imports and reading.
+RUN_START_S = 2.7
+# Time of a run with its scan and checks over the expected time of its search: 0.3 to 6 for templates
+# of specimens, benches and swings; 10 and 50 for laws whose constants the swing does not determine.
+FIT_FACTOR = 4.0
 # Hint beside each stage of a design.
 STOPPING = "Ctrl-C stops and keeps the best"
 
@@ -135,6 +140,25 @@ class DesignProgress(SolveProgress):
         """
         self.share(None)
         self.announce(f"{what} ({STOPPING})")
+
+
+def expected_study_s(
+    searches_s: Sequence[float | None], count: int, worker_count: int
+) -> float | None:
+    """Return the expected time of a comparison of models before any run [s]; None without the
+    expected time of any search.
+
+    Parameters
+    ----------
+    searches_s : sequence of float or None
+        Expected time of the search of each model [s]; None if it is not known.
+    count : int
+        Number of runs.
+    worker_count : int
+        Number of runs that are executed at once.
+    """
+    each_s = [RUN_START_S + FIT_FACTOR * search for search in searches_s if search is not None]
+    return remaining_time_s(count * ["fit"], {"fit": each_s} if each_s else {}, worker_count)
 
 
 def remaining_time_s(
