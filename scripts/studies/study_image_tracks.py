@@ -28,18 +28,20 @@ DISTORTION = [-0.1, 0.02, 1e-3, -5e-4, 0.0]
 # Cameras, in the order in which they are added [m], and the point at which they look.
 EYES_M = {"front": (0.06, -0.45, 0.1), "side": (0.5, -0.15, 0.15), "top": (0.05, 0.1, 0.55)}
 MIDDLE_M = np.array([0.06, 0.015, 0.0])
-# Points, and the axis of the normal of their face.
+# Normals of the faces of the bar that cameras see, and points on them.
+FRONT, END, TOP = (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 PLACES_M = {
-    "tip_front": ((0.115, 0.0, 0.012), 1),
-    "tip_end": ((0.12, 0.016, 0.008), 0),
-    "tip_top": ((0.108, 0.012, 0.02), 2),
-    "middle_front": ((0.07, 0.0, 0.006), 1),
-    "middle_top": ((0.066, 0.02, 0.02), 2),
-    "near_front": ((0.035, 0.0, 0.014), 1),
-    "near_top": ((0.04, 0.01, 0.02), 2),
+    "tip_front": ((0.115, 0.0, 0.012), FRONT),
+    "tip_end": ((0.12, 0.016, 0.008), END),
+    "tip_top": ((0.108, 0.012, 0.02), TOP),
+    "middle_front": ((0.07, 0.0, 0.006), FRONT),
+    "middle_top": ((0.066, 0.02, 0.02), TOP),
+    "near_front": ((0.035, 0.0, 0.014), FRONT),
+    "near_top": ((0.04, 0.01, 0.02), TOP),
 }
 NAMES = tuple(PLACES_M)
 STATED_M = np.array([place for place, _ in PLACES_M.values()])
+NORMALS = np.array([normal for _, normal in PLACES_M.values()])
 T_S = 0.01 * np.arange(41)
 # The true motion begins before and ends after the images, for delays.
 LONG_S = 0.01 * np.arange(-3, 45)
@@ -92,8 +94,7 @@ def project(points_m: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def true_places_m(rng: np.random.Generator) -> np.ndarray:
     """Return places that differ from the stated ones along the surface."""
     off = PLACE_M * rng.normal(size=STATED_M.shape)
-    for k, (_, axis) in enumerate(PLACES_M.values()):
-        off[k, axis] = 0.0
+    off *= NORMALS == 0
     low, high = BODY.nodes_m.min(axis=0), BODY.nodes_m.max(axis=0)
     return np.clip(STATED_M + off, low, high)
 
@@ -114,13 +115,14 @@ def film(
     pixels += NOISE_PX * rng.normal(size=pixels.shape)
     wild = rng.random(pixels.shape[:2]) < options.outliers
     pixels[wild] += OUTLIER_PX * rng.normal(size=(wild.sum(), 2))
+    seen = np.flatnonzero(np.sum((pose[:3, 3] - STATED_M) * NORMALS, axis=1) > 0)
     return cs.ImageTracks(
         name,
         cs.Camera(MATRIX, DISTORTION, pose, size_px=(1280, 720)),
         T_S,
-        pixels,
-        NAMES,
-        places_m=STATED_M if options.places == "known" else None,
+        pixels[:, seen],
+        [NAMES[k] for k in seen],
+        places_m=STATED_M[seen] if options.places == "known" else None,
         sigma_px=NOISE_PX,
         pose_sigma=cs.PoseSigma(turn_deg=options.turn_deg, shift_m=options.shift_m),
     )
