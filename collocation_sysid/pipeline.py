@@ -27,6 +27,7 @@ from .problem import Problem
 from .program.collocation import Collocation
 from .recording.impact_steps import IMPACT_NOTE
 from .runs.check.cost import require_memory
+from .runs.expected_precision import with_measurements
 from .runs.forward_simulation import simulate_experiments, step_error
 from .runs.mesh_resolution import estimate_mesh_error
 from .runs.misspecifications import cause_notes, find_misspecifications
@@ -223,6 +224,7 @@ def run(
             changes = _changes(answer, say)
             sources = _sources(answer, fit, known=known, changes=changes)
             answer = replace(answer, profiles=profiles, systematic_effects=sources)
+            answer = _with_added_measurements(answer, say)
             solved_fit = _solved_fit(answer, fit, changes)
             answer = replace(answer, probes=_probes(solved_fit, say=say, deep=probe))
             answer = _with_budgeted_residuals(answer, solved_fit)
@@ -292,6 +294,30 @@ def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:
         )
     notes = (*answer.notes, note) if note else answer.notes
     return replace(answer, refinement=refinement, notes=notes)
+
+
+def _with_added_measurements(answer: Run, say: Log) -> Run:
+    """Return the run with the sensors or tests that would determine constants of which only a
+    combination is determined.
+    """
+    if not answer.combinations or answer.uncertainty is None:
+        return answer
+    say("predicting the effect of another measurement")
+    solution = answer.solution
+    level = 1.0 if answer.uncertainty.noise == "given" else answer.uncertainty.level.pooled
+    found = with_measurements(
+        answer.combinations,
+        solution.collocation,
+        solution.z,
+        answer.problem.assumed_deviations,
+        noise=level,
+    )
+    added = {
+        frozenset(new.determined.names): new.fixes[0]
+        for old, new in zip(answer.combinations, found, strict=True)
+        if new is not old
+    }
+    return replace(answer, added_measurements=added)
 
 
 def _with_offset_notes(answer: Run, fit: LinearisedFit) -> Run:

@@ -157,31 +157,43 @@ class SquareRootInformation:
         """Matrix L (P, r) with L Lᵀ = (SᵀS)⁻¹ in the r directions that the rows determine; r = P if
         these determine all parameters.
         """
-        return self._root_and_undetermined[0]
+        return self._root_and_null_space[0]
 
     @cached_property
     def is_undetermined(self) -> NDArray[np.bool_]:
         """Mask (P,) of the parameters with a share above `NEGLIGIBLE` in a direction without
         information; an eigenvalue below `SINGULAR` counts as zero.
         """
-        return self._root_and_undetermined[1]
+        shares = np.abs(self._root_and_null_space[1][1])
+        return np.asarray((shares > NEGLIGIBLE).any(axis=0))
 
     @cached_property
-    def _root_and_undetermined(self) -> tuple[Array, NDArray[np.bool_]]:
-        """Matrix of `root` and mask of `is_undetermined`, computed together."""
+    def null_space(self) -> Array:
+        """Matrix (P, P − r) of the directions of p without information, in columns of length 1; an
+        eigenvalue below `SINGULAR` counts as zero.
+        """
+        units, directions = self._root_and_null_space[1]
+        ways = (directions / units).T
+        return ways / np.linalg.norm(ways, axis=0)
+
+    @cached_property
+    def _root_and_null_space(self) -> tuple[Array, tuple[Array, Array]]:
+        """Matrix of `root`, and units (P,) with the directions (P − r, P) without information in
+        these units, computed together.
+        """
         units = np.linalg.norm(self.jacobian, axis=0)
         units[units == 0] = 1.0
         square = (self.jacobian / units)[: len(units)]
         size = len(units)
         # So that no eigenvalue is zero up to rounding; much faster.
         if len(square) == size > 0 and _trcon(square)[0] > size * np.sqrt(SINGULAR):
-            return _trtri(square)[0] / units[:, None], np.zeros(size, dtype=bool)
+            return _trtri(square)[0] / units[:, None], (units, np.zeros((0, size)))
         _, singular_values, vectors = np.linalg.svd(square)
         values = np.zeros(len(units))
         values[: len(singular_values)] = singular_values
         is_determined = values**2 > SINGULAR
         root = vectors[is_determined].T / values[is_determined] / units[:, None]
-        return root, np.asarray((np.abs(vectors[~is_determined]) > NEGLIGIBLE).any(axis=0))
+        return root, (units, vectors[~is_determined])
 
     def covariance(self, score_covariance: Array | None = None) -> Array:
         """Return the covariance (P, P) of p.

@@ -321,8 +321,14 @@ def _cost_text(cost: MethodCost) -> str:
 
 
 def _solve_brief(findings: CheckResult) -> Table:
-    """Return the table of guesses, the first mode, and the expected cost of the chosen method."""
+    """Return the table of guesses, the first mode, combinations that are determined, and the
+    expected cost of the chosen method.
+    """
     rows = _guess_rows(findings) | _motion_rows(findings)
+    if findings.combinations:
+        best, *others = findings.combinations
+        more = f" (and {len(others)} more: see --details)" if others else ""
+        rows["determined"] = best.sentence().removeprefix("the data determine ") + more
     for cost in findings.costs:
         if cost.method == findings.method:
             rows["solve"] = f"{_cost_text(cost)} by {cost.method} (rough estimates, without checks)"
@@ -334,6 +340,9 @@ def _solve_section(findings: CheckResult) -> Table:
     errors.
     """
     rows = _guess_rows(findings)
+    for number, each in enumerate(findings.combinations, start=1):
+        which = f" {number}" if len(findings.combinations) > 1 else ""
+        rows[f"determined{which}"] = each.statement()
     rows |= {
         "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
         f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"

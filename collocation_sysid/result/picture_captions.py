@@ -24,6 +24,8 @@ PICTURE_CAPTIONS = {
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
     "confidence": "95 % regions of pairs of parameters, for the combined uncertainty if it is known.",
+    "combinations": "95 % intervals of the constants alone and, below the line, of their independent "
+    "combinations. Blue: narrower than the value; orange: not determined.",
     "correlation": "Correlation of the estimates, for the same uncertainty.",
     "budget": "Contributions to the variance of each estimate.",
     "convergence": "Loss, violation of the dynamics and parameters over the iterations.",

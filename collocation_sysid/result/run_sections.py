@@ -220,6 +220,7 @@ def parameter_section(result: Result) -> TitledParts:
         parts.append(
             f"corrected for the stated grip layer and machine compliance: {', '.join(known)}"
         )
+    parts += [each.statement() for each in result.combinations]
     parts += _undetermined_sentence(result)
     parts += alternative_sentences(result)
     parts += _largest_contributions(result)
@@ -330,7 +331,8 @@ def estimate_row(result: Result, name: str) -> tuple[str, ...]:
     ones are empty. Instead of an interval the cell is "at its bound"; if the estimate has a
     `reason`, which is the remark, it is "not identifiable", or "not determined" without a
     statistical interval. An interval that is wider than the value is followed by "not determined",
-    and the value has no ±. Instead of the guess of a fixed or tied parameter the cell is "fixed" or
+    and the value has no ±. Where a combination with other parameters is determined, it replaces
+    these words. Instead of the guess of a fixed or tied parameter the cell is "fixed" or
     "tied".
     """
     values = result.collect_estimates()
@@ -357,6 +359,8 @@ def estimate_row(result: Result, name: str) -> tuple[str, ...]:
         interval = "not determined" if each.statistical95 is None else "not identifiable"
     elif is_vague:
         interval = f"not determined ({interval})"
+    if (is_vague or each.reason) and not each.at_bound:
+        interval = _combination_text(result, name) or interval
     guess = "" if each.guess is None else f"{factor * each.guess:.5g}"
     if each.fixed:
         guess = "tied" if each.tied else "fixed"
@@ -370,6 +374,14 @@ def estimate_row(result: Result, name: str) -> tuple[str, ...]:
         guess,
         each.reason or "",
     )
+
+
+def _combination_text(result: Result, name: str) -> str:
+    """Return the best determined combination of a parameter with others; "" if there is none."""
+    for each in result.combinations:
+        if name in each.determined.names:
+            return f"only {each.determined.formula()} {each.precision()}".rstrip()
+    return ""
 
 
 def _deviation_text(deviation: float | None) -> str:

@@ -161,14 +161,20 @@ def _estimates(result: Result) -> Iterator[Shown]:
 
 
 def _limit(result: Result) -> Iterator[str]:
-    """Yield a sentence on what limits the answer and what to measure: for the estimates that are
-    not determined, or else for the most important stiffness.
+    """Yield a sentence on the combination that is determined in place of its constants, and one on
+    what limits the answer and what to measure: for the estimates that are not determined, or else
+    for the most important stiffness.
     """
+    if result.combinations:
+        best, *others = result.combinations
+        more = f" (and {len(others)} more: see --details)" if others else ""
+        yield best.statement(most=1) + more
+    stated = stated_as_undetermined(result)
+    combined = {name for each in result.combinations for name in each.determined.names}
     values = result.collect_estimates()
     known = [name for name in result.budget if name in values and result.budget[name]]
     if not known:
         return
-    stated = stated_as_undetermined(result)
     vague = [name for name in known if name not in stated and not values[name].is_determined]
     shown = [
         name for name in vague if name in result.parameters or without_region(name) in SHOWN_MODULI
@@ -182,8 +188,8 @@ def _limit(result: Result) -> Iterator[str]:
         if share > SMALLEST_SHOWN_SHARE
     ]
     subject = f"variance of {symbol_of(name)}: {', '.join(sources)}"
-    if shown:
-        symbols = listed(map(symbol_of, shown))
+    if alone := [name for name in shown if name not in combined]:
+        symbols = listed(map(symbol_of, alone))
         subject = f"not determined: {symbols}; {subject}"
     yield f"{subject}; to reduce {source_label(largest)}, {remedy_for(largest)}"
 

@@ -184,7 +184,9 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
         combined_covariance=combined,
         noise_factors=known.level.factors,
         autocorrelation=known.dependence.lag1,
-        verdicts=tuple(identifiability_sentences(known)),
+        verdicts=tuple(identifiability_sentences(known, answer.combinations)),
+        combinations=answer.combinations,
+        directions=answer.principal_directions,
         recordings=_recordings_agreement(answer),
         profiles={
             profile.parameter: copy_fields(

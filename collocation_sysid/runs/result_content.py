@@ -21,6 +21,7 @@ from ..methods.stiffness_scan import ScanSummary
 from ..statistics.assessment import Assessment
 from ..statistics.budget.alternatives import Alternative, OriginAnswer
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds
+from ..statistics.combinations import Combination, Direction
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.remedies import remedy_for
@@ -326,6 +327,11 @@ class UncertaintyResult:
         half widths of 1.96 standard deviations; None if systematic effects were not evaluated.
     verdicts : tuple of str
         Sentences on what the data determine.
+    combinations : tuple of Combination
+        Combinations of constants that are determined although a constant alone is not.
+    directions : tuple of Direction
+        Independent combinations of all constants that are not at a bound, the best determined
+        first; intervals are combined.
     recordings : mapping of str to RecordingsAgreement, or None
         Agreement of the recordings, by parameter; None if it was not evaluated.
     profiles : mapping of str to ProfileResult
@@ -345,6 +351,8 @@ class UncertaintyResult:
     recordings: Mapping[str, RecordingsAgreement] | None
     profiles: Mapping[str, ProfileResult]
     combined_covariance: Array | None = optional()  # noqa: RUF009, it returns a field
+    combinations: tuple[Combination, ...] = ()
+    directions: tuple[Direction, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -583,6 +591,11 @@ class Result:
         }
         both = {**self.parameters, **self.derived}
         return {name: each for name, each in both.items() if name not in coefficients}
+
+    @property
+    def combinations(self) -> tuple[Combination, ...]:
+        """Combinations of constants that are determined although a constant alone is not."""
+        return () if self.uncertainty is None else self.uncertainty.combinations
 
     def list_discretisation_kinds(self) -> tuple[str, ...]:
         """Return the kinds of discretisation error that the combined intervals contain: "step",

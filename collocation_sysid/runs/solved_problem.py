@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from typing import Any, Literal
@@ -25,7 +25,20 @@ from ..statistics.budget.alternatives import (
 )
 from ..statistics.budget.combined_intervals import combine
 from ..statistics.budget.discretisation_error import DiscretisationError, Refinement
-from ..statistics.budget.uncertainty_budget import BudgetLine, VarianceSources, budget
+from ..statistics.budget.uncertainty_budget import (
+    MESH,
+    NUMERICAL,
+    BudgetLine,
+    VarianceSources,
+    budget,
+)
+from ..statistics.combinations import (
+    Combination,
+    Direction,
+    Fix,
+    find_combinations,
+    principal_directions,
+)
 from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate, relative_derivatives
 from ..statistics.field_estimates import FieldEstimate, field_estimates
@@ -81,6 +94,8 @@ class SolvedProblem:
     probes : tuple of Probe
         Refits with an assumption relaxed: those of every solve, see `routine_probes`; or all, and
         of parts of the data, where these were requested. Empty without error bars.
+    added_measurements : mapping of frozenset of str to Fix
+        The sensor or test that would determine the constants of a combination best, by their names.
     budgeted : BudgetedResiduals or None
         Residuals that deviations within the budget leave; None if the residuals gave no concern, or
         if such deviations do not explain them.
@@ -101,6 +116,7 @@ class SolvedProblem:
     omitted_checks: str = ""
     systematic_effects: VarianceSources | None = None
     probes: tuple[Probe, ...] = ()
+    added_measurements: Mapping[frozenset[str], Fix] = field(default_factory=dict)
     budgeted: BudgetedResiduals | None = None
     elapsed_s: Elapsed = field(default_factory=Elapsed)
 
@@ -408,22 +424,114 @@ class SolvedProblem:
                 raise InputError(f"{name}: found {found!r}; expected one of {', '.join(known)}")
         if self.uncertainty is None or self.systematic_effects is None:
             raise InputError("the run has no error bars, and therefore no covariance")
-        statistical = self.uncertainty.covariance
-        parameters = self.solution.collocation.parameters
-        sizes = relative_derivatives(parameters, self.solution.q)
-        by_value = sizes.copy()  # derivatives of the relative coordinates by the values
-        deviations = np.full(len(sizes), np.nan)
-        for k, name in enumerate(self.uncertainty.names):
-            each = self.estimates[name]
-            is_linear, _ = parameters.scale_and_bounds(name)
-            by_value[k] /= parameters.free[k].value_derivative(self.solution.parameters[name])
-            if not is_linear and each.value:
-                by_value[k] = 1 / each.value
-            deviations[k] = abs(by_value[k]) * _or_nan(each.combined_std_error)
-        matrix = statistical
+        matrix = self.uncertainty.covariance
+        by_value = self._relative_by_value()
         if kind == "combined":
-            matrix = self.systematic_effects.combine_covariance(statistical, sizes, deviations)
+            deviations = self._collect_relative_deviations()
+            # The budget adds little to the sum of the contributions, such as Student's quantiles.
+            factors = deviations / np.sqrt(np.diag(self._complete_covariance))
+            matrix = self._complete_covariance * np.outer(factors, factors)
         return matrix if units == "relative" else matrix / np.outer(by_value, by_value)
+
+    def _relative_by_value(self) -> Array:
+        """Return the derivatives (k,) of the relative coordinates of the estimated parameters by
+        their values.
+        """
+        parameters = self.solution.collocation.parameters
+        by_value = relative_derivatives(parameters, self.solution.q)
+        for k, item in enumerate(parameters.free):
+            by_value[k] /= item.value_derivative(self.solution.parameters[item.name])
+            if item.scale == "log" and self.estimates[item.name].value:
+                by_value[k] = 1 / self.estimates[item.name].value
+        return by_value
+
+    def _collect_relative_deviations(self) -> Array:
+        """Return the combined standard uncertainties (k,) of the relative coordinates; NaN where
+        there is none.
+        """
+        known = [_or_nan(self.estimates[n].combined_std_error) for n in self._estimated_names]
+        return np.abs(self._relative_by_value()) * np.array(known)
+
+    @property
+    def _estimated_names(self) -> tuple[str, ...]:
+        return tuple(item.name for item in self.solution.collocation.parameters.free)
+
+    @cached_property
+    def _complete_covariance(self) -> Array:
+        """Finite combined covariance (k, k) of the relative coordinates, see
+        `Uncertainty.complete_covariance`.
+        """
+        assert self.uncertainty is not None
+        assert self.systematic_effects is not None
+        parameters = self.solution.collocation.parameters
+        numerical = np.zeros(len(parameters.free))
+        deviations = np.nan_to_num(self._collect_relative_deviations())
+        for k, name in enumerate(self._estimated_names):
+            error = self.collect_discretisation_errors().get(name)
+            if error is None or name not in self.budget:
+                continue
+            shares = self.budget[name].shares
+            share = shares.get(MESH, 0.0) + shares.get(NUMERICAL, 0.0)
+            change = error.extrapolated - self.optimum[name].value
+            towards = error.estimated_mesh if MESH in shares else change
+            numerical[k] = np.copysign(np.sqrt(share) * deviations[k], towards or 0.0)
+        return self.systematic_effects.combine_covariance(
+            self._estimated_names,
+            self.uncertainty.complete_covariance,
+            relative_derivatives(parameters, self.solution.q),
+            numerical,
+        )
+
+    @cached_property
+    def combinations(self) -> tuple[Combination, ...]:
+        """Combinations of constants that are determined although a constant alone is not; empty
+        without error bars. Coefficients of fields and parameters at a bound are left out.
+        """
+        names, values, covariance = self._stated_covariance()
+        if not names:
+            return ()
+        vague = {name for name in names if not self._is_determined_alone(name)}
+        found = find_combinations(names, values, covariance, vague, self._modulus_slopes(names))
+        added = (self.added_measurements.get(frozenset(each.determined.names)) for each in found)
+        return tuple(
+            (each if fix is None else replace(each, fixes=(fix,))).with_known_value(
+                names, covariance
+            )
+            for each, fix in zip(found, added, strict=True)
+        )
+
+    @cached_property
+    def principal_directions(self) -> tuple[Direction, ...]:
+        """Independent combinations of the constants of `combinations`, the best determined first."""
+        return principal_directions(*self._stated_covariance())
+
+    def _is_determined_alone(self, name: str) -> bool:
+        return self.estimates[name].reason is None and self.estimates[name].is_determined
+
+    def _stated_covariance(self) -> tuple[list[str], Array, Array]:
+        """Return names, values (k,) and finite combined covariance (k, k) of the scalar parameters
+        that are not at a bound; none without error bars.
+        """
+        if self.uncertainty is None or self.systematic_effects is None:
+            return [], np.zeros(0), np.zeros((0, 0))
+        free = enumerate(self._estimated_names)
+        kept = {k: n for k, n in free if n in self.optimum and not self.optimum[n].at_bound}
+        values = np.array([self.solution.parameters[name] for name in kept.values()])
+        return [*kept.values()], values, self._complete_covariance[np.ix_([*kept], [*kept])]
+
+    def _modulus_slopes(self, names: Sequence[str]) -> dict[str, Array]:
+        """Return the relative derivatives (k,) of the derived moduli by the logarithms of some
+        parameters.
+        """
+        assert self.systematic_effects is not None
+        sizes = relative_derivatives(self.solution.collocation.parameters, self.solution.q)
+        places = [self._estimated_names.index(name) for name in names]
+        by_q = self.systematic_effects.derivatives
+        return {
+            modulus: (by_q[modulus] / sizes)[places] / value
+            for modulus, value in self.derived.items()
+            if value
+        }
 
     def nuisance(self, name: str) -> float:
         """Return the value of a nuisance parameter of a recording in its unit; `name` is as in
@@ -499,7 +607,7 @@ class SolvedProblem:
             *mesh_resolution_notes(self.problem),
             *grasp_extent_notes(self.problem),
             *self.uncertainty.notes,
-            *identifiability_sentences(self.uncertainty),
+            *identifiability_sentences(self.uncertainty, self.combinations),
         )
         return (*dict.fromkeys(notes), *(profile.message for profile in self.profiles))
 

@@ -32,7 +32,7 @@ from ..fem.laws.constants import constant_named, is_damping
 from ..model.parameters import Parameters
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.linear_algebra.lapack import one_blas_thread
-from .distributions import student_ppf
+from .distributions import normal_isf, student_ppf
 from .estimates import (
     UNDETERMINED,
     Estimate,
@@ -145,6 +145,10 @@ class Uncertainty(ErrorBasis):
         may be negative, of its value over its size. NaN in rows and columns of parameters at a
         bound (the variances of the others treat those as free); infinite variance where the data do
         not determine a parameter.
+    complete_covariance : (nq, nq) array
+        Finite covariance of the same quantities for normal 95 % intervals: directions without
+        information have the standard deviation `UNDETERMINED`, and parameters at a bound are free.
+        Differences between recordings are not contained.
     correlation : (nq, nq) array
         Correlations; NaN where a variance is not finite.
     quantiles : (nq,) array
@@ -173,6 +177,7 @@ class Uncertainty(ErrorBasis):
 
     names: tuple[str, ...]
     covariance: Array
+    complete_covariance: Array
     correlation: Array
     quantiles: Array
     estimates: Mapping[str, Estimate]
@@ -274,10 +279,16 @@ def uncertainty_from_fit(
     longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
     sizes = relative_derivatives(parameters, q)
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
+    # One factor for all: different ones would widen combinations that are known well.
+    of_noise = np.nanmax(bars.quantiles, initial=normal_isf(0.025)) / normal_isf(0.025)
+    complete = of_noise**2 * bars.determined[:shared, :shared]
+    open_ways = sizes[:, None] * factored.fit.null_space[:shared]
     return Uncertainty(
         **vars(basis),
         names=fit.names[:shared],
         covariance=of_q * np.outer(sizes, sizes),
+        complete_covariance=complete * np.outer(sizes, sizes)
+        + UNDETERMINED**2 * open_ways @ open_ways.T,
         correlation=correlation_from_covariance(of_q),
         quantiles=quantiles,
         estimates=estimates,
@@ -312,6 +323,8 @@ class _ErrorBars:
     ----------
     covariance : (p, p) array
         Covariance of all parameters, in the solver's coordinates.
+    determined : (p, p) array
+        The same in the directions that are determined, finite.
     quantiles : (nq,) array
         Half widths of the 95 % intervals of shared parameters, in standard deviations.
     basis : ErrorBasis
@@ -319,6 +332,7 @@ class _ErrorBars:
     """
 
     covariance: Array
+    determined: Array
     quantiles: Array
     basis: ErrorBasis
 
@@ -341,20 +355,27 @@ def _error_bars(fit: LinearisedFit, factored: Information, requested: ErrorModel
     covariance = factored.fit.covariance(of_score)
     used = "independent"
     if correlated:
-        of_score, few_freedom = _correlated_score_covariance(fit, factored, kind=kind, level=level)
-        persistent = factored.fit.covariance(of_score)
+        of_correlated, few_freedom = _correlated_score_covariance(
+            fit, factored, kind=kind, level=level
+        )
+        persistent = factored.fit.covariance(of_correlated)
         before, after = (np.diag(each)[: fit.shared_count] for each in (covariance, persistent))
         widens = (after > CONSEQUENCE**2 * before).any()
         if requested.errors == "autocorrelated" or kind != "given" or widens:
             covariance = persistent
             freedom = few_freedom
             used = "autocorrelated"
+            of_score = of_correlated
+    determined = factored.fit.root @ of_score @ factored.fit.root.T
     if fit.phase_covariance is not None:
+        shared = slice(fit.shared_count)
         covariance = covariance.copy()
-        covariance[: fit.shared_count, : fit.shared_count] += fit.phase_covariance
+        covariance[shared, shared] += fit.phase_covariance
+        determined[shared, shared] += fit.phase_covariance
     return _ErrorBars(
         covariance,
-        student_ppf(0.975, freedom),
+        determined,
+        quantiles=student_ppf(0.975, freedom),
         basis=ErrorBasis(kind, used, level=level, dependence=dependence, outliers=outliers),
     )
 

@@ -18,7 +18,13 @@ from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI, own_settings
 from ..replay import MotionRecord, damaged_run_refused, read_run
 from .camera_pictures import camera_pictures
-from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
+from .confidence import (
+    Confidence,
+    budget_picture,
+    combinations_picture,
+    confidence_ellipses,
+    correlation_matrix,
+)
 from .field_intervals import field_picture
 from .mesh_pictures import elements_picture, mesh_picture
 from .over_time import marker_errors, marker_tracks, sensor_picture
@@ -61,6 +67,16 @@ def all_pictures(
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
         pictures["correlation"] = correlation_matrix(confidence)
+    known = result.uncertainty
+    if known is not None and len(known.directions) > 1:
+        members = {name for each in known.directions for name in each.names}
+        ends = {n: result.parameters[n].combined95 for n in names if n in members}
+        alone = {
+            name: float(np.sqrt(interval[1] / interval[0]))
+            for name, interval in ends.items()
+            if interval is not None and interval[0] > 0
+        }
+        pictures["combinations"] = combinations_picture(alone, known.directions)
     if result.budget:
         pictures["budget"] = budget_picture(result.budget)
     with_mesh = [replay for replay in replays if replay.strain is None]

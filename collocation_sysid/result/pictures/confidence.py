@@ -11,9 +11,11 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from ...common.array_types import Array
+from ...fem.laws.constants import symbol_of
 from ...runs.result_content import Result
 from ...statistics.budget.combined_intervals import NORMAL_95
 from ...statistics.budget.uncertainty_budget import main_sources, source_label
+from ...statistics.combinations import WIDE, Direction
 from ...statistics.distributions import chi2_isf, normal_isf
 from ...statistics.estimates import correlation_from_covariance
 from ..figure_style import (
@@ -21,6 +23,7 @@ from ..figure_style import (
     BLUE,
     COLOUR_CYCLE,
     COLUMN_MM,
+    ORANGE,
     SKY,
     SMALL_PT,
     TEXT_PT,
@@ -239,6 +242,53 @@ def correlation_matrix(confidence: Confidence) -> Figure:
     bar = figure.colorbar(image, cax=bar_axes, ticks=(-1, 0, 1))
     bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
+    return figure
+
+
+# Half widths of intervals with a tick in the picture of combinations, as factors with their texts;
+# and the largest one that is drawn.
+PRECISION_TICKS = {1.001: "0.1 %", 1.01: "1 %", 1.1: "10 %", 2.0: "×2", 10.0: "×10"}
+WIDEST_DRAWN = 1e4
+
+
+def combinations_picture(alone: Mapping[str, float], directions: Sequence[Direction]) -> Figure:
+    """Return a figure of the 95 % intervals of constants alone and of their independent
+    combinations, as bars over a logarithmic axis.
+
+    Intervals narrower than their value are blue, wider ones orange; a bar that ends in an arrow is
+    longer than the axis.
+
+    Parameters
+    ----------
+    alone : mapping of str to float
+        Half width of the interval of each constant, as a factor.
+    directions : sequence of Direction
+        Combinations, the best determined first.
+    """
+    rows = [(symbol_of(name), factor) for name, factor in alone.items()]
+    rows += [(each.formula(), each.factor) for each in directions]
+    longest = max(len(text) for text, _ in rows)
+    figure = framed_figure(
+        COLUMN_MM, 16 + 6 * len(rows), left_mm=min(45.0, 6 + 1.5 * longest), right_mm=5, foot_mm=11,
+        top_mm=4,
+    )  # fmt: skip
+    axes = figure.subplots()
+    shortest = np.log(1.0003)
+    for row, (_, factor) in enumerate(rows):
+        reach = min(np.log(factor), np.log(WIDEST_DRAWN))
+        colour = BLUE if factor < WIDE else ORANGE
+        axes.barh(row, max(0.0, reach - shortest), left=shortest, color=colour, height=0.6)
+        if factor > WIDEST_DRAWN:
+            axes.plot(reach, row, ">", color=colour, markersize=5, clip_on=False)
+    style_axes(axes, "", xlabel="half width of the 95 % interval", ylabel="")
+    axes.axhline(len(alone) - 0.5, color=BLACK, lw=0.6)
+    axes.set_xscale("log")
+    axes.set_xlim(shortest, np.log(WIDEST_DRAWN))
+    axes.set_xticks([np.log(factor) for factor in PRECISION_TICKS], [*PRECISION_TICKS.values()])
+    axes.minorticks_off()
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_yticks(range(len(rows)), [text for text, _ in rows], fontsize=SMALL_PT)
+    axes.grid(False, axis="y")
     return figure
 
 

@@ -31,6 +31,7 @@ from ...program.modes.stability import Instability, find_instabilities
 from ...recording.impact_steps import IMPACT_NOTE
 from ...statistics.assessment import rotation_step_concerns, stability_concerns
 from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
+from ...statistics.combinations import Combination
 from ...statistics.concerns import Concern
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
 from ...statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
@@ -38,6 +39,7 @@ from ...statistics.misspecification.plausibility import size_and_density_hypothe
 from ...statistics.misspecification.track_misspecifications import copied_measurements
 from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
+from ..expected_precision import expected_precision, with_measurements
 from .body_check import (
     BodyCheck,
     ElementShape,
@@ -156,6 +158,9 @@ class CheckResult(QuickCheck):
         Largest relative deviation from central differences along random directions.
     causes : tuple of Hypothesis
         Likely errors in the description; their sentences are the first warnings.
+    combinations : tuple of Combination
+        Combinations of constants that the recordings determine at the guess although a constant
+        alone is not determined; empty unless the complete recordings were simulated.
     notes : tuple of str
         Sentences for information, without a remedy.
     concerns : tuple of Concern
@@ -183,6 +188,7 @@ class CheckResult(QuickCheck):
     jacobian_error: float
     hessian_error: float
     causes: tuple[Hypothesis, ...]
+    combinations: tuple[Combination, ...] = ()
     notes: tuple[str, ...] = ()
     concerns: tuple[Concern, ...] = ()
 
@@ -315,6 +321,10 @@ def check_problem(
             causes = rank((*causes, *found))
             check = replace(check, causes=causes)
         notes += found_notes
+    combinations = ()
+    if simulated is not first and not start_notes:
+        report_progress("computing what the recordings determine")
+        combinations = _expected_combinations(problem, collocation, z)
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
@@ -324,6 +334,7 @@ def check_problem(
         jacobian_error=jacobian_error,
         hessian_error=hessian_error,
         causes=causes,
+        combinations=combinations,
     )
     parts = simulated.iterates(z)
     # Forces on a body that was only carried by its grasps mean nothing.
@@ -357,6 +368,22 @@ def check_problem(
     notes += [] if rests_on is None else [rests_on.sentence]
     known = [note for note in problem.notes if note not in findings.warnings]
     return replace(findings, notes=(*known, *lost, *notes))
+
+
+def _expected_combinations(
+    problem: Problem, collocation: Collocation, z: Array
+) -> tuple[Combination, ...]:
+    """Return the combinations of constants that are determined although a constant alone is not, at
+    the variables z, with what would determine the constants; empty if they cannot be computed.
+    """
+    if not collocation.nq:
+        return ()
+    deviations = problem.assumed_deviations
+    try:
+        found = expected_precision(collocation, z, deviations).combinations()
+        return with_measurements(found, collocation, z, deviations)
+    except SimulationError:
+        return ()
 
 
 def expected_search_s(problem: Problem) -> float | None:

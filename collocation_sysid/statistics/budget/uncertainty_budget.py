@@ -11,7 +11,7 @@ with their degrees of freedom (Welch & Satterthwaite: ibid., G.4).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -281,24 +281,31 @@ class VarianceSources:
         freedom = self.freedom * ((others + more) / more) ** 2
         return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
 
-    def combine_covariance(self, statistical: Array, sizes: Array, deviations: Array) -> Array:
-        """Return the covariance (nq, nq) due to noise and systematic effects in the coordinates of
-        a statistical one, scaled to given standard deviations.
+    def combine_covariance(
+        self, names: Sequence[str], statistical: Array, sizes: Array, discretisation: Array
+    ) -> Array:
+        """Return the covariance (nq, nq) due to noise, discretisation and systematic effects in the
+        coordinates of a statistical one.
 
         Parameters
         ----------
+        names : sequence of nq str
+            Estimated parameters; assumptions that define one do not change it.
         statistical : (nq, nq) array
-            Statistical covariance; NaN for parameters at a bound.
+            Statistical covariance.
         sizes : (nq,) array
             Derivatives of its coordinates by q.
-        deviations : (nq,) array
-            Combined standard uncertainties in the same coordinates, which also contain the
-            discretisation error; its correlations are those of the other contributions.
+        discretisation : (nq,) array
+            Standard deviations of the discretisation error in the same coordinates, with the sign
+            of the error: finer steps or meshes change all parameters together.
         """
-        ways = sizes[:, None] * np.hstack([self.sensitivities, self.recording_sensitivities])
-        both = statistical + ways @ ways.T
-        factors = deviations / np.sqrt(np.diag(both))
-        return both * np.outer(factors, factors)
+        defined = [
+            [is_definition(source.partition(" ")[0], name) for source in self.names]
+            for name in names
+        ]
+        own = np.where(np.reshape(defined, self.sensitivities.shape), 0.0, self.sensitivities)
+        ways = sizes[:, None] * np.hstack([own, self.recording_sensitivities])
+        return statistical + ways @ ways.T + np.outer(discretisation, discretisation)
 
     def known_effect(self, by_q: Array) -> float:
         """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects,

@@ -1,0 +1,265 @@
+"""Precision that a description promises, without its measured values.
+
+`expected_precision` linearises a program where the equations of motion hold, and evaluates noise of
+the stated σ and the uncertainty budget. `check` uses it at the guess, and `with_measurements` for
+the precision with one more sensor or test: the equilibria or motions are those of the estimates,
+and a new test is simulated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..common.array_types import Array
+from ..errors import InputError, SimulationError
+from ..program.collocation import Collocation
+from ..program.measured_motion import fitted_values
+from ..program.simulation import simulate
+from ..recording.experiment import Experiment
+from ..recording.measured_wrench import Wrench
+from ..recording.specimen import Specimen, cell_body
+from ..recording.specimen_files import specimen_strains
+from ..statistics.budget.consider_analysis import UNWEIGHTED, changes_of_assumptions
+from ..statistics.budget.uncertainty_budget import VarianceSources
+from ..statistics.combinations import (
+    WIDE,
+    Combination,
+    Fix,
+    find_combinations,
+    undetermined_names,
+    widest_after,
+)
+from ..statistics.estimates import relative_derivatives
+from ..statistics.linearised import linearise_fit
+from ..statistics.uncertainty import ErrorModel, uncertainty_from_fit
+
+# Noise of an added instrument over its largest value.
+NOISE = 0.01
+# Tests that are tried beside those that were made.
+ADDED_TESTS = {
+    "equibiaxial": "an equibiaxial test",
+    "simple-shear": "a test in simple shear",
+    "planar": "a planar test",
+    "confined": "a confined test",
+    "uniaxial": "a uniaxial test",
+}
+# Half width of an interval, as a factor, below which no other measurement is tried.
+NARROW = 1.25
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedPrecision:
+    """Covariance that is expected of estimates.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The k estimated scalar parameters that are not at a bound.
+    values : (k,) array
+        Their values.
+    statistical, covariance : (k, k) arrays
+        Finite covariance of their relative deviations, due to noise alone, and with the budget.
+    moduli : mapping of str to (k,) array
+        Relative derivatives of derived moduli by their logarithms.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    statistical: Array
+    covariance: Array
+    moduli: Mapping[str, Array]
+
+    def combinations(self) -> tuple[Combination, ...]:
+        """Return the combinations that are determined where a constant alone is not, with the
+        constant whose known value would determine the others.
+        """
+        vague = undetermined_names(self.names, self.covariance)
+        found = find_combinations(self.names, self.values, self.covariance, vague, self.moduli)
+        return tuple(each.with_known_value(self.names, self.covariance) for each in found)
+
+
+def expected_precision(
+    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+) -> ExpectedPrecision:
+    """Return the precision of the estimates if all residuals were zero at the variables z, which
+    satisfy the equations of motion.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) array
+    deviations : mapping of str to float or None
+        Standard deviations of the assumptions of the budget.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of motion are singular.
+    """
+    collocation = replace(collocation, huber=UNWEIGHTED)
+    fit = linearise_fit(collocation, z)
+    exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
+    fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
+    parameters = collocation.parameters
+    q = z[: collocation.nq]
+    known = uncertainty_from_fit(fit, parameters, q, ErrorModel("given", "independent"))
+    changes = changes_of_assumptions(collocation, z, deviations)
+    sources = VarianceSources.from_fit(fit, changes, parameters, q, known, deviations=deviations)
+    sizes = relative_derivatives(parameters, q)
+    of_noise = known.complete_covariance
+    covariance = sources.combine_covariance(known.names, of_noise, sizes, np.zeros(len(q)))
+    kept = [k for k in parameters.scalar_coordinates if not fit.at_bound[k]]
+    names = tuple(known.names[k] for k in kept)
+    values = parameters.values(q)
+    return ExpectedPrecision(
+        names,
+        np.array([values[name] for name in names]),
+        of_noise[np.ix_(kept, kept)],
+        covariance[np.ix_(kept, kept)],
+        {
+            name: (sources.derivatives[name] / sizes)[kept] / value
+            for name, value in fit.derived.values.items()
+            if value
+        },
+    )
+
+
+def with_measurements(
+    combinations: Sequence[Combination],
+    collocation: Collocation,
+    z: Array,
+    deviations: Mapping[str, float | None],
+    noise: float = 1.0,
+) -> tuple[Combination, ...]:
+    """Return the combinations with the added sensor or test that would determine their constants
+    best as the first of their `fixes`; unchanged where none would. Of specimens, the first test
+    that determines all of them well (`NARROW`) is taken.
+
+    Parameters
+    ----------
+    combinations : sequence of Combination
+    collocation : Collocation
+    z : (variables,) array
+        Variables that satisfy the equations of motion.
+    deviations : mapping of str to float or None
+        Standard deviations of the assumptions of the budget.
+    noise : float
+        Variance of the noise over that of the stated σ.
+    """
+    if not combinations:
+        return ()
+    found: list[list[Fix]] = [[] for _ in combinations]
+    for what, added in added_measurements(collocation, z):
+        try:
+            wide, at = _extended(collocation, z, added)
+            expected = expected_precision(wide, at, deviations)
+        except (InputError, SimulationError):
+            continue  # the law or the body does not allow this test
+        covariance = expected.covariance + (noise - 1) * expected.statistical
+        for fixes, each in zip(found, combinations, strict=True):
+            if set(each.determined.names) <= set(expected.names):
+                members = each.determined.names
+                fixes.append(widest_after(expected.names, members, covariance, what))
+        if all(fixes and fixes[-1].factor < NARROW for fixes in found):
+            break
+    best = (min(fixes, key=lambda fix: fix.factor, default=None) for fixes in found)
+    return tuple(
+        each if fix is None or fix.factor >= WIDE else replace(each, fixes=(fix, *each.fixes))
+        for each, fix in zip(combinations, best, strict=True)
+    )
+
+
+def added_measurements(
+    collocation: Collocation, z: Array
+) -> Iterator[tuple[str, Sequence[Experiment]]]:
+    """Yield measurements that may be added to a problem, as phrases with all experiments.
+
+    For specimens these are other tests of the same strains with the same relative noise and errors
+    of area and zero. A body with a mesh, of which no force is measured, gets a force sensor at its
+    grasp.
+    """
+    experiments = [each.experiment for each in collocation.transcriptions]
+    values = collocation.parameters.values(z[: collocation.nq])
+    tests = {each.specimen.test for each in experiments if each.specimen is not None}
+    for k, experiment in enumerate(experiments):
+        if experiment.specimen is None:
+            if not experiment.wrenches and experiment.grasps:
+                which = "" if len(experiments) == 1 else f" of '{experiment.name}'"
+                sensed = _with_force_sensor(collocation, z, k)
+                yield (
+                    f"a force sensor at the grasp{which} (noise {NOISE:.0%} of the largest force)",
+                    [*experiments[:k], sensed, *experiments[k + 1 :]],
+                )
+        elif len(experiment.body.parts) == 1:
+            for test, phrase in ADDED_TESTS.items():
+                if test not in tests:
+                    tests.add(test)
+                    yield (
+                        f"{phrase} up to the same strain",
+                        [*experiments, _other_test(experiment, test, values)],
+                    )
+
+
+def _other_test(experiment: Experiment, test: str, values: Mapping[str, float]) -> Experiment:
+    """Return another test of a specimen, up to the same strain, with the same noise over the
+    largest stress.
+    """
+    (part,) = experiment.body.parts
+    stress = experiment.readings[0]
+    assert stress.values is not None
+    relative = stress.sigma / np.nanmax(np.abs(stress.values))
+    strain, _ = specimen_strains(experiment)
+    body = cell_body(test, part.material, damping=part.damping, made=experiment.body.made)
+    blank = Specimen(test, strain, np.zeros_like(strain), 1.0)
+    added = blank.experiment(body=body, name=f"added {test}")
+    (stresses_pa,) = simulate(added, values).custom_sensor_values
+    specimen = replace(blank, sigma_pa=float(relative * np.abs(stresses_pa).max()))
+    return specimen.experiment(body=body, name=f"added {test}")
+
+
+def _with_force_sensor(collocation: Collocation, z: Array, number: int) -> Experiment:
+    """Return a fitted experiment with a force sensor at its first grasp."""
+    experiments = [each.experiment for each in collocation.transcriptions]
+    experiment = experiments[number]
+    blank = Wrench(experiment.t_s, np.zeros((len(experiment.t_s), 3)), 1.0)
+
+    def sensed(wrench: Wrench) -> Experiment:
+        first, *others = experiment.grasps
+        return replace(experiment, grasps=[replace(first, wrench=wrench), *others])
+
+    experiments[number] = sensed(blank)
+    wide, at = _extended(collocation, z, experiments)
+    measurements = experiments[number].measurements
+    predicted = fitted_values(wide.iterates(at)[number])
+    (forces_n,) = (
+        each for of, each in zip(measurements, predicted, strict=True) if isinstance(of, Wrench)
+    )
+    largest_n = float(np.nanmax(np.abs(np.asarray(forces_n)[:, :3])))
+    return sensed(replace(blank, sigma_n=NOISE * largest_n))
+
+
+def _extended(
+    collocation: Collocation, z: Array, experiments: Sequence[Experiment]
+) -> tuple[Collocation, Array]:
+    """Return the program of fitted experiments of which some are changed or new, and its variables:
+    new nuisance parameters are zero, and new experiments are simulated.
+    """
+    wide = replace(collocation, experiments=[*experiments])
+    p, positions = collocation.unpack(z)
+    by_name = dict(zip(collocation.list_parameter_names(), p.tolist(), strict=True))
+    known = {
+        each.experiment.name: x
+        for each, x in zip(collocation.transcriptions, positions, strict=True)
+    }
+    values = collocation.parameters.values(z[: collocation.nq])
+    motions = [
+        known[each.name]
+        if each.name in known
+        else simulate(each, values).positions_m.reshape(len(each.t_s), -1)
+        for each in experiments
+    ]
+    of_names = (by_name.get(name, 0.0) for name in wide.list_parameter_names())
+    return wide, wide.pack(np.fromiter(of_names, dtype=float), motions)

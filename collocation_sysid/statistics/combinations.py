@@ -1,0 +1,349 @@
+"""Combinations of constants that are determined where a constant alone is not.
+
+A covariance C of relative deviations (of logarithms) gives the standard deviation √(wᵀCw) of the
+product Π v_k^(w_k) of powers of the constants v. In units of the standard deviations of the
+constants, C is their correlation matrix: an eigenvalue ε ≪ 1 belongs to a product that is known √ε
+times better than each constant alone. What remains undetermined is the eigenvector of C itself with
+the largest eigenvalue: the product of powers with the widest interval.
+
+To first order, a product of powers is also a sum: d ln Σ c_k v_k = Σ w_k d ln v_k / Σ w_k for
+c_k = w_k / v_k. Where all weights have one sign and all constants one unit, the sum is stated,
+because forces are linear in moduli and the sum then holds also far from the estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ..common.array_types import Array, Index
+from ..common.display import short
+from ..fem.laws.constants import symbol_of, unit_of
+from .budget.combined_intervals import NORMAL_95
+
+Form = Literal["sum", "product", "unstated"]
+
+# Largest variance of a combination in units of the variances of its constants. At this value, two
+# constants have a correlation of 0.9, and the combination is known three times better than each.
+LARGEST_SHARE = 0.1
+# Share of the largest weight from which on a constant belongs to a combination, in units of
+# standard deviations; and smallest power that is written, relative to the largest one.
+MEMBER = 0.2
+SMALLEST_POWER = 0.05
+# Half width of an interval, as a factor, from which on the interval is wider than the value:
+# f − 1/f = 1.
+WIDE = (1 + 5**0.5) / 2
+# Half width, as a factor, from which on an interval is no information.
+HOPELESS = 1e4
+# Half width below which an interval is stated in percent.
+PERCENT = 1.5
+# Logarithm beyond which a factor is not representable.
+LARGEST_LOGARITHM = 700.0
+# Standard deviation of a constant that would be known, relative to its value.
+KNOWN = 0.05
+# A modulus replaces a combination if its interval is at most this many times as wide.
+SAME = 1.5
+
+
+def precision_text(factor: float) -> str:
+    """Return the half width of an interval, as a factor of 1 or more, as text that follows
+    "determine … ".
+    """
+    if factor < PERCENT:
+        return f"to ±{100 * (factor - 1):.2g} %"
+    return f"to within a factor of {short(factor)}" if factor < HOPELESS else "not at all"
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A product of powers, or a sum, of estimated constants, with its precision.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Constants, the one with the largest power first.
+    powers : tuple of float
+        Powers of the constants in a product, the first of them 1; or their factors in a sum.
+    form : {"sum", "product", "unstated"}
+        "unstated" if a value is not positive, so that powers of it do not exist.
+    factor : float
+        Half width of the 95 % interval, as a factor.
+    """
+
+    names: tuple[str, ...]
+    powers: tuple[float, ...]
+    form: Form
+    factor: float
+
+    @classmethod
+    def from_weights(
+        cls,
+        names: Sequence[str],
+        values: Array,
+        weights: Array,
+        covariance: Array,
+        smallest: float = SMALLEST_POWER,
+    ) -> Direction:
+        """Return the direction with weights (k,) of the logarithms of constants.
+
+        Parameters
+        ----------
+        names : sequence of str
+        values : (k,) array
+        weights : (k,) array
+        covariance : (k, k) array
+            Covariance of the relative deviations of the constants.
+        smallest : float
+            Smallest weight over the largest one that is stated; the interval contains all.
+        """
+        sizes = np.abs(weights)
+        order = np.argsort(-sizes, kind="stable")
+        kept = order[sizes[order] >= smallest * sizes.max()]
+        w = weights[kept] / weights[kept[0]]
+        own = tuple(names[k] for k in kept.tolist())
+        variance = max(0.0, weights @ covariance @ weights) / weights[kept[0]] ** 2
+        form: Form = "product"
+        if not (values[kept] > 0).all():
+            form = "unstated"
+        elif len(kept) > 1 and (w > 0).all() and len({unit_of(name) for name in own}) == 1:
+            form = "sum"
+            variance /= w.sum() ** 2
+            w = w * values[kept[0]] / values[kept]
+        factor = float(np.exp(min(NORMAL_95 * np.sqrt(variance), LARGEST_LOGARITHM)))
+        return cls(own, tuple(w.tolist()), form, factor)
+
+    def formula(self) -> str:
+        """Return the combination as text, such as "λ + 0.9 μ" or "E · ν^0.22"."""
+        symbols = [symbol_of(name) for name in self.names]
+        if self.form == "unstated" and len(symbols) > 1:
+            return f"one combination of {', '.join(symbols)}"
+        if self.form == "sum":
+            terms = (
+                symbol if f"{factor:.2g}" == "1" else f"{factor:.2g} {symbol}"
+                for factor, symbol in zip(self.powers, symbols, strict=True)
+            )
+            return " + ".join(terms)
+        text = symbols[0]
+        for power, symbol in zip(self.powers[1:], symbols[1:], strict=True):
+            exponent = f"{abs(power):.2g}"
+            text += " · " if power > 0 else " / "
+            text += symbol if exponent == "1" else f"{symbol}^{exponent}"
+        return text
+
+
+@dataclass(frozen=True)
+class Fix:
+    """What would determine the constants of a combination, with its predicted effect.
+
+    Attributes
+    ----------
+    what : str
+        The known value, sensor or recording, as a phrase.
+    name : str
+        Constant with the widest interval afterwards.
+    factor : float
+        Half width of that interval, as a factor.
+    """
+
+    what: str
+    name: str
+    factor: float
+
+    def sentence(self) -> str:
+        """Return the effect as a clause."""
+        return f"{self.what} would determine {symbol_of(self.name)} {precision_text(self.factor)}"
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Constants of which only a combination is determined.
+
+    Attributes
+    ----------
+    determined : Direction
+        The combination with the narrowest interval.
+    loosest : Direction
+        The combination of the same constants with the widest interval.
+    modulus : str or None
+        Derived modulus that is known as well as `determined`, which it replaces in sentences.
+    fixes : tuple of Fix
+        Ways to determine the constants, the most effective first.
+    """
+
+    determined: Direction
+    loosest: Direction
+    modulus: str | None = None
+    fixes: tuple[Fix, ...] = ()
+
+    def precision(self) -> str:
+        """Return how well the combination is determined, as text; empty if it has no formula."""
+        if self.determined.form == "unstated":
+            return ""
+        return precision_text(self.determined.factor)
+
+    def sentence(self) -> str:
+        """Return what is determined and what is not, as a sentence without a full stop."""
+        formula = self.determined.formula()
+        if self.determined.form == "unstated":
+            return f"the data determine only {formula}"
+        if self.modulus is not None:
+            formula = f"{symbol_of(self.modulus)} (about {formula})"
+        loose = precision_text(self.loosest.factor)
+        only = "" if loose.startswith("not") else "only "
+        return (
+            f"the data determine {formula} {self.precision()}, and "
+            f"{self.loosest.formula()} {only}{loose}"
+        )
+
+    def statement(self, most: int | None = None) -> str:
+        """Return `sentence` and what would determine the constants: at most so many ways, all by
+        default.
+        """
+        fixes = "; ".join(fix.sentence() for fix in self.fixes[:most])
+        return f"{self.sentence()}{'; ' if fixes else ''}{fixes}"
+
+    def with_known_value(self, names: Sequence[str], covariance: Array) -> Combination:
+        """Return the combination with the constant, among its `fixes`, of which a value known to
+        `KNOWN` would determine the others best; unchanged if one of them would remain undetermined.
+
+        Parameters
+        ----------
+        names : sequence of k str
+            Constants of the covariance.
+        covariance : (k, k) array
+            Covariance of their relative deviations.
+        """
+        members = self.determined.names
+        fixes = []
+        for known in members:
+            k = names.index(known)
+            gain = np.outer(covariance[:, k], covariance[:, k]) / (covariance[k, k] + KNOWN**2)
+            others = [name for name in members if name != known]
+            what = f"{symbol_of(known)} known to {KNOWN:.0%}"
+            fixes.append(widest_after(names, others, covariance - gain, what))
+        best = min(fixes, key=lambda fix: fix.factor)
+        return replace(self, fixes=(*self.fixes, best)) if best.factor < WIDE else self
+
+
+def find_combinations(
+    names: Sequence[str],
+    values: Array,
+    covariance: Array,
+    undetermined: Collection[str],
+    moduli: Mapping[str, Array] | None = None,
+) -> tuple[Combination, ...]:
+    """Return the combinations that are determined although one of their constants alone is not,
+    the best determined in units of its constants first.
+
+    Parameters
+    ----------
+    names : sequence of k str
+        Constants.
+    values : (k,) array
+        Their values.
+    covariance : (k, k) array
+        Finite covariance of their relative deviations, for normal distributions.
+    undetermined : collection of str
+        Constants that are not determined alone.
+    moduli : mapping of str to (k,) array, optional
+        Relative derivatives of derived moduli by the logarithms of the constants.
+    """
+    deviations = np.sqrt(np.diag(covariance))
+    known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0))
+    if len(known) < 2:
+        return ()
+    scaled = covariance[np.ix_(known, known)] / np.outer(deviations[known], deviations[known])
+    found: dict[tuple[int, ...], Combination] = {}
+    for variance, vector in zip(*_eigenpairs(scaled), strict=True):
+        if variance > LARGEST_SHARE:
+            break
+        inside = np.flatnonzero(np.abs(vector) > MEMBER * np.abs(vector).max())
+        members = known[inside]
+        if len(members) < 2 or not {names[k] for k in members.tolist()} & set(undetermined):
+            continue
+        within = covariance[np.ix_(members, members)]
+        variances, vectors = _eigenpairs(scaled[np.ix_(inside, inside)])
+        if variances[0] > LARGEST_SHARE:
+            continue  # the constants left out belong to it
+        own = [names[k] for k in members.tolist()]
+        weights = vectors[0] / deviations[members]
+        best = Direction.from_weights(own, values[members], weights, within, smallest=0.0)
+        loosest = Direction.from_weights(own, values[members], _eigenpairs(within)[1][-1], within)
+        if best.factor >= min(HOPELESS, loosest.factor):
+            continue
+        modulus = _equal_modulus(best, members, covariance, moduli or {})
+        found.setdefault(tuple(members.tolist()), Combination(best, loosest, modulus))
+    return tuple(found.values())
+
+
+def principal_directions(
+    names: Sequence[str], values: Array, covariance: Array
+) -> tuple[Direction, ...]:
+    """Return the independent combinations of k constants, the eigenvectors of a finite covariance
+    (k, k) of their relative deviations, the best determined first.
+    """
+    _, vectors = _eigenpairs(covariance)
+    found = (Direction.from_weights(names, values, vector, covariance) for vector in vectors)
+    return tuple(sorted(found, key=lambda direction: direction.factor))
+
+
+def undetermined_names(names: Sequence[str], covariance: Array) -> set[str]:
+    """Return the constants whose interval is wider than their value, from the covariance (k, k) of
+    their relative deviations.
+    """
+    widest = np.log(WIDE) / NORMAL_95
+    return {
+        name
+        for name, variance in zip(names, np.diag(covariance), strict=True)
+        if variance > widest**2
+    }
+
+
+def widest_after(
+    names: Sequence[str], members: Collection[str], covariance: Array, what: str
+) -> Fix:
+    """Return the effect of a measurement on some constants: the widest of their intervals.
+
+    Parameters
+    ----------
+    names : sequence of k str
+        Constants of the covariance.
+    members : collection of str
+        Constants that count.
+    covariance : (k, k) array
+        Covariance of their relative deviations with the measurement.
+    what : str
+        The measurement, as a phrase.
+    """
+    variances = {
+        name: max(0.0, covariance[k, k]) for k, name in enumerate(names) if name in members
+    }
+    widest = max(variances, key=lambda name: variances[name])
+    reach = min(NORMAL_95 * np.sqrt(variances[widest]), LARGEST_LOGARITHM)
+    return Fix(what, widest, float(np.exp(reach)))
+
+
+def _eigenpairs(matrix: Array) -> tuple[Array, Array]:
+    """Return the eigenvalues (k,) of a symmetric matrix, ascending, and its eigenvectors in rows."""
+    values, vectors = np.linalg.eigh(matrix)
+    return values, vectors.T
+
+
+def _equal_modulus(
+    best: Direction, members: Index, covariance: Array, moduli: Mapping[str, Array]
+) -> str | None:
+    """Return the derived modulus that depends on these constants (their indices) alone and has an
+    interval at most `SAME` times as wide as a combination of them; None without one.
+    """
+    others = np.setdiff1d(np.arange(len(covariance)), members)
+    for name, slope in moduli.items():
+        size = np.abs(slope[members]).max(initial=0.0)
+        if not size or np.abs(slope[others]).max(initial=0.0) > SMALLEST_POWER * size:
+            continue
+        deviation = float(np.sqrt(max(0.0, slope @ covariance @ slope)))
+        if NORMAL_95 * deviation <= SAME * np.log(best.factor):
+            return name
+    return None

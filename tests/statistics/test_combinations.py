@@ -1,0 +1,207 @@
+"""Combinations of constants that are determined where a constant alone is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.common.array_types import Array
+from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.result.pictures.confidence import combinations_picture
+from collocation_sysid.runs.expected_precision import expected_precision, with_measurements
+from collocation_sysid.statistics.combinations import (
+    Direction,
+    find_combinations,
+    principal_directions,
+    undetermined_names,
+)
+from collocation_sysid.statistics.estimates import UNDETERMINED
+
+Z95 = 1.96
+MODULI = ("lambda_pa", "mu_pa")
+
+
+def pair(determined: Array, deviation: float, open_deviation: float) -> Array:
+    """Covariance of two logarithms: the combination with these weights, over its largest one, has
+    one deviation, and the one across it, over its largest weight, another.
+    """
+    across = np.array([-determined[1], determined[0]])
+    parts = ((determined, deviation), (across, open_deviation))
+    unit = [(w / np.abs(w).max(), s) for w, s in parts]
+    return np.sum([s**2 * np.outer(w, w) / (w @ w) ** 2 for w, s in unit], axis=0)
+
+
+def combinations(covariance: Array, names=MODULI, values=(1.0, 1.0), **known):
+    vague = undetermined_names(names, covariance)
+    return find_combinations(names, np.array(values), covariance, vague, **known)
+
+
+def test_a_sum_of_moduli_is_determined_to_a_percent_and_their_ratio_to_a_factor():
+    """Measurements of λ + 0.9 μ, whose logarithm changes by (1, 0.9) / 1.9 per logarithm."""
+    weights = np.array([1.0, 0.9])
+    deviation = 1.9 * np.log(1.01) / Z95  # of the product, which has the largest weight 1
+    covariance = pair(weights, deviation, np.log(4.0) / Z95)
+    (found,) = combinations(covariance)
+    assert found.sentence() == (
+        "the data determine λ + 0.9 μ to ±1 %, and μ / λ^0.9 only to within a factor of 4"
+    )
+    assert found.determined.form == "sum"
+    assert found.determined.factor == pytest.approx(1.01, abs=1e-4)
+
+
+def test_the_factors_of_a_sum_follow_from_the_values():
+    """d ln(λ + 0.5 μ) = (λ d ln λ + 0.5 μ d ln μ) / (λ + 0.5 μ)."""
+    values = (2000.0, 300.0)
+    weights = np.array([2000.0, 150.0]) / 2150.0
+    (found,) = combinations(pair(weights, 1e-3, 1.0), values=values)
+    assert found.determined.names == MODULI
+    assert found.determined.powers == pytest.approx((1.0, 0.5), rel=1e-3)
+    assert np.log(found.determined.factor) == pytest.approx(
+        Z95 * 1e-3 * np.abs(weights).max(), rel=1e-2
+    )
+
+
+def test_constants_of_different_units_form_a_product():
+    weights = np.array([1.0, 0.22])
+    (found,) = combinations(pair(weights, 5e-4, 1.0), ("young_pa", "poisson"), (3e4, 0.4))
+    assert found.determined.formula() == "E · ν^0.22"
+    assert found.loosest.formula() == "ν / E^0.22"
+    assert found.determined.powers == pytest.approx((1.0, 0.22), rel=1e-3)
+
+
+def test_a_direction_without_information_is_not_determined_at_all():
+    (found,) = combinations(pair(np.array([1.0, 1.0]), 1e-3, UNDETERMINED))
+    assert found.sentence().endswith("and λ / μ not at all") or found.sentence().endswith(
+        "and μ / λ not at all"
+    )
+
+
+def test_constants_that_are_determined_alone_need_no_combination():
+    assert combinations(pair(np.array([1.0, 0.9]), 1e-4, 0.1)) == ()
+
+
+def test_a_constant_that_is_confounded_with_none_is_in_no_combination():
+    assert combinations(np.diag([1e-4, 4.0])) == ()
+
+
+def test_three_constants_can_be_confounded_without_any_two_being_so():
+    basis = np.array([[1.0, 0, 0], [0, 1.0, 0], [1, 1, 0.1]])
+    names = (*MODULI, "gamma_r_s")
+    (found,) = combinations(0.5**2 * basis @ basis.T, names, (1.0, 1.0, 1.0))
+    assert set(found.determined.names) == set(names)
+    powers = dict(zip(found.determined.names, found.determined.powers, strict=True))
+    assert powers["gamma_r_s"] / powers["mu_pa"] == pytest.approx(-1.0, abs=0.01)
+
+
+def test_a_third_with_a_fifth_of_the_others_share_belongs_to_the_combination():
+    basis = np.array([[1.0, 0, 0], [-1.0, -0.35, 0.05], [0, 1.0, 0]])
+    names = (*MODULI, "gamma_r_s")
+    found = combinations(basis @ basis.T, names, (1.0, 1.0, 1.0))
+    powers = dict(zip(found[0].determined.names, found[0].determined.powers, strict=True))
+    assert powers["gamma_r_s"] / powers["mu_pa"] == pytest.approx(0.35, abs=0.01)
+
+
+def test_values_that_are_not_positive_have_no_powers():
+    (found,) = combinations(pair(np.array([1.0, 1.0]), 1e-3, 1.0), values=(1.0, -1.0))
+    assert found.sentence() == "the data determine only one combination of λ, μ"
+
+
+def test_a_modulus_that_is_known_as_well_names_the_combination():
+    weights = np.array([1.0, 0.9]) / 1.9
+    moduli = {"young_pa": weights, "poisson": np.array([1.0, -1.0])}
+    (found,) = combinations(pair(weights, 1e-2, 1.0), moduli=moduli)
+    assert found.modulus == "young_pa"
+    assert found.sentence().startswith("the data determine E (about λ + 0.9 μ) to ±")
+
+
+def test_a_known_value_conditions_the_others():
+    """With λ · μ exact, the interval of one constant is that of the other."""
+    covariance = pair(np.array([1.0, 1.0]), 1e-6, 1.0)
+    (found,) = combinations(covariance)
+    (fix,) = found.with_known_value(MODULI, covariance).fixes
+    assert fix.what == ("μ known to 5%" if fix.name == "lambda_pa" else "λ known to 5%")
+    assert np.log(fix.factor) == pytest.approx(Z95 * 0.05, rel=0.01)
+
+
+def test_principal_directions_are_independent():
+    covariance = pair(np.array([1.0, 0.5]), 1e-2, 1.0)
+    best, worst = principal_directions(MODULI, np.ones(2), covariance)
+    assert best.formula() == "λ + 0.5 μ"
+    assert worst.formula() == "μ / λ^0.5"
+    assert np.log(worst.factor) == pytest.approx(Z95, rel=1e-3)
+
+
+def test_the_picture_has_a_bar_for_each_constant_and_combination():
+    directions = [
+        Direction(MODULI, (1.0, 0.9), "sum", 1.01),
+        Direction(("mu_pa", "lambda_pa"), (1.0, -0.9), "product", 1e6),
+    ]
+    (axes,) = combinations_picture({"lambda_pa": 3.0, "mu_pa": 4.0}, directions).axes
+    assert [each.get_text() for each in axes.get_yticklabels()] == [
+        "λ", "μ", "λ + 0.9 μ", "μ / λ^0.9",
+    ]  # fmt: skip
+    lengths = [bar.get_x() + bar.get_width() for bar in axes.patches]
+    assert lengths[:3] == pytest.approx(np.log([3.0, 4.0, 1.01]))
+
+
+# Of specimens -------------------------------------------------------------------------------------
+
+
+def specimen_program(test, material, truth, free, strain):
+    """Program of a simulated specimen at the truth, and its variables."""
+    strains = np.linspace(strain / 9, strain, 9)
+    blank = cs.Specimen(test, strains, 0 * strains, 1.0)
+    (stress_pa,) = cs.simulate(blank.experiment(material), truth).custom_sensor_values
+    measured = replace(blank, stress_pa=stress_pa[:, 0], sigma_pa=1e-3 * np.abs(stress_pa).max())
+    unknown = {name: cs.Unknown(truth[name]) for name in free}
+    problem = cs.Problem([measured.experiment(material)], truth | unknown)
+    collocation = problem.collocation()
+    z, failures = initial_variables(collocation)
+    assert not failures
+    return problem, collocation, z
+
+
+def test_a_tension_test_determines_young_modulus_of_two_moduli():
+    """E = μ (3 λ + 2 μ) / (λ + μ): at λ = μ, ∂E/∂λ = 1/4 and ∂E/∂μ = 9/4."""
+    truth = {"lambda_pa": 1e5, "mu_pa": 1e5}
+    problem, collocation, z = specimen_program("uniaxial", "neo-hookean", truth, MODULI, 2e-3)
+    expected = expected_precision(collocation, z, problem.assumed_deviations)
+    (found,) = expected.combinations()
+    assert found.modulus == "young_pa"
+    assert found.determined.names == ("mu_pa", "lambda_pa")
+    assert found.determined.powers == pytest.approx((1.0, 1 / 9), rel=0.02)
+    assert found.loosest.factor > 100.0
+
+
+def test_a_confined_test_determines_the_modulus_of_plane_waves():
+    """λ + 2 μ = E (1 − ν) / ((1 + ν) (1 − 2ν)), whose logarithm changes with that of ν by 0.8407."""
+    truth, free = {"young_pa": 2.5e5, "poisson": 0.3}, ("young_pa", "poisson")
+    problem, collocation, z = specimen_program("confined", "neo-hookean", truth, free, 2e-3)
+    expected = expected_precision(collocation, z, problem.assumed_deviations)
+    (found,) = expected.combinations()
+    assert found.determined.formula() == "E · ν^0.84"
+    assert found.determined.powers == pytest.approx((1.0, 0.8407), rel=0.01)
+
+
+@pytest.mark.long
+def test_another_test_is_named_that_would_determine_both_constants():
+    truth = {"lambda_pa": 1e5, "mu_pa": 1e5}
+    problem, collocation, z = specimen_program("uniaxial", "neo-hookean", truth, MODULI, 0.02)
+    deviations = problem.assumed_deviations
+    found = expected_precision(collocation, z, deviations).combinations()
+    (each,) = with_measurements(found, collocation, z, deviations)
+    added, known = each.fixes
+    assert added.what == "an equibiaxial test up to the same strain"
+    assert known.what == "λ known to 5%"
+    # As predicted with both tests in one problem.
+    second = specimen_program("equibiaxial", "neo-hookean", truth, MODULI, 0.02)[0].experiments[0]
+    both = replace(problem, experiments=[*problem.experiments, replace(second, name="second")])
+    program = both.collocation()
+    z, _ = initial_variables(program)
+    expected = expected_precision(program, z, deviations)
+    k = expected.names.index(added.name)
+    reach = Z95 * np.sqrt(expected.covariance[k, k])
+    assert np.log(added.factor) == pytest.approx(reach, rel=0.05)
