@@ -17,10 +17,12 @@ from .common.array_types import Array
 from .common.checked_calls import checked
 from .common.display import plain_text
 from .common.step_counting import StepUnit, counted_phase
+from .common.time_limit import TimeLimitReached, time_limit
 from .errors import InputError, SimulationError
 from .fem.two_phase import TwoPhaseModes
 from .methods.experiment_executors import connect_executor
 from .methods.initial_trajectories import simulate_trajectories
+from .methods.reduced_space import ReducedSpace
 from .methods.solution import Method, Solution, Status, Watch
 from .model.schemes import as_scheme
 from .problem import Problem
@@ -35,7 +37,12 @@ from .runs.numerical_error import refine
 from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
 from .runs.solved_problem import SolvedProblem
-from .runs.solving import solve, solve_with_renewed_correspondences, with_workers
+from .runs.solving import (
+    continued_beyond_bounds,
+    solve,
+    solve_with_renewed_correspondences,
+    with_workers,
+)
 from .runs.warm_start import WarmStart
 from .statistics.assessment import WITHIN_BUDGET, fit_concerns, rotation_step_concerns
 from .statistics.budget.consider_analysis import ResidualChanges, changes_of_assumptions
@@ -200,50 +207,57 @@ def run(
     problem = _with_estimated_fields(problem, solution)
     answer = Run(problem, solution, rollouts={}, uncertainty=None)
     missing = "the result has no error bars and was not checked by a forward simulation"
-    try:
-        answer, fit = _checked(problem, answer.solution, say=say)
-        missing = (
-            "the steps after the error bars were skipped: a finer time step, and causes "
-            "of the misfit"
-        )
-        if problem.substeps == "auto":
-            answer, fit = _fine_enough(
-                answer,
-                fit,
-                solver=problem.solver(method),
-                watch=watch,
-                say=say,
-                scheduler=scheduler,
+    solver = problem.solver(method)
+    limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else np.inf
+    with time_limit(max(0.0, limit_s - (searched_s - began_s))):
+        try:
+            answer, fit = _checked(problem, answer.solution, say=say)
+            missing = (
+                "the steps after the error bars were skipped: a finer time step, and causes "
+                "of the misfit"
             )
-        answer = _with_problem_notes(answer)
-        if answer.uncertainty is not None and fit is not None:
-            known = answer.uncertainty
-            if not problem.uncertainty.numerical:
-                answer = _with_mesh_error(answer, fit, say=say)
-            profiles = profile_likelihoods(answer, fit, say=say)
-            changes = _changes(answer, say)
-            sources = _sources(answer, fit, known=known, changes=changes)
-            answer = replace(answer, profiles=profiles, systematic_effects=sources)
-            answer = _with_added_measurements(answer, say)
-            solved_fit = _solved_fit(answer, fit, changes)
-            answer = replace(answer, probes=_probes(solved_fit, say=say, deep=probe))
-            answer = _with_budgeted_residuals(answer, solved_fit)
-            answer = _with_offset_notes(answer, fit)
-        if answer.solution.status is Status.INTERRUPTED:
+            if problem.substeps == "auto":
+                answer, fit = _fine_enough(
+                    answer,
+                    fit,
+                    solver=problem.solver(method),
+                    watch=watch,
+                    say=say,
+                    scheduler=scheduler,
+                )
+            answer = _with_problem_notes(answer)
+            if answer.uncertainty is not None and fit is not None:
+                known = answer.uncertainty
+                if not problem.uncertainty.numerical:
+                    answer = _with_mesh_error(answer, fit, say=say)
+                profiles = profile_likelihoods(answer, fit, say=say)
+                changes = _changes(answer, say)
+                sources = _sources(answer, fit, known=known, changes=changes)
+                answer = replace(answer, profiles=profiles, systematic_effects=sources)
+                answer = _with_added_measurements(answer, say)
+                solved_fit = _solved_fit(answer, fit, changes)
+                answer = replace(answer, probes=_probes(solved_fit, say=say, deep=probe))
+                answer = _with_budgeted_residuals(answer, solved_fit)
+                answer = _with_offset_notes(answer, fit)
+            if answer.solution.status is Status.INTERRUPTED:
+                return timed(answer)
+            if seek_causes and answer.budgeted is None:
+                say("testing possible causes of the misfit")
+                causes = find_misspecifications(answer.solution)
+                tested = cause_notes(answer.solution, causes)
+                causes = tuple(each for each in causes if not each.is_open)
+                answer = replace(answer, causes=causes, notes=(*answer.notes, *tested))
+            if problem.uncertainty.numerical and answer.uncertainty is not None:
+                answer = refine(answer, report_progress=say, watch=watch)
             return timed(answer)
-        if seek_causes and answer.budgeted is None:
-            say("testing possible causes of the misfit")
-            causes = find_misspecifications(answer.solution)
-            tested = cause_notes(answer.solution, causes)
-            causes = tuple(each for each in causes if not each.is_open)
-            answer = replace(answer, causes=causes, notes=(*answer.notes, *tested))
-        if problem.uncertainty.numerical and answer.uncertainty is not None:
-            answer = refine(answer, report_progress=say, watch=watch)
-        return timed(answer)
-    except KeyboardInterrupt:
-        unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
-        rollouts = unsimulated | dict(answer.rollouts)
-        return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
+        except (KeyboardInterrupt, TimeLimitReached) as end:
+            unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
+            rollouts = unsimulated | dict(answer.rollouts)
+            if isinstance(end, TimeLimitReached):
+                is_late = answer.solution.status is Status.TIME_LIMIT
+                why = answer.solution.message if is_late else f"at the limit of {limit_s:g} s,"
+                missing = f"{why} {missing}"
+            return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
 
 
 def _with_estimated_fields(problem: Problem, solution: Solution) -> Problem:
@@ -559,10 +573,11 @@ def _solve_from_parameters(
     if failure is not None:
         raise failure
     with connect_executor(scheduler) as workers:
+        method = with_workers(solver, workers)
         solution = solve_with_renewed_correspondences(
-            with_workers(solver, workers),
-            collocation,
-            watch=watch,
-            start=collocation.pack(p, positions),
+            method, collocation, watch=watch, start=collocation.pack(p, positions)
         )
+        if isinstance(solver, ReducedSpace):
+            # Errors of coarse steps may have hidden that the best value is beyond a default bound.
+            solution = continued_beyond_bounds(method, solution, watch)
     return solution.unless_interrupted()

@@ -29,6 +29,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.time_limit import time_limit, unlimited
 from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
@@ -70,6 +71,9 @@ class ReducedSpace(SearchOptions):
     coarse_start_tolerance : float
         Tolerance of the search on the given mesh after a coarse start, if it is larger than
         `tolerance`. The default is far below the error of any mesh, and saves a sweep or two.
+    max_time_s : float
+        Time limit of a run [s]: the search ends with the best iterate, and later steps, such as
+        error bars, are left out.
     """
 
     name: ClassVar[str] = "reduced-space"
@@ -77,6 +81,7 @@ class ReducedSpace(SearchOptions):
     coarse_start: Literal["auto", False] = "auto"
     coarse_start_nodes: AtLeastOne = 1500
     coarse_start_tolerance: Positive = 1e-6
+    max_time_s: Positive = 1e6
 
     @one_blas_thread()
     def __call__(
@@ -105,21 +110,23 @@ class ReducedSpace(SearchOptions):
         recorder = Recorder(self.name, collocation, watch=watch)
         search = ReducedSearch(self, recorder, start=start, workers=workers)
         try:
-            status = search.solve_from_start()
-            is_started = status is not None
-            for share in () if is_started else self.ladder:
-                horizon = search.horizon_of_share(share)
-                search.extend_to(horizon)
-                status = search.minimise(horizon, share == self.ladder[-1])
-                if status is Status.ITERATION_LIMIT:
-                    break
+            with time_limit(self.max_time_s):
+                status = search.solve_from_start()
+                is_started = status is not None
+                for share in () if is_started else self.ladder:
+                    horizon = search.horizon_of_share(share)
+                    search.extend_to(horizon)
+                    status = search.minimise(horizon, share == self.ladder[-1])
+                    if status is Status.ITERATION_LIMIT:
+                        break
             status = status or Status.CONVERGED
             if search.ended_by_association:
                 recorder.notes.append(ENDED_BY_ASSOCIATION)
             message = status.explain(self.name, max_iterations=self.max_iterations)
         except SEARCH_ENDS as end:
             status, message = status_of_end(end)
-        return _solution_of_search(search, workers, status=status, message=message)
+        with unlimited():
+            return _solution_of_search(search, workers, status=status, message=message)
 
 
 def _solution_of_search(

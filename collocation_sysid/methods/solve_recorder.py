@@ -7,6 +7,7 @@ import time
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.time_limit import TimeLimitReached
 from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch
@@ -32,19 +33,23 @@ class SearchEnded(Exception):
 
 
 # Exceptions that end a search with a status, see `status_of_end`.
-SEARCH_ENDS = (SearchEnded, SimulationError, KeyboardInterrupt)
+SEARCH_ENDS = (SearchEnded, SimulationError, TimeLimitReached, KeyboardInterrupt)
 
 
-def status_of_end(end: SearchEnded | SimulationError | KeyboardInterrupt) -> tuple[Status, str]:
+def status_of_end(
+    end: SearchEnded | SimulationError | TimeLimitReached | KeyboardInterrupt,
+) -> tuple[Status, str]:
     """Return the status and message of a search that one of the `SEARCH_ENDS` has ended.
 
-    `SearchEnded` gives its own status, `SimulationError` gives `NOT_SIMULABLE`, and
-    `KeyboardInterrupt` gives `INTERRUPTED`.
+    `SearchEnded` gives its own status, `SimulationError` gives `NOT_SIMULABLE`,
+    `TimeLimitReached` gives `TIME_LIMIT`, and `KeyboardInterrupt` gives `INTERRUPTED`.
     """
     if isinstance(end, SearchEnded):
         return end.status, end.message
     if isinstance(end, KeyboardInterrupt):
         return Status.INTERRUPTED, Status.INTERRUPTED.sentence
+    if isinstance(end, TimeLimitReached):
+        return Status.TIME_LIMIT, Status.TIME_LIMIT.sentence
     # Another stiffness does not prevent that a surface wrinkles: stretches decide.
     is_physical = end.stability_loss is not None and end.stability_loss.is_surface_instability
     sentence = (

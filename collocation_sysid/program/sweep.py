@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
 from ..common.step_counting import StepUnit, complete_steps
+from ..common.time_limit import require_time
 from ..errors import SimulationError
 from ..fem.body import Linearisation
 from ..model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
@@ -920,6 +921,7 @@ class ForwardSubstitution:
                     self.solve_step(step, right, force=force, out=solution)
                 self.indefinite += not step.factor.positive_definite
                 complete_steps(StepUnit.TIME_STEP)
+                require_time()
                 yield solution
 
     def _residual(self, step: FactorisedStep, acceleration: Array) -> Array:

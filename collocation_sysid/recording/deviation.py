@@ -132,6 +132,9 @@ class Deviation:
         Condition under which the description is wrong by one unit, with the placeholder
         "component", for a deviation whose alternative is reported. It is also evaluated if the
         budget does not contain the deviation, unless that is stated to be exact.
+    proportional_to : callable, optional
+        Whether the forces as described and those of the alternative are proportional to a constant,
+        by name, see `uncertainty_budget.rescaled`.
     key : str
         Key of [experiment.nuisance] in the problem file.
     reference : float or None
@@ -192,6 +195,7 @@ class Deviation:
     is_one_sided: bool = False
     redefines: tuple[str, ...] = ()
     alternative: str = ""
+    proportional_to: Callable[[str], bool] | None = None
     key: str = ""
     reference: float | None = None
     changes: tuple[ModelPart, ...] = ("reading",)

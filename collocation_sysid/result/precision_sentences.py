@@ -8,11 +8,12 @@ from ..errors import listed
 from ..fem.laws.constants import is_modulus, symbol_of, unit_of
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import is_definition
+from ..statistics.remedies import remedy_for
 
 
 def alternative_sentences(result: Result) -> Iterator[str]:
     """Yield a sentence on each alternative: the values of constants that it defines differently, or
-    else the change of a modulus, whose sign is that of an unknown direction.
+    else the change of a modulus, without its sign where the direction of gravity is not known.
     """
     known = result.collect_estimates()
     for each in result.alternatives:
@@ -24,11 +25,12 @@ def alternative_sentences(result: Result) -> Iterator[str]:
             ]
             yield f"{each.condition}: {listed(values)}"
         elif (name := _shown_modulus(each.values)) is not None and known[name].value:
-            change = abs(each.values[name] / known[name].value - 1)
-            yield (
-                f"{each.condition}, {symbol_of(name)} would change by about {change:.0%} "
-                f"(object.{each.assumption} is not stated)"
-            )
+            change = each.values[name] / known[name].value - 1
+            if each.assumption == "rest_shape":
+                by = f"{abs(change):.0%} (object.rest_shape is not stated)"
+            else:
+                by = f"{change:+.0%}; {remedy_for(each.assumption)}"
+            yield f"{each.condition}, {symbol_of(name)} would change by about {by}"
 
 
 def origin_sentences(result: Result) -> Iterator[str]:

@@ -10,9 +10,11 @@ from pathlib import Path
 from ..common.array_types import Array
 from ..common.checked_calls import checked
 from ..common.step_counting import search_activity
+from ..common.time_limit import TimeLimitReached, time_limit
 from ..errors import InputError
 from ..features.measurements import lost_samples
 from ..features.registry import FEATURES
+from ..fem.laws.constants import without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
@@ -66,6 +68,8 @@ FINAL_STATUSES = (
 LEAST_GAIN = 1e-3
 # Least tolerance of a solve on a coarser mesh: below the difference between both meshes.
 COARSE_TOLERANCE = 1e-4
+# Poisson's ratio from which elements that do not average the volume need many small steps.
+INCOMPRESSIBLE = 0.499
 # Most repetitions of a solve whose estimates change the correspondences of the measurements.
 MOST_REREADINGS = 5
 
@@ -126,6 +130,49 @@ def solve(
     for experiment in problem.experiments:
         experiment.require_measured_values()
     solver = problem.solver(method)
+    if isinstance(solver, ReducedSpace):
+        try:
+            with time_limit(solver.max_time_s):
+                solution = _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+        except TimeLimitReached:
+            raise InputError(
+                f"no start of the search was found within {solver.max_time_s:g} s; raise the limit, "
+                f"or give guesses{_incompressible_remedy(problem)}",
+                problem.path,
+                where="solver.reduced-space.max_time_s",
+            ) from None
+        if solution.status is Status.TIME_LIMIT:
+            remedy = _incompressible_remedy(problem)
+            solution = replace(solution, message=solution.message.rstrip(".") + f"{remedy}.")
+        return solution
+    return _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+
+
+def _incompressible_remedy(problem: Problem) -> str:
+    """Return a phrase for problems whose simulations are slow because the elements are not made for
+    a Poisson's ratio that is stated or guessed near one half; "" for others.
+    """
+    ratios = [
+        item.guess
+        for item in problem.parameters.components
+        if without_region(item.name) == "poisson" and item.guess and item.guess > INCOMPRESSIBLE
+    ]
+    if not ratios or all(body.element.mean_dilatation for body in problem.bodies):
+        return ""
+    return (
+        f"; with Poisson's ratio {max(ratios):g} these elements need many small steps: "
+        'use element = "tet10-p0"'
+    )
+
+
+def _solve_by(
+    solver: Method,
+    problem: Problem,
+    watch: Watch | None,
+    start: str | Path | WarmStart | None,
+    scheduler: str | None,
+) -> Solution:
+    """Return the solution of `solve` with a method."""
     if scheduler is not None and not isinstance(solver, ReducedSpace):
         raise InputError(
             f"{getattr(solver, 'name', solver)} cannot distribute its experiments to workers; "
@@ -484,7 +531,14 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
         Called with every iteration of the other searches.
     """
     best = _better_of(solver, first, watch, choose=second_start)
-    return _better_of(solver, best, watch, choose=start_beyond_bounds)
+    return continued_beyond_bounds(solver, best, watch)
+
+
+def continued_beyond_bounds(solver: Method, first: Solution, watch: Watch | None) -> Solution:
+    """Return the better of a solution and of the one that continues at default bounds, as
+    `best_of_second_start`.
+    """
+    return _better_of(solver, first, watch, choose=start_beyond_bounds)
 
 
 def _better_of(

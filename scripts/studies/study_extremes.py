@@ -57,8 +57,10 @@ class Extreme:
     rate_hz: float = 60.0
     duration_s: float = 0.4
 
-    def run(self) -> dict[str, Any]:
-        """Simulate the recording, identify it, and return what the table shows."""
+    def run(self, max_time_s: float) -> dict[str, Any]:
+        """Simulate the recording, identify it with a limit of time, and return what the table
+        shows.
+        """
         import numpy as np
 
         import collocation_sysid as cs
@@ -86,7 +88,17 @@ class Extreme:
         unknown = truth | {name: cs.Unknown() for name in self.free}
         problem = cs.Problem([recorded], unknown)
         before_s = _cpu_s()
-        answer = cs.run(problem)
+        try:
+            answer = cs.run(problem, cs.ReducedSpace(max_time_s=max_time_s))
+        except cs.InputError as refusal:
+            reason = str(refusal)
+            return {
+                "cpu_s": _cpu_s() - before_s,
+                "status": "refused",
+                "verdict": "",
+                "reason": reason,
+                "estimates": {},
+            }
         lines = str(answer).splitlines()
         return {
             "cpu_s": _cpu_s() - before_s,
@@ -118,11 +130,19 @@ def _cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _outcome(name: str, limit_s: int) -> dict[str, Any]:
+def _outcome(name: str, limit_s: int, max_time_s: float) -> dict[str, Any]:
     """Return what a case in a process of its own has printed, or how it ended."""
     environment = os.environ | {"COLLOCATION_SYSID_THREADS": "1", "OMP_NUM_THREADS": "1"}
     ended = subprocess.run(
-        [sys.executable, str(Path(__file__).resolve().parents[1]), "study_extremes", "--run", name],
+        [
+            sys.executable,
+            str(Path(__file__).resolve().parents[1]),
+            "study_extremes",
+            "--run",
+            name,
+            "--max-time-s",
+            str(max_time_s),
+        ],
         env=environment,
         capture_output=True,
         text=True,
@@ -145,14 +165,15 @@ def main() -> None:
     parser: argparse.ArgumentParser = make_parser(__doc__)
     parser.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--limit-s", type=int, default=120)
+    parser.add_argument("--max-time-s", type=float, default=1e6, help="max_time_s of the method")
     parser.add_argument("--run", choices=list(CASES), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.run:
-        print(json.dumps(CASES[arguments.run].run()))
+        print(json.dumps(CASES[arguments.run].run(arguments.max_time_s)))
         return
     print("case | CPU [s] | status | verdict | first reason | estimate, truth, 95 % interval")
     for name in arguments.only:
-        found = _outcome(name, arguments.limit_s)
+        found = _outcome(name, arguments.limit_s, arguments.max_time_s)
         estimates = "; ".join(
             f"{key} {value:.5g}, {true:.5g}, {'none' if ends is None else [float(f'{e:.4g}') for e in ends]}"
             for key, (value, true, ends) in found["estimates"].items()

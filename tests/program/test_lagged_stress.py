@@ -16,8 +16,11 @@ from collocation_sysid import (
     box_mesh,
     simulate,
 )
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.newton_linearisation import LaggedStress
 from collocation_sysid.program.linear_algebra.factorisation import Factoriser
+from collocation_sysid.program.modes.stability import find_instabilities
 
 SIZE_M = (0.03, 0.03, 0.09)
 MODULI = {"gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
@@ -106,3 +109,23 @@ def test_the_stresses_change_the_way_to_a_solution_and_not_the_solution(monkeypa
     with_stresses_m = moved("rayleigh", 0.49)
     monkeypatch.setattr(LaggedStress, "replace_stress", lambda self, at, x, stress_pa: at)
     np.testing.assert_allclose(moved("rayleigh", 0.49), with_stresses_m, atol=1e-9)
+
+
+def test_elastic_and_viscous_stresses_that_cancel_are_no_instability():
+    """At the ends of coarse steps the volumes of a turning body are off, and between them the
+    elastic mean stresses: K is not positive definite there without the viscous ones.
+    """
+    body = bar(damping="kelvin-voigt")
+    t_s = np.arange(7) / 60
+    sway_m = np.outer(0.03 * (1 - np.cos(20 * t_s)), [1.0, 0.5, 0.3])
+    poses = PoseSequence(t_s, sway_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)))
+    markers = Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=[body.nodes_m[0]])
+    grasp = Grasp(nodes_where(body, 2, SIZE_M[2]), poses)
+    experiment = Experiment(body, t_s, [grasp], markers, nuisance=Nuisance.none())
+    values = MODULI | {"young_pa": 2e4, "poisson": 0.4999}
+    x = simulate(experiment, values, "midpoint", substeps=1).positions_m
+    collocation = Collocation([experiment], Parameters.from_mapping(values))
+    assert (
+        find_instabilities(collocation, collocation.pack(np.zeros(0), [x.reshape(len(x), -1)]))
+        == ()
+    )

@@ -30,6 +30,7 @@ from collocation_sysid import (
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
@@ -40,7 +41,11 @@ from collocation_sysid.statistics.budget.consider_analysis import (
 )
 from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
-from collocation_sysid.statistics.budget.uncertainty_budget import VarianceSources, source_label
+from collocation_sysid.statistics.budget.uncertainty_budget import (
+    VarianceSources,
+    rescaled,
+    source_label,
+)
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
@@ -343,3 +348,20 @@ def test_a_problem_file_states_with_one_word_that_all_is_exact(tmp_path):
     assert read.uncertainty.assumptions == Assumptions.exact()
     with pytest.raises(InputError, match=r'found "exact"; expected a table, or "none"'):
         Problem.read(file, ['uncertainty.assumptions="exact"'])
+
+
+def test_another_damping_law_of_much_larger_forces_has_a_smaller_constant():
+    """Forces K f + e in place of f: with 1/K of the constant they agree, and e/K remains."""
+    parameters = Parameters.from_mapping({"young_pa": Unknown(1e4), "gamma_r_s": Unknown(1e-3)})
+    times, rest = 1e3, 500.0
+    young, gamma = rescaled(np.array([rest, 1 - times]), parameters, lambda n: n == "gamma_r_s")
+    assert np.exp(gamma) == pytest.approx(1 / times)
+    assert young == pytest.approx(rest / times)
+
+
+def test_forces_that_are_a_little_larger_change_the_estimates_as_to_first_order():
+    parameters = Parameters.from_mapping({"young_pa": Unknown(1e4), "gamma_r_s": Unknown(1e-3)})
+    step = np.array([1e-3, -1e-3])
+    np.testing.assert_allclose(
+        rescaled(step, parameters, lambda n: n == "gamma_r_s"), step, rtol=2e-3
+    )

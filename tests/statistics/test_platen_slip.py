@@ -55,11 +55,7 @@ def with_loads(fitted: Experiment, truth: Experiment) -> Experiment:
 
 def load_change_n(experiment: Experiment) -> np.ndarray:
     """Change (T,) of the load if the faces slide, to first order [N]."""
-    values = {"young_pa": YOUNG_PA, **STATED}
-    parameters = Parameters.from_mapping(values | {"young_pa": Unknown(YOUNG_PA, 10.0, 1e6)})
-    program = Collocation([experiment], parameters)
-    x = simulate(experiment, values).positions_m
-    z = program.pack(program.guess_p, [x.reshape(len(x), -1)])
+    program, z = at_answer(experiment)
     changes = changed_residuals(program, z, [(SLIP, 1.0)])
     return SIGMA_N * changes.blocks[-1][:, 0, 2, 0]
 
@@ -176,3 +172,32 @@ def test_the_problem_file_states_that_faces_are_glued(tmp_path, monkeypatch):
     stated = 'uncertainty.assumptions.platen_slip="none"'
     problem = Problem.read("mine/problem.toml", [stated])
     assert problem.uncertainty.assumptions.platen_slip == "none"
+
+
+def test_sticking_faces_change_the_load_of_sliding_ones_as_in_a_simulation():
+    program, z = at_answer(small("z"))
+    (stick,) = (row for row in ASSUMPTIONS if row.name == "platen_stick")
+    changes = changed_residuals(program, z, [(stick, 1.0)])
+    change_n = SIGMA_N * changes.blocks[-1][:, 0, 2, 0]
+    expected_n = loads_n(small("xyz")) - loads_n(small("z"))
+    np.testing.assert_allclose(change_n[1:], expected_n[1:], rtol=0.02)
+
+
+def test_an_answer_with_sliding_platens_states_the_modulus_with_sticking_ones():
+    """Faces that stuck, described as sliding: the residuals are small, and E is too large."""
+    stuck = with_loads(bench(block("z")), bench(block("xyz")))
+    fitted = solved(stuck)
+    assert fitted.trust.verdict != "doubtful"
+    assert fitted.estimates["young_pa"].value > 1.1 * YOUNG_PA
+    (sticking,) = (each for each in fitted.alternatives if each.assumption == "platen_stick")
+    assert abs(sticking.values["young_pa"] / YOUNG_PA - 1) < 0.05
+    text = str(run_summary(fitted.result))
+    assert "if the faces stuck to the platens" in text
+
+
+def at_answer(experiment: Experiment) -> tuple[Collocation, np.ndarray]:
+    values = {"young_pa": YOUNG_PA, **STATED}
+    parameters = Parameters.from_mapping(values | {"young_pa": Unknown(YOUNG_PA, 10.0, 1e6)})
+    program = Collocation([experiment], parameters)
+    x = simulate(experiment, values).positions_m
+    return program, program.pack(program.guess_p, [x.reshape(len(x), -1)])

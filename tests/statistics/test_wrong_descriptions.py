@@ -30,6 +30,8 @@ from collocation_sysid.runs.check.body_check import check_grasps, grasp_concerns
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
 from collocation_sysid.statistics.misspecification import fit_misspecifications
+from collocation_sysid.statistics.misspecification.fit_misspecifications import _is_reproduced
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
 from collocation_sysid.statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
@@ -306,6 +308,18 @@ def test_steps_within_a_fast_motion_are_no_slips():
     (slip,) = step_hypotheses(with_markers(fast, slipped_m))
     assert slip.code == "marker-slip/alone"
     assert slip.data["marker"] == names[0]
+
+
+def test_a_step_that_the_fit_reproduces_is_no_slip():
+    (experiment,) = soft("block").experiments
+    marker = experiment.markers.names[1]
+    slip = Hypothesis("marker-slip/alone", data={"marker": marker, "by_mm": 10.0})
+    residual_m = np.zeros((len(experiment.t_s), len(experiment.markers.names), 3))
+    residual_m[:, 1, 0] = 2e-3
+    assert _is_reproduced(slip, experiment, residual_m)
+    residual_m[5:, 1, 0] = -4e-3
+    assert not _is_reproduced(slip, experiment, residual_m)
+    assert not _is_reproduced(replace(slip, code="pose-jump"), experiment, 0 * residual_m)
 
 
 @pytest.mark.parametrize("count", [0, 4])

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array
+from ...common.time_limit import require_time
 from ...errors import SimulationError
 from ...recording.experiment import Experiment
 from ..linear_algebra.factorisation import Factor, Factoriser
@@ -231,6 +232,7 @@ class NewtonSolver:
             If the method does not converge, a matrix is singular or not positive definite, or an
             element is inverted at the start.
         """
+        require_time()
         x = (
             x.copy()
             if prescribed_m is None
@@ -285,6 +287,7 @@ class NewtonSolver:
         NewtonFailure
             If no method converges, or an element is inverted at the start.
         """
+        require_time()
         solution = self._solve_step(x, equations)
         self._last_step = equations.stress, solution
         return solution

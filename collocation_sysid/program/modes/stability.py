@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,6 +31,8 @@ DIRECTIONS = 8
 # Share of the largest diagonal entry per mass by which matrices are shifted, because those with
 # rigid motions are singular, not indefinite.
 SHIFT = 1e-9
+# Largest number of restarts of Arnoldi's iteration for the fastest growth.
+RESTARTS = 100
 # Accuracy of Lanczos iterations, enough to determine a sign.
 TOLERANCE = 1e-3
 
@@ -61,7 +64,8 @@ def find_instabilities(collocation: Collocation, z: Array) -> tuple[Instability,
     """Return the instabilities of the motions at z, at most one for each fitted experiment, in
     their order; experiments whose examined states are stable have none.
 
-    Up to `STATES` samples of each experiment are examined.
+    Up to `STATES` samples of each experiment are examined, at the states at which the scheme
+    evaluates the forces next to them.
     """
     unstable = (_instability(part) for part in collocation.iterates(z))
     return tuple(each for each in unstable if each is not None)
@@ -77,15 +81,20 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
     t_s = experiment.t_s[samples]
     rows = iterate.transcription.markers.observable.rows[samples]
     is_prescribed = experiment.is_prescribed(t_s).reshape(len(t_s), -1)
-    theta = iterate.equations.dynamics.theta
+    dynamics = iterate.equations.dynamics
+    theta = dynamics.theta
+    # The mean stresses of a nearly incompressible body balance at these states only: those of the
+    # grid oscillate about them from step to step.
+    xi, nu = (each[rows] for each in dynamics.all_evaluation_states(iterate.x))
     growths = np.array(
         [
             growth_rate_1_s(
                 Forces.from_experiment(experiment, time, theta=theta),
                 x,
                 free_dofs=np.flatnonzero(~there),
+                v=v,
             )
-            for time, x, there in zip(t_s, iterate.x[rows], is_prescribed, strict=True)
+            for time, x, v, there in zip(t_s, xi, nu, is_prescribed, strict=True)
         ]
     )
     worst = int(np.argmax(growths))
@@ -97,9 +106,13 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
     )
 
 
-def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
+def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index, v: Array | None = None) -> float:
     """Return the largest Re(s) of M s² + D s + K at a state [1/s]; 0 where none exceeds the
     rounding errors, no dof is free, or K or D is not finite, as where an element is inverted.
+
+    With velocities, a state also counts as stable if K is positive definite with the complete mean
+    stresses of the elements: in a nearly incompressible body the elastic and the viscous parts may
+    be large and cancel.
 
     Parameters
     ----------
@@ -109,6 +122,8 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
         State [m].
     free_dofs : (k,) array
         Sorted dofs that are not prescribed; their masses must be positive.
+    v : (3n,) array, optional
+        Velocities [m/s].
     """
     if not len(free_dofs):
         return 0.0
@@ -119,8 +134,12 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     lowers = -at.by_position[0], -at.by_velocity[0]
     if not all(np.isfinite(lower).all() for lower in lowers):
         return 0.0
-    if all(_is_definite(lower, pattern, free_dofs=free_dofs, mass=mass) for lower in lowers):
-        return 0.0
+    is_definite = partial(_is_definite, pattern=pattern, free_dofs=free_dofs, mass=mass)
+    if is_definite(lowers[1]):
+        if is_definite(lowers[0]):
+            return 0.0
+        if v is not None and is_definite(lowers[0] + _viscous_volume_stiffness(forces, x, v)):
+            return 0.0
     root = sp.diags_array(1 / np.sqrt(mass))
     stiffness, damping = (
         sp.csc_array(root @ pattern.matrix(lower)[:, free_dofs][free_dofs] @ root)
@@ -129,6 +148,17 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
     noise = SHIFT * np.sqrt(stiffness.diagonal().max())
     growth = _fastest_growth(stiffness, damping)
     return growth if growth > noise else 0.0
+
+
+def _viscous_volume_stiffness(forces: Forces, x: Array, v: Array) -> Array:
+    """Return the lower triangle [N/m] that the viscous mean stresses of the elements at positions
+    [m] and velocities [m/s] (3n,) add to K.
+    """
+    state = x.reshape(1, -1)
+    moving = forces.mean_stresses(state, v.reshape(1, -1))
+    still = forces.mean_stresses(state, np.zeros_like(state))
+    change = forces.body.volume_stiffness(x, moving - still)
+    return np.asarray(forces.joint_pattern.expand(change[None])[0])
 
 
 def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
@@ -233,7 +263,11 @@ def _growth_about(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) 
     turning = _CayleyTransform(stiffness, damping, sigma=sigma)
     try:
         eigenpairs = eigs(
-            turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60
+            turning,
+            4,
+            v0=np.random.default_rng(0).normal(size=turning.shape[0]),
+            ncv=60,
+            maxiter=RESTARTS,
         )
         turned = np.asarray(eigenpairs[0])
     except ArpackNoConvergence as stopped:

@@ -1,8 +1,9 @@
-"""Displacements of a specimen's faces on platens if they slide instead of sticking.
+"""A specimen's faces on platens if they slide instead of sticking, or stick instead of sliding.
 
 The load of a compression test depends on whether the end faces stick to the platens, and the load
-alone does not show which is the case. The displacements are of first order: those at which the
-tangential reactions of the faces vanish, linearised about the equilibrium with sticking faces.
+alone does not show which is the case. The displacements of faces that slide instead of sticking are
+of first order: those at which the tangential reactions vanish, linearised about the equilibrium with
+sticking faces.
 """
 
 from __future__ import annotations
@@ -13,11 +14,16 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from ...common.array_types import Array, Index
+from ...model.forces import Forces
 from ...program.experiment_iterate import ExperimentIterate
+from ...program.forward.initial_equilibrium import static_equations
+from ...program.forward.newton_solver import NewtonFailure, NewtonSolver
 from ...recording.experiment import FLATNESS, Experiment
 from ...recording.grasp import Grasp, free_rigid_modes
 from ...recording.measurement_selection import is_load_only
 
+# Number of steps in which a face that slid returns to where it would stick.
+STICKING_STEPS = 4
 # Largest tensile reaction of a face over its largest compressive one for which it may slide: above,
 # the face is bonded, since a platen does not pull. Errors of the zero remain below.
 LARGEST_TENSION = 0.2
@@ -78,6 +84,60 @@ def slip_displacements_m(
     return displacements_m
 
 
+def sticking_change_n(iterate: ExperimentIterate, theta: Array) -> Array | None:
+    """Return the change (N, 3n) [N] of the body's forces on the prescribed dofs if faces that slide
+    on platens stick to them; zero on other dofs.
+
+    The equilibria with sticking faces are computed, because faces slide far in large compressions.
+    Material memory is neglected as in `slip_displacements_m`.
+
+    Parameters
+    ----------
+    iterate : ExperimentIterate
+        The experiment at the answer.
+    theta : (k,) array
+        Constants of the body.
+
+    Returns
+    -------
+    (N, 3n) array or None
+        None if no flat face is pressed and free to slide, if obstacles touch the body, if other
+        measurements than loads show the grip, or if there is no such equilibrium.
+    """
+    experiment = iterate.transcription.experiment
+    prescribed = iterate.equations.prescribed
+    axis = pressed_axis(prescribed.dofs, prescribed.positions_m)
+    if axis is None or experiment.obstacles or not is_load_only(experiment):
+        return None
+    sliding = [each for each in experiment.body_grasps if tuple(each.axis_indices) == (axis,)]
+    dofs = np.setdiff1d(_tangential_dofs(experiment, sliding, axis), prescribed.dofs)
+    if not len(dofs):
+        return None
+    body = experiment.body
+    start_m = body.nodes_m.ravel()
+    is_held = np.zeros(start_m.size, dtype=bool)
+    is_held[prescribed.dofs] = is_held[dofs] = True
+    solver = NewtonSolver(experiment, prescribed=is_held)
+    change_n = np.zeros_like(iterate.x)
+    for row, (time_s, slid_m) in enumerate(zip(experiment.t_s, iterate.x, strict=True)):
+        forces = Forces.from_experiment(experiment, float(time_s), theta=theta)
+        equations = static_equations(forces, 1.0, free=solver.free)
+        x = slid_m
+        try:
+            for share in np.linspace(0, 1, STICKING_STEPS + 1)[1:]:
+                goal_m = slid_m.copy()
+                goal_m[dofs] += share * (start_m[dofs] - slid_m[dofs])
+                x = solver.solve_equilibrium(
+                    x, *equations, prescribed_m=goal_m[solver.is_prescribed]
+                )
+        except NewtonFailure:
+            return None
+        still = np.zeros((2, x.size))
+        stuck_n, slid_n = body.force(np.stack([x, slid_m]), still, theta=theta)
+        change_n[row, prescribed.dofs] = (stuck_n - slid_n)[prescribed.dofs]
+    return change_n
+
+
 def pressed_axis(dofs: Index, positions_m: Array) -> int | None:
     """Return the only axis (0, 1, 2) along which prescribed displacements change; None if they
     change along several axes or none.
@@ -132,17 +192,25 @@ def _released_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> Ind
     """Return the tangential dofs (s,) of the faces, ascending, without those that a plane of
     symmetry holds: nodes of the faces that lie in that plane remain held along its normal.
     """
-    released = {
-        int(3 * node + other)
-        for face in faces
-        for node in face.nodes
-        for other in range(3)
-        if other != axis
-    }
+    released = set(_tangential_dofs(experiment, faces, axis))
     for normal, nodes in experiment.planes_of_symmetry:
         if normal != axis:
             released -= set((3 * nodes + normal).tolist())
     return np.array(sorted(released), dtype=np.int64)
+
+
+def _tangential_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> list[int]:
+    """Return the dofs of the nodes of flat faces perpendicular to an axis, without those along it."""
+    nodes_m = experiment.body.nodes.points_m
+    tolerance_m = FLATNESS * float(np.ptp(nodes_m, axis=0).max())
+    return [
+        int(3 * node + other)
+        for face in faces
+        if np.ptp(nodes_m[face.nodes, axis]) <= tolerance_m
+        for node in face.nodes
+        for other in range(3)
+        if other != axis
+    ]
 
 
 def _relaxed(stiffness: sp.csc_array, force_n: Array, kept: Index, positions_m: Array) -> Array:

@@ -25,7 +25,7 @@ from ...common.schema_tables import ByForm, Section
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive
 from ...fem.body import Body
-from ...fem.laws.constants import GAMMA_M, GAMMA_R, without_region
+from ...fem.laws.constants import GAMMA_M, GAMMA_R, is_modulus, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.rest_shape import RestShape
@@ -54,7 +54,7 @@ from .obstacle_effects import (
     rigid_contact_change_n,
     scaled_start_m,
 )
-from .platen_slip import slip_displacements_m
+from .platen_slip import slip_displacements_m, sticking_change_n
 from .shape_error import (
     CORRELATION,
     SURFACE_MODES,
@@ -751,6 +751,17 @@ def _platen_slip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(displacement_m=displacement_m)
 
 
+def _platen_stick(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of faces that stick to platens instead of sliding; None where that of
+    `_platen_slip` has no counterpart, see `sticking_change_n`.
+    """
+    if not at.iterate.transcription.experiment.is_static:
+        return None
+    force_n = sticking_change_n(at.iterate, at.theta)
+    # On dofs that are prescribed: nothing moves, and the reactions change.
+    return None if force_n is None else Effect(force_n)
+
+
 def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of rigid contact in place of the pressure law, to first order; None without
     contact, or where it is rigid already.
@@ -778,6 +789,10 @@ def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
 def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
     return Effect(at.air_drag_n) if at.iterate.transcription.experiment.has_air_drag else None
+
+
+def _is_stiffness_damping(name: str) -> bool:
+    return without_region(name) == GAMMA_R.name
 
 
 def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
@@ -997,6 +1012,7 @@ ASSUMPTIONS = (
         axes=" ".join(OBJECTIVE_DAMPINGS),
         redefines=(GAMMA_R.name, GAMMA_M.name),
         alternative="with the damping law {component}",
+        proportional_to=_is_stiffness_damping,
     ),
     Deviation(
         "rayleigh_damping",
@@ -1007,6 +1023,7 @@ ASSUMPTIONS = (
         effect=_rayleigh_damping,
         redefines=(GAMMA_R.name, GAMMA_M.name),
         alternative="with the damping law rayleigh",
+        proportional_to=_is_stiffness_damping,
     ),
     Deviation(
         "grip_layer_m",
@@ -1078,6 +1095,17 @@ ASSUMPTIONS = (
         'platen_slip = "none" in [uncertainty.assumptions] if the faces are glued, or axes = "z" if '
         "they slide",
         effect=_platen_slip,
+    ),
+    Deviation(
+        "platen_stick",
+        "1",
+        description="sticking of faces that slide on platens, as a fraction of that without any "
+        "slip, if only loads are measured",
+        remedy="measure the bulge, by markers on the side or depth images, or compare both "
+        "assumptions with compare-models --with",
+        effect=_platen_stick,
+        alternative="if the faces stuck to the platens",
+        proportional_to=is_modulus,
     ),
     Deviation(
         "contact_stiffness",
@@ -1153,13 +1181,14 @@ KnownDeviation = Annotated[KnownEffect | Deviated, ByForm((dict, KnownEffect))]
 
 def _field_of(row: Deviation) -> FieldOfRow:
     """Return the field of `Assumptions` for a row; None is the default of bodies that were made
-    like those of the problem, see `Deviation.by_origin`.
+    like those of the problem, see `Deviation.by_origin`, or that only the alternative is reported.
     """
     default = "none" if row.considered is None else row.considered
     annotation: Any = KnownDeviation if row.is_one_sided else Deviated
     form = 'float, "none" or table' if row.is_one_sided else 'float or "none"'
     text = sentence(f"{row.description} [{row.unit or 1}]")
-    if row.by_origin:
+    is_reported = row.alternative and row.considered is None and not row.redefines
+    if row.by_origin or is_reported:
         return FieldOfRow(annotation | None, None, f"{form}, optional", text)
     return FieldOfRow(annotation, default, form, text)
 

@@ -11,7 +11,7 @@ with their degrees of freedom (Welch & Satterthwaite: ibid., G.4).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,6 +36,7 @@ MESH = "mesh"
 BETWEEN = "between recordings"
 # Rows of assumptions whose alternative is reported, by name.
 ALTERNATIVES = {row.name: row for row in ASSUMPTIONS if row.alternative}
+PROPORTIONAL = {row.name: row.proportional_to for row in ASSUMPTIONS if row.proportional_to}
 
 
 def is_definition(row: str, estimate: str) -> bool:
@@ -201,6 +202,9 @@ class VarianceSources:
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
         moved = estimate_changes(fit, assumed.blocks)[: fit.shared_count]
         rows = [name.partition(" ")[0] for name in assumed.names]
+        for k, row in enumerate(rows):
+            if row in PROPORTIONAL:
+                moved[:, k] = rescaled(moved[:, k], parameters, PROPORTIONAL[row])
         units = evaluated or {}
         alternatives = {
             name: moved[:, k] / (units[row] or 1.0)
@@ -330,6 +334,38 @@ class VarianceSources:
         """Return whether the interval of an estimate contains the effect of an assumption."""
         counted = any(name.partition(" ")[0] == row for name in self.names)
         return counted and not is_definition(row, estimate)
+
+
+def rescaled(step: Array, parameters: Parameters, is_proportional: Callable[[str], bool]) -> Array:
+    """Return the changes of q (nq,) by other forces that are proportional to a constant, which is
+    estimated anew for these forces.
+
+    The linear change −(K − 1) of the logarithm of the constant says that the other forces are K
+    times those of the answer. With 1/K of the constant they agree, and only 1/K of what they differ
+    in otherwise remains: with a large K, as of viscosities that contain the bulk modulus of a
+    nearly incompressible body, the linear changes of the other parameters mean nothing. Forces that
+    are smaller than those of the answer, and constants that are fixed, change nothing.
+
+    Parameters
+    ----------
+    step : (nq,) array
+        Linear changes.
+    parameters : Parameters
+        Shared parameters.
+    is_proportional : callable
+        Whether the forces are proportional to a constant, by name. Of several the largest K counts.
+    """
+    own = [
+        k
+        for k, item in enumerate(parameters.free)
+        if is_proportional(item.name) and item.scale == "log"
+    ]
+    ratio = 1.0 - min((float(step[k]) for k in own), default=0.0)
+    if ratio <= 1.0:
+        return step
+    scaled = step / ratio
+    scaled[own] = -np.log1p(np.maximum(0.0, -step[own]))
+    return scaled
 
 
 def budget(

@@ -91,6 +91,9 @@ BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
 # Error of gravity or of the pose in the grasp, in standard deviations, from which on a linear step
 # from the answer does not tell which law is right (31 in a twin of another law).
 FAR = 10.0
+# Largest residual over a step of the tracks that the fit reproduces; a slip leaves half of it on
+# both sides.
+REPRODUCED = 0.25
 # Fewest samples before and after a slip.
 SHORTEST = 4
 
@@ -127,14 +130,33 @@ def motion_misspecifications(
         worst, solution.parameters, huber=solution.collocation.huber
     )
     rms_m = solution.rms_by_experiment_m.get(worst.name, np.inf)
+    residual_m = _residual(worst, solution.readings_m[number])
     # The fit moved the body, not only its natural modes: what leaves more than the fit is refuted.
-    hypotheses += [h for h in by_modes if h.remaining is None or h.remaining < rms_m]
+    hypotheses += [
+        h
+        for h in by_modes
+        if (h.remaining is None or h.remaining < rms_m) and not _is_reproduced(h, worst, residual_m)
+    ]
     certainty = max((each.strength for each in (*known, *hypotheses)), default=0.0)
     if certainty < CERTAIN:
         hypotheses += _refit_hypotheses(
             solution, worst, discrepancy=discrepancies[number], budget=budget
         )
     return hypotheses
+
+
+def _is_reproduced(hypothesis: Hypothesis, experiment: Experiment, residual_m: Array) -> bool:
+    """Return whether a step of a marker or of all markers is a motion of the fitted body: the
+    residuals (T, M, 3) [m] of these markers are everywhere below `REPRODUCED` times the step.
+    """
+    if hypothesis.cause not in ("marker-slip", "markers-jump") or "by_mm" not in hypothesis.data:
+        return False
+    names = experiment.markers.names
+    name = hypothesis.data.get("marker", "")
+    own_m = residual_m[:, [names.index(name)]] if name in names else residual_m
+    distances_m = np.linalg.norm(own_m, axis=2)
+    largest_m = np.max(distances_m, initial=0.0, where=np.isfinite(distances_m))
+    return bool(largest_m < REPRODUCED * 1e-3 * hypothesis.data["by_mm"])
 
 
 def measurements_miss(solution: Solution) -> bool:
