@@ -51,7 +51,11 @@ from .statistics.budget.systematic_effects import ASSUMPTIONS
 from .statistics.budget.uncertainty_budget import VarianceSources
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
-from .statistics.probes.budgeted_residuals import budgeted_residuals, is_significant_beside_budget
+from .statistics.probes.budgeted_residuals import (
+    budgeted_residuals,
+    is_significant_beside_budget,
+    with_budget,
+)
 from .statistics.probes.deep_probes import deep_probes, routine_probes_with_steps
 from .statistics.probes.profile_likelihood import Profile, profile_of_solution
 from .statistics.probes.relaxed_assumptions import Probe, SolvedFit, probed_changes
@@ -462,7 +466,8 @@ def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
     if not is_contradicted or answer.problem.uncertainty.noise == "estimated":
         return answer
     granted = answer.problem.assumed_deviations
-    budgeted = budgeted_residuals(solved_fit, granted)
+    relaxed = with_budget(solved_fit, granted)
+    budgeted = budgeted_residuals(solved_fit, relaxed)
     if budgeted is None:
         return answer
     left = {each.code for each in fit_concerns(answer.uncertainty, budgeted.basis)}
@@ -472,7 +477,7 @@ def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
         replace(probe, sentences=())
         if probe.routine
         and is_alarming(probe)
-        and not is_significant_beside_budget(solved_fit, granted, probe.name)
+        and not is_significant_beside_budget(solved_fit, granted, relaxed, probe.name)
         else probe
         for probe in answer.probes
     )

@@ -22,6 +22,7 @@ from ..program.depth.depth_comparison import camera_residuals
 from ..program.depth.depth_residual import DepthResidual
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ..statistics.thresholds import LEAST_IMPROVEMENT
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES_OF_TIMES = {
@@ -43,8 +44,6 @@ GRAZING = 0.3
 GATE = 0.1
 # Distance over the diagonal that a wrong stiffness explains.
 ROUGHLY = 0.02
-# Factor by which the misfit must decrease.
-REQUIRED_FACTOR = 2.0
 # Alignments of the camera with the images, one after the other.
 ALIGNMENTS = 3
 # Clock lags that are tried [s].
@@ -154,8 +153,8 @@ class _MotionComparison:
         test = HypothesisTest(
             misfit_m,
             self.misfit_m,
-            required_factor=REQUIRED_FACTOR,
-            smallest_misfit=self.rough_m / REQUIRED_FACTOR,
+            required_factor=LEAST_IMPROVEMENT,
+            smallest_misfit=self.rough_m / LEAST_IMPROVEMENT,
         )
         subject = f"'{self.camera.depth.name}' of '{experiment}'"
         yield from test.accepted(self._mistakes(subject))

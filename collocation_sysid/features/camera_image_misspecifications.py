@@ -29,6 +29,7 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ..statistics.thresholds import LEAST_IMPROVEMENT, MISFIT
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES_OF_IMAGES = {
@@ -67,10 +68,6 @@ INITIAL_GATE = 0.35
 GRAZING = 0.3
 # Distance over the diagonal that interpolated shapes and noise explain.
 ROUGHLY = 0.003
-# Factor by which the misfit must decrease.
-REQUIRED_FACTOR = 2.0
-# Misfit up to which a correction explains the image: models of real bodies leave about as much.
-EXPLAINED = 1.5
 # Factor of the misfit from which on a correction may leave more.
 CERTAIN = 4.0
 # Standard deviations of the prior of its pose by which a camera may be off.
@@ -290,15 +287,15 @@ class _ImageComparison:
         test = HypothesisTest(
             stated.misfit,
             lambda corrected: self.fit(corrected).misfit,
-            required_factor=REQUIRED_FACTOR,
+            required_factor=LEAST_IMPROVEMENT,
             smallest_misfit=1.0,
         )
-        if stated.misfit <= REQUIRED_FACTOR:
+        if stated.misfit <= LEAST_IMPROVEMENT:
             return
         accepted = [
             each
             for each in test.accepted(self._mistakes())
-            if each.strength > CERTAIN or self.fit(each.corrected).misfit < EXPLAINED
+            if each.strength > CERTAIN or self.fit(each.corrected).misfit < MISFIT
         ]
         yield from accepted
         if accepted or stated.distance_m > ALIGNED * self.rough_m:

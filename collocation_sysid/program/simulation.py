@@ -169,6 +169,7 @@ def simulate(
     substeps: Substeps | Literal["auto"] = "auto",
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
+    is_measured: bool = True,
 ) -> Trajectory:
     """Simulate an experiment forward from its start; a static one from equilibrium to equilibrium.
 
@@ -194,6 +195,8 @@ def simulate(
         Called with the share done, ascending from 0 to 1. Automatic steps take several passes,
         whose number is not known before: each pass takes a part of what remains, and the share
         may end before 1.
+    is_measured : bool
+        Whether the measurements are predicted, too.
 
     Returns
     -------
@@ -209,22 +212,6 @@ def simulate(
         When a step fails even after halvings; names time and element, and where an equilibrium
         ceased to be stable the mode, see `program.find_stability_loss`.
     """
-    motion = simulate_motion(
-        experiment, parameters, integrator, timestep_s, substeps, options, progress
-    )
-    return replace(motion, predicted=_ideal_predictions(motion))
-
-
-def simulate_motion(
-    experiment: Experiment,
-    parameters: Parameters | Mapping[str, float] | Sequence[float] | Array,
-    integrator: str | Scheme = NEWMARK,
-    timestep_s: float | None = None,
-    substeps: int | Literal["auto"] = "auto",
-    options: NewtonOptions | None = None,
-    progress: Progress | None = None,
-) -> Trajectory:
-    """Simulate an experiment without predictions of its measurements; see `simulate`."""
     body = experiment.body
     if experiment.specimen is not None and isinstance(parameters, Mapping):
         parameters = with_undamped(parameters, body.constants)
@@ -236,21 +223,23 @@ def simulate_motion(
         raise InputError(unreachable)
     try:
         if steps == "auto":
-            return _with_automatic_steps(
+            motion = _with_automatic_steps(
                 experiment, theta, integrator=integrator, options=options, progress=progress
             )
-        return _with_steps(
-            experiment,
-            theta,
-            integrator=integrator,
-            steps=steps,
-            options=options,
-            progress=progress,
-        )
+        else:
+            motion = _with_steps(
+                experiment,
+                theta,
+                integrator=integrator,
+                steps=steps,
+                options=options,
+                progress=progress,
+            )
     except SimulationError as error:
         if (reason := explain_failure(experiment, theta, error=error)) is error:
             raise
         raise reason from error
+    return replace(motion, predicted=_ideal_predictions(motion)) if is_measured else motion
 
 
 def _ideal_predictions(motion: Trajectory) -> tuple[Array, ...]:

@@ -343,17 +343,12 @@ class Specimen:
         )
 
 
-class NominalStress:
-    """Expression of a component of the nominal stress, measured with a wrong area and zero.
+class _MeasuredStress:
+    """Expression of a stress, measured with a wrong area and zero; subclasses define the stress."""
 
-    Attributes
-    ----------
-    direction : int
-        Index of the direction of the force.
-    """
-
-    def __init__(self, direction: int) -> None:
-        self.direction = direction
+    def stress_pa(self, at: GraspQuantities) -> ca.SX:
+        """Return the stress [Pa] from force and torque on a node of the cell."""
+        raise NotImplementedError
 
     def __call__(
         self,
@@ -361,45 +356,40 @@ class NominalStress:
         area_error: ca.SX | float = 0.0,
         stress_zero_pa: ca.SX | float = 0.0,
     ) -> ca.SX:
-        """Return the measured stress P (1 + `area_error`) + `stress_zero_pa` [Pa], with the nominal
-        stress P from the force on a node of the cell.
-        """
-        stress_pa = STRESS_PER_FORCE * at.force_n[self.direction]
-        return stress_pa * (1 + area_error) + stress_zero_pa
+        """Return the measured stress P (1 + `area_error`) + `stress_zero_pa` [Pa]."""
+        return self.stress_pa(at) * (1 + area_error) + stress_zero_pa
 
 
-class StressDifference:
-    """Expression of the difference of two principal true stresses, multiplied by J, measured with a
-    wrong area and zero.
+class NominalStress(_MeasuredStress):
+    """Component of the nominal stress, by the index of the direction of its force."""
+
+    def __init__(self, direction: int) -> None:
+        self.direction = direction
+
+    def stress_pa(self, at: GraspQuantities) -> ca.SX:
+        """Return the nominal stress [Pa]."""
+        return STRESS_PER_FORCE * at.force_n[self.direction]
+
+
+class StressDifference(_MeasuredStress):
+    """Difference of two principal true stresses, multiplied by J.
 
     The cell is at 45° to the stretches λ₁ and λ₂: the node on its axis z has the position
     ½ (λ₁ − λ₂, 0, λ₁ + λ₂) size and the nominal stress ½ (P₁ − P₂, 0, P₁ + P₂), and
-    λ₁ P₁ − λ₂ P₂ = J (σ₁ − σ₂).
-
-    Attributes
-    ----------
-    t_s : (T,) array
-        Sample times [s].
-    difference : (T,) array
-        λ₁ − λ₂.
+    λ₁ P₁ − λ₂ P₂ = J (σ₁ − σ₂). The arguments are the times (T,) [s] and λ₁ − λ₂ (T,).
     """
 
     def __init__(self, t_s: Array, difference: Array) -> None:
         self.t_s = t_s
         self.difference = difference
 
-    def __call__(
-        self,
-        at: GraspQuantities,
-        area_error: ca.SX | float = 0.0,
-        stress_zero_pa: ca.SX | float = 0.0,
-    ) -> ca.SX:
-        """Return the measured difference [Pa], with the same errors as a `NominalStress`."""
+    def stress_pa(self, at: GraspQuantities) -> ca.SX:
+        """Return the difference [Pa]."""
         difference = self.difference[0]
         if len(self.t_s) > 1:
             difference = ca.pw_lin(at.t_s, ca.DM(self.t_s), ca.DM(self.difference))
         lever_n = at.torque_nm[1] / CELL_SIZE_M + difference * at.force_n[2]
-        return 2 * STRESS_PER_FORCE * lever_n * (1 + area_error) + stress_zero_pa
+        return 2 * STRESS_PER_FORCE * lever_n
 
 
 class LateralStretch:

@@ -20,7 +20,7 @@ from ..methods.solution import Solution
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
 from ..program.measured_motion import residual_changes, simulated_values
-from ..program.simulation import Trajectory, simulate_motion
+from ..program.simulation import Trajectory, simulate
 from ..program.transcription import Transcription
 from ..recording import Experiment
 from ..statistics.assessment import largest_deviation
@@ -264,13 +264,14 @@ def simulate_with_parameters(
     """
     integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
     corrected = with_contact_energy(transcription.corrected_experiment(phi))
-    trajectory = simulate_motion(
+    trajectory = simulate(
         corrected,
         transcription.body.theta_from_values(parameters),
         integrator=integrator,
         timestep_s=_step_s(problem, transcription),
         substeps=transcription.substeps,
         progress=report,
+        is_measured=False,
     )
     predicted = simulated_values(transcription, trajectory, phi)
     error = prediction_error(experiment, predicted)

@@ -36,64 +36,40 @@ from .probes.routine_probes import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import PERSISTENT
 from .residuals.noise_level import NoiseLevel
 from .residuals.residual_diagnostics import MOST_WILD
+from .thresholds import (
+    ABSURD,
+    AS_GOOD_AS_CERTAIN,
+    CLEARLY_PERSISTENT,
+    DAMPING_SHARE,
+    E_FOLDINGS,
+    GROSS_DAMPING_SHARE,
+    GROSS_E_FOLDINGS,
+    GROSS_MISFIT,
+    GROSS_PERIOD_ERROR,
+    GROSS_PREDICTION,
+    GROSS_ROLLOUT,
+    HARDLY_TAME,
+    LATE,
+    LITTLE_DAMPING,
+    MARKER_MISFIT,
+    MISFIT,
+    MOVED,
+    OWN_ONSET,
+    PERIOD_ERROR,
+    PREDICTION,
+    RARE,
+    ROLLOUT,
+)
 from .uncertainty import ErrorBasis, Uncertainty
 
 Verdict = Literal["good", "check", "doubtful"]
 
-# Factor of the misfit from which on a hypothesis is as good as certain.
-CERTAIN = 2.0
 # Codes of concerns about bounds from which others may follow.
 FIRST = "information/default-bound", "information/liquid"
 # Codes of hypotheses that stand for several, none of which is likely alone.
 OPEN_CAUSES = "several", "insufficient"
-# Probability of a false alarm of each test.
-RARE = 1e-4
-# Residuals over sigma, or sigma over residuals: from here on "check". The noise of
-# cameras is known to about this factor.
-MISFIT = 1.5
-# Residuals over sigma: from here on "doubtful" if they are not white, or are those of a prediction.
-# The only threshold for doubtful residuals; docs/howto/verdict.md states its value.
-GROSS_MISFIT = 3.0
-# Factor by which one marker may be noisier than the others.
-MARKER_MISFIT = 2.0
-# Autocorrelation of residuals of more than `GROSS_MISFIT` that are not noise, although the samples
-# are too few for a test at the level `RARE`.
-CLEARLY_PERSISTENT = 0.8
-# Additional misfit of a forward simulation, over that of the fit or of noise: "check".
-ROLLOUT = 0.35
-# The same for "doubtful".
-GROSS_ROLLOUT = 2.0
-# Misfit of a prediction over that of the fit or of noise: "check".
-PREDICTION = 3.0
-# The same for "doubtful".
-GROSS_PREDICTION = 10.0
-# Onset of a validation recording in standard deviations of its prior: "check".
-OWN_ONSET = 2.0
-# Nuisance parameters in standard deviations of their priors: "doubtful".
-ABSURD = 6.0
-# Time shift in standard deviations of its prior: "check".
-LATE = 3.0
 # Share of the samples beyond Huber's threshold: "check".
 WILD = MOST_WILD
-# The same for "doubtful".
-HARDLY_TAME = 0.2
-# Damping ratio that a scheme adds, over that of the mode: "check".
-DAMPING_SHARE = 0.2
-# The same for "doubtful".
-GROSS_DAMPING_SHARE = 1.0
-# Added damping ratio that never matters.
-LITTLE_DAMPING = 0.005
-# Relative change of a period by the scheme: "check".
-PERIOD_ERROR = 0.02
-# The same for "doubtful".
-GROSS_PERIOD_ERROR = 0.1
-# Powers of e by which a disturbance may grow in a recording: "check".
-E_FOLDINGS = 1.0
-# The same for "doubtful".
-GROSS_E_FOLDINGS = 7.0
-# Combined standard uncertainties by which step and mesh may change a parameter: the half width of
-# its 95 % interval.
-MOVED = 2.0
 # End of the message about an assumption that other laws than the stated ones contradict as well.
 LAWS_ADVICE = (
     "; a wrong damping or material law has similar effects: compare the laws first, with "
@@ -177,14 +153,14 @@ class Assessment:
 def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     """Return a concern for each likely misspecification, in the same order.
 
-    It is "doubtful" if the misfit decreases by more than a factor of two (`CERTAIN`) without the
+    It is "doubtful" if the misfit decreases by more than a factor of two (`AS_GOOD_AS_CERTAIN`) without the
     misspecification, else "check"; its message begins with "likely: " unless it names several. No
     hypothesis is left out.
     """
     return [
         (
             each if each.code in OPEN_CAUSES else replace(each, subject=f"likely: {each.subject}")
-        ).concern("doubtful" if each.strength > CERTAIN else "check")
+        ).concern("doubtful" if each.strength > AS_GOOD_AS_CERTAIN else "check")
         for each in causes
     ]
 

@@ -29,6 +29,7 @@ from .linearised import DerivedModuli
 from .residuals.autocorrelation import Dependence
 from .residuals.noise_level import Noise, NoiseLevel
 from .residuals.recording_scatter import RecordingComparison
+from .thresholds import NOTEWORTHY
 
 Mask = NDArray[np.bool_]
 
@@ -367,8 +368,6 @@ def _logarithmic_estimate(name: str, value: float, deviation: float, quantile: f
 
 # A relaxation time beyond so many recordings is not seen to end.
 LONG = 1.0
-# Residuals this many times sigma, or one over it, are worth a word.
-NOTEWORTHY = 1.1
 
 
 def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -> list[str]:

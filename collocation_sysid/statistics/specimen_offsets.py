@@ -17,15 +17,8 @@ from ..recording.experiment import Experiment
 from ..recording.specimen import STRESS_NAME
 from .distributions import f_sf
 from .linearised import LinearisedFit
+from .thresholds import GROSS_MISFIT, NAMED_ERRORS, NOTEWORTHY, OFFSET_FALSE_ALARMS
 
-# Residuals this many times sigma, below which there is nothing to explain.
-NOTEWORTHY = 1.1
-# Residuals this many times sigma, above which the law or the description is wrong.
-GROSS_MISFIT = 3.0
-# Probability of a false alarm of the F test.
-FALSE_ALARMS = 0.01
-# Offset over its standard error from which on its specimen is named.
-NAMED_ERRORS = 1.5
 # Standard deviation of the prior of an offset, over sigma of the stress: without a prior, errors of
 # the law appear as offsets that no load cell has.
 PRIOR_SIGMAS = 10.0
@@ -37,7 +30,7 @@ def stress_offset_notes(fit: LinearisedFit, experiments: Sequence[Experiment]) -
 
     Empty if an experiment is no test of a specimen, the offset of each stress is estimated already,
     the residuals are up to `NOTEWORTHY` or above `GROSS_MISFIT` times sigma, or the F test has a
-    probability above `FALSE_ALARMS`.
+    probability above `OFFSET_FALSE_ALARMS`.
 
     Parameters
     ----------
@@ -69,7 +62,7 @@ def stress_offset_notes(fit: LinearisedFit, experiments: Sequence[Experiment]) -
     before = _remaining_squares(slopes, residual)
     after = _remaining_squares(complete, residual)
     statistic = (before - after) / count / max(after / free, 1e-300)
-    if f_sf(statistic, count, freedom=free) > FALSE_ALARMS:
+    if f_sf(statistic, count, freedom=free) > OFFSET_FALSE_ALARMS:
         return []
     estimates, errors = _offsets(complete, residual, count=count)
     errors = errors * np.sqrt(after / free)

@@ -386,7 +386,7 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(forward_simulation, "simulate_motion", interrupt)
+    monkeypatch.setattr(forward_simulation, "simulate", interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Verdict: doubtful\n  interrupted: the result has no error bars" in outcome.out

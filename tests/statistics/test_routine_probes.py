@@ -44,12 +44,12 @@ from collocation_sysid.statistics.probes.relaxed_assumptions import (
     probed_changes,
 )
 from collocation_sysid.statistics.probes.routine_probes import (
-    FALSE_ALARMS,
     RELEVANT,
     is_alarming,
     probed_deviations,
     routine_probes,
 )
+from collocation_sysid.statistics.thresholds import RARE
 from collocation_sysid.statistics.uncertainty import AUTO
 
 TRUTH = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
@@ -199,7 +199,7 @@ def test_faultless_fits_have_no_significant_probe():
         of_fit = here.uncertainty_of_refit(fit, here.read_parameters())
         here = replace(here, statistical={**of_fit.estimates, **of_fit.derived})
         alarms += any(probe.sentences for probe in routine_probes(here))
-    assert FALSE_ALARMS == 1e-4
+    assert RARE == 1e-4
     assert alarms == 0
 
 

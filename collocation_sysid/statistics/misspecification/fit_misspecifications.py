@@ -34,6 +34,20 @@ from ...recording.nuisance import GRASP_SHIFT, GRASP_TURN, TILT, TIME
 from ...recording.poses import PoseSequence
 from ..distributions import normal_isf
 from ..probes.relaxed_assumptions import NOISE
+from ..thresholds import (
+    BETTER,
+    CERTAIN,
+    ESTIMATED_LAGS,
+    FAR,
+    INDISTINGUISHABLE,
+    LINEAR,
+    MIRRORED,
+    PARTIAL,
+    PARTLY,
+    RARE,
+    REPRODUCED,
+    SLIP,
+)
 from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
 from .modal_misspecifications import (
     ModalComparison,
@@ -49,10 +63,6 @@ from .model_misspecifications import (
 from .sensor_misspecifications import sensor_hypotheses, sensor_misfits
 from .track_misspecifications import filtered_signals, same_tracks
 
-# Factor by which the misfit of a refit must decrease, unless only noise remains.
-BETTER = 1.5
-# Factor by which two means, before and after, must explain residuals better than one.
-SLIP = 2.0
 # Largest number of samples of a refit.
 MOST_SAMPLES = 100
 # Largest number of refits for the lag of a clock.
@@ -67,33 +77,10 @@ EFFORT = 5
 BUDGET = 200
 # Length of the last step of a parameter's logarithm.
 TOLERANCE = 1e-2
-# Factor of the misfit from which on no other hypothesis is tested.
-CERTAIN = 4.0
 # Change of the lag that ends the search [s].
 SAME_LAG_S = 5e-4
-# Standard deviations of an estimated time shift up to which the fit follows a lag by itself.
-ESTIMATED_LAGS = 2.0
-# Discrepancy from which on mirror images of the mesh are fitted.
-MIRRORED = 2.0
-# Factor by which a correction that is known to first order must decrease the misfit to be the cause:
-# what remains is of second order.
-LINEAR = 2.0
-# The same to be mentioned, and before corrections that do not suffice either.
-PARTLY = 1.2
-# Difference of losses (χ²) below which two corrections explain the data equally well.
-INDISTINGUISHABLE = 10.0
-# Strength over the largest one from which on a correction that does not suffice is mentioned.
-PARTIAL = 0.7
-# Probability of a discrepancy of the pose of a faultless recording, as of every test of the verdict.
-RARE = 1e-4
 # Nuisance parameters of the body in its grasp, which turn and shift it to hide other mistakes.
 BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
-# Error of gravity or of the pose in the grasp, in standard deviations, from which on a linear step
-# from the answer does not tell which law is right (31 in a twin of another law).
-FAR = 10.0
-# Largest residual over a step of the tracks that the fit reproduces; a slip leaves half of it on
-# both sides.
-REPRODUCED = 0.25
 # Fewest samples before and after a slip.
 SHORTEST = 4
 

@@ -22,6 +22,7 @@ from ...program.modes.modal_prediction import DeclaredMotion, ModalResponse, del
 from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, place_markers
 from ..axes import OTHER_AXES
+from ..thresholds import FITTED, LARGEST_MISFIT, LEAST_IMPROVEMENT, ONE_OF_MANY
 from .initial_motion import initial_motion_hypotheses
 from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
 from .plausibility import (
@@ -31,10 +32,6 @@ from .plausibility import (
     undriven_motion,
 )
 
-# Factor by which the misfit must decrease.
-LEAST_IMPROVEMENT = 2.0
-# Additional factor for hypotheses with fitted numbers.
-FITTED = 1.5
 # Accuracy of small strains and a few modes, over the size of the body.
 ROUGHLY = 0.005
 # Share of the samples that are used, the best ones; others may be exchanged labels or reflections.
@@ -45,12 +42,8 @@ LAGS_S = np.concatenate([-np.arange(15, 0, -1), np.arange(1, 16)]) * 0.01
 LONGEST_LAG = 0.3
 # Alternations between the best stiffness and the best rigid motion.
 REFITS = 3
-# Additional factor for each of many variants of one mistake.
-ONE_OF_MANY = 1.05
 # Deformation of an equilibrium over the body's diagonal that needs no explanation.
 DEFORMED = 0.1
-# Distance of the tracks over the body's diagonal from which on no stiffness explains them.
-LARGEST_MISFIT = 0.3
 # Hypotheses that fit better if the poses are in another frame than the markers.
 FRAME_CAUSES = (
     "camera-frame",

@@ -31,26 +31,20 @@ from ..budget.mesh_error import LARGEST_NODE_COUNT, finer_mesh_row
 from ..budget.shape_error import GRAVITY_M_S2, sag_m
 from ..budget.systematic_effects import Effect, ExperimentAtAnswer
 from ..linearised import LinearisedFit, linearise_fit
+from ..thresholds import LEAST_DECREASE, LEAST_SIGMAS, WIDEST
 from .misspecification_hypothesis import Hypothesis
 
 AXES = "xyz"
-# Decrease of χ² by a linear step below which a hypothesis is not fitted again: e⁻⁸ as likely.
-LEAST_DECREASE = 16.0
 # Most hypotheses of a screening that are fitted again.
 MOST_REFITS = 5
 # The same of one kind.
 MOST_OF_A_KIND = 2
-# Largest relative error of the width of a mesh that is no mistake of another kind.
-WIDEST = 0.25
 # Distance of the nodes of a mirrored mesh from the mesh, over the largest extent, up to which they
 # are the same shape.
 SAME_SHAPE = 0.02
 # Smallest and largest error of a mesh over the change to half the edge lengths: with the order of
 # convergence n it is 2ⁿ / (2ⁿ − 1), 1.3 to 3.4 for the lowest orders, to first order.
 MESH_AMPLITUDES = (0.5, 3.5)
-# Root mean square of an error of the mesh that the constants do not absorb, in σ, up to which it is no
-# cause: smaller than noise.
-LEAST_SIGMAS = 1.0
 # Share of the weight in a scan that is taken as the whole weight.
 WHOLE_WEIGHT = (0.4, 2.0)
 

@@ -29,6 +29,7 @@ from ...recording.grasp import Grasp
 from ...recording.obstacle import Obstacle
 from ...recording.poses import Frame
 from ..concerns import Concern
+from ..thresholds import AGAINST, CLEARLY, DENSITY_DEVIATION, SECTION_RATIO, SUDDEN, TAMED
 from .misspecification_hypothesis import Hypothesis
 
 # Densities of soft objects [kg/m³].
@@ -98,13 +99,6 @@ DENSITIES_BY_MAKING_KG_M3 = {
 }
 
 
-# Deviation of the mass over the volume of the mesh from the known density: data sheets are right to
-# 1 %, meshes and balances too.
-DENSITY_DEVIATION = 0.05
-# Relative difference up to which the ratio of both is that of a round and a square section.
-SECTION_RATIO = 0.03
-
-
 def density_concerns(body: Body) -> list[Concern]:
     """Return one concern, as a list, if the density of a body, its mass over the volume of its mesh,
     is not that of its material (`Body.material_density_kg_m3`), or not one of bodies that were made
@@ -170,9 +164,6 @@ def _excess_factor(value: float, limits: tuple[float, float]) -> float:
     return max(limits[0] / value, value / limits[1])
 
 
-# Correlation of load and displacement below which a sign is wrong; noise and hysteresis leave it
-# positive.
-AGAINST = -0.8
 # Fewest samples for this correlation.
 FEWEST_SAMPLES = 3
 # Loads of an obstacle below this share of the largest may be those before it touches the body.
@@ -222,8 +213,6 @@ def _pushing_axis(grasp: Grasp, shifts_m: Array, frame: Frame) -> str:
     return "xyz"[int(moved_m.argmax())]
 
 
-# Size of a step over usual changes between samples.
-SUDDEN = 4.0
 # Quantile of the changes that counts as usual.
 LIVELY = 0.9
 # Share of the usual second difference of a motion that is no step: in fast motions with few samples,
@@ -436,12 +425,6 @@ def _median_second_difference(track_m: Array) -> float:
     """
     norms_m = np.linalg.norm(np.diff(track_m, 2, axis=0), axis=1)
     return float(np.median(norms_m[np.isfinite(norms_m)])) if np.isfinite(norms_m).any() else 0.0
-
-
-# Factor by which exchanged names must fit better.
-CLEARLY = 2.5
-# With Huber's loss, exchanges of a smaller share of the samples are tolerated as outliers.
-TAMED = 0.2
 
 
 def name_exchange_hypotheses(

@@ -21,6 +21,7 @@ from ...recording.measured_wrench import Wrench
 from ...recording.measurement import Measurement
 from ..axes import OTHER_AXES
 from ..linearised import LinearisedFit, linearise_fit
+from ..thresholds import BETTER
 from .misspecification_hypothesis import Hypothesis
 from .model_misspecifications import projected_gram
 
@@ -30,8 +31,6 @@ FACTORS = (1e6, 1e3, 1e2, 1e1, 180 / np.pi, 9.80665, 4.4482216, 6894.757, 25.4)
 SAME_SIZE = 3.0
 # Most units that are fitted again.
 MOST_UNITS = 2
-# Factor by which other axes must bring the values nearer to the prediction of the fit.
-BETTER = 1.5
 # Largest lag over the length of the recording.
 LATEST = 0.25
 

@@ -45,42 +45,28 @@ from ...recording.specimen import (
 )
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
+from ..thresholds import (
+    BETTER,
+    CERTAIN,
+    DECISIVE,
+    LEAST_KIND_CHANGE,
+    LIKELIER,
+    MISFIT,
+    NOISE_LEVEL,
+    PLAUSIBLE_NUISANCE,
+    UNCORRELATED,
+    UNIT_LIKE,
+    UNLIKELY,
+)
 from .misspecification_hypothesis import Hypothesis, HypothesisTest
 
-# Root mean square of residuals and nuisance parameters, in standard deviations, up to which there
-# is nothing to explain.
-NOISE_LEVEL = 1.3
-# Factor by which the misfit must decrease.
-REQUIRED_FACTOR = 1.5
 # Fewest samples of a specimen whose curve distinguishes hypotheses.
 FEWEST_SAMPLES = 4
 # Most iterations of one refit, and its tolerance: a misfit is needed, not an estimate.
 MOST_ITERATIONS = 15
 TOLERANCE = 1e-2
-# Factor of the misfit from which on no other specimen is tested.
-CERTAIN = 4.0
 # Samples of each specimen that are refitted.
 REFITTED_SAMPLES = 8
-# Factor between initial slopes from which on a wrong unit is tested.
-UNIT_LIKE = 20.0
-# Root mean square residual of a corrected fit over sigma up to which it explains the data: that of
-# the concern about the noise.
-EXPLAINED = 1.5
-# Autocorrelation of its residuals, in standard deviations of that of noise, 1/√n, up to which
-# they are noise.
-UNCORRELATED = 2.0
-# Largest nuisance parameter of a corrected fit, in standard deviations of its prior.
-PLAUSIBLE_NUISANCE = 4.0
-# Decrease of χ² that no statistical fluctuation causes: a ratio of likelihoods of e^10.
-DECISIVE = 20.0
-# Decrease of χ², over that of one measurement, from which on one kind of test is likelier than
-# another: a ratio of likelihoods of e^5, which the wrong kind reaches in less than 1 of 100 tests.
-LIKELIER = 10.0
-# Standard deviations of χ² by which that of the stated kind must exceed its mean.
-UNLIKELY = 2.0
-# Change of the logarithm of E from which on another kind of test is more than an error of the gauge
-# length: that of a dogbone between its grips is 10 % too long.
-LEAST_KIND_CHANGE = 0.2
 # Samples of each specimen, and most iterations, of the fit that decides.
 DECIDING_SAMPLES = 60
 DECIDING_ITERATIONS = 30
@@ -137,11 +123,7 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         return []
     hypotheses: list[Hypothesis] = []
     test = HypothesisTest(
-        misfit,
-        misfit_of,
-        required_factor=REQUIRED_FACTOR,
-        smallest_misfit=1.0,
-        noise_level=NOISE_LEVEL,
+        misfit, misfit_of, required_factor=BETTER, smallest_misfit=1.0, noise_level=NOISE_LEVEL
     )
     slopes_pa = [_initial_slope(each) for each in experiments]
     for index, experiment in enumerate(experiments):
@@ -246,7 +228,7 @@ def _is_explained(
 ) -> bool:
     """Return whether the data are as expected from noise if one mistake is corrected.
 
-    The residuals of all specimens must be at most `EXPLAINED` times sigma, with the number of
+    The residuals of all specimens must be at most `MISFIT` times sigma, with the number of
     estimated parameters considered, those of each stress uncorrelated, the nuisance parameters
     plausible (`PLAUSIBLE_NUISANCE`), and χ² smaller by at least `DECISIVE`.
     """
@@ -269,7 +251,7 @@ def _is_explained(
     phi = np.concatenate([part.phi for part in refit.parts])
     decrease = count * stated_misfit**2 - squares - float(phi @ phi)
     return bool(
-        np.sqrt(squares / freedom) <= EXPLAINED
+        np.sqrt(squares / freedom) <= MISFIT
         and not any(_is_correlated(row) for row in residuals)
         and np.abs(phi).max(initial=0.0) <= PLAUSIBLE_NUISANCE
         and decrease >= DECISIVE

@@ -19,15 +19,10 @@ from ..budget.systematic_effects import DEVIATIONS
 from ..budget.uncertainty_budget import source_label
 from ..distributions import chi2_isf, normal_isf
 from ..linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
+from ..thresholds import GRANTED, RARE
 from ..uncertainty import ErrorBasis
 from .relaxed_assumptions import SolvedFit, assumption_name, with_relaxed_assumption
 from .routine_probes import prior_widening, significance_limit
-
-# Probability that the deviations of a faultless recording are larger than the budget grants.
-RARE = 1e-4
-# Deviation of an assumption that is probed in every solve, in standard deviations of the budget, up
-# to which it is within the budget.
-GRANTED = 3.0
 
 
 @dataclass(frozen=True)
@@ -58,9 +53,7 @@ class BudgetedResiduals:
         )
 
 
-def budgeted_residuals(
-    solved_fit: SolvedFit, budgeted: Mapping[str, float | None]
-) -> BudgetedResiduals | None:
+def budgeted_residuals(solved_fit: SolvedFit, fit: LinearisedFit) -> BudgetedResiduals | None:
     """Return the residuals after one linear step of all parameters and all assumptions of the
     budget; None if the budget is empty, or if the step needs deviations larger than it grants.
 
@@ -68,11 +61,10 @@ def budgeted_residuals(
     ----------
     solved_fit : SolvedFit
         The fit. Its `changes` belong to its `deviations`.
-    budgeted : mapping of str to float or None
-        Standard deviations in the budget; assumptions that are None or missing do not take part.
+    fit : LinearisedFit
+        Result of `with_budget`.
     """
     first = len(solved_fit.fit.names)
-    fit = _with_budget(solved_fit, budgeted)
     step = gauss_newton_step(fit)
     own = step[first:]
     count = len(own)
@@ -88,16 +80,15 @@ def budgeted_residuals(
 
 
 def is_significant_beside_budget(
-    solved_fit: SolvedFit, budgeted: Mapping[str, float | None], name: str
+    solved_fit: SolvedFit, budgeted: Mapping[str, float | None], fit: LinearisedFit, name: str
 ) -> bool:
     """Return whether a routine probe, by the name of its assumption with component, remains if all
-    assumptions of the budget are relaxed.
+    assumptions of the budget are relaxed, as in `fit`, the result of `with_budget`.
 
     One that the budget contains remains if its deviation is larger than `GRANTED`; another, like
     memory, if it is significant.
     """
     row = assumption_name(name)
-    fit = _with_budget(solved_fit, budgeted)
     if budgeted.get(row):
         first = len(solved_fit.fit.names)
         own = [assumption_name(each.rpartition(" ")[0]) == row for each in fit.names[first:]]
@@ -110,8 +101,12 @@ def is_significant_beside_budget(
     return bool((ratios > significance_limit(changes, name)).any())
 
 
-def _with_budget(solved_fit: SolvedFit, budgeted: Mapping[str, float | None]) -> LinearisedFit:
-    """Return the fit with all assumptions of the budget relaxed that change any residual."""
+def with_budget(solved_fit: SolvedFit, budgeted: Mapping[str, float | None]) -> LinearisedFit:
+    """Return the fit with all assumptions of the budget relaxed that change any residual.
+
+    `budgeted` has the standard deviations in the budget; assumptions that are None or missing do
+    not take part.
+    """
     fit = solved_fit.fit
     changes = solved_fit.changes
     has_effect = np.any([block.any(axis=(0, 1, 2)) for block in changes.blocks], axis=0)

@@ -28,6 +28,7 @@ from ..linearised import (
     linearise_fit,
 )
 from ..residuals.recording_scatter import blocks_by_recording, fit_part, single_fits
+from ..thresholds import CHANCE
 from .relaxed_assumptions import (
     MEMORY,
     Kind,
@@ -49,8 +50,6 @@ from .routine_probes import (
 
 # Into so many windows of time the data are cut.
 WINDOWS = ("first third", "middle third", "last third")
-# Probability that a faultless run has any significant probe, beside those of every solve.
-CHANCE = 0.01
 # Most linear steps of a significant assumption: each is a simulation.
 STEPS = 4
 # Change of a parameter's logarithm in a step that is the last.

@@ -25,20 +25,14 @@ from ..estimates import Estimate
 from ..linearised import DerivedModuli, LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..residuals.autocorrelation import PERSISTENT
 from ..residuals.recording_scatter import TELLING
+from ..thresholds import NOISE, RETURN, SUFFICIENT
 from ..uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 DRIFT = "stiffness_drift"
 MEMORY = "memory_share"
 ANISOTROPY = "anisotropy"
-# Share of the range of the load by which it may return in a static recording that still counts as
-# monotonic: measured displacements scatter.
-RETURN = 0.02
 # Fewest samples of a static recording in which the load can return.
 FEWEST_SAMPLES = 3
-# RMS residual over σ up to which residuals count as noise, whatever their correlation.
-NOISE = 1.15
-# Least share of what exceeds χ² of noise that an assumption explains, if the rest is not noise.
-SUFFICIENT = 0.5
 Kind = Literal["window", "recording", "assumption"]
 
 

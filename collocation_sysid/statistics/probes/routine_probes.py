@@ -28,6 +28,7 @@ from ..budget.consider_analysis import ResidualChanges
 from ..budget.systematic_effects import DEVIATIONS
 from ..distributions import normal_isf
 from ..linearised import gauss_newton_step
+from ..thresholds import RARE, RELEVANT, WIDENING_OF_FIELDS
 from .relaxed_assumptions import (
     MEMORY,
     Probe,
@@ -40,17 +41,6 @@ from .relaxed_assumptions import (
 # Deviations that are tested in every solve, by name: each can occur while the residuals look white,
 # biases the estimates, and is determined by a single recording.
 ROUTINE = {name: row for name, row in DEVIATIONS.items() if "test" in row.modes}
-# Probability that any routine probe of a faultless run is significant, as of every other test of
-# the verdict. The first order that a probe rests on is not exact: at a level of 1/200 one of six
-# draws of the noise of one faultless recording was significant.
-FALSE_ALARMS = 1e-4
-# Factor on the standard deviations of the coefficients of fields for which a probe must be
-# significant, too: hardly anything is smoothed then, and what the data do not determine stays bounded.
-WIDENING_OF_FIELDS = 100.0
-# Least change of an estimate that is relevant, in half widths of its combined interval, which is the
-# one to publish: with the deviations of real bodies and laboratories every assumption is violated a
-# little, and the interval contains that. Memory left out changes E by two half widths and more.
-RELEVANT = 0.5
 
 
 def probed_deviations(deviations: Mapping[str, float | None]) -> dict[str, float | None]:
@@ -162,7 +152,7 @@ def significance_limit(changes: ResidualChanges, name: str) -> float:
     """
     amplitudes = Counter(map(assumption_name, filter(is_routine_assumption, changes.names)))
     tests = max(1, len(amplitudes)) * max(1, amplitudes[assumption_name(name)])
-    return float(normal_isf(FALSE_ALARMS / 2 / tests))
+    return float(normal_isf(RARE / 2 / tests))
 
 
 def is_alarming(probe: Probe) -> bool:

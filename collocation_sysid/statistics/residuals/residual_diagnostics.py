@@ -22,6 +22,7 @@ from ...common.array_types import Array
 from ..concerns import Concern
 from ..distributions import beta_sf, chi2_isf, normal_isf
 from ..linearised import LinearisedFit, Mask, ResidualBlock, factorise_information
+from ..thresholds import MOST_WILD
 from .noise_level import NoiseLevel, estimate_noise_level
 
 # Level of the tests for patterns.
@@ -43,8 +44,6 @@ DRIFT_CAUSES = (
 )
 # RMS residual that is rounding [m].
 ROUNDING_M = 1e-9
-# Share of the samples beyond Huber's threshold that noise alone may explain.
-MOST_WILD = 0.05
 # Factor within which uncorrelated residuals agree with σ.
 LARGEST_AGREEING_RATIO = 1.25
 

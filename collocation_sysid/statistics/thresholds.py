@@ -1,0 +1,330 @@
+"""Thresholds of all tests of a fit: each number with its reason, and its study.
+
+A test decides by one of these numbers: the verdict (`assessment`), the probes of assumptions
+(`probes`), and the refits of likely mistakes (`misspecification`). Limits of effort, and ranges of
+what is physically possible, stand where they are used.
+"""
+
+from __future__ import annotations
+
+
+class Threshold(float):
+    """Number with its reason; used like the number.
+
+    Attributes
+    ----------
+    reason : str
+        Meaning, and reason for the value, as sentences.
+    study : str
+        Page of docs/studies whose cases decide by the test; "" if there is none.
+    """
+
+    reason: str
+    study: str
+
+    def __new__(cls, value: float, reason: str = "", study: str = "") -> Threshold:
+        """Return the number with its reason and study."""
+        made = super().__new__(cls, value)
+        made.reason, made.study = reason, study
+        return made
+
+
+RARE = Threshold(
+    1e-4,
+    "Probability of a false alarm of each test: at least 95 % of fits to faultless data are "
+    "to be good, however many tests there are.",
+    study="verdict_reliability",
+)
+MISFIT = Threshold(
+    1.5,
+    "Residuals over sigma, or sigma over residuals: from here on check. The noise of cameras "
+    "is known to about this factor.",
+    study="verdict_reliability",
+)
+GROSS_MISFIT = Threshold(
+    3.0,
+    "Residuals over sigma: from here on doubtful if they are not white, or are those of a "
+    "prediction; the only threshold for doubtful residuals.",
+    study="verdict_reliability",
+)
+MARKER_MISFIT = Threshold(
+    2.0, "Factor by which one marker may be noisier than the others.", study="verdict_reliability"
+)
+CLEARLY_PERSISTENT = Threshold(
+    0.8,
+    "Autocorrelation of residuals of more than `GROSS_MISFIT` that are not noise, although "
+    "the samples are too few for a test at the level `RARE`.",
+    study="verdict_reliability",
+)
+ROLLOUT = Threshold(
+    0.35,
+    "Additional misfit of a forward simulation, over that of the fit or of noise: check.",
+    study="verdict_reliability",
+)
+GROSS_ROLLOUT = Threshold(
+    2.0,
+    "The additional misfit of a forward simulation that is doubtful.",
+    study="verdict_reliability",
+)
+PREDICTION = Threshold(
+    3.0,
+    "Misfit of a prediction over that of the fit or of noise: check.",
+    study="verdict_reliability",
+)
+GROSS_PREDICTION = Threshold(
+    10.0, "The misfit of a prediction that is doubtful.", study="verdict_reliability"
+)
+OWN_ONSET = Threshold(
+    2.0,
+    "Onset of a validation recording in standard deviations of its prior: check.",
+    study="verdict_reliability",
+)
+ABSURD = Threshold(
+    6.0,
+    'Nuisance parameters in standard deviations of their priors: "doubtful".',
+    study="verdict_reliability",
+)
+LATE = Threshold(
+    3.0, "Time shift in standard deviations of its prior: check.", study="verdict_reliability"
+)
+HARDLY_TAME = Threshold(
+    0.2,
+    "Share of the samples beyond Huber's threshold that is doubtful.",
+    study="verdict_reliability",
+)
+DAMPING_SHARE = Threshold(
+    0.2, "Damping ratio that a scheme adds, over that of the mode: check.", study="time_steps"
+)
+GROSS_DAMPING_SHARE = Threshold(
+    1.0, "The added damping ratio over that of the mode that is doubtful.", study="time_steps"
+)
+LITTLE_DAMPING = Threshold(0.005, "Added damping ratio that never matters.", study="time_steps")
+PERIOD_ERROR = Threshold(
+    0.02, "Relative change of a period by the scheme: check.", study="time_steps"
+)
+GROSS_PERIOD_ERROR = Threshold(
+    0.1, "The relative change of a period that is doubtful.", study="time_steps"
+)
+E_FOLDINGS = Threshold(1.0, "Powers of e by which a disturbance may grow in a recording: check.")
+GROSS_E_FOLDINGS = Threshold(7.0, "The powers of e that are doubtful.")
+MOVED = Threshold(
+    2.0,
+    "Combined standard uncertainties by which step and mesh may change a parameter: the half "
+    "width of its 95 % interval.",
+    study="verdict_reliability",
+)
+AS_GOOD_AS_CERTAIN = Threshold(
+    2.0, "Factor of the misfit from which on a hypothesis is as good as certain.", study="mistakes"
+)
+MOST_WILD = Threshold(
+    0.05,
+    "Share of the samples beyond Huber's threshold that noise alone may explain.",
+    study="verdict_reliability",
+)
+NOISE = Threshold(
+    1.15,
+    "RMS residual over σ up to which residuals count as noise, whatever their correlation.",
+    study="verdict_reliability",
+)
+SUFFICIENT = Threshold(
+    0.5,
+    "Least share of what exceeds χ² of noise that an assumption explains, if the rest is not "
+    "noise.",
+    study="verdict_reliability",
+)
+RETURN = Threshold(
+    0.02,
+    "Share of the range of the load by which it may return in a static recording that still "
+    "counts as monotonic: measured displacements scatter.",
+    study="specimens",
+)
+RELEVANT = Threshold(
+    0.5,
+    "Least change of an estimate that is relevant, in half widths of its combined interval, "
+    "which is the one to publish: with the deviations of real bodies and laboratories every "
+    "assumption is violated a little, and the interval contains that. Memory left out changes "
+    "E by two half widths and more.",
+    study="verdict_reliability",
+)
+WIDENING_OF_FIELDS = Threshold(
+    100.0,
+    "Factor on the standard deviations of the coefficients of fields for which a probe must "
+    "be significant, too: hardly anything is smoothed then, and what the data do not "
+    "determine stays bounded.",
+    study="field_recovery",
+)
+CHANCE = Threshold(
+    0.01,
+    "Probability that a faultless run has any significant probe, beside those of every solve.",
+    study="verdict_reliability",
+)
+GRANTED = Threshold(
+    3.0,
+    "Deviation of an assumption that is probed in every solve, in standard deviations of the "
+    "budget, up to which it is within the budget.",
+    study="laboratory",
+)
+BETTER = Threshold(
+    1.5,
+    "Factor by which the misfit of a refit must decrease, unless only noise remains.",
+    study="mistakes",
+)
+SLIP = Threshold(
+    2.0,
+    "Factor by which two means, before and after, must explain residuals better than one.",
+    study="mistakes",
+)
+CERTAIN = Threshold(
+    4.0,
+    "Factor of the misfit from which on no other hypothesis, and no other specimen, is tested.",
+    study="mistakes",
+)
+ESTIMATED_LAGS = Threshold(
+    2.0,
+    "Standard deviations of an estimated time shift up to which the fit follows a lag by itself.",
+    study="mistakes",
+)
+MIRRORED = Threshold(
+    2.0, "Discrepancy from which on mirror images of the mesh are fitted.", study="mistakes"
+)
+LINEAR = Threshold(
+    2.0,
+    "Factor by which a correction that is known to first order must decrease the misfit to be "
+    "the cause: what remains is of second order.",
+    study="mistakes",
+)
+PARTLY = Threshold(
+    1.2,
+    "The same to be mentioned, and before corrections that do not suffice either.",
+    study="mistakes",
+)
+INDISTINGUISHABLE = Threshold(
+    10.0,
+    "Difference of losses (χ²) below which two corrections explain the data equally well.",
+    study="mistakes",
+)
+PARTIAL = Threshold(
+    0.7,
+    "Strength over the largest one from which on a correction that does not suffice is mentioned.",
+    study="mistakes",
+)
+FAR = Threshold(
+    10.0,
+    "Error of gravity or of the pose in the grasp, in standard deviations, from which on a "
+    "linear step from the answer does not tell which law is right (31 in a twin of another "
+    "law).",
+    study="mistakes",
+)
+REPRODUCED = Threshold(
+    0.25,
+    "Largest residual over a step of the tracks that the fit reproduces; a slip leaves half of "
+    "it on both sides.",
+    study="mistakes",
+)
+LEAST_IMPROVEMENT = Threshold(2.0, "Factor by which the misfit must decrease.", study="mistakes")
+FITTED = Threshold(1.5, "Additional factor for hypotheses with fitted numbers.", study="mistakes")
+ONE_OF_MANY = Threshold(
+    1.05, "Additional factor for each of many variants of one mistake.", study="mistakes"
+)
+LARGEST_MISFIT = Threshold(
+    0.3,
+    "Distance of the tracks over the body's diagonal from which on no stiffness explains them.",
+    study="mistakes",
+)
+LEAST_DECREASE = Threshold(
+    16.0,
+    "Decrease of χ² by a linear step below which a hypothesis is not fitted again: e⁻⁸ as likely.",
+    study="mistakes",
+)
+WIDEST = Threshold(
+    0.25,
+    "Largest relative error of the width of a mesh that is no mistake of another kind.",
+    study="mistakes",
+)
+LEAST_SIGMAS = Threshold(
+    1.0,
+    "Root mean square of an error of the mesh that the constants do not absorb, in σ, up to "
+    "which it is no cause: smaller than noise.",
+    study="mistakes",
+)
+NOISE_LEVEL = Threshold(
+    1.3,
+    "Root mean square of residuals and nuisance parameters, in standard deviations, up to "
+    "which there is nothing to explain.",
+    study="mistakes",
+)
+UNIT_LIKE = Threshold(
+    20.0, "Factor between initial slopes from which on a wrong unit is tested.", study="mistakes"
+)
+UNCORRELATED = Threshold(
+    2.0,
+    "Autocorrelation of its residuals, in standard deviations of that of noise, 1/√n, up to "
+    "which they are noise.",
+    study="mistakes",
+)
+PLAUSIBLE_NUISANCE = Threshold(
+    4.0,
+    "Largest nuisance parameter of a corrected fit, in standard deviations of its prior.",
+    study="mistakes",
+)
+DECISIVE = Threshold(
+    20.0,
+    "Decrease of χ² that no statistical fluctuation causes: a ratio of likelihoods of e^10.",
+    study="specimens",
+)
+LIKELIER = Threshold(
+    10.0,
+    "Decrease of χ², over that of one measurement, from which on one kind of test is likelier "
+    "than another: a ratio of likelihoods of e^5, which the wrong kind reaches in less than 1 "
+    "of 100 tests.",
+    study="specimens",
+)
+UNLIKELY = Threshold(
+    2.0,
+    "Standard deviations of χ² by which that of the stated kind must exceed its mean.",
+    study="specimens",
+)
+LEAST_KIND_CHANGE = Threshold(
+    0.2,
+    "Change of the logarithm of E from which on another kind of test is more than an error of "
+    "the gauge length: that of a dogbone between its grips is 10 % too long.",
+    study="specimens",
+)
+DENSITY_DEVIATION = Threshold(
+    0.05,
+    "Deviation of the mass over the volume of the mesh from the known density: data sheets "
+    "are right to 1 %, meshes and balances too.",
+    study="mistakes",
+)
+SECTION_RATIO = Threshold(
+    0.03,
+    "Relative difference up to which the ratio of both is that of a round and a square section.",
+    study="mistakes",
+)
+AGAINST = Threshold(
+    -0.8,
+    "Correlation of load and displacement below which a sign is wrong; noise and hysteresis "
+    "leave it positive.",
+    study="mistakes",
+)
+SUDDEN = Threshold(4.0, "Size of a step over usual changes between samples.", study="mistakes")
+CLEARLY = Threshold(2.5, "Factor by which exchanged names must fit better.", study="mistakes")
+TAMED = Threshold(
+    0.2,
+    "With Huber's loss, exchanges of a smaller share of the samples are tolerated as outliers.",
+    study="mistakes",
+)
+NOTEWORTHY = Threshold(
+    1.1,
+    "Residuals this many times sigma, below which there is nothing to explain.",
+    study="specimens",
+)
+OFFSET_FALSE_ALARMS = Threshold(
+    0.01, "Probability of a false alarm of the F test.", study="specimens"
+)
+NAMED_ERRORS = Threshold(
+    1.5, "Offset over its standard error from which on its specimen is named.", study="specimens"
+)
+
+# Every threshold, by its name.
+THRESHOLDS = {name: each for name, each in [*vars().items()] if isinstance(each, Threshold)}
