@@ -11,26 +11,17 @@ problem file that states a vacuum.
 from __future__ import annotations
 
 import argparse
-import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.stats import binom
+from coverage_runner import Intervals, count_coverage
 from study_coverage import truth
 from study_faults import ASSUMED, ROWS, draw_assumption_errors, exact_recording, fit_from_truth
 
 from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.recording.experiment import Experiment
 
 GAMMA_M = "gamma_m_1_s"
-
-
-@dataclass(frozen=True)
-class DampingEstimate:
-    """Estimate of γ_m and its intervals for one twin [1/s]."""
-
-    estimate: float
-    statistical: tuple[float, float]
-    combined: tuple[float, float]
 
 
 def main() -> None:
@@ -39,64 +30,34 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--all", action="store_true", help="draw every assumption")
     parser.add_argument("--vacuum", action="store_true", help="fit without air")
-    parser.add_argument("--list", action="store_true", help="print every twin")
     arguments = parser.parse_args()
-    began = time.perf_counter()
-    twins = [
-        one_twin((arguments.seed, number), everything=arguments.all, in_vacuum=arguments.vacuum)
+    fault = "assumed: all of these" if arguments.all else "assumed: air"
+    twins = (
+        (recording(fault, (arguments.seed, number), in_vacuum=arguments.vacuum), truth())
         for number in range(arguments.twins)
-    ]
-    if arguments.list:
-        for twin in twins:
-            print(twin)
-    print(summary([twin for twin in twins if twin is not None], arguments.twins))
-    print(f"{time.perf_counter() - began:.0f} s")
+    )
+    print(count_coverage(twins, lambda described: intervals(described, fault)).table())
 
 
-def one_twin(seed: tuple[int, int], everything: bool, in_vacuum: bool) -> DampingEstimate | None:
-    """Draw a twin and fit it; None if the fit does not converge."""
+def recording(fault: str, seed: tuple[int, int], in_vacuum: bool) -> Experiment:
+    """Return a recording with drawn errors of assumptions and noise, as it is described."""
     rng = np.random.default_rng(seed)
-    fault = "assumed: all of these" if everything else "assumed: air"
     true_recording, described = draw_assumption_errors(ASSUMED[fault])(exact_recording(), rng)
     tracks = true_recording.markers.positions_m
     tracks = tracks + true_recording.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
     if in_vacuum:
         described = replace(described, air_density_kg_m3="none")
-    fit = fit_from_truth(with_markers(described, tracks), ROWS[fault])
+    return with_markers(described, tracks)
+
+
+def intervals(described: Experiment, fault: str) -> Intervals | None:
+    """Return the statistical and the combined interval of γ_m; None if the fit does not converge."""
+    fit = fit_from_truth(described, ROWS[fault])
     line = fit.lines.get(GAMMA_M)
-    interval = fit.uncertainty.estimates[GAMMA_M].statistical95
-    if not fit.converged or line is None or interval is None:
+    if not fit.converged or line is None:
         return None
-    return DampingEstimate(fit.uncertainty.estimates[GAMMA_M].value, interval, line.combined95)
-
-
-def summary(twins: list[DampingEstimate], count: int) -> str:
-    """Return the table of coverage and median half widths, in percent of the true γ_m."""
-    true_value = truth()[GAMMA_M]
-    low, high = binom.interval(0.95, len(twins), 0.95)
-    rows = [
-        f"{len(twins)} of {count} twins have an interval of γ_m; of {len(twins)} exact intervals "
-        f"{low:.0f} to {high:.0f} contain the truth with a probability of 95 %",
-        f"γ_m: truth {true_value:g} 1/s, median {np.median([t.estimate for t in twins]):.4g} 1/s",
-        "| interval | contains the truth | median half width, % of γ_m |",
-        "|---|---|---|",
-    ]
-    for kind in ("statistical", "combined"):
-        interval_ends_1_s = np.array([getattr(twin, kind) for twin in twins])
-        contained = int(
-            (
-                (interval_ends_1_s[:, 0] <= true_value) & (true_value <= interval_ends_1_s[:, 1])
-            ).sum()
-        )
-        width = (
-            100
-            * float(np.median(interval_ends_1_s[:, 1] - interval_ends_1_s[:, 0]))
-            / 2
-            / true_value
-        )
-        share = f"{contained} ({100 * contained / len(twins):.1f} %)"
-        rows.append(f"| {kind} | {share} | {width:.1f} |")
-    return "\n".join(rows)
+    statistical = fit.uncertainty.estimates[GAMMA_M].statistical95
+    return {f"{GAMMA_M}, statistical": statistical, f"{GAMMA_M}, combined": line.combined95}
 
 
 if __name__ == "__main__":

@@ -10,11 +10,12 @@ the instantaneous modulus. Before it, the error of the estimates without noise i
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from scipy.stats import binom
+from coverage_runner import Intervals, count_coverage, statistical_intervals
 
 from collocation_sysid import (
     Body,
@@ -25,14 +26,13 @@ from collocation_sysid import (
     Nuisance,
     Parameters,
     PoseSequence,
+    Problem,
     ReducedSpace,
     Unknown,
     simulate,
     with_markers,
 )
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 # Edges [m] and numbers of elements of the block.
 SIZE_M = (0.1, 0.03, 0.03)
@@ -74,34 +74,23 @@ def print_coverage(branches: int, twins: int, seed: int) -> None:
         abs(solution.parameters[name] / value - 1) for name, value in true_values.items()
     )
     print(f"{branches} Prony terms; largest relative error without noise {largest_error:.1e}")
+    shares = [value for name, value in true_values.items() if name.endswith("share")]
+    true_values["instantaneous_young_pa"] = true_values["young_pa"] * (1 + sum(shares))
     rng = np.random.default_rng(seed)
-    instantaneous_pa = true_values["young_pa"] * (
-        1 + sum(v for n, v in true_values.items() if n.endswith("share"))
-    )
-    true_values |= {"instantaneous_young_pa": instantaneous_pa}
-    contains_truth = {name: 0 for name in true_values}
-    intervals = dict.fromkeys(true_values, 0)
-    for _ in range(twins):
-        tracks = exact_recording.markers.positions_m
-        noisy = with_markers(exact_recording, tracks + rng.normal(scale=NOISE_M, size=tracks.shape))
-        collocation = Collocation([noisy], parameters)
-        answer = ReducedSpace()(collocation)
-        fit = linearise_fit(collocation, answer.z)
-        uncertainty = uncertainty_from_fit(fit, parameters, answer.q)
-        for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
-            if name in true_values and estimate.statistical95 is not None:
-                contains_truth[name] += (
-                    estimate.statistical95[0] <= true_values[name] <= estimate.statistical95[1]
-                )
-                intervals[name] += 1
-    low, high = binom.interval(0.95, twins, 0.95)
-    print(
-        f"  {twins} twins; the coverage of exact intervals is {100 * low / twins:.1f} to "
-        f"{100 * high / twins:.1f} % with a probability of 95 %"
-    )
-    for name, count in contains_truth.items():
-        share = 100 * count / max(1, intervals[name])
-        print(f"  {name:24} coverage {share:6.1f} % of {intervals[name]} intervals", flush=True)
+
+    def noisy_recordings() -> Iterator[tuple[Experiment, Mapping[str, float]]]:
+        """Yield the recordings with noise."""
+        for _ in range(twins):
+            tracks = exact_recording.markers.positions_m
+            noise = rng.normal(scale=NOISE_M, size=tracks.shape)
+            yield with_markers(exact_recording, tracks + noise), true_values
+
+    def intervals(noisy: Experiment) -> Intervals:
+        """Return the intervals of the parameters and of the instantaneous modulus."""
+        every = statistical_intervals(Problem([noisy], parameters, substeps=1))
+        return {name: every[name] for name in true_values if name in every}
+
+    print(count_coverage(noisy_recordings(), intervals).table(), flush=True)
 
 
 def truth(branches: int) -> dict[str, float]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from coverage_runner import Intervals, count_coverage
 from script_arguments import make_parser
 from twins import random_poses
 
@@ -77,57 +78,27 @@ def twin(name: str, seed: int) -> tuple[Problem, dict[str, float]]:
     return replace(coarse, experiments=[with_markers(coarse.experiments[0], tracks + noise)]), truth
 
 
+def intervals(problem: Problem) -> Intervals:
+    """Return the intervals for independent noise, and with the numerical error by a refinement."""
+    solution = solve(problem)
+    error_model = ErrorModel(errors="independent")
+    estimates = uncertainty_at(solution.collocation, solution.z, error_model).estimates
+    errors = solve_refined(problem, WarmStart.of(solution), estimates).errors
+    found = {}
+    for name in NAMES[:3]:
+        error = errors.get(name)
+        found[f"{name}, noise"] = estimates[name].statistical95
+        found[f"{name}, numerical error"] = None if error is None else error.interval95
+    return found
+
+
 def main(twins: int = 20, first: int = 0) -> None:
-    """Print the intervals of all twins, and the shares that contain the truth.
+    """Print the shares of intervals that contain the truth.
 
     `twins` is the number of twins of each body, `first` the first seed.
     """
-    covered: dict[str, list[tuple[bool, bool]]] = {name: [] for name in NAMES[:3]}
-    for seed in range(first, first + twins):
-        for name in BODIES:
-            problem, truth = twin(name, seed)
-            solution = solve(problem)
-            uncertainty = uncertainty_at(
-                solution.collocation, solution.z, ErrorModel(errors="independent")
-            )
-            refined = solve_refined(problem, WarmStart.of(solution), uncertainty.estimates)
-            for key in covered:
-                estimate = uncertainty.estimates[key]
-                error = refined.errors.get(key)
-                if estimate.statistical95 is None or error is None or error.interval95 is None:
-                    print(name, seed, key, estimate.reason, flush=True)
-                    continue
-                contains_truth = tuple(
-                    low <= truth[key] <= high
-                    for low, high in (estimate.statistical95, error.interval95)
-                )
-                covered[key].append((contains_truth[0], contains_truth[1]))
-                intervals = [
-                    [f"{v:.5g}" for v in pair]
-                    for pair in (estimate.statistical95, error.interval95)
-                ]
-                changes = [f"{change:+.3g}" for change in (error.step or 0.0, error.mesh or 0.0)]
-                print(
-                    f"{name}, seed {seed}, {key}: truth {truth[key]:.5g}, "
-                    f"estimate {estimate.value:.5g}, "
-                    f"change by step {changes[0]}, by mesh {changes[1]}, "
-                    f"intervals for noise {intervals[0]}, "
-                    f"with numerical error {intervals[1]}, "
-                    f"contain the truth: {contains_truth[0]}, "
-                    f"{contains_truth[1]}",
-                    flush=True,
-                )
-    for key, counted in covered.items():
-        shares = np.mean(counted, axis=0)
-        print(
-            f"{key}: coverage of the interval for noise {shares[0]:.0%}, "
-            f"with numerical error {shares[1]:.0%}; {len(counted)} intervals"
-        )
-    shares = np.mean([each for counted in covered.values() for each in counted], axis=0)
-    print(
-        f"all: coverage of the interval for noise {shares[0]:.0%}, "
-        f"with numerical error {shares[1]:.0%}"
-    )
+    every = (twin(name, seed) for seed in range(first, first + twins) for name in BODIES)
+    print(count_coverage(every, intervals).table())
 
 
 if __name__ == "__main__":

@@ -10,18 +10,15 @@ anisotropic nor drifting, so that the combined intervals would be too wide.
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from studies import markdown
+from coverage_runner import Intervals, count_coverage, statistical_intervals
 
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import with_readings
-from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 UNDAMPED = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 # Number of samples per test, and standard deviations of stress [Pa] and lateral stretch.
@@ -99,36 +96,18 @@ def main() -> None:
     parser.add_argument("--twins", type=int, default=200)
     parser.add_argument("--case", type=int, choices=range(len(CASES)), help="one of the cases")
     options = parser.parse_args()
-    rows = []
     for case in CASES if options.case is None else CASES[options.case : options.case + 1]:
-        start = time.perf_counter()
-        outcomes = [intervals_with_truth(case, seed) for seed in range(options.twins)]
-        elapsed = time.perf_counter() - start
-        for name in case.free:
-            contains_truth = np.array([outcome[name] for outcome in outcomes])
-            share = f"{contains_truth.sum()} of {len(contains_truth)}, {contains_truth.mean():.1%}"
-            rows.append((case.name, name, share, f"{elapsed / len(contains_truth):.2g}"))
-    heads = ("twins", "constant", "intervals that contain the truth", "time per twin [s]")
-    print(markdown(heads, rows))
+        rngs = map(np.random.default_rng, range(options.twins))
+        twins = (([twin(case, test, rng) for test in case.tests], case.truth) for rng in rngs)
+        coverage = count_coverage(twins, lambda tests, case=case: intervals(case, tests))
+        print(f"{case.name}: {coverage.table()}\n", flush=True)
 
 
-def intervals_with_truth(case: SpecimenCase, seed: int) -> dict[str, bool]:
-    """Return for each estimated constant whether its statistical 95 % interval contains the truth."""
-    rng = np.random.default_rng(seed)
-    experiments = [twin(case, test, rng) for test in case.tests]
+def intervals(case: SpecimenCase, tests: Sequence[cs.Experiment]) -> Intervals:
+    """Return the statistical 95 % interval of each estimated constant."""
     free = {name: cs.Unknown(guess=GUESS_SHARE * case.truth[name]) for name in case.free}
-    problem = cs.Problem(experiments, {**case.truth, **UNDAMPED, **free})
-    solution = cs.solve(problem)
-    assert solution.status.converged, seed
-    fit = linearise_fit(solution.collocation, solution.z)
-    parameters = solution.collocation.parameters
-    uncertainty = uncertainty_from_fit(fit, parameters, solution.q, problem.uncertainty)
-    contains_truth = {}
-    for name in case.free:
-        interval = uncertainty.estimates[name].statistical95
-        assert interval is not None, (name, seed)
-        contains_truth[name] = interval[0] <= case.truth[name] <= interval[1]
-    return contains_truth
+    every = statistical_intervals(cs.Problem(tests, {**case.truth, **UNDAMPED, **free}))
+    return {name: every[name] for name in case.free}
 
 
 def twin(case: SpecimenCase, test: str, rng: np.random.Generator) -> cs.Experiment:

@@ -13,6 +13,7 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
+from coverage_runner import Intervals, count_coverage
 from script_arguments import make_parser
 from study_refinement import BODIES, NAMES, STEP_S, unmeasured_problem
 
@@ -43,39 +44,26 @@ def main(twins: int = 20, first: int = 0) -> None:
     `twins` is the number of twins of each body and noise, `first` the first seed.
     """
     for noise_m in NOISES_M:
-        covered = Counter()
-        steps = Counter()
-        count = 0
-        for name in BODIES:
-            for seed in range(first, first + twins):
-                problem, truth = twin(name, noise_m, seed)
-                one_step_answer = run(replace(problem, substeps=1), seek_causes=False)
-                chosen_step_answer = run(problem, seek_causes=False)
-                steps[chosen_step_answer.solution.collocation.substeps] += 1
-                for key in NAMES[:3]:
-                    intervals = {
-                        "one step, noise": one_step_answer.optimum[key].statistical95,
-                        "one step, noise, estimate corrected": one_step_answer.estimates[
-                            key
-                        ].statistical95,
-                        "one step, noise and step": _interval_with_step(
-                            one_step_answer.estimates[key]
-                        ),
-                        "chosen steps, noise and step": _interval_with_step(
-                            chosen_step_answer.estimates[key]
-                        ),
-                    }
-                    if all(intervals.values()):
-                        count += 1
-                        covered.update(
-                            k for k, e in intervals.items() if e and e[0] <= truth[key] <= e[1]
-                        )
-        shares = ", ".join(f"{kind} {100 * n / count:.0f} %" for kind, n in covered.items())
-        print(f"noise {1e3 * noise_m:g} mm, coverage of {count} intervals: {shares}", flush=True)
-        print(
-            f"    number of twins by chosen steps per sample: {dict(sorted(steps.items()))}",
-            flush=True,
-        )
+        steps = Counter[int]()
+
+        def intervals(problem: Problem, steps: Counter[int] = steps) -> Intervals:
+            """Return the intervals with one step per sample, and with the chosen number."""
+            one = run(replace(problem, substeps=1), seek_causes=False)
+            chosen = run(problem, seek_causes=False)
+            steps[chosen.solution.collocation.substeps] += 1
+            found = {}
+            for name in NAMES[:3]:
+                found[f"{name}, one step, noise"] = one.optimum[name].statistical95
+                corrected = one.estimates[name]
+                found[f"{name}, one step, noise, estimate corrected"] = corrected.statistical95
+                found[f"{name}, one step, noise and step"] = _interval_with_step(corrected)
+                found[f"{name}, chosen steps"] = _interval_with_step(chosen.estimates[name])
+            return found
+
+        seeds = range(first, first + twins)
+        every = (twin(name, noise_m, seed) for name in BODIES for seed in seeds)
+        print(f"noise {1e3 * noise_m:g} mm: {count_coverage(every, intervals).table()}")
+        print(f"\ntwins by chosen steps per sample: {dict(sorted(steps.items()))}\n", flush=True)
 
 
 def _interval_with_step(estimate: ReportedEstimate) -> tuple[float, float] | None:

@@ -13,7 +13,7 @@ import argparse
 from functools import cache
 
 import numpy as np
-from scipy.stats import binom
+from coverage_runner import Intervals, count_coverage, statistical_intervals
 
 from collocation_sysid import (
     Body,
@@ -23,7 +23,6 @@ from collocation_sysid import (
     Nuisance,
     PoseSequence,
     Problem,
-    ReducedSpace,
     Unknown,
     Wrench,
     simulate,
@@ -31,8 +30,6 @@ from collocation_sysid import (
 )
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.program.simulation import with_wrenches
-from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 # Edges [m] and numbers of elements of the block.
 SIZE_M = (0.2, 0.06, 0.06)
@@ -57,42 +54,15 @@ def main() -> None:
     arguments = parser.parse_args()
     exact_recording = recording()
     rng = np.random.default_rng(arguments.seed)
-    covered: dict[str, int] = {name: 0 for name in COUNTED_NAMES}
-    errors: dict[str, list[float]] = {name: [] for name in COUNTED_NAMES}
-    for twin in range(1, arguments.twins + 1):
-        uncertainty = uncertainty_of_fit(noisy_recording(exact_recording, rng))
-        for name in COUNTED_NAMES:
-            estimate = uncertainty.estimates[name]
-            assert estimate.statistical95 is not None
-            assert estimate.statistical_std_error is not None
-            covered[name] += estimate.statistical95[0] <= TRUTH[name] <= estimate.statistical95[1]
-            errors[name].append(estimate.statistical_std_error / TRUTH[name])
-        if twin % 20 == 0 or twin == arguments.twins:
-            print_coverage(covered, errors, twin)
+    twins = ((noisy_recording(exact_recording, rng), TRUTH) for _ in range(arguments.twins))
+    print(count_coverage(twins, intervals).table())
 
 
-def print_coverage(covered: dict[str, int], errors: dict[str, list[float]], twins: int) -> None:
-    """Print the coverage of the intervals and the median standard error of each parameter."""
-    low, high = binom.interval(0.95, twins, 0.95)
-    print(
-        f"{twins} twins; the coverage of exact intervals is {100 * low / twins:.1f} to "
-        f"{100 * high / twins:.1f} % with a probability of 95 %"
-    )
-    for name, count in covered.items():
-        error = 100 * np.median(errors[name])
-        print(
-            f"  {name:16} coverage {100 * count / twins:6.1f} %, median standard error {error:.2g} %",
-            flush=True,
-        )
-
-
-def uncertainty_of_fit(experiment: Experiment):
-    """Return the uncertainties of a fit of all parameters, from guesses 10 % above the truth."""
+def intervals(experiment: Experiment) -> Intervals:
+    """Return the intervals of a fit of all parameters, from guesses 10 % above the truth."""
     unknown = {name: Unknown(guess=1.1 * value) for name, value in TRUTH.items()}
-    problem = Problem([experiment], unknown)
-    solution = ReducedSpace()(problem.collocation())
-    fit = linearise_fit(solution.collocation, solution.z)
-    return uncertainty_from_fit(fit, problem.parameters, solution.q)
+    every = statistical_intervals(Problem([experiment], unknown))
+    return {name: every[name] for name in COUNTED_NAMES}
 
 
 def noisy_recording(exact_recording: Experiment, rng: np.random.Generator) -> Experiment:

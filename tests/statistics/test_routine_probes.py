@@ -29,6 +29,7 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.recording.nuisance import TEMPERATURE
 from collocation_sysid.result.probe_sections import DEEPER_CHECK_ADVICE, is_deeper_check_worthwhile
 from collocation_sysid.result.run_summary import next_step, run_summary
 from collocation_sysid.statistics.assessment import Assessment, probe_concerns
@@ -265,6 +266,7 @@ def test_quantities_stated_as_exact_are_probed_too():
         MEMORY: 0.1,
         CLOCK: 1e-4,
         ANISOTROPY: 0.05,
+        TEMPERATURE.name: 5e-3,
     }
     assert probed_deviations({**exact, DRIFT: 0.1})[DRIFT] == 0.1
 
