@@ -1,7 +1,7 @@
 """Change of the stiffness over time: the internal forces times a small share, as a force term.
 
-Everything that is proportional to the stiffness changes by the same share: elastic forces and the
-damping γ_r. Drag γ_m and masses stay. The share s(t) is the only input.
+Elastic forces and those of the damping law change by the same share; drag γ_m and masses stay. The
+share s(t) is the only input.
 """
 
 from __future__ import annotations

@@ -218,6 +218,7 @@ class Experiment:
         self._check_actuators()
         self._check_obstacles()
         self._check_air()
+        self._check_stiffness_deviations()
 
     @property
     def description(self) -> str:
@@ -638,6 +639,27 @@ class Experiment:
             "laboratory: check air_density_kg_m3, and mass or density of the body",
             where="air_density_kg_m3",
         )
+
+    def _check_stiffness_deviations(self) -> None:
+        """Raise an `InputError` if a known deviation does not change the stiffness here, or a custom
+        one would change that of a body with memory, whose overstress would not follow.
+        """
+        if self.body.has_memory:
+            for row in self.nuisance.own:
+                if row.stiffness is not None:
+                    raise InputError(
+                        f"the deviation {row.name!r} changes the stiffness, and the body has memory; "
+                        "expected a body without memory"
+                    )
+        listed_names = [row.name for row in self.list_stiffness_deviations()]
+        for name in self.known_deviations:
+            if name not in listed_names:
+                raise InputError(
+                    f"found a value of {name!r}, which does not change the stiffness here; expected "
+                    "stiffness_per_kelvin of a body without memory, beside temperature_difference_k, "
+                    "or a deviation of your own with a function stiffness",
+                    where="known_deviations",
+                )
 
     def _check_time(self) -> None:
         """Check the sample times against each other and against those of all measurements."""

@@ -104,3 +104,18 @@ def test_every_solve_tests_a_coefficient_that_is_not_estimated():
 def test_a_custom_change_of_the_stiffness_needs_no_code_elsewhere():
     ageing = cs.Deviation("ageing", "1", 0.05, stiffness=lambda e, t_s: t_s / e.t_s[-1])
     check_nuisance(ageing, experiment=cube(None))
+
+
+def test_known_values_of_deviations_without_effect_are_refused():
+    with pytest.raises(cs.InputError, match="known_deviations: found a value of 'ageing'"):
+        replace(cube(5.0), known_deviations={"ageing": 0.1})
+    with pytest.raises(cs.InputError, match="beside temperature_difference_k"):
+        replace(cube(None), known_deviations={NAME: 0.1})
+
+
+def test_a_custom_change_of_the_stiffness_of_a_body_with_memory_is_refused():
+    ageing = cs.Deviation("ageing", "1", 0.05, stiffness=lambda e, t_s: t_s / e.t_s[-1])
+    described = cube(None)
+    viscous = cs.Body(described.body.mesh, density_kg_m3=60.0, prony=["prony_1"])
+    with pytest.raises(cs.InputError, match="the body has memory"):
+        replace(described, body=viscous, nuisance=cs.Nuisance.none(own=[ageing]))
