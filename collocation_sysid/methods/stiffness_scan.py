@@ -26,8 +26,8 @@ import numpy as np
 from ..common.array_types import Array, root_mean
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
-from ..fem.laws.constants import is_modulus, usual_value
-from ..model.parameters import Parameter, Parameters
+from ..fem.laws.constants import YOUNG, is_modulus, usual_value
+from ..model.parameters import Parameter, Parameters, with_widest_bounds
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.forward.newton_solver import NewtonOptions
 from ..program.transcription import Transcription
@@ -42,7 +42,7 @@ SOFTEST_PA = 1e2
 # Number of moduli in the scan, equally spaced on a logarithmic scale.
 STEPS = 15
 # Largest and smallest modulus when the scan continues beyond an end [Pa].
-LIMITS_PA = 1e10, 1.0
+LIMITS_PA = 1e13, 1.0
 # Typical Young's modulus of a soft body, where nothing is known [Pa].
 SOFT_PA = 1e4
 # Tolerance of simulations that are only compared.
@@ -51,8 +51,11 @@ LOOSE = NewtonOptions(tolerance=1e-4)
 CONSECUTIVE_FAILURES = 2
 # Misfit over the best one that counts as a failure.
 WORSE = 3.0
-# The scan continues beyond an end as long as the misfit decreases by this share.
+# The scan continues beyond an end as long as the misfit decreases by this share, or by more than in
+# the step before: a body that is much too soft, such as a metal, moves alike at every stiffness.
 BETTER = 0.01
+# Misfit up to which the measurements are explained, so that no other stiffness is sought [sigma].
+EXPLAINED = 1.5
 # Number of other starts where there are local minima: each costs a solve, and the right one was
 # next to the best in all twins.
 MORE_STARTS = 2
@@ -103,6 +106,11 @@ class ScanSummary:
         return (
             f"{self.reason}: started from E = {self.young_pa[self.best]:.3g} Pa after a scan of "
             f"{len(self.young_pa)} stiffnesses in {self.time_s:.2g} s"
+            + (
+                f", beyond the default bound of {YOUNG.bounds[1]:.3g} Pa of soft bodies"
+                if self.young_pa[self.best] > YOUNG.bounds[1]
+                else ""
+            )
         )
 
 
@@ -224,6 +232,9 @@ def scan_stiffness(
 ) -> Scan:
     """Simulate the problem at stiffnesses from stiff to soft, and return the best as a start.
 
+    Default bounds of moduli are those of foams and rubbers: where a stiffer body fits best, as one
+    of metal, the start has the `widest` bounds instead. Stated bounds are kept.
+
     With `is_complete` it is the best, or else the next stiffer one, at which the complete
     recordings can be simulated; there are then no `others`. The problem is not modified.
 
@@ -243,7 +254,8 @@ def scan_stiffness(
         from the best one on.
     """
     began = time.perf_counter()
-    sized = collocation.with_parameters(_with_units(collocation.parameters, 1.0))
+    widest = collocation.parameters.map_components(_with_wider_modulus)
+    sized = collocation.with_parameters(_with_units(widest, 1.0))
     for share in SHARES:
         trial = TrialSimulation(sized, share)
         trials = _tried(trial)
@@ -265,9 +277,11 @@ def scan_stiffness(
             where="parameters",
         )
     best = int(np.flatnonzero(young_pa == candidates[0])[0])
-    start = typical_parameters(collocation.parameters, candidates[0])
+    is_beyond = candidates[0] > YOUNG.bounds[1]
+    bounded = widest if is_beyond else collocation.parameters
+    start = typical_parameters(bounded, candidates[0])
     others = other_starts(misfit, best) if not is_complete else ()
-    starts = {k: typical_parameters(collocation.parameters, young_pa[k]) for k in (best, *others)}
+    starts = {k: typical_parameters(bounded, young_pa[k]) for k in (best, *others)}
     return Scan(
         reason,
         young_pa,
@@ -288,9 +302,7 @@ def _tried(trial: TrialSimulation) -> ScanState:
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
     with counted_phase(StepUnit.STIFFNESS, STEPS):
         trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
-    if not trials.depends_on_stiffness:
-        return trials
-    if trials.is_best_at_end(softest=True):
+    if trials.depends_on_stiffness and trials.is_best_at_end(softest=True):
         trials.extend_range(min(trials.misfits), step)
     if trials.is_best_at_end(softest=False):
         trials.last_trajectories = None
@@ -377,6 +389,10 @@ def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
     return parameters.map_components(
         lambda item: replace(item, unit=unit) if np.isnan(item.unit) else item
     )
+
+
+def _with_wider_modulus(item: Parameter) -> Parameter:
+    return with_widest_bounds(item) if is_modulus(item.name) else item
 
 
 def _has_free_modulus(collocation: Collocation) -> bool:
@@ -621,10 +637,11 @@ class ScanState:
 
     def extend_range(self, young_pa: float, factor: float) -> None:
         """Try moduli beyond an end of the range, as long as each decreases the misfit by more than
-        the share `BETTER`, within `LIMITS_PA`; their misfits are stored, also that of the last one.
+        the share `BETTER`, or by more than the modulus before, within `LIMITS_PA`; their misfits
+        are stored, also that of the last one.
 
-        It also ends where a simulation fails, or where the parameters are at their bounds and no
-        longer change.
+        It also ends where a simulation fails, where the measurements are `EXPLAINED`, or where the
+        parameters are at their bounds and no longer change.
 
         Parameters
         ----------
@@ -634,14 +651,17 @@ class ScanState:
             Ratio of successive moduli, below one towards softer ones.
         """
         best = self.misfits[young_pa]
+        inside = min(self.misfits, key=lambda each: abs(np.log(each * factor / young_pa)))
+        decrease = self.misfits[inside] - best
         beyond = young_pa * factor
-        while LIMITS_PA[1] < beyond < LIMITS_PA[0]:
+        while LIMITS_PA[1] < beyond < LIMITS_PA[0] and best > EXPLAINED:
             if self.trial.parameter_key(beyond) == self.trial.parameter_key(beyond / factor):
                 return
             misfit = self._try(beyond)
-            if not misfit < (1 - BETTER) * best:
+            gain = best - misfit
+            if not (gain > BETTER * best or gain > max(decrease, 0.0)):
                 return
-            best = misfit
+            best, decrease = misfit, gain
             beyond = beyond * factor
 
     @property

@@ -240,6 +240,20 @@ def is_default_bound(item: Parameter, value: float) -> bool:
     return item.has_default_bound(side) and constant.bounds[side] != constant.widest[side]
 
 
+def with_widest_bounds(item: Parameter) -> Parameter:
+    """Return a parameter with the `widest` bounds of its constant in place of its default ones; a
+    parameter without such bounds, a fixed or a tied one is returned itself. Stated bounds are kept.
+    """
+    widest = constant_named(item.name).widest
+    if item.is_fixed or item.tied is not None or widest is None:
+        return item
+    lower, upper = (
+        widest[side] if item.has_default_bound(side) else (item.lower, item.upper)[side]
+        for side in (0, 1)
+    )
+    return replace(item, lower=lower, upper=upper)
+
+
 def _lower_limit_text(least: float) -> str:
     """Return the start of an inequality with the smallest admissible value; "" if there is none."""
     return "" if least == -np.inf else f"{least:g} <= "
@@ -288,6 +302,9 @@ def complete_parameter(
     user_statement = _with_usual_guess(name, user_statement, constant)
     scale = user_statement.scale or constant.scale
     low, high = constant.bounds
+    guess = user_statement.guess
+    if guess is not None and constant.widest is not None and not low <= guess <= high:
+        low, high = constant.widest  # as of metal: the default bounds are those of soft bodies
     if scale == "linear" and constant.scale == "log":
         low = -high
     if scale == "log" and low <= 0:

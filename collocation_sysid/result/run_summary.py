@@ -11,7 +11,7 @@ from ..common.display import Line, Shown, Table, flattened_parts, number
 from ..common.serialisation import copy_fields
 from ..errors import listed
 from ..features.measurement_results import FittedExperiment, PredictionErrors, SimulatedExperiment
-from ..fem.laws.constants import symbol_of, unit_of, without_region
+from ..fem.laws.constants import INSTANTANEOUS, symbol_of, unit_of, without_region
 from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
@@ -39,7 +39,7 @@ from .run_sections import (
 )
 
 # Derived moduli in the summary; others are in the details.
-SHOWN_MODULI = ("young_pa", "poisson")
+SHOWN_MODULI = ("young_pa", "poisson", INSTANTANEOUS.name)
 # Sources of uncertainty in the summary, and the smallest share of a variance that counts.
 SHOWN_SOURCES = 3
 SMALLEST_SHOWN_SHARE = 0.01

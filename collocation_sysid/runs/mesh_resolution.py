@@ -108,8 +108,8 @@ def _modulus_beyond_first_order(
 
 
 def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) -> list[Concern]:
-    """Return a "check" concern for each body of linear tetrahedra whose mesh is too coarse for its
-    bending.
+    """Return a "check" concern for each body whose mesh is too coarse for its bending: of linear
+    tetrahedra, and of other elements where the error of the mesh could not be estimated.
 
     Empty if the recordings are declared to be simulated (`is_declared_simulated`), or if a solve on
     a finer mesh has measured the error.
@@ -123,14 +123,15 @@ def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) ->
     levels = () if refinement is None else refinement.levels
     if is_declared_simulated(problem) or any(level.refined == MESH for level in levels):
         return []
-    return [*_large_error_concerns(problem, refinement), *_few_cells_concerns(problem)]
+    few = [each for each in _coarse_mesh_concerns(problem) if _is_reason(each, refinement)]
+    return [*_large_error_concerns(problem, refinement), *few]
 
 
-def _few_cells_concerns(problem: Problem) -> list[Concern]:
-    """Return a concern for each body of too few linear tetrahedra."""
-    return [
-        concern for concern in _coarse_mesh_concerns(problem) if concern.data["element"] == LINEAR
-    ]
+def _is_reason(few: Concern, refinement: Refinement | None) -> bool:
+    """Return whether too few elements are a reason of the verdict, and not a note."""
+    known = () if refinement is None else refinement.errors.values()
+    is_estimated = any(error.estimated_mesh is not None for error in known)
+    return few.data["element"] == LINEAR or (refinement is not None and not is_estimated)
 
 
 def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> Iterator[Concern]:
@@ -156,15 +157,15 @@ def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> It
         yield Concern(MESH_ERROR, "check", data={"name": name, "percent": 100 * changes[name]})
 
 
-def mesh_resolution_notes(problem: Problem) -> list[str]:
+def mesh_resolution_notes(problem: Problem, refinement: Refinement | None = None) -> list[str]:
     """Return the same sentences as notes where they are no concerns: for recordings that are
-    declared to be simulated, and for other elements, whose error is smaller.
+    declared to be simulated, and for other elements with a known error of the mesh.
     """
     is_simulated = is_declared_simulated(problem)
     return [
         concern.message
         for concern in _coarse_mesh_concerns(problem)
-        if is_simulated or concern.data["element"] != LINEAR
+        if is_simulated or not _is_reason(concern, refinement)
     ]
 
 

@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..fem.laws.constants import SHARE, constant_named, usual_value, without_region
+from ..fem.laws.constants import SHARE, is_limitless, usual_value, without_region
 from ..methods.power_law_start import power_law_start
 from ..methods.solution import Solution
-from ..model.parameters import Parameter, Parameters, is_default_bound
+from ..model.parameters import Parameter, Parameters, is_default_bound, with_widest_bounds
 from ..statistics.linearised import AT_BOUND, parameter_values
 
 # Poisson's ratio above which a second search starts from the usual one at the same Young's modulus.
@@ -93,6 +93,25 @@ def start_beyond_bounds(solution: Solution) -> SecondStart | None:
     )
 
 
+def without_limitless_shares(solution: Solution) -> Parameters | None:
+    """Return the estimates of a solution with the shares of memory fixed that grew to their largest
+    value; None if there are none.
+
+    Of a liquid the data determine E (1 + Σg), the instantaneous modulus, and neither factor.
+    """
+    parameters = solution.collocation.parameters
+    values = parameter_values(solution.collocation, solution.q)
+    fixed = {
+        item.name: replace(item, guess=values[item.name], is_fixed=True)
+        for item in parameters.free
+        if is_limitless(item.name, values[item.name])
+    }
+    if not fixed:
+        return None
+    known = {item.name: values[item.name] for item in parameters.free}
+    return parameters.with_estimates(known).map_components(lambda item: fixed.get(item.name, item))
+
+
 def _is_nearly_half(name: str, value: float) -> bool:
     return without_region(name) == "poisson" and value > NEARLY_INCOMPRESSIBLE
 
@@ -101,20 +120,16 @@ def _widened(item: Parameter, ended: Container[str], locks: bool) -> Parameter:
     """Return a parameter with the widest bounds in place of its default ones, of shares those that
     ended at one.
     """
-    widest = constant_named(item.name).widest
-    if item.is_fixed or item.tied is not None or widest is None:
-        return item
     is_share = without_region(item.name) == SHARE.name
     if is_share and item.name not in ended:
         return item
-    lower = widest[0] if item.has_default_bound(0) else item.lower
-    keeps_upper = not item.has_default_bound(1) or (
-        locks and _is_nearly_half(item.name, item.upper)
-    )
-    upper = item.upper if keeps_upper else widest[1]
-    if is_share:
-        return replace(item, lower=max(lower, LITTLE_MEMORY), upper=upper, scale="log", unit=1.0)
-    return replace(item, lower=lower, upper=upper)
+    widened = with_widest_bounds(item)
+    if locks and _is_nearly_half(item.name, item.upper):
+        widened = replace(widened, upper=item.upper)
+    if is_share and widened is not item:
+        lower = max(widened.lower, LITTLE_MEMORY)
+        return replace(widened, lower=lower, scale="log", unit=1.0)
+    return widened
 
 
 def _usual_poisson_start(solution: Solution) -> SecondStart | None:

@@ -604,7 +604,7 @@ class SolvedProblem:
             return self.notes
         notes = (
             *self.notes,
-            *mesh_resolution_notes(self.problem),
+            *mesh_resolution_notes(self.problem, self.refinement),
             *grasp_extent_notes(self.problem),
             *self.uncertainty.notes,
             *identifiability_sentences(self.uncertainty, self.combinations),

@@ -34,7 +34,7 @@ from .coarse_start import (
     start_note,
     undetermined_names,
 )
-from .second_start import SecondStart, second_start, start_beyond_bounds
+from .second_start import SecondStart, second_start, start_beyond_bounds, without_limitless_shares
 from .several_starts import follow_starts
 from .thinned_start import (
     NoThinnedStartError,
@@ -66,6 +66,8 @@ FINAL_STATUSES = (
 )
 # Least decrease of χ² for which the solution from a second start is preferred.
 LEAST_GAIN = 1e-3
+# Most searches that continue beyond a default bound: those of two shares of memory and a modulus.
+MOST_BOUNDS = 3
 # Least tolerance of a solve on a coarser mesh: below the difference between both meshes.
 COARSE_TOLERANCE = 1e-4
 # Poisson's ratio from which elements that do not average the volume need many small steps.
@@ -536,9 +538,22 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
 
 def continued_beyond_bounds(solver: Method, first: Solution, watch: Watch | None) -> Solution:
     """Return the better of a solution and of the one that continues at default bounds, as
-    `best_of_second_start`.
+    `best_of_second_start`; shares of memory without limit are then held, as of a liquid.
     """
-    return _better_of(solver, first, watch, choose=start_beyond_bounds)
+    best = first
+    for _ in range(MOST_BOUNDS):
+        better = _better_of(solver, best, watch, choose=start_beyond_bounds)
+        if better is best:
+            break
+        best = better
+    limited = without_limitless_shares(best) if best.status.converged else None
+    if limited is None:
+        return best
+    again = solver(best.collocation.with_parameters(limited), watch, None)
+    if not again.history or again.history[-1].loss > best.history[-1].loss + LEAST_GAIN:
+        return best
+    # A restart at the optimum may find no decrease that exceeds rounding.
+    return replace(again, status=best.status, message=best.message, notes=best.notes)
 
 
 def _better_of(

@@ -28,7 +28,7 @@ from .budget.systematic_effects import DEVIATIONS
 from .budget.uncertainty_budget import source_label
 from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
-from .estimates import Estimate, display_name, is_liquid
+from .estimates import Estimate, display_name, limitless_shares
 from .instrument_misfit import InstrumentMisfit
 from .misspecification.misspecification_hypothesis import Hypothesis
 from .probes.relaxed_assumptions import ANISOTROPY, DRIFT, MEMORY, Probe, assumption_name
@@ -294,8 +294,8 @@ def parameter_concerns(
         and is_default_bound(item, estimates[item.name].value)
     ]
     at_bound = [name for name, estimate in estimates.items() if estimate.at_bound]
-    liquid = [name for name in at_bound if is_liquid(name, estimates[name])]
-    bounded = [name for name in at_bound if name not in (*at_default, *liquid)]
+    liquid = [] if parameters is None else limitless_shares(parameters)
+    bounded = [name for name in at_bound if name not in at_default]
     undetermined = [
         name
         for name, estimate in estimates.items()

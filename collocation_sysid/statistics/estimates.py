@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 from ..common.array_types import Array
 from ..fem.laws.constants import (
     FIELD_COEFFICIENT,
+    INSTANTANEOUS,
     SHARE,
     TAU,
     constant_named,
     is_damping,
+    is_limitless,
+    is_modulus,
     without_region,
 )
 from ..model.parameters import Parameter, Parameters
@@ -381,8 +384,6 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
     for item in (each for each in parameters.free if each.name in estimates):
         name = item.name
         estimate = estimates[item.name]
-        if is_liquid(name, estimate):
-            continue  # the verdict tells it
         if estimate.at_bound:
             nearest = min(
                 ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
@@ -392,6 +393,8 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
                 "error bar, and the error bars of the others include its uncertainty; widen "
                 "the bound, or fix the parameter if it is known"
             )
+        elif estimate.statistical95 is None and limitless_shares(parameters):
+            continue  # the verdict tells it
         elif estimate.statistical95 is None:
             damping = is_damping(name)
             by = ": no information on damping in these data" if damping else " by these data"
@@ -404,13 +407,31 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
     return [*notes, *_unidentifiable_notes(reasons)]
 
 
-def is_liquid(name: str, estimate: Estimate) -> bool:
-    """Return whether a share of memory ended at the largest one, so that no long-term modulus is
-    left.
+def limitless_shares(parameters: Parameters) -> list[str]:
+    """Return the names of shares of memory that leave no long-term stiffness, see `is_limitless`."""
+    return [
+        item.name
+        for item in parameters.scalars
+        if item.is_fixed and item.guess is not None and is_limitless(item.name, item.guess)
+    ]
+
+
+def without_long_term_moduli(
+    parameters: Parameters, estimates: Mapping[str, Estimate]
+) -> dict[str, Estimate]:
+    """Return estimates in which the long-term moduli of a liquid have no interval: those of the
+    region of a share in `limitless_shares`. The instantaneous modulus keeps its own.
     """
-    if without_region(name) != SHARE.name or SHARE.widest is None:
-        return False
-    return estimate.at_bound and estimate.value > 0.99 * SHARE.widest[1]
+    regions = {name.rpartition(".")[0].rpartition(".")[0] for name in limitless_shares(parameters)}
+    return {
+        name: Estimate(each.value, reason="the stress relaxes to zero")
+        if name.rpartition(".")[0] in regions
+        and is_modulus(name)
+        and without_region(name) != INSTANTANEOUS.name
+        and each.statistical95 is not None
+        else each
+        for name, each in estimates.items()
+    }
 
 
 def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:

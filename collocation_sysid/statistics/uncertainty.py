@@ -45,6 +45,7 @@ from .estimates import (
     parameter_notes,
     relative_derivatives,
     user_estimates,
+    without_long_term_moduli,
 )
 from .linearised import (
     Information,
@@ -276,6 +277,14 @@ def uncertainty_from_fit(
     estimates = user_estimates(
         parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles
     )
+    derived = derived_estimates(
+        fit.derived,
+        of_q,
+        at_bound=bounded,
+        quantiles=quantiles,
+        reasons=[estimates[n].reason if n in estimates else None for n in fit.names[:shared]],
+    )
+    estimates = without_long_term_moduli(parameters, estimates)
     longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
     sizes = relative_derivatives(parameters, q)
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
@@ -292,13 +301,7 @@ def uncertainty_from_fit(
         correlation=correlation_from_covariance(of_q),
         quantiles=quantiles,
         estimates=estimates,
-        derived=derived_estimates(
-            fit.derived,
-            of_q,
-            at_bound=bounded,
-            quantiles=quantiles,
-            reasons=[estimates[n].reason if n in estimates else None for n in fit.names[:shared]],
-        ),
+        derived=without_long_term_moduli(parameters, derived),
         nuisance=dict(zip(fit.names[shared:], deviations, strict=True)),
         nuisance_covariance=of_all[shared:, shared:],
         chi_squared=fit.compute_chi_squared(),

@@ -9,9 +9,14 @@ import numpy as np
 
 import collocation_sysid as cs
 from collocation_sysid.runs.mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
-from collocation_sysid.statistics.budget.discretisation_error import Refinement, RefinementLevel
+from collocation_sysid.statistics.budget.discretisation_error import (
+    DiscretisationError,
+    Refinement,
+    RefinementLevel,
+)
 
 FOAM_CYLINDER = Path(__file__).parents[2] / "problems" / "foam_cylinder" / "problem.toml"
+ERROR = DiscretisationError(-0.1, None, 2.0, None, 1.0, None)
 LEVEL = RefinementLevel("mesh", 1, 1, 1, 1, 1.0, {})
 
 
@@ -47,7 +52,7 @@ def test_a_solve_on_a_finer_mesh_answers_the_concern():
     assert mesh_resolution_concerns(of_real_body(), measured) == []
 
 
-def test_averaged_dilatation_has_a_note_only():
+def test_averaged_dilatation_has_a_note_unless_the_mesh_error_is_unknown():
     body = cs.Body(
         cs.box_mesh((0.03, 0.03, 0.12), (1, 1, 4)), density_kg_m3=30.0, element="tet10-p0"
     )
@@ -61,6 +66,13 @@ def test_averaged_dilatation_has_a_note_only():
     )
     assert mesh_resolution_concerns(problem, None) == []
     (note,) = mesh_resolution_notes(problem)
+    known = Refinement({"mu_pa": replace(ERROR, estimated_mesh=-0.1)}, ())
+    assert mesh_resolution_concerns(problem, known) == []
+    assert mesh_resolution_notes(problem, known) == [note]
+    unknown = Refinement({"mu_pa": ERROR}, ())
+    (concern,) = mesh_resolution_concerns(problem, unknown)
+    assert concern.message == note
+    assert mesh_resolution_notes(problem, unknown) == []
     assert "stiffness of a real body will be too high" in note
 
 

@@ -356,6 +356,14 @@ def is_modulus(name: str) -> bool:
     return unit_of(name) == "Pa"
 
 
+def is_limitless(name: str, value: float) -> bool:
+    """Return whether a value is that of a share of memory so large that no long-term stiffness is
+    left, as of a liquid.
+    """
+    assert SHARE.widest is not None
+    return without_region(name) == SHARE.name and value > 0.99 * SHARE.widest[1]
+
+
 def is_density(name: str) -> bool:
     """Return whether a parameter of this name determines a density: a density or the total mass."""
     return without_region(name) in (DENSITY.name, MASS.name)
