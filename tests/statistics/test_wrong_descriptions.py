@@ -361,6 +361,19 @@ def test_an_implausible_size_is_reported_with_the_key_that_states_it():
         assert words in oddity.message
 
 
+def test_a_weighed_body_whose_mesh_is_in_millimetres_has_the_unit_of_the_mesh_as_remedy():
+    """Not another density, which would be as implausible."""
+    mesh = box_mesh((30.0, 30.0, 120.0), (1, 1, 2))
+    read = TetMesh(mesh.points_m, mesh.tetrahedra)
+    with pytest.raises(InputError, match=r'rather object\.length_unit, likely "mm"') as caught:
+        size_and_density_hypotheses(Body(read, mass_kg=0.1134))
+    assert "g/cm³" not in caught.value.message
+    with pytest.raises(InputError, match="masses are in kg"):
+        size_and_density_hypotheses(Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), mass_kg=1e-9))
+    with pytest.raises(InputError, match=r"probably 30 kg/m³, if the value is in g/cm³"):
+        size_and_density_hypotheses(Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), density_kg_m3=0.03))
+
+
 def test_a_metal_as_soft_as_rubber_is_odd():
     theta = {"young_pa": 5e5, "poisson": 0.4, "gamma_r_s": 0.01, "gamma_m_1_s": 0.0}
 

@@ -73,9 +73,7 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
         "density_kg_m3": density_kg_m3,
         "least": thin,
         "most": dense,
-        "likely": f"probably {1e3 * density_kg_m3:.4g} kg/m³, if the value is in g/cm³"
-        if density_kg_m3 < thin
-        else f"probably {density_kg_m3 / 1e3:.4g} kg/m³, if the mass is in g",
+        "likely": _likely_density(body, density_kg_m3, size_m),
     }
     tried = (
         Hypothesis("length-unit/size", data=size, strength=_excess_factor(size_m, SIZES_M)),
@@ -141,6 +139,22 @@ def _likely_length(body: Body, *, too_large: bool) -> str:
         return "its lengths, which are in metres"
     unit = 'likely "mm"' if too_large else "the mesh may be in metres already"
     return f"object.length_unit, {unit}"
+
+
+def _likely_density(body: Body, density_kg_m3: float, size_m: float) -> str:
+    """Return, for a message, what is wrong with an implausible density: the unit of the mesh, if a
+    weighed body is too large or too small as well, or else that of the density or mass.
+    """
+    thin, dense = DENSITIES_KG_M3
+    is_low = density_kg_m3 < thin
+    if body.has_declared_mass and (size_m > SIZES_M[1] if is_low else size_m < SIZES_M[0]):
+        likely = _likely_length(body, too_large=is_low)
+        return f"or rather {likely}: the mesh is {size_m:.3g} m large"
+    corrected_kg_m3 = density_kg_m3 * (1e3 if is_low else 1e-3)
+    if not thin <= corrected_kg_m3 <= dense:
+        return "masses are in kg"
+    unit = "the value is in g/cm³" if is_low else "the mass is in g"
+    return f"probably {corrected_kg_m3:.4g} kg/m³, if {unit}"
 
 
 def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
