@@ -234,9 +234,8 @@ class FieldResult:
         share = f"halve the prior uncertainty in {self.determined_share:.0%} of the volume"
         details = [
             f"resolved details: above {short(1e3 * self.shapes.detail_m)} mm",
-            f"values and intervals are those of a field smoothed over "
-            f"{short(1e3 * self.shapes.length_m)} mm, and a small inclusion with a sharp boundary "
-            "differs more",
+            f"values are those of a field smoothed over {short(1e3 * self.shapes.length_m)} mm, so "
+            "that a small inclusion with a sharp boundary differs more; the intervals contain this",
         ]
         if len(self.likelier) > 1:
             each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())

@@ -11,6 +11,12 @@ prior N(0, D), for another length or amplitude, the data would be more likely, t
     ln Z(D) − ln Z(I),   ln Z(D) = −½ ln |I + H D| + ½ bᵀ D (I + H D)⁻¹ b,   b = C_a⁻¹ a
 
 (Laplace's approximation, with all other estimates fixed).
+
+The variance is that of fields of the prior. Edges are no such fields: an estimate is a mean of the
+true field with the weights R = S (I − C_a) Sᵀ (averaging kernel; Backus and Gilbert 1968) of the
+modes S in the elements, and near an edge the true value is that of one of its sides. The intervals
+therefore also contain the variance of the estimated field under the positive weights of each
+element, which vanishes for a homogeneous body.
 """
 
 from __future__ import annotations
@@ -44,6 +50,8 @@ LIKELIER = 3.0
 # Variance over that of the prior above which error bars contain model error, and no evidence is
 # computed.
 WIDER = 1.1
+# Largest number of elements, evenly taken, of which an averaging kernel consists.
+KERNEL_ELEMENTS = 1000
 # By this factor χ² per measurement of two phases is above that of a smooth field, or of noise,
 # where two phases do not describe the body: chance moves it by a few per cent.
 WORSE = 1.1
@@ -123,6 +131,9 @@ class FieldEstimate:
         Ends (k,) of the 95 % intervals from samples; None if they follow from the deviation.
     phases : PhaseSummary or None
         Result of a two-phase field; None for a smooth field.
+    smoothing : (k,) array or None
+        Standard deviation of the estimated field under the averaging kernel of each element, in the
+        unit of `deviation`; None where it is zero.
     """
 
     name: str
@@ -136,19 +147,22 @@ class FieldEstimate:
     declared_density_kg_m3: float | None = None
     sampled_intervals: tuple[Array, Array] | None = None
     phases: PhaseSummary | None = None
+    smoothing: Array | None = None
 
     @property
     def statistical95(self) -> tuple[Array, Array]:
         """Lower and upper ends (k,) of the 95 % intervals: those from samples if there are any,
         symmetric about the value for a density, else symmetric in the logarithm. NaN without
-        error bars.
+        error bars. They contain `smoothing`.
         """
         if self.sampled_intervals is not None:
             return self.sampled_intervals
+        smoothing = 0.0 if self.smoothing is None else self.smoothing
+        deviation = np.hypot(self.deviation, smoothing)
         if self.declared_density_kg_m3 is not None:
-            half_width = self.quantile * self.deviation * self.declared_density_kg_m3
+            half_width = self.quantile * deviation * self.declared_density_kg_m3
             return self.value - half_width, self.value + half_width
-        factor = np.exp(self.quantile * self.deviation)
+        factor = np.exp(self.quantile * deviation)
         return self.value / factor, self.value * factor
 
     def compute_deviation_over_prior(self) -> Array:
@@ -342,8 +356,24 @@ def field_estimates(
         if isinstance(modes, TwoPhaseModes):
             contrast = theta[coefficients.stop - 1]
             estimate = _with_phases(estimate, modes, contrast=float(contrast))
+        elif uncertainty is not None and len(free) == len(modes.shapes.T):
+            estimate = replace(estimate, smoothing=_smoothing(estimate))
         estimates.append(estimate)
     return estimates
+
+
+def _smoothing(estimate: FieldEstimate) -> Array:
+    """Return the standard deviation (k,) of the estimated field under the positive weights of the
+    averaging kernel of each element.
+    """
+    shapes = estimate.modes.shapes
+    known = np.eye(shapes.shape[1]) - np.nan_to_num(estimate.covariance, nan=1.0)
+    others = shapes[:: 1 + len(shapes) // KERNEL_ELEMENTS]
+    weights = np.maximum(shapes @ known @ others.T, 0.0)
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+    field = others @ estimate.coefficients
+    mean = weights @ field
+    return np.sqrt(np.maximum(weights @ field**2 - mean**2, 0.0))
 
 
 def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float) -> FieldEstimate:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import study_field
 from kit.checks import assert_derivative
 from kit.problems import IDEAL, point_markers, smooth_poses, times
 from matplotlib.figure import Figure
@@ -557,5 +558,25 @@ def test_check_reports_the_fields_that_the_shapes_can_determine(length_m: float,
 def test_the_line_about_a_field_says_that_it_is_smoothed():
     shapes = FieldResolution(modes=40, length_m=0.04, amplitude=0.5, share=0.95, detail_m=0.021)
     line = FieldResult(shapes, (2e4, 7e4), 1.0, 28, {}).sentence("young_pa")
-    assert "above 21 mm; values and intervals are those of a field smoothed over 40 mm" in line
-    assert "a small inclusion with a sharp boundary differs more" in line
+    assert "above 21 mm; values are those of a field smoothed over 40 mm" in line
+    assert "a small inclusion with a sharp boundary differs more; the intervals contain" in line
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", ["stiff ball, twice", "stiff ball, three times"])
+def test_intervals_inside_a_stiff_ball_contain_its_stiffness(name, seed):
+    """The prior smooths the edge of the ball: without that, 40 to 70 % of them contain it."""
+    (twin,) = (each for each in study_field.TWINS if each.name == name)
+    answer = study_field.identify(twin, seed)
+    inside = study_field.stiff_cells(twin.kind, answer.mesh, twin.centre_m(seed))
+    low, high = np.log(answer.field.statistical95)
+    contains = (low < answer.truth) & (answer.truth < high)
+    assert contains[inside].mean() > 0.9
+    assert np.median(high - low) < 2.0 * 0.6
+
+
+def test_nothing_is_smoothed_in_a_homogeneous_body():
+    field = found()
+    assert field.smoothing is not None
+    assert field.smoothing.max() < 0.5 * field.deviation.min()
