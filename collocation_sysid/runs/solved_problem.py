@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -15,6 +16,7 @@ from ..errors import InputError, hint_at
 from ..fem.laws.constants import unit_of
 from ..methods.solution import Solution
 from ..problem import Problem
+from ..recording.measurement import Measurement
 from ..statistics.assessment import Assessment, cause_concerns, numerical_concerns, probe_concerns
 from ..statistics.budget.alternatives import (
     Alternative,
@@ -52,6 +54,7 @@ from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
 from .check.grasp_extent import grasp_extent_concerns, grasp_extent_notes
 from .check.modes_check import ModesCheck
+from .ensemble import draw_samples
 from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
 from .result_content import Elapsed, ReportedEstimate
@@ -433,6 +436,116 @@ class SolvedProblem:
             matrix = self._complete_covariance * np.outer(factors, factors)
         return matrix if units == "relative" else matrix / np.outer(by_value, by_value)
 
+    def samples(self, count: int, seed: int = 0) -> Any:
+        """Return draws from the combined distribution of the parameters as a pandas DataFrame, one
+        row each, for simulations with random constants.
+
+        The columns are all parameters, also fixed and tied ones, and the derived moduli, in SI
+        units (`attrs["units"]`). The distribution is normal in the coordinates in which the
+        intervals are symmetric, usually logarithms, with the correlations of `covariance`, within
+        the bounds of the parameters and with moduli of a stable material. A parameter that the
+        data do not determine varies between its bounds; one at a bound varies on one side of it.
+
+        Parameters
+        ----------
+        count : int
+            Number of draws, at least 1.
+        seed : int
+            Seed of the random numbers; the same seed gives the same draws.
+
+        Raises
+        ------
+        InputError
+            Without error bars or pandas, for a count below 1, or if hardly any draw is admissible.
+        """
+        if count < 1:
+            raise InputError(f"count: found {count}; expected at least 1")
+        pandas = _optional_package("pandas", "a data frame")
+        if self.uncertainty is None or self.systematic_effects is None:
+            raise InputError("the run has no error bars, and therefore no samples")
+        # Wide, not NaN, where a parameter is not determined.
+        complete = self._complete_covariance
+        factors = self._collect_relative_deviations() / np.sqrt(np.diag(complete))
+        factors = np.nan_to_num(factors, nan=1.0) / self._relative_by_value()
+        draws = draw_samples(
+            self.solution.collocation,
+            self.parameters,
+            complete * np.outer(factors, factors),
+            self.combinations,
+            count,
+            seed,
+        )
+        frame = pandas.DataFrame(draws)
+        frame.index.name = "sample"
+        frame.attrs["units"] = {name: unit_of(name) for name in frame.columns}
+        return frame
+
+    def predicted(self) -> dict[str, Any]:
+        """Return the predictions of the fit as labelled arrays.
+
+        Returns
+        -------
+        dict of str to xarray.DataArray
+            By "experiment: measurement", with the dimensions time [s] and quantity and the unit in
+            `attrs`; NaN where a sample was not predicted. Points of depth cameras, which have no
+            labels, are left out.
+
+        Raises
+        ------
+        InputError
+            Without xarray.
+        """
+        return {
+            title: self._labelled(measurement, values)
+            for title, measurement, values in self._iterate_fitted()
+        }
+
+    def residuals(self) -> dict[str, Any]:
+        """Return the measured values less the predictions of the fit, as `predicted`; NaN also
+        where nothing was measured. `attrs["sigma"]` has the stated standard deviation of each
+        quantity.
+
+        Raises
+        ------
+        InputError
+            Without xarray.
+        """
+        return {
+            title: self._labelled(measurement, measurement.measured_values - values).assign_attrs(
+                sigma=measurement.value_sigmas.tolist()
+            )
+            for title, measurement, values in self._iterate_fitted()
+        }
+
+    def _iterate_fitted(self) -> Iterator[tuple[str, Measurement, Array]]:
+        """Yield title, measurement and prediction (S, m) of every measurement with labels."""
+        for part in self.solution.parts:
+            experiment = part.transcription.experiment
+            fitted = self.solution.fitted_values[experiment.name]
+            titles = Counter[str]()
+            for measurement, values in zip(experiment.measurements, fitted, strict=True):
+                if not isinstance(values, np.ndarray) or not measurement.measured_values.size:
+                    continue
+                titles[measurement.title] += 1
+                number = titles[measurement.title]
+                which = f" {number}" if number > 1 else ""
+                yield f"{experiment.name}: {measurement.title}{which}", measurement, values
+
+    @staticmethod
+    def _labelled(measurement: Measurement, values: Array) -> Any:
+        """Return numbers (S, m) of a measurement as an array with labels."""
+        xarray = _optional_package("xarray", "a labelled array")
+        return xarray.DataArray(
+            values,
+            dims=("time", "quantity"),
+            coords={
+                "time": ("time", measurement.sample_times_s, {"units": "s"}),
+                "quantity": list(measurement.number_names),
+            },
+            name=measurement.title,
+            attrs={"units": measurement.unit},
+        )
+
     def _relative_by_value(self) -> Array:
         """Return the derivatives (k,) of the relative coordinates of the estimated parameters by
         their values.
@@ -559,10 +672,7 @@ class SolvedProblem:
         InputError
             Without pandas.
         """
-        try:
-            pandas = import_module("pandas")
-        except ImportError as error:
-            raise InputError("a data frame needs pandas: pip install pandas") from error
+        pandas = _optional_package("pandas", "a data frame")
         rows = {name: self._row(name) for name in self.estimates}
         return pandas.DataFrame.from_dict(rows, orient="index")
 
@@ -610,6 +720,14 @@ class SolvedProblem:
             *identifiability_sentences(self.uncertainty, self.combinations),
         )
         return (*dict.fromkeys(notes), *(profile.message for profile in self.profiles))
+
+
+def _optional_package(name: str, purpose: str) -> Any:
+    """Return an installed package that only some methods need."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise InputError(f"{purpose} needs {name}: pip install {name}") from error
 
 
 def _or_nan(value: float | None) -> float:

@@ -29,6 +29,7 @@ from collocation_sysid.extras.export import (
     IdentifiedBody,
     parse_destination,
     verify_export,
+    write_ensemble,
     write_export,
 )
 from collocation_sysid.extras.export.export_target import equilibria
@@ -125,6 +126,33 @@ def test_a_run_without_a_problem_file_is_exported_from_python(run_folder, tmp_pa
     np.testing.assert_allclose(found.simulated_m, expected.simulated_m, atol=1e-4)
     with pytest.raises(InputError, match="expected one of swing"):
         IdentifiedBody.from_run(run, "other")
+
+
+@pytest.mark.long
+def test_an_ensemble_has_an_export_for_each_draw(run_folder, tmp_path):
+    run = cs.run(cs.Problem.read(run_folder.parent / "problem.toml"), "reduced-space")
+    assert run.uncertainty is not None
+    samples = run.samples(3, seed=1)
+    for target, files in (("mujoco", "body.xml"), ("usd", "body.usda")):
+        folder = tmp_path / target
+        write_ensemble(run, target, folder, 3, seed=1)
+        table = np.genfromtxt(folder / "samples.csv", delimiter=",", names=True)
+        for k in range(3):
+            place = folder / f"sample_{k + 1:03d}"
+            assert (place / files).is_file()
+            values = json.loads((place / "identified.json").read_text())
+            for name in run.uncertainty.names:
+                assert values["parameters"][name]["value"] == samples[name].iloc[k]
+                assert table[name][k] == samples[name].iloc[k]
+            (region,) = values["regions"]
+            assert region["young_pa"] == pytest.approx(samples["young_pa"].iloc[k])
+        write_ensemble(run, target, folder, 2)  # replaces the earlier one
+        assert len([*folder.glob("sample_*")]) == 2
+    xml = ElementTree.parse(tmp_path / "mujoco" / "sample_001" / "body.xml").getroot()
+    elasticity = xml.find(".//elasticity")
+    assert elasticity is not None
+    stated = float(elasticity.get("young", ""))
+    assert stated == pytest.approx(run.samples(2)["young_pa"].iloc[0], rel=1e-4)
 
 
 # What files hold

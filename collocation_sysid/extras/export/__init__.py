@@ -20,12 +20,14 @@ from ...common.serialisation import as_json
 from ...errors import InputError, hint_at
 from ...recording import write_poses_csv
 from ...result.run_writers import replaced_folder
+from ...runs.solved_problem import SolvedProblem
 from . import calculix, mujoco, newton, rerun_recording, usd
 from .export_destination import ExportDestination, parse_destination
 from .export_target import ExportedFiles, ExportTarget, PredictionComparison
 from .identified import IdentifiedBody
 
 IDENTIFIED_FILE = "identified.json"
+SAMPLES_FILE = "samples.csv"
 
 
 TARGETS: dict[str, ExportTarget] = {
@@ -76,6 +78,53 @@ def write_export(body: IdentifiedBody, target_name: str, folder: str | Path) -> 
         (place / IDENTIFIED_FILE).write_text(as_json(content) + "\n", encoding="utf-8")
         for k, grasp in enumerate((*body.experiment.grasps, *body.obstacles), start=1):
             write_poses_csv(place / f"poses_{k}.csv", grasp.poses)
+    return exported
+
+
+def write_ensemble(
+    run: SolvedProblem,
+    target_name: str,
+    folder: str | Path,
+    count: int,
+    seed: int = 0,
+    experiment: str | None = None,
+) -> ExportedFiles:
+    """Write the body of a run for a target with `count` draws of its constants, for domain
+    randomisation: an export in each of the folders ``sample_001``, …, and ``samples.csv`` with a
+    row for each.
+
+    Parameters
+    ----------
+    run : SolvedProblem
+        A run with error bars, such as the value of `collocation_sysid.run`.
+    target_name : str
+        Name of a target in `TARGETS`, such as "mujoco".
+    folder : str or Path
+        Written completely or not at all; an earlier ensemble there is replaced.
+    count, seed : int
+        See `SolvedProblem.samples`.
+    experiment : str, optional
+        Name of a fitted experiment; the first by default.
+
+    Returns
+    -------
+    ExportedFiles
+        Files of the last sample, and what the target cannot express.
+
+    Raises
+    ------
+    InputError
+        As `write_export` and `SolvedProblem.samples`.
+    """
+    samples = run.samples(count, seed)
+    body = IdentifiedBody.from_run(run, experiment)
+    exported = target_named(target_name).export(body)  # refused before anything is written
+    digits = max(3, len(str(count)))
+    with replaced_folder(folder, marker_file=SAMPLES_FILE, content_word="ensemble") as place:
+        samples.to_csv(place / SAMPLES_FILE, index_label="sample")
+        for k, values in enumerate(samples.to_dict("records"), start=1):
+            draw = body.with_values({name: values[name] for name in run.parameters})
+            exported = write_export(draw, target_name, place / f"sample_{k:0{digits}d}")
     return exported
 
 
@@ -156,5 +205,6 @@ __all__ = [
     "parse_destination",
     "target_named",
     "verify_export",
+    "write_ensemble",
     "write_export",
 ]

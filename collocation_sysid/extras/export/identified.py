@@ -297,6 +297,17 @@ class IdentifiedBody:
             title=run.problem.title,
         )
 
+    def with_values(self, values: Mapping[str, float]) -> IdentifiedBody:
+        """Return the body with other values of the parameters, by name in SI units, as those of one
+        draw: without intervals, and without a forward simulation.
+        """
+        known = {
+            name: ReportedEstimate(values[name], fixed=each.fixed, tied=each.tied)
+            for name, each in self.parameters.items()
+        }
+        theta = self.body.theta_from_values(values)
+        return replace(self, parameters=known, theta=theta, simulated_m=None)
+
     @classmethod
     def _from_experiment(
         cls,
