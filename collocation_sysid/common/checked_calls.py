@@ -7,7 +7,6 @@ it, too (`declarations`).
 from __future__ import annotations
 
 import inspect
-import re
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,8 +17,8 @@ from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_
 import numpy as np
 from pydantic import BeforeValidator, InstanceOf, Strict, TypeAdapter, ValidationError
 
-from ..errors import InputError, hint_at
-from .validated_types import Flag, Number, StrictInteger, expected
+from ..errors import InputError
+from .validated_types import Flag, Number, StrictInteger, expectation
 
 C = TypeVar("C", bound=Callable[..., Any])
 _PLAIN = {float: Number, int: StrictInteger, bool: Flag, str: Annotated[str, Strict()]}
@@ -146,12 +145,4 @@ def refused(what: str, found: Any, faults: Sequence[Mapping[str, Any]]) -> Input
     """
     shown = f"{found:g}" if isinstance(found, float) else repr(found)
     shown = shown if len(shown) < 80 else f"a {type(found).__name__}"
-    choices = [re.findall("'(.*?)'", str(fault.get("ctx", {}).get("expected"))) for fault in faults]
-    expectation = " or ".join(
-        dict.fromkeys(
-            f"one of {', '.join(words)}" if words else expected(fault)
-            for fault, words in zip(faults, choices, strict=True)
-        )
-    )
-    hint = hint_at(str(found), (word for words in choices for word in words))
-    return InputError(f"{what} is {shown}; expected {expectation}{hint}")
+    return InputError(f"{what} is {shown}; {expectation(faults, found)}")

@@ -8,7 +8,6 @@ value is validated once, where the instance is made: in Python, or from the tabl
 from __future__ import annotations
 
 import inspect
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache, wraps
@@ -18,9 +17,9 @@ from typing import Any, TypeVar, dataclass_transform, overload
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ArgsKwargs
 
-from ..errors import InputError, hint_at
+from ..errors import InputError
 from .field_descriptions import attributes
-from .validated_types import expected, faulty_entry
+from .validated_types import expectation, faulty_entry
 
 T = TypeVar("T")
 
@@ -150,6 +149,4 @@ def _key_refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
     where, value = faulty_entry(instance, fault)
     if fault["type"] == "value_error":
         return InputError(str(fault["ctx"]["error"]), None, where=where)
-    choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
-    hint = hint_at(str(value), choices)
-    return InputError(f"found {value!r}; expected {expected(fault)}{hint}", None, where=where)
+    return InputError(f"found {value!r}; {expectation([fault], value)}", None, where=where)

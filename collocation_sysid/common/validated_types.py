@@ -7,11 +7,14 @@ values, so that "30" or true in place of a number is a mistake.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
+
+from ..errors import hint_at
 
 # Smallest magnitude of meaningful input; its square is still a nonzero floating-point number.
 SMALLEST = 1e-100
@@ -91,6 +94,22 @@ def expected(fault: Mapping[str, Any]) -> str:
     message = fault["msg"].partition("Input should be ")[2] or fault["msg"]
     # As in problem files.
     return message.replace("False", "false").replace("True", "true")
+
+
+def expectation(faults: Sequence[Mapping[str, Any]], found: Any) -> str:
+    """Return the end of the message about a value that was `found`: "expected …", with a word that
+    it resembles.
+
+    Parameters
+    ----------
+    faults : sequence of mapping
+        Entries of pydantic's `ValidationError.errors()`, one for each form that is accepted.
+    found : object
+    """
+    literals = (fault["ctx"]["expected"] for fault in faults if fault["type"] == "literal_error")
+    words = [word for text in literals for word in re.findall("'(.*?)'", text)]
+    forms = " or ".join(dict.fromkeys(expected(fault) for fault in faults))
+    return f"expected {forms}{hint_at(str(found), words)}"
 
 
 def faulty_entry(instance: Any, fault: Mapping[str, Any]) -> tuple[str, Any]:

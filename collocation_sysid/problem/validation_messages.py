@@ -10,7 +10,7 @@ from typing import Any, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from ..common.validated_types import expected as wanted
+from ..common.validated_types import expectation
 from ..errors import InputError, excerpt, hint_at
 from .schema import SPECIMEN_TAG, ProblemFile, with_experiment_defaults
 from .specimen_schema import SpecimenSection
@@ -98,11 +98,7 @@ def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel])
         return (
             f"{finding}; expected a table with some of the keys {', '.join(_fields_by_key(model))}"
         )
-    if kind == "literal_error":
-        choices = fault["ctx"]["expected"]
-        hint = hint_at(str(fault["input"]), re.findall("'(.*?)'", choices))
-        return f"{finding}; expected {choices}{hint}"
-    return f"{finding}; expected {wanted(fault)}"
+    return f"{finding}; {expectation([fault], fault['input'])}"
 
 
 def _fault_location(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:

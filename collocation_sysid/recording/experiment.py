@@ -644,13 +644,12 @@ class Experiment:
         """Raise an `InputError` if a known deviation does not change the stiffness here, or a custom
         one would change that of a body with memory, whose overstress would not follow.
         """
-        if self.body.has_memory:
-            for row in self.nuisance.own:
-                if row.stiffness is not None:
-                    raise InputError(
-                        f"the deviation {row.name!r} changes the stiffness, and the body has memory; "
-                        "expected a body without memory"
-                    )
+        for row in self.nuisance.own:
+            if row.stiffness is not None and self.body.has_memory:
+                raise InputError(
+                    f"the deviation {row.name!r} changes the stiffness, and the body has memory; "
+                    "expected a body without memory"
+                )
         listed_names = [row.name for row in self.list_stiffness_deviations()]
         for name in self.known_deviations:
             if name not in listed_names:

@@ -128,7 +128,7 @@ def test_a_law_needs_a_function_and_constants():
         ({"bounds": (0.0, 1.0)}, "are 0 and 1; expected 0 < lower < upper"),
         ({"bounds": (3.0, 2.0)}, "are 3 and 2; expected 0 < lower < upper"),
         ({"bounds": (1.0, -1.0), "scale": "linear"}, "are 1 and -1; expected lower < upper$"),
-        ({"scale": "lin"}, "is 'lin'; expected one of log, linear"),
+        ({"scale": "lin"}, "is 'lin'; expected 'log' or 'linear'"),
     ],
 )
 def test_a_constant_refuses_bounds_and_scale(changes: dict, words: str):

@@ -44,7 +44,7 @@ def test_wrong_values_are_refused_or_clear():
     [
         (lambda: cs.Body("x", density_kg_m3=30.0), "Body: mesh is 'x'; expected a TetMesh"),  # pyright: ignore[reportArgumentType]
         (lambda: cs.Unknown("300"), "Unknown: guess is '300'; expected a number"),  # pyright: ignore[reportArgumentType]
-        (lambda: cs.Unknown(scale="lg"), "scale is 'lg'; expected one of log, linear"),  # pyright: ignore[reportArgumentType]
+        (lambda: cs.Unknown(scale="lg"), "scale is 'lg'; expected 'log' or 'linear'"),  # pyright: ignore[reportArgumentType]
         (lambda: cs.run(5), "run: problem is 5; expected a Problem"),  # pyright: ignore[reportArgumentType]
         (lambda: cs.run("none.toml"), "none.toml: there is no such file"),
         (lambda: cs.Ball((0, 0, 0), 1j), "Ball: radius_m is 1j; expected a number"),  # pyright: ignore[reportArgumentType]

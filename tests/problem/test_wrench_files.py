@@ -143,7 +143,7 @@ def test_a_slip_in_the_problem_is_named(tiny: Path, text: str, sensor: str, word
         ({"values": np.full((3, 6), np.nan)}, "all values of the measured wrench are missing"),
         ({"sigma_nm": None}, "sigma_nm is missing"),
         ({"sigma_n": -1.0}, "sigma_n of a wrench is -1"),
-        ({"frame": "hand"}, "expected one of world, grasp"),
+        ({"frame": "hand"}, "expected 'world' or 'grasp'"),
         ({"point_m": [0.0, 1.0]}, "point_m"),
         ({"values": np.full((3, 6), np.inf)}, "infinite"),
     ],

@@ -135,10 +135,7 @@ def test_error_bars_and_verdict_know_them():
         ({"unknowns": {}}, r"of its unknowns \(none\)"),
         ({"points_m": ()}, "has neither points_m nor grasp"),
         ({"sigma": "1e-3"}, "sigma of the reading 'accelerometer' is '1e-3'; expected a number"),
-        (
-            {"frame": "hand"},
-            "frame of the reading 'accelerometer' is 'hand'; expected one of world",
-        ),
+        ({"frame": "hand"}, "frame of the reading 'accelerometer' is 'hand'; expected 'world'"),
     ],
 )
 def test_missing_keys_of_a_custom_sensor_are_named(changes: dict, words: str):

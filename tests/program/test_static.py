@@ -281,7 +281,7 @@ def test_a_relaxing_block_between_platens_creeps_towards_its_rest():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "slow"}, "kind is 'slow'; expected one of dynamic, static"),
+        ({"kind": "slow"}, "kind is 'slow'; expected 'dynamic' or 'static'"),
         ({"start": "undeformed"}, "start is 'undeformed', but the experiment is static"),
         ({"start_rule": "paper"}, "start_rule is 'paper', but the experiment is static"),
         ({"t_s": TIMES[[0, 2, 1, 3]]}, "row 3: t_s: t_s = 1 follows 1.5; time must increase"),
@@ -314,7 +314,7 @@ def test_grasps_may_share_nodes_along_different_axes_only():
     replace(experiment, grasps=(*experiment.grasps[:3], replace(experiment.grasps[3], axes="y")))
     with pytest.raises(InputError, match="held by the grasps 2 and 5 at the same time along z"):
         replace(experiment, grasps=(*experiment.grasps, replace(top, axes="xz")))
-    with pytest.raises(InputError, match="axes of a grasp is 'zx'; expected one of x, y, z, xy"):
+    with pytest.raises(InputError, match="axes of a grasp is 'zx'; expected 'x', 'y', 'z', 'xy'"):
         replace(top, axes="zx")
 
 

@@ -303,7 +303,7 @@ def test_shapes_must_agree(t_s, positions, quaternions):
 
 
 def test_an_unknown_interpolation_is_refused():
-    with pytest.raises(InputError, match="'cubic'; expected one of smooth, linear, hold"):
+    with pytest.raises(InputError, match="'cubic'; expected 'smooth', 'linear' or 'hold'"):
         turning_poses("cubic")
 
 

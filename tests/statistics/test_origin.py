@@ -41,7 +41,7 @@ def test_the_origin_selects_default_deviations():
 
 @pytest.mark.parametrize(
     ("origin", "words"),
-    [({"made": "steel"}, "expected one of cast"), ({"mesh_from": "photo"}, "expected one of cad")],
+    [({"made": "steel"}, "expected 'cast'"), ({"mesh_from": "photo"}, "expected 'cad'")],
 )
 def test_unknown_words_are_refused(origin, words):
     with pytest.raises(InputError, match=words):
