@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from . import datasets, testing
     from .errors import InputError, SimulationError
     from .extras import live
+    from .extras.design.hand_limits import Limits
+    from .extras.planning.motion_plan import MotionPlan, plan_motion
+    from .extras.planning.task import Task
     from .extras.studies.model_comparison import ModelComparison, compare_models
     from .features.image_tracks.tracks import ImageTracks, PoseSigma
     from .fem.body import Body
@@ -115,9 +118,11 @@ __all__ = [
     "InputError",
     "InteriorPoint",
     "Iteration",
+    "Limits",
     "Markers",
     "Material",
     "ModelComparison",
+    "MotionPlan",
     "Named",
     "NodeForce",
     "Nuisance",
@@ -149,6 +154,7 @@ __all__ = [
     "SqpMethod",
     "Status",
     "Stencil",
+    "Task",
     "Tendon",
     "TetMesh",
     "Tied",
@@ -164,6 +170,7 @@ __all__ = [
     "depth_image",
     "live",
     "place_markers",
+    "plan_motion",
     "refine",
     "run",
     "simulate",

@@ -1,9 +1,11 @@
-"""The command `design_motion`, which finds the motion that makes the error bars smallest."""
+"""The commands `design`, which finds the motion that makes the error bars smallest, and `plan`,
+which finds the motion with which points of the body follow references.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import Annotated, cast
 
 import typer
 
@@ -14,8 +16,15 @@ from ..extras.design import DesignCriterion, DesignOptions, Limits
 from ..extras.design import design_motion as designed
 from ..extras.design.predicted_information import Kind, Over
 from ..result.run_writers import require_replaceable
-from .command_options import OneExperiment, OutputFolder, OutputOptions, ProblemOptions, command
-from .common import EXIT_INTERRUPTED, error_console
+from .command_options import (
+    AllowCode,
+    OneExperiment,
+    OutputFolder,
+    OutputOptions,
+    ProblemOptions,
+    command,
+)
+from .common import EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
 
 commands = typer.Typer()
 
@@ -102,3 +111,88 @@ def design(options: DesignCommand) -> None:
         write_design(answer, folder, with_film=options.film, say=progress.show_activity)
     options.print_result(design_json(answer), design_summary(answer, folder))
     raise typer.Exit(EXIT_INTERRUPTED if answer.best.is_interrupted else 0)
+
+
+@validated(kw_only=True)
+class PlanCommand(OutputOptions):
+    """Options of `plan`.
+
+    Attributes
+    ----------
+    source : PROBLEM_OR_RUN
+        A run folder, or a problem file, whose guesses are used.
+    task : TASK
+        TOML file with the references of points of the body.
+    limits : FILE
+        TOML file with the limits of the robot, as of design.
+    rate : HZ
+        Rate of the poses for the robot.
+    film : bool
+        Make a film of the motion.
+    """
+
+    source: Annotated[Path, typer.Argument(metavar="PROBLEM_OR_RUN", help="Run folder or problem.")]
+    task: Annotated[Path, typer.Argument(metavar="TASK.toml", help="The task file.")]
+    limits: Path
+    rate: float | None = None
+    experiment: OneExperiment = None
+    allow_code: AllowCode = False
+    out: OutputFolder = None
+    film: bool = True
+
+
+@command(
+    commands,
+    "plan runs/foam_cylinder task.toml --limits limits.toml",
+    "plan problem.toml task.toml --limits limits.toml --rate 500 --out plan",
+)
+def plan(options: PlanCommand) -> None:
+    """Plan the motion of the hand with which points of the body follow references (experimental).
+
+    The motion begins at rest, ends at rest without residual vibration, and respects the limits. The
+    output folder contains poses.csv for the robot, the predicted points, pictures, a film and
+    plan.json. Ctrl-C stops the search and keeps the best plan so far; the exit code is then 130.
+    """
+    from ..extras.planning import Task, plan_motion
+    from ..extras.planning.plan_folder import PLAN_FILE, plan_json, plan_summary, write_plan
+    from ..result.solve_progress import SolveProgress
+
+    if options.rate is not None and not 0 < options.rate < float("inf"):
+        raise InputError(
+            f"found {options.rate:g}; expected a number of hertz above 0", None, where="--rate"
+        )
+    folder = options.out or Path("runs") / f"{run_name(options.source)}-plan"
+    task, limits = Task.read(options.task), Limits.read(options.limits)
+    require_possible(folder)
+    require_replaceable(folder, marker_file=PLAN_FILE, content_word="plan")
+    with SolveProgress(error_console, quiet=options.quiet, activity="preparing") as progress:
+        try:
+            answer = plan_motion(
+                options.source,
+                task,
+                limits,
+                experiment=options.experiment,
+                allow_code=options.allow_code,
+                say=progress.announce,
+                watch=lambda number, value: progress.announce(
+                    f"iteration {number}, objective {value:.4g} (Ctrl-C keeps the best)"
+                ),
+            )
+        except InputError as error:
+            if error.source is not None:
+                raise
+            of_limits = error.where in Limits.model_fields
+            of_options = (error.where or "").startswith("--")
+            raise (
+                error
+                if of_options
+                else error.located(options.limits if of_limits else options.task)
+            ) from error
+        write_plan(
+            answer, folder, rate_hz=options.rate, with_film=options.film, say=progress.announce
+        )
+    options.print_result(plan_json(answer), plan_summary(answer, folder))
+    if answer.interrupted:
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if answer.answer.status not in ("converged", "flat"):
+        raise typer.Exit(EXIT_NOT_CONVERGED)

@@ -73,6 +73,7 @@ SHORT = {
     "sweep": ["--dry-run"],
     "solve": ["--method", "reduced-space"],
     "design": ["--duration", "0.05", "--evaluations", "1", "--pairs", "0", "--no-film"],
+    "plan": ["--no-film"],
 }
 
 

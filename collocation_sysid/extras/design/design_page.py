@@ -23,6 +23,7 @@ from ...result.figure_style import (
     style_axes,
     symbol_as_mathtext,
 )
+from .hand_limits import CheckedMotion, Limits
 from .hand_motion import angular_motion
 from .motion_design import Design
 
@@ -101,14 +102,18 @@ def design_figures(design: Design) -> dict[str, Figure]:
 
 
 def motion_picture(design: Design) -> Figure:
+    """Return the figure of the motion of a design, see `motion_picture_of`."""
+    return motion_picture_of(design.motion, design.limits)
+
+
+def motion_picture_of(motion: CheckedMotion, limits: Limits) -> Figure:
     """Return a figure of four panels over time: translation [mm] and rotation vector [°] of the
     hand, and its speeds and accelerations in percent of their limits.
     """
     figure = new_figure(PAGE_MM, 100)
     shift, turn, speed, growth = figure.subplots(2, 2, sharex=True).ravel()
-    t_s = design.motion.grid_s
-    limits = design.limits
-    place, rate, curvature = design.motion.derivatives(t_s)
+    t_s = motion.grid_s
+    place, rate, curvature = motion.derivatives(t_s)
     angular = angular_motion(place[:, 3:], rate[:, 3:], curvature=curvature[:, 3:])
     for axis, colour in zip(range(3), COLOUR_CYCLE, strict=False):
         style = {"color": colour, "lw": LINE_PT, "label": "xyz"[axis]}

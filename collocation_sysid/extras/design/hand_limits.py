@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -167,6 +168,17 @@ def _beyond_cone(camera: CameraSection, points_m: Array) -> Array:
     return np.arccos(np.clip(cosine, -1.0, 1.0)) - np.radians(camera.field_of_view_deg) / 2
 
 
+class CheckedMotion(Protocol):
+    """Motion of a hand whose limits are checked: its derivatives at times that resolve its peaks."""
+
+    @property
+    def grid_s(self) -> Array:
+        """Times (T,) since the start [s]."""
+
+    def derivatives(self, t_s: Array) -> TimeDerivatives:
+        """Return the coordinates (T, 6) and their first and second derivatives."""
+
+
 @dataclass(frozen=True, eq=False)
 class HandBounds:
     """Limits of a hand with a known initial position.
@@ -199,7 +211,7 @@ class HandBounds:
             second=np.array([limits.acceleration_m_s2, np.radians(growth)]),
         )
 
-    def shares(self, motion: HandMotion) -> dict[str, float]:
+    def shares(self, motion: CheckedMotion) -> dict[str, float]:
         """Return the largest values of a motion on its grid as shares of the limits, by name of the
         limit; the limit is exceeded above 1.
 

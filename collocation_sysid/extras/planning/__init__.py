@@ -1,0 +1,11 @@
+"""Planned motions: the hand moves so that points of the identified body follow references.
+
+`task` reads what is wanted, `planned_body` the body and its constants, `spline_motion` describes
+the hand and its limits, `planned_program` the optimal-control problem, `reduced_solver` solves it,
+`motion_plan` has the function `plan_motion`, and `plan_folder` and `plan_pictures` write the result.
+"""
+
+from .motion_plan import MotionPlan, plan_motion
+from .task import Task
+
+__all__ = ["MotionPlan", "Task", "plan_motion"]

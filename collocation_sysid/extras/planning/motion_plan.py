@@ -1,0 +1,322 @@
+"""A planned motion of the hand, with the motion of the body that it is predicted to cause.
+
+Use `plan_motion`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...errors import InputError
+from ...problem import Problem
+from ...program.simulation import Trajectory, simulate
+from ...recording import PoseSequence
+from ...runs.solved_problem import SolvedProblem
+from ..design.hand_limits import REACHED, Limits
+from .planned_body import PlannedBody
+from .planned_program import POSES_PER_SAMPLE, PlannedProgram
+from .reduced_solver import (
+    HandLimitsExcludeTask,
+    ReducedAnswer,
+    ReducedTolerances,
+    Watch,
+    solve_reduced,
+)
+from .spline_motion import PoseLimit, SplineMotion
+from .task import Reference, Task
+
+# Time steps of the simulation that checks a plan, for each of the plan's.
+FINER = 4
+# Half width of a 95 % interval over the standard deviation.
+HALF_WIDTH_95 = 1.959964
+
+
+@dataclass(frozen=True)
+class TrackingError:
+    """Deviation of a point from its reference, over the times and coordinates that count.
+
+    Attributes
+    ----------
+    rms_m, largest_m : float
+        Root mean square and largest distance from the reference [m]; NaN if only velocities count.
+    band_m : float or None
+        Largest half width of the 95 % band of a coordinate due to the uncertainty of the constants
+        [m]; None if that is not known.
+    expected_rms_m : float or None
+        Root mean square distance that is expected with this uncertainty [m].
+    """
+
+    rms_m: float
+    largest_m: float
+    band_m: float | None
+    expected_rms_m: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan:
+    """Planned motion.
+
+    Attributes
+    ----------
+    program : PlannedProgram
+        The optimal-control problem.
+    answer : ReducedAnswer
+        Solution on the time grid of the plan.
+    fine : Trajectory
+        Simulation of the plan with `FINER` time steps for each of the plan's.
+    seconds : float
+        Time of the search [s].
+    """
+
+    program: PlannedProgram
+    answer: ReducedAnswer
+    fine: Trajectory
+    seconds: float
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended the search."""
+        return self.answer.status == "interrupted"
+
+    @cached_property
+    def motion(self) -> SplineMotion:
+        """Motion of the hand."""
+        return self.program.space.motion(self.answer.c)
+
+    @cached_property
+    def shares(self) -> Mapping[str, float]:
+        """Largest value over each limit of the robot, by name of the limit."""
+        return self.program.bounds.shares(self.motion)
+
+    def list_active_limits(self) -> list[str]:
+        """Return the names of the limits of which the motion uses more than `REACHED`."""
+        return [name for name, share in self.shares.items() if share > REACHED]
+
+    @property
+    def t_s(self) -> Array:
+        """Times (T,) of the samples since the start [s]."""
+        return self.program.experiment.t_s - self.program.experiment.t_s[0]
+
+    def poses(self, t_s: Array) -> PoseSequence:
+        """Return the poses in the format of the problem at any times since the start [s]; they are
+        values of a curve with two continuous derivatives.
+        """
+        poses = self.program.body.gripper_poses(self.program.poses(self.answer.c, np.asarray(t_s)))
+        start_s = self.program.experiment.t_s[0]
+        return PoseSequence(
+            poses.t_s - start_s, poses.positions_m, quaternions_xyzw=poses.quaternions_xyzw
+        )
+
+    @cached_property
+    def points_m(self) -> dict[str, Array]:
+        """Predicted positions (T, 3) of the points of the references, by name [m]."""
+        markers = self.program.experiment.markers
+        predicted = markers.predict_positions(self.fine.positions_m)
+        return {name: predicted[:, k] for k, name in enumerate(markers.names)}
+
+    @cached_property
+    def time_step_error_m(self) -> float:
+        """Largest distance of a point between the time grid of the plan and finer steps [m]."""
+        program = self.program
+        coarse = self.answer.x[program.sample_rows].reshape(len(self.t_s), -1, 3)
+        markers = program.experiment.markers
+        if not markers.names:
+            return 0.0
+        on_grid = markers.predict_positions(coarse)
+        fine = np.stack([*self.points_m.values()], axis=1)
+        return float(np.linalg.norm(on_grid - fine, axis=2).max(initial=0.0))
+
+    @cached_property
+    def constants_std_m(self) -> dict[str, Array] | None:
+        """Standard deviation (T, 3) of each point due to the uncertainty of the constants [m], by
+        name; None if that is not known.
+        """
+        contributions = self.contributions_m
+        return None if contributions is None else {
+            name: np.sqrt(np.einsum("tiq,qr,tir->ti", by_q, self.covariance, by_q))
+            for name, by_q in contributions.items()
+        }  # fmt: skip
+
+    @property
+    def covariance(self) -> Array:
+        """Combined covariance (nq, nq) of the parameters in the solver's coordinates."""
+        covariance = self.program.body.covariance
+        assert covariance is not None
+        return covariance
+
+    @cached_property
+    def contributions_m(self) -> dict[str, Array] | None:
+        """Derivatives (T, 3, nq) of each point by the parameters [m]; None if the uncertainty of
+        the parameters is not known.
+        """
+        program = self.program
+        if program.body.covariance is None:
+            return None
+        by_q = program.driven.respond_to_parameters(program.drive(self.answer.c), self.answer.x)
+        sampled = by_q[program.sample_rows]
+        return {
+            name: np.einsum("ij,tjq->tiq", program.point_weights(name).toarray(), sampled)
+            for name in program.experiment.markers.names
+        }
+
+    @cached_property
+    def limiting_constant(self) -> tuple[str, float] | None:
+        """Name of the constant whose own uncertainty contributes most to the variance of the
+        tracked coordinates, and its share of the sum of these contributions; None if unknown.
+        """
+        contributions = self.contributions_m
+        names = [item.name for item in self.program.body.problem.parameters.free]
+        if contributions is None or not names:
+            return None
+        variances = np.zeros(len(names))
+        for reference in self.program.references:
+            counted = np.isfinite(reference.position_m)
+            squares = contributions[reference.name][counted] ** 2 / reference.sigma_m**2
+            variances += squares.sum(axis=0) * np.diag(self.covariance)
+        if not variances.any():
+            return None
+        first = int(variances.argmax())
+        return names[first], float(variances[first] / variances.sum())
+
+    def tracking_error(self, reference: Reference) -> TrackingError:
+        """Return the predicted deviation of a point from its reference."""
+        counted = np.isfinite(reference.position_m)
+        if not counted.any():
+            return TrackingError(np.nan, np.nan, None, None)
+        deviation = np.where(counted, self.points_m[reference.name] - reference.position_m, 0.0)
+        at = counted.any(axis=1)
+        distance = np.linalg.norm(deviation[at], axis=1)
+        rms = float(np.sqrt(np.mean(distance**2)))
+        std = self.constants_std_m
+        if std is None:
+            return TrackingError(rms, float(distance.max()), None, None)
+        spread = np.where(counted, std[reference.name], 0.0)[at]
+        return TrackingError(
+            rms,
+            float(distance.max()),
+            HALF_WIDTH_95 * float(spread.max()),
+            float(np.sqrt(np.mean(distance**2 + np.sum(spread**2, axis=1)))),
+        )
+
+    @cached_property
+    def residual_vibration_m(self) -> float | None:
+        """Largest distance of a node from its mean position after the motion [m]; None if the body
+        need not be at rest.
+        """
+        if not self.program.task.end.at_rest:
+            return None
+        after = self.t_s >= self.program.task.duration_s - 1e-9
+        positions = self.fine.positions_m[after]
+        return float(np.linalg.norm(positions - positions.mean(axis=0), axis=2).max())
+
+
+def plan_motion(
+    source: str | Path | Problem | SolvedProblem,
+    task: Task | str | Path,
+    limits: Limits | str | Path,
+    *,
+    experiment: str | None = None,
+    allow_code: bool = False,
+    pose_limits: PoseLimit | None = None,
+    tolerances: ReducedTolerances | None = None,
+    watch: Watch | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> MotionPlan:
+    """Return the motion of the hand with which points of the body follow their references.
+
+    Ctrl-C ends the search with the best plan so far, which respects all limits.
+
+    Parameters
+    ----------
+    source : path, Problem or Run
+        Run folder or run, whose estimates are used, or problem (file), whose guesses are used.
+    task : Task or path
+        What the points shall do; task.toml.
+    limits : Limits or path
+        What the hand may do; limits.toml, as of a designed motion.
+    experiment : str, optional
+        Name of the recording whose grasp, loads and surroundings the plan keeps; by default the
+        first that moves.
+    allow_code : bool
+        Whether Python files that the problem or the task names may run.
+    pose_limits : callable, optional
+        ``pose_limits(position_m, rotation) -> margins``: expressions in CasADi operations that must
+        not be positive, of the position (3,) and the rotation matrix (3, 3) of the hand in the
+        frame of the poses, such as limits of joints.
+    tolerances : ReducedTolerances, optional
+        Tolerances of the search.
+    watch : callable, optional
+        Called with the number of each iterate and its objective.
+    say : callable, optional
+        Called with the present activity, a text.
+
+    Raises
+    ------
+    InputError
+        For mistakes in the files, a task that does not fit the body, and limits that exclude every
+        motion.
+    SimulationError
+        If the body has no initial equilibrium, or the motion cannot be simulated.
+    """
+    say("reading the body")
+    body = PlannedBody.read(source, experiment, allow_code=allow_code)
+    if not isinstance(task, Task):
+        task = Task.read(task)
+    if not isinstance(limits, Limits):
+        limits = Limits.read(limits)
+    began_s = time.perf_counter()
+    say("computing the equilibrium before the motion")
+    program = PlannedProgram.from_task(body, task, limits, pose_limits)
+    say("searching for the motion")
+    try:
+        answer = solve_reduced(program, tolerances=tolerances, watch=watch)
+    except HandLimitsExcludeTask as error:
+        raise InputError(_contradiction(program), None, where="hand") from error
+    seconds = time.perf_counter() - began_s
+    say("simulating the plan with fine time steps")
+    return MotionPlan(program, answer, _finely_simulated(program, answer.c), seconds)
+
+
+def _finely_simulated(program: PlannedProgram, c: Array) -> Trajectory:
+    """Return the simulation of a plan with `FINER` time steps for each of the plan's."""
+    since_s = program.experiment.t_s - program.experiment.t_s[0]
+    fine_s = np.linspace(0.0, since_s[-1], POSES_PER_SAMPLE * (len(since_s) - 1) + 1)
+    experiment = program.body.experiment(
+        program.poses(c, fine_s),
+        program.experiment.t_s,
+        dict(
+            zip(
+                program.experiment.markers.names,
+                program.experiment.markers.predict_positions(program.experiment.body.nodes_m[None])[
+                    0
+                ],
+                strict=True,
+            )
+        ),
+    )
+    problem = program.body.problem
+    values = problem.parameters.values(program.body.q)
+    substeps = FINER * program.driven.transcription.substeps
+    return simulate(experiment, values, integrator=problem.scheme, substeps=substeps)
+
+
+def _contradiction(program: PlannedProgram) -> str:
+    """Return the message that no motion of the hand respects its limits."""
+    hand = program.task.hand
+    ends = [
+        f"{key} = {list(value)}"
+        for key, value in (("end_m", hand.end_m), ("end_rotation_deg", hand.end_rotation_deg))
+        if value is not None
+    ]
+    return (
+        f"no motion of {program.task.duration_s:g} s from rest to rest respects the limits with "
+        f"{' and '.join(ends) or 'the joint limits'}; expected a longer duration_s, a nearer end, or "
+        "wider limits of speed and acceleration"
+    )

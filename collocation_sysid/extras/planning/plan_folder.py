@@ -1,0 +1,201 @@
+"""Folder of a plan: poses for the robot, prediction, pictures and plan.json."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...common.display import Line, Shown, Table
+from ...common.serialisation import as_json
+from ...fem.laws.constants import symbol_with_unit
+from ...recording import write_markers_csv, write_poses_csv
+from ...recording.recording_writers import write_columns_csv
+from ...result.animation import film
+from ...result.pictures.album import save_pictures
+from ...result.replay import MotionRecord
+from ...result.run_writers import replaced_folder
+from ..design.hand_motion import angular_motion
+from .motion_plan import MotionPlan
+from .plan_pictures import plan_figures
+
+PLAN_FILE = "plan.json"
+POSES_FILE = "poses.csv"
+HAND_FILE = "hand.csv"
+PREDICTION_FILE = "predicted_points.csv"
+FILM_FILE = "motion.gif"
+# Form of plan.json.
+SCHEMA = 1
+FRAMES_PER_SECOND = 25.0
+
+
+def write_plan(
+    plan: MotionPlan,
+    folder: str | Path,
+    rate_hz: float | None = None,
+    with_film: bool = True,
+    say: Callable[[str], None] = lambda _: None,
+) -> Path:
+    """Write the folder of a plan atomically, and return its path.
+
+    It contains poses.csv (poses in the format of the problem), hand.csv (the hand with velocity and
+    acceleration), predicted_points.csv, pictures, plan.json and, with `with_film`, motion.gif.
+
+    Parameters
+    ----------
+    plan : MotionPlan
+        The plan.
+    folder : str or Path
+        Folder, which may contain an earlier plan; that is replaced.
+    rate_hz : float, optional
+        Rate of poses.csv and hand.csv; four times that of the samples by default.
+    with_film : bool
+        Whether to render the motion as a film.
+    say : callable
+        Called with the present activity.
+
+    Raises
+    ------
+    InputError
+        If the folder contains anything but an earlier plan, or cannot be written.
+    """
+    target = Path(folder)
+    with replaced_folder(target, marker_file=PLAN_FILE, content_word="plan") as place:
+        t_s = command_times_s(plan, rate_hz)
+        write_poses_csv(place / POSES_FILE, plan.poses(t_s))
+        write_columns_csv(place / HAND_FILE, hand_columns(plan, t_s))
+        if plan.points_m:
+            write_markers_csv(
+                place / PREDICTION_FILE,
+                plan.t_s,
+                names=[*plan.points_m],
+                positions_m=np.stack([*plan.points_m.values()], axis=1),
+            )
+        save_pictures(place, plan_figures(plan))
+        if with_film:
+            say("rendering the film of the motion")
+            replay = MotionRecord.from_experiment(
+                plan.fine.experiment, (plan.fine.positions_m, _references_m(plan))
+            )
+            film(replay, place / FILM_FILE, fps=FRAMES_PER_SECOND, names=("predicted", "wanted"))
+        (place / PLAN_FILE).write_text(as_json(plan_json(plan)), encoding="utf-8")
+    return target
+
+
+def command_times_s(plan: MotionPlan, rate_hz: float | None = None) -> Array:
+    """Return the times (P,) since the start at which a controller gets poses [s]: at a rate, to the
+    end of the plan.
+    """
+    last_s = plan.t_s[-1]
+    rate_hz = rate_hz or 4 / plan.t_s[1]
+    return np.arange(int(np.ceil(last_s * rate_hz - 1e-9)) + 1) / rate_hz
+
+
+def hand_columns(plan: MotionPlan, t_s: Array) -> dict[str, Array]:
+    """Return the hand over time, by name of the column: position, rotation vector from the initial
+    orientation, velocity, angular velocity, acceleration and angular acceleration in world axes.
+    """
+    value, rate, growth = plan.motion.derivatives(t_s)
+    spin, spin_rate = angular_motion(value[:, 3:], rate[:, 3:], curvature=growth[:, 3:])
+    blocks = {
+        "{}_m": value[:, :3] + plan.program.frame.position_m,
+        "r{}_rad": value[:, 3:],
+        "v{}_m_s": rate[:, :3],
+        "w{}_rad_s": spin,
+        "a{}_m_s2": growth[:, :3],
+        "alpha_{}_rad_s2": spin_rate,
+    }
+    return {"t_s": t_s} | {
+        name.format(axis): values[:, k]
+        for name, values in blocks.items()
+        for k, axis in enumerate("xyz")
+    }
+
+
+def _references_m(plan: MotionPlan) -> Array:
+    """Return the wanted positions (T, P, 3) of the points of the plan, NaN where free."""
+    wanted = {name: np.full((len(plan.t_s), 3), np.nan) for name in plan.points_m}
+    for each in plan.program.references:
+        wanted[each.name] = np.where(
+            np.isfinite(each.position_m), each.position_m, wanted[each.name]
+        )
+    return np.stack([*wanted.values()], axis=1) if wanted else np.zeros((len(plan.t_s), 0, 3))
+
+
+def plan_json(plan: MotionPlan) -> dict[str, Any]:
+    """Return the content of plan.json, in types that JSON has."""
+    program = plan.program
+    limiting = plan.limiting_constant
+    return {
+        "schema": SCHEMA,
+        "experiment": program.body.template.name,
+        "run": None if program.body.run is None else str(program.body.run),
+        "warnings": list(program.body.warnings),
+        "status": plan.answer.status,
+        "duration_s": program.task.duration_s,
+        "samples": len(plan.t_s),
+        "time_steps": len(program.grid_since_s) - 1,
+        "unknowns": program.space.size,
+        "seconds": plan.seconds,
+        "objective": program.objective_parts(plan.answer.c, plan.answer.x),
+        "history": plan.answer.history,
+        "references": [
+            {"point": each.name, **vars(plan.tracking_error(each))} for each in program.references
+        ],
+        "lowest_frequency_hz": program.lowest_hz if np.isfinite(program.lowest_hz) else None,
+        "residual_vibration_m": plan.residual_vibration_m,
+        "time_step_error_m": plan.time_step_error_m,
+        "limiting_constant": None
+        if limiting is None
+        else {"name": limiting[0], "share": limiting[1]},
+        "limits": {
+            name: {"limit": getattr(program.limits, name), "share_used": float(share)}
+            for name, share in plan.shares.items()
+        },
+        "limits_reached": plan.list_active_limits(),
+        "hand": {
+            "intervals": program.space.intervals,
+            "coefficients": plan.motion.coefficients,
+            "initial_position_m": program.frame.position_m,
+        },
+    }
+
+
+def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
+    """Return a plan on one screen."""
+    notes: list[Shown] = [Line(f"warning: {text}", "check") for text in plan.program.body.warnings]
+    if plan.interrupted:
+        notes.append(Line("interrupted: the best plan so far", "check"))
+    elif plan.answer.status not in ("converged", "flat"):
+        notes.append(Line(f"the search ended early: {plan.answer.status}", "check"))
+    rows = []
+    for each in plan.program.references:
+        error = plan.tracking_error(each)
+        if not np.isfinite(error.rms_m):
+            continue
+        rows.append(
+            (
+                each.name,
+                f"{1e3 * error.rms_m:.3g}",
+                f"{1e3 * error.largest_m:.3g}",
+                "" if error.band_m is None else f"{1e3 * error.band_m:.3g}",
+            )
+        )
+    shown: list[Shown] = [*notes]
+    if rows:
+        heads = ("point", "RMS error [mm]", "largest [mm]", "95 % band ± [mm]")
+        shown.append(Table("", heads, rows=tuple(rows)))
+    if plan.residual_vibration_m is not None:
+        shown.append(f"residual vibration: {1e3 * plan.residual_vibration_m:.3g} mm")
+    if (limiting := plan.limiting_constant) is not None:
+        shown.append(
+            f"the uncertainty of {symbol_with_unit(limiting[0])} limits the plan "
+            f"({100 * limiting[1]:.0f} % of the variance)"
+        )
+    shown.append(f"time steps change the points by {1e3 * plan.time_step_error_m:.2g} mm")
+    shown.append(f"limits reached: {', '.join(plan.list_active_limits()) or 'none'}")
+    shown.append(f"written to {folder}")
+    return shown

@@ -1,0 +1,56 @@
+"""Pictures of a plan: points beside their references, and the motion of the hand."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ...result.figure_style import (
+    COLOUR_CYCLE,
+    LINE_PT,
+    PAGE_MM,
+    add_legend_above,
+    new_figure,
+    own_settings,
+    style_axes,
+)
+from ..design.design_page import motion_picture_of
+from .motion_plan import HALF_WIDTH_95, MotionPlan
+
+
+@own_settings()
+def plan_figures(plan: MotionPlan) -> dict[str, Figure]:
+    """Return the figures of a plan by file name without suffix: "hand", and "tracking" if it has
+    references of positions.
+    """
+    figures = {"hand": motion_picture_of(plan.motion, plan.program.limits)}
+    if any(np.isfinite(each.position_m).any() for each in plan.program.references):
+        figures["tracking"] = tracking_picture(plan)
+    return figures
+
+
+def tracking_picture(plan: MotionPlan) -> Figure:
+    """Return a figure with a panel for each reference: the displacement of the point from its
+    initial place [mm] with its 95 % band, and the reference, dashed.
+    """
+    references = [each for each in plan.program.references if np.isfinite(each.position_m).any()]
+    figure = new_figure(PAGE_MM, 15 + 45 * len(references))
+    panels = figure.subplots(len(references), 1, sharex=True, squeeze=False)[:, 0]
+    std = plan.constants_std_m
+    for panel, reference in zip(panels, references, strict=True):
+        points = plan.points_m[reference.name]
+        for axis, colour in zip(range(3), COLOUR_CYCLE, strict=False):
+            middle = 1e3 * (points[:, axis] - points[0, axis])
+            panel.plot(plan.t_s, middle, color=colour, lw=LINE_PT, label="xyz"[axis])
+            wanted = 1e3 * (reference.position_m[:, axis] - points[0, axis])
+            panel.plot(plan.t_s, wanted, color=colour, lw=LINE_PT, ls="--")
+            if std is not None:
+                half = 1e3 * HALF_WIDTH_95 * std[reference.name][:, axis]
+                panel.fill_between(
+                    plan.t_s, middle - half, middle + half, color=colour, alpha=0.2, lw=0
+                )
+        panel.axvline(plan.program.task.duration_s, color="black", lw=0.6, ls=":")
+        style_axes(panel, "", xlabel="", ylabel=f"{reference.name} [mm]")
+    panels[-1].set_xlabel("time [s]")
+    add_legend_above(panels[0], columns=3)
+    return figure

@@ -1,0 +1,315 @@
+"""Body of a planned motion: that of a problem at its guesses, or as a run identified it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...common.files import RESULT_FILE, require_run_folder
+from ...errors import InputError, located
+from ...problem import Problem
+from ...recording import Experiment, Markers, Nuisance, Obstacle, PoseSequence
+from ...recording.measurement_selection import NO_SENSORS
+from ...result.replay import damaged_run_refused
+from ...runs.result_builder import build_result
+from ...runs.result_content import Result
+from ...runs.solved_problem import SolvedProblem
+from ...runs.warm_start import WarmStart
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedBody:
+    """Body with its parameters, and the recording whose grasp, loads and surroundings a plan keeps.
+
+    Attributes
+    ----------
+    problem : Problem
+        Problem with scheme and parameters, whose guesses are the values of the plan.
+    template : Experiment
+        Recording with grasps and gravity as identified.
+    q : (nq,) array
+        Parameters in the solver's coordinates.
+    covariance : (nq, nq) array or None
+        Combined covariance of q; None if it is not known.
+    marker_places_m : dict of name to (3,) array
+        Places of the markers on the undeformed body [m]; NaN where a place is not known.
+    warnings : tuple of str
+        Reasons not to rely on the constants without care.
+    run : Path or None
+        Run folder; None for a problem or a run in memory.
+    """
+
+    problem: Problem
+    template: Experiment
+    q: Array
+    covariance: Array | None
+    marker_places_m: dict[str, Array]
+    warnings: tuple[str, ...] = ()
+    run: Path | None = None
+
+    def __post_init__(self) -> None:
+        with located(self.problem.path, f"experiment '{self.template.name}'"):
+            _require_plannable(self.template)
+
+    @classmethod
+    def read(
+        cls,
+        source: str | Path | Problem | SolvedProblem,
+        experiment: str | None = None,
+        allow_code: bool = False,
+    ) -> PlannedBody:
+        """Return the body of a problem file, run folder, `Problem` or `Run`.
+
+        Parameters
+        ----------
+        source : path, Problem or SolvedProblem
+            Problem, whose guesses are used, or run, whose estimates are used.
+        experiment : str, optional
+            Name of the recording whose grasp is planned; the first that moves by default.
+        allow_code : bool
+            Whether Python files that a problem file names may run.
+
+        Raises
+        ------
+        InputError
+            For a damaged run, a parameter without a guess, an experiment that does not exist, is
+            static, or has no grasp that holds all axes throughout.
+        """
+        if isinstance(source, Problem):
+            return cls._from_problem(source, experiment)
+        if isinstance(source, SolvedProblem):
+            return cls._from_solved(source, experiment)
+        path = Path(source)
+        if path.is_dir():
+            return cls._from_folder(path, experiment, allow_code=allow_code)
+        if path.name == RESULT_FILE:
+            require_run_folder(path)
+        return cls._from_problem(
+            Problem.read(path, allow_code=allow_code, simulation=True), experiment
+        )
+
+    @classmethod
+    def _from_problem(cls, problem: Problem, experiment: str | None) -> PlannedBody:
+        if names := problem.parameters.list_names_without_guess():
+            key = f"parameters.{names[0]}"
+            raise InputError(
+                "this parameter has no guess, but a motion is planned for a value of each "
+                f"parameter; expected --set {key}.guess=VALUE, or a run that identified it",
+                problem.path,
+                where=key,
+            )
+        template = _select(problem, problem.experiments, experiment)
+        places = _stated_places(template)
+        return cls(problem, template, problem.parameters.guess_q, None, places)
+
+    @classmethod
+    def _from_solved(cls, run: SolvedProblem, experiment: str | None) -> PlannedBody:
+        parts = {part.transcription.experiment.name: part for part in run.solution.parts}
+        chosen = _select(
+            run.problem, [part.transcription.experiment for part in parts.values()], experiment
+        )
+        part = parts[chosen.name]
+        names = chosen.markers.names
+        places = dict(zip(names, part.transcription.marker_places_m(part.phi), strict=True))
+        problem = WarmStart.of(run.solution).apply_to_problem(run.problem)
+        result = build_result(run)
+        return cls(
+            problem,
+            part.transcription.corrected_experiment(part.phi),
+            problem.parameters.guess_q,
+            _combined_covariance(result, problem),
+            places,
+            warnings=_warnings(result),
+        )
+
+    @classmethod
+    def _from_folder(cls, folder: Path, experiment: str | None, allow_code: bool) -> PlannedBody:
+        result = Result.read(folder)
+        answer = WarmStart.from_result(result, folder)
+        home = result.problem_folder(
+            folder,
+            "which a plan needs: in Python, plan with the run itself, cs.plan_motion(run, …)",
+        )
+        problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
+        problem = problem.with_lengths(
+            {name: each.shapes.length_m for name, each in result.fields.items()}
+        )
+        if problem.parameters.free:
+            problem = answer.apply_to_problem(problem)
+        collocation = answer.apply_to_places(problem.collocation())
+        fitted = {each.experiment.name: each for each in collocation.transcriptions}
+        chosen = _select(problem, [each.experiment for each in fitted.values()], experiment)
+        transcription = fitted[chosen.name]
+        phi = answer.apply_to_nuisance(collocation)[0][transcription.nuisance_indices.indices]
+        places = dict(zip(chosen.markers.names, transcription.marker_places_m(phi), strict=True))
+        with damaged_run_refused(folder):
+            covariance = _combined_covariance(result, problem)
+            warnings = _warnings(result)
+        return cls(
+            problem,
+            transcription.corrected_experiment(phi),
+            problem.parameters.guess_q,
+            covariance,
+            places,
+            warnings=warnings,
+            run=folder,
+        )
+
+    @property
+    def grasp_number(self) -> int:
+        """Index of the planned grasp among the grasps: the first that holds all axes throughout."""
+        return next(k for k, each in enumerate(self.template.grasps) if _is_held(each))
+
+    @cached_property
+    def start_pose(self) -> tuple[Array, Array]:
+        """Rotation (3, 3) and translation (3,) [m] of the planned grasp at the first sample of the
+        recording: a grasped node at X is at R X + p.
+        """
+        poses = self.template.grasps[self.grasp_number].poses
+        rotations, translations = poses.at(self.template.t_s[:1])
+        return rotations[0], translations[0]
+
+    @cached_property
+    def hand_m(self) -> Array:
+        """Middle (3,) of the grasped nodes on the undeformed body [m]."""
+        grasp = self.template.grasps[self.grasp_number]
+        return np.asarray(self.template.body.nodes_m[grasp.nodes].mean(axis=0), dtype=np.float64)
+
+    def experiment(self, poses: PoseSequence, t_s: Array, points: dict[str, Array]) -> Experiment:
+        """Return the experiment of a plan: the recording with other poses of the planned grasp and
+        other times, from equilibrium, with points in place of the measurements.
+
+        Other grasps and obstacles stay where they are at the first sample.
+
+        Parameters
+        ----------
+        poses : PoseSequence
+            Poses of the planned grasp over the times.
+        t_s : (T,) array
+            Times, from the first sample of the recording on.
+        points : dict of name to (3,) array
+            Places of the points on the undeformed body [m].
+        """
+        template = self.template
+        grasps = []
+        for number, grasp in enumerate(template.grasps):
+            moved = poses if number == self.grasp_number else _standing(grasp.poses, t_s)
+            grasps.append(replace(grasp, poses=moved, wrench=None))
+        changes: dict[str, Any] = {
+            "start_positions_m": None,
+            "start_velocities_m_s": None,
+            "start_velocity_m_s": None,
+            "start_spin_rad_s": None,
+        }
+        markers = Markers(
+            t_s,
+            np.zeros((len(t_s), len(points), 3)),
+            1e-3,
+            [*points],
+            np.array([*points.values()]).reshape(-1, 3),
+        )
+        return replace(
+            template,
+            t_s=t_s,
+            grasps=tuple(grasps),
+            markers=markers,
+            start="equilibrium",
+            start_rule="standard",
+            loaded_since_s=np.inf,
+            validation=False,
+            nuisance=Nuisance.none(),
+            **NO_SENSORS,
+            **changes,
+        )
+
+    def gripper_poses(self, poses: PoseSequence) -> PoseSequence:
+        """Return poses of the body in the planned grasp as poses of the gripper, in the format of
+        the problem: without the identified hand–eye transform and `gripper_to_body`, which the
+        poses of a recording contain as their first motion.
+        """
+        identified = self.template.grasps[self.grasp_number].poses.first_motion
+        return replace(poses.after(np.linalg.inv(identified)), first_motion=np.eye(4))
+
+
+def _select(problem: Problem, experiments: Any, name: str | None) -> Experiment:
+    """Return the experiment with a name, or the first that is not static if `name` is None."""
+    moving = {each.name: each for each in experiments if not each.is_static}
+    if not moving:
+        raise InputError(
+            "every experiment is static; expected at least one that moves", problem.path
+        )
+    if name is None:
+        return next(iter(moving.values()))
+    if name not in moving:
+        raise InputError(
+            f"found {name!r}; expected one of the experiments that move: {', '.join(moving)}",
+            problem.path,
+            where="--experiment",
+        )
+    return moving[name]
+
+
+def _is_held(grasp: Any) -> bool:
+    return (
+        not isinstance(grasp, Obstacle)
+        and grasp.axes == "xyz"
+        and bool(np.isinf(grasp.from_s) and np.isinf(grasp.until_s))
+    )
+
+
+def _require_plannable(template: Experiment) -> None:
+    """Raise an `InputError` if no grasp holds all axes throughout."""
+    if template.is_static:
+        raise InputError("the experiment is static; expected one that moves, to plan a motion for")
+    if not any(_is_held(each) for each in template.grasps):
+        raise InputError(
+            "no grasp holds the body along all axes throughout; expected one, whose motion is "
+            "planned"
+        )
+
+
+def _standing(poses: PoseSequence, t_s: Array) -> PoseSequence:
+    """Return the pose at the first of the times, for all times."""
+    rotations, translations = poses.at(t_s[:1])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotations[0], translations[0]
+    return PoseSequence.from_matrices(t_s[:1], matrix[None])
+
+
+def _stated_places(experiment: Experiment) -> dict[str, Array]:
+    """Return the stated places of the markers on the undeformed body [m]; NaN where there is none."""
+    markers = experiment.markers
+    if not markers.names:
+        return {}
+    placed = markers.predict_positions(experiment.body.nodes_m[None])[0]
+    placed = np.where(np.asarray(markers.located)[:, None], placed, np.nan)
+    return dict(zip(markers.names, placed, strict=True))
+
+
+def _combined_covariance(result: Result, problem: Problem) -> Array | None:
+    """Return the combined covariance (nq, nq) of q, zero for coefficients of fields; the statistical
+    one if systematic effects were not evaluated, None without any.
+    """
+    uncertainty = result.uncertainty
+    if uncertainty is None:
+        return None
+    known = uncertainty.combined_covariance
+    matrix = np.asarray(uncertainty.covariance if known is None else known, dtype=np.float64)
+    names = [item.name for item in problem.parameters.free]
+    places = [names.index(name) for name in uncertainty.names]
+    covariance = np.zeros((len(names),) * 2)
+    covariance[np.ix_(places, places)] = matrix
+    return covariance
+
+
+def _warnings(result: Result) -> tuple[str, ...]:
+    warnings = [] if result.converged else ["the run did not converge"]
+    if result.trust.verdict != "good":
+        reasons = "; ".join(result.trust.reasons)
+        warnings.append(f"the verdict on the run is {result.trust.verdict!r}: {reasons}")
+    return tuple(warnings)

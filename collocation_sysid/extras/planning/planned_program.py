@@ -1,0 +1,554 @@
+"""Optimal-control problem of a plan: residuals, effort of the hand, and limits.
+
+With the unknowns c of the hand's spline, the motion x(c) of the body, the references y* at the
+samples and the mass M of the body, the plan minimises
+
+    Σ_k mean_t ‖(S_k x − y*_k)/σ_k‖² + mean_t Σ_i (m_i/M) ‖v_i/(ω₁ σ_rest)‖² + w mean ‖jerk/j₀‖²
+
+subject to limits of the hand g(c) ≤ 0. All residuals are linear in the positions x at the grid times
+(velocities are differences), so that they are one sparse matrix. The second term is the mean kinetic
+energy in the window after the motion, in units of that of a vibration with the amplitude σ_rest at
+the lowest natural frequency ω₁. The unit j₀ of the jerk is ten times the largest acceleration over
+the duration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+
+from ...common.array_types import Array, Index
+from ...common.time_dependence import at_times
+from ...errors import InputError
+from ...model.parameters import ThetaMap
+from ...program.driven_motion import Drive, DrivenMotion
+from ...program.modes.natural_modes import natural_modes
+from ...recording import Experiment, PoseSequence
+from ..design.hand_limits import HandBounds, Limits
+from .planned_body import PlannedBody
+from .spline_motion import LIMIT_POINTS, HandFrame, HandLimits, PoseLimit, SplineSpace
+from .task import AXES, Reference, Task, point_names, point_places, sampled_references
+
+# Fewest and largest numbers of samples of a plan.
+FEWEST_SAMPLES, MOST_SAMPLES = 10, 20_000
+# Fewest samples of the window after the motion.
+FEWEST_AT_REST = 4
+# Jerk in units of the limit of the acceleration over the duration: that of a motion which changes
+# between the limits in a tenth of its duration.
+JERK_UNIT = 10.0
+# Poses per sample that the simulation of a plan interpolates.
+POSES_PER_SAMPLE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualRows:
+    """Residuals S x − b of one kind, in units of their deviations.
+
+    Attributes
+    ----------
+    name : str
+        Name of the point, or "rest".
+    matrix : (m, N · 3n) sparse array
+        S, by the flattened positions [1/m].
+    target : (m,) array
+        b.
+    """
+
+    name: str
+    matrix: sp.csr_array
+    target: Array
+
+
+class LinearisedLimits(NamedTuple):
+    """Limits of a hand near some unknowns, to first order; linear limits are exact.
+
+    Attributes
+    ----------
+    vectors : (k, 3) array
+        Vectors whose norms must not exceed one.
+    vector_slopes : (k, 3, c) array
+        Their derivatives by the unknowns.
+    rows : (m,) array
+        Values that must not be positive.
+    row_slopes : (m, c) array
+        Their derivatives.
+    """
+
+    vectors: Array
+    vector_slopes: Array
+    rows: Array
+    row_slopes: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LimitsOverTime:
+    """Limits of a hand at all times at which they hold, as functions of the unknowns.
+
+    Attributes
+    ----------
+    at_time : HandLimits
+        Limits at one time.
+    t_s : (T,) array
+        Times since the start [s].
+    matrix, constant : (T, 18, c) and (T, 18) arrays
+        Coordinates and their two derivatives as an affine function of the unknowns.
+    """
+
+    at_time: HandLimits
+    t_s: Array
+    matrix: Array
+    constant: Array
+
+    @classmethod
+    def in_space(cls, at_time: HandLimits, space: SplineSpace) -> LimitsOverTime:
+        """Build for the motions of a space of splines."""
+        t_s = np.linspace(0.0, space.duration_s, LIMIT_POINTS * space.intervals + 1)
+        matrices, constants = zip(*(space.affine(t_s, order) for order in range(3)), strict=True)
+        return cls(
+            at_time, t_s, np.concatenate(matrices, axis=1), np.concatenate(constants, axis=1)
+        )
+
+    def linearise(self, c: Array) -> LinearisedLimits:
+        """Return the limits near unknowns c (c,), time by time."""
+        states = (self.matrix @ c + self.constant).T
+        parts = []
+        for function in self._slopes:
+            values, slopes = (each.full() for each in function(states))
+            by_state = slopes.reshape(len(values), len(self.t_s), 18).transpose(1, 0, 2)
+            parts += [values.T.ravel(), (by_state @ self.matrix).reshape(-1, len(c))]
+        vectors, vector_slopes, rows, row_slopes = parts
+        return LinearisedLimits(
+            vectors.reshape(-1, 3), vector_slopes.reshape(-1, 3, len(c)), rows, row_slopes
+        )
+
+    @cached_property
+    def _slopes(self) -> tuple[ca.Function, ca.Function]:
+        """Vectors and rows with their slopes, at all times."""
+        state = ca.SX.sym("state", 18)
+        functions = []
+        for each in (self.at_time.vectors, self.at_time.rows):
+            values = each(state)
+            slopes = ca.densify(ca.jacobian(values, state))
+            functions.append(ca.Function("slopes", [state], [values, slopes]).map(len(self.t_s)))
+        return functions[0], functions[1]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of the limit of each vector, then of each row."""
+        count = len(self.t_s)
+        return self.at_time.vector_names * count + self.at_time.row_names * count
+
+    @property
+    def times_s(self) -> Array:
+        """Time of each vector, then of each row [s]."""
+        kinds = (self.at_time.vector_names, self.at_time.row_names)
+        return np.concatenate([np.repeat(self.t_s, len(names)) for names in kinds])
+
+    def shares(self, c: Array) -> Array:
+        """Return the share of each limit that is used: norms of vectors, and one plus the rows."""
+        near = self.linearise(c)
+        return np.concatenate([np.linalg.norm(near.vectors, axis=1), 1 + near.rows])
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedProgram:
+    """Optimal-control problem of a task for a body.
+
+    Attributes
+    ----------
+    body : PlannedBody
+        The body.
+    task : Task
+        The task.
+    limits : Limits
+        Limits of the robot.
+    experiment : Experiment
+        Experiment of the plan, with the hand standing at its initial pose.
+    driven : DrivenMotion
+        Motion of the body as a function of the hand's.
+    space : SplineSpace
+        Motions of the hand.
+    start : (3n,) array
+        Equilibrium before the motion [m].
+    references : list of Reference
+        References at the samples.
+    lowest_hz : float
+        Lowest natural frequency of the body about the equilibrium; NaN if there is none.
+    pose_limits : callable or None
+        Limits of the joints, see `HandLimits`.
+    """
+
+    body: PlannedBody
+    task: Task
+    limits: Limits
+    experiment: Experiment
+    driven: DrivenMotion
+    space: SplineSpace
+    start: Array
+    references: list[Reference]
+    lowest_hz: float
+    pose_limits: PoseLimit | None = None
+
+    @classmethod
+    def from_task(
+        cls,
+        body: PlannedBody,
+        task: Task,
+        limits: Limits,
+        pose_limits: PoseLimit | None = None,
+        substeps: int | None = None,
+    ) -> PlannedProgram:
+        """Build the problem.
+
+        Raises
+        ------
+        InputError
+            If the limits exclude the start or the end, a point is unknown, or the times do not fit.
+        SimulationError
+            If the body has no equilibrium in the initial pose.
+        """
+        template = body.template
+        sample_s = task.sample_s or template.timestep_s
+        count = round(task.duration_s / sample_s)
+        if not FEWEST_SAMPLES <= count <= MOST_SAMPLES:
+            raise InputError(
+                f"{task.duration_s:g} s are {task.duration_s / sample_s:.6g} samples of "
+                f"{sample_s:g} s; expected {FEWEST_SAMPLES} to {MOST_SAMPLES}",
+                None,
+                where="duration_s" if task.sample_s is None else "sample_s",
+            )
+        # The motion ends at a sample, so that the window begins at rest.
+        sample_s = task.duration_s / count
+        rotation, translation = body.start_pose
+        hand_m = rotation @ body.hand_m + translation
+        bounds = limits.bounds_from(hand_m)
+        space = _space(task, bounds)
+        names, places = point_names(task), point_places(task, body.marker_places_m)
+        points = dict(zip(names, places, strict=True)) or _farthest_node(body)
+        substeps = substeps or body.problem.choose_first_substeps()
+
+        def standing(samples: int) -> tuple[Experiment, DrivenMotion]:
+            """Return the experiment with `samples` samples in which the hand stands."""
+            t_s = template.t_s[0] + sample_s * np.arange(samples)
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = rotation, translation
+            poses = PoseSequence.from_matrices(t_s[:1], matrix[None])
+            experiment = body.experiment(poses, t_s, points)
+            return experiment, DrivenMotion.from_experiment(
+                experiment,
+                body.problem.parameters,
+                body.problem.scheme,
+                substeps=substeps,
+                q=body.q,
+            )
+
+        _, brief = standing(3)
+        start = brief.simulate(_standing_drive(brief))[0]
+        lowest_hz = _lowest_frequency_hz(brief, start)
+        window = _window_samples(task, sample_s, lowest_hz)
+        experiment, driven = standing(count + 1 + window)
+        since_s = sample_s * np.arange(count + 1 + window)
+        started = experiment.markers.predict_positions(start.reshape(1, -1, 3))[0]
+        index = {name: k for k, name in enumerate(points)}
+        first = started[[index[name] for name in names]] if names else np.zeros((0, 3))
+        references = sampled_references(task, since_s, places, first)
+        return cls(
+            body, task, limits, experiment, driven, space, start, references, lowest_hz, pose_limits
+        )
+
+    # The hand -------------------------------------------------------------------------------------
+
+    @cached_property
+    def bounds(self) -> HandBounds:
+        """Limits of the hand relative to its initial position."""
+        return self.limits.bounds_from(self.frame.position_m)
+
+    @cached_property
+    def frame(self) -> HandFrame:
+        """Initial pose of the hand with the grasped nodes."""
+        rotation, translation = self.body.start_pose
+        grasp = self.experiment.grasps[self.body.grasp_number]
+        arms = (self.experiment.body.nodes_m[grasp.nodes] - self.body.hand_m) @ rotation.T
+        return HandFrame(rotation, rotation @ self.body.hand_m + translation, arms)
+
+    @cached_property
+    def grid_since_s(self) -> Array:
+        """Grid times (N,) since the start [s]."""
+        return self.driven.t_s - self.driven.t_s[0]
+
+    @cached_property
+    def coordinates_at_grid(self) -> tuple[Array, Array]:
+        """Matrix (N, 6, c) and constant (N, 6) of the hand's coordinates at the grid times."""
+        return self.space.affine(self.grid_since_s)
+
+    @cached_property
+    def planned_columns(self) -> Index:
+        """Places of the planned grasp's dofs among the prescribed ones."""
+        grasp = self.experiment.grasps[self.body.grasp_number]
+        return np.searchsorted(self.driven.dofs, grasp.prescribed_dofs)
+
+    def drive(self, c: Array) -> Drive:
+        """Return what drives the body at the unknowns c (c,), with derivatives."""
+        matrix, constant = self.coordinates_at_grid
+        positions, slopes = self.frame.positions(matrix @ c + constant)
+        rows = len(self.grid_since_s)
+        goals = self.driven.stated_goals_m.copy()
+        by_control = np.zeros((*goals.shape, len(c)))
+        goals[:, self.planned_columns] = positions.reshape(rows, -1)
+        by_control[:, self.planned_columns] = slopes.reshape(rows, -1, 6) @ matrix
+        nothing = np.zeros((rows, 0, len(c)))
+        return Drive(goals, by_control, np.zeros((rows, 0)), nothing)
+
+    def coordinates(self, c: Array, t_s: Array) -> Array:
+        """Return the coordinates (T, 6) of the hand at times since the start."""
+        return self.space.motion(c).derivatives(t_s).value
+
+    def poses(self, c: Array, t_s: Array) -> PoseSequence:
+        """Return the poses of the grasped body at times (T,) since the start [s], as grasps have
+        them: a grasped node at X of the undeformed body is at R X + p. Times of the poses are those
+        of the experiment.
+        """
+        from scipy.spatial.transform import Rotation
+
+        coordinates = self.coordinates(c, t_s)
+        turned = Rotation.from_rotvec(coordinates[:, 3:]) * Rotation.from_matrix(
+            self.frame.rotation
+        )
+        placed = self.frame.position_m + coordinates[:, :3] - turned.apply(self.body.hand_m)
+        return PoseSequence(t_s + self.experiment.t_s[0], placed, quaternions_xyzw=turned.as_quat())
+
+    @cached_property
+    def hand_limits(self) -> LimitsOverTime:
+        """Limits of the hand."""
+        at_time = HandLimits.from_bounds(self.bounds, self.frame, self.space.free, self.pose_limits)
+        return LimitsOverTime.in_space(at_time, self.space)
+
+    # The residuals --------------------------------------------------------------------------------
+
+    @cached_property
+    def residual_rows(self) -> tuple[ResidualRows, ...]:
+        """Residuals of the body: those of each reference, then those of the rest at the end."""
+        rows = [self._reference_rows(each) for each in self.references]
+        if self.task.end.at_rest:
+            rows.append(self._rest_rows())
+        return tuple(rows)
+
+    @cached_property
+    def residuals(self) -> tuple[sp.csr_array, Array]:
+        """Matrix S (m, N · 3n) and vector b (m,) of all residuals S x − b of the body."""
+        size = len(self.grid_since_s) * self.driven.transcription.dof_count
+        matrices = [each.matrix for each in self.residual_rows]
+        if not matrices:
+            return sp.csr_array((0, size)), np.zeros(0)
+        return (
+            sp.csr_array(sp.vstack(matrices)),
+            np.concatenate([each.target for each in self.residual_rows]),
+        )
+
+    @cached_property
+    def effort(self) -> tuple[Array, Array]:
+        """Matrix (k, c) and constant (k,) of the weighted jerk of the hand, an affine residual."""
+        matrix, constant = self.space.jerk()
+        limits = self.limits
+        growth = np.radians(limits.angular_acceleration_deg_s2)
+        unit = np.repeat([limits.acceleration_m_s2, growth], 3) * JERK_UNIT / self.space.duration_s
+        weight = np.sqrt(self.task.hand.jerk_weight / len(matrix)) / unit
+        scaled = matrix * weight[:, None]
+        return scaled.reshape(-1, self.space.size), (constant * weight).ravel()
+
+    def point_weights(self, name: str) -> sp.csr_array:
+        """Return the weights (3, 3n) of the node positions in the position of a point."""
+        markers = self.experiment.markers
+        placement = markers.placement
+        number = markers.names.index(name)
+        weights = np.zeros((3, self.driven.transcription.dof_count))
+        for axis in range(3):
+            weights[axis, 3 * placement.nodes[number] + axis] = placement.weights[number]
+        return sp.csr_array(weights)
+
+    @property
+    def sample_rows(self) -> Index:
+        """Grid times of the samples."""
+        substeps = self.driven.transcription.substeps
+        return np.arange(len(self.experiment.t_s)) * substeps
+
+    def _reference_rows(self, reference: Reference) -> ResidualRows:
+        """Return the residuals of a reference."""
+        at_point = self.point_weights(reference.name)
+        rows = self.sample_rows
+        last = len(self.grid_since_s) - 1
+        step_s = self.driven.transcription.dynamics.step_s
+        blocks, targets = [], []
+        for values, unit, is_velocity in (
+            (reference.position_m, reference.sigma_m, False),
+            (reference.velocity_m_s, reference.sigma_m_s, True),
+        ):
+            samples, axes = np.nonzero(np.isfinite(values))
+            if not len(samples):
+                continue
+            scale = 1 / (unit * np.sqrt(len(np.unique(samples))))
+            at = rows[samples]
+            if is_velocity:
+                before, after = np.maximum(at - 1, 0), np.minimum(at + 1, last)
+                weight = scale / ((after - before) * step_s)
+                select = _selection(after, len(self.grid_since_s), weight)
+                select = select - _selection(before, len(self.grid_since_s), weight)
+            else:
+                select = _selection(at, len(self.grid_since_s), np.full(len(at), scale))
+            # Row r has the product of its time's weights and its axis' weights.
+            blocks.append(_row_products(select, sp.csr_array(at_point[axes])))
+            targets.append(scale * values[samples, axes])
+        return ResidualRows(
+            reference.name, sp.csr_array(sp.vstack(blocks)), np.concatenate(targets)
+        )
+
+    def _rest_rows(self) -> ResidualRows:
+        """Return the residuals of the velocity of all nodes after the motion."""
+        transcription = self.driven.transcription
+        free = transcription.free_dofs
+        mass = transcription.dynamics.mass.inertia_at(0)[free]
+        weight = np.sqrt(mass / (mass.sum() / 3))
+        step_s = transcription.dynamics.step_s
+        first = round(self.task.duration_s / step_s)
+        rows = np.arange(first, len(self.grid_since_s) - 1)
+        omega = 2 * np.pi * self.lowest_hz
+        scale = 1 / (omega * self.task.end.sigma_m * step_s * np.sqrt(len(rows)))
+        difference = _selection(rows + 1, len(self.grid_since_s), np.full(len(rows), scale))
+        difference = difference - _selection(
+            rows, len(self.grid_since_s), np.full(len(rows), scale)
+        )
+        of_dofs = sp.csr_array(
+            (weight, (np.arange(len(free)), free)), shape=(len(free), transcription.dof_count)
+        )
+        matrix = sp.csr_array(sp.kron(difference, of_dofs))
+        return ResidualRows("rest", matrix, np.zeros(matrix.shape[0]))
+
+    def objective_parts(self, c: Array, x: Array) -> dict[str, float]:
+        """Return the parts of the objective at unknowns c and motion x (N, 3n): of each reference,
+        of the rest at the end, and of the jerk.
+        """
+        parts: dict[str, float] = {}
+        flat = x.ravel()
+        for each in self.residual_rows:
+            value = float(np.sum((each.matrix @ flat - each.target) ** 2))
+            parts[each.name] = parts.get(each.name, 0.0) + value
+        matrix, constant = self.effort
+        parts["jerk"] = float(np.sum((matrix @ c + constant) ** 2))
+        return parts
+
+    def objective(self, c: Array, x: Array) -> float:
+        """Return the objective at unknowns c and motion x (N, 3n)."""
+        return sum(self.objective_parts(c, x).values())
+
+    def simulate(self, c: Array, near: Array | None = None) -> Array:
+        """Return the motion (N, 3n) [m] at the unknowns c, see `DrivenMotion.simulate`."""
+        return self.driven.simulate(self.drive(c), start=self.start, near=near)
+
+
+def _selection(rows: Index, count: int, weights: Array) -> sp.csr_array:
+    """Return a matrix (k, count) with one weight in each row."""
+    return sp.csr_array((weights, (np.arange(len(rows)), rows)), shape=(len(rows), count))
+
+
+def _row_products(left: sp.csr_array, right: sp.csr_array) -> sp.csr_array:
+    """Return the matrix (k, a · b) whose rows are the Kronecker products of the rows of two matrices
+    (k, a) and (k, b).
+    """
+    count, width = int(left.shape[0]), int(right.shape[1])
+    entries = sp.coo_array(left)
+    first, place = entries.coords
+    counts = np.diff(right.indptr)[first]
+    rows = np.repeat(first, counts)
+    offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    source = right.indptr[rows] + offsets
+    columns = np.repeat(place, counts) * width + right.indices[source]
+    values = np.repeat(entries.data, counts) * right.data[source]
+    return sp.csr_array((values, (rows, columns)), shape=(count, int(left.shape[1]) * width))
+
+
+def _farthest_node(body: PlannedBody) -> dict[str, Array]:
+    """Return the node that is farthest from the hand, for a task without references."""
+    nodes_m = body.template.body.nodes.points_m
+    farthest = np.linalg.norm(nodes_m - body.hand_m, axis=1).argmax()
+    return {"farthest node": nodes_m[farthest]}
+
+
+def _standing_drive(driven: DrivenMotion) -> Drive:
+    goals = driven.stated_goals_m
+    rows = len(goals)
+    return Drive(goals, np.zeros((*goals.shape, 0)), np.zeros((rows, 0)), np.zeros((rows, 0, 0)))
+
+
+def _space(task: Task, bounds: HandBounds) -> SplineSpace:
+    """Return the space of the hand's motions; an `InputError` if the end is beyond the workspace."""
+    hand = task.hand
+    free = np.array([AXES.index(axis) for axis in hand.free])
+    end = np.zeros(6)
+    end[free] = np.nan
+    if hand.end_m is not None:
+        end[:3] = hand.end_m
+        if not ((bounds.low_m < end[:3]) & (end[:3] < bounds.high_m)).all():
+            raise InputError(
+                f"the hand ends {list(hand.end_m)} m from its start, outside the workspace; "
+                "expected an end within workspace_m of the limits",
+                None,
+                where="hand.end_m",
+            )
+    if hand.end_rotation_deg is not None:
+        end[3:] = np.radians(hand.end_rotation_deg)
+        angle = float(np.linalg.norm(hand.end_rotation_deg))
+        if angle >= bounds.limits.rotation_deg:
+            raise InputError(
+                f"the hand turns by {angle:g}° until its end; expected less than rotation_deg = "
+                f"{bounds.limits.rotation_deg:g} of the limits",
+                None,
+                where="hand.end_rotation_deg",
+            )
+    reach = bounds.compute_reach()
+    units = np.repeat(np.minimum(reach.value, reach.second * task.duration_s**2 / 4), 3)
+    return SplineSpace(task.duration_s, hand.intervals, np.sort(free), end, units)
+
+
+def _lowest_frequency_hz(driven: DrivenMotion, start: Array) -> float:
+    """Return the lowest natural frequency about the equilibrium [Hz]; NaN if nothing oscillates."""
+    transcription = driven.transcription
+    theta = ThetaMap(transcription.parameters, transcription.body).theta(driven.q)
+    forces = at_times(transcription.dynamics.with_theta(theta).forces, slice(1))
+    found = natural_modes(forces, start, free_dofs=transcription.free_dofs, count=1)
+    return float(found.frequencies_hz[0]) if len(found.frequencies_hz) else np.nan
+
+
+def _window_samples(task: Task, sample_s: float, lowest_hz: float) -> int:
+    """Return the number of samples after the motion in which the body is at rest; 0 if it need not
+    be.
+
+    Raises
+    ------
+    InputError
+        If the window has too few samples, or the body does not oscillate and none is stated.
+    """
+    end = task.end
+    if not end.at_rest:
+        return 0
+    if end.window_s is None and not np.isfinite(lowest_hz):
+        raise InputError(
+            "the body has no natural frequency from which the window of rest follows; expected "
+            "window_s, or at_rest = false",
+            None,
+            where="end.window_s",
+        )
+    window_s = 0.5 / lowest_hz if end.window_s is None else end.window_s
+    samples = int(np.ceil(window_s / sample_s - 1e-9))
+    if end.window_s is not None and samples < FEWEST_AT_REST:
+        raise InputError(
+            f"found window_s = {end.window_s:g}, which is {samples} samples of {sample_s:g} s; "
+            f"expected at least {FEWEST_AT_REST}",
+            None,
+            where="end.window_s",
+        )
+    return max(samples, FEWEST_AT_REST)

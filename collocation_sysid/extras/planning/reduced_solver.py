@@ -1,0 +1,290 @@
+"""Solution of a plan in the reduced space of the hand's unknowns, by Gauss–Newton steps.
+
+At each iteration one forward sweep gives the derivatives Z of the motion by the unknowns c. With the
+residuals S x − b of the body and the affine residual of the jerk, the step minimises the
+linearised sum of squares with Levenberg's damping, subject to the limits of the hand. Limits of
+translations are convex and enter as they are (second-order cones), those of rotations linearised.
+Every iterate respects all limits. A step counts only if the simulated motion is better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import clarabel
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import solve_triangular
+
+from ...common.array_types import Array
+from ...errors import SimulationError
+from ..design.hand_limits import WITHIN
+from .planned_program import LinearisedLimits, PlannedProgram
+
+# Tolerance of the conic program of a step, relative.
+SOLVER_TOLERANCE = 1e-12
+# Largest number of linearisations of the limits in the search for the smoothest motion.
+MOST_LINEARISATIONS = 10
+# Largest share of a limit that an iterate may use: limits are tightened by `WITHIN`, so that it
+# respects the limits themselves.
+LARGEST_SHARE = 1 + 0.5 * (1 / WITHIN - 1)
+# Called with the iteration and the objective.
+Watch = Callable[[int, float], None]
+
+
+@dataclass(frozen=True)
+class ReducedTolerances:
+    """Tolerances of the search.
+
+    Attributes
+    ----------
+    step : float
+        Largest change of an unknown (in units of the workspace) at convergence. Two solvers agree
+        to 1e-6 if both steps end far below it.
+    decrease : float
+        Largest predicted decrease of the objective, relative to it, at convergence.
+    progress : float
+        Share of the objective by which three iterations together must improve it; 0 searches until
+        convergence. Motions that differ by redundant coordinates of the hand are nearly as good as
+        one another, and the search among them is slow.
+    iterations : int
+        Largest number of iterations.
+    failures : int
+        Largest number of steps in a row that are not better.
+    """
+
+    step: float = 1e-9
+    decrease: float = 1e-12
+    progress: float = 1e-2
+    iterations: int = 60
+    failures: int = 12
+
+
+@dataclass(eq=False)
+class ReducedAnswer:
+    """Result of the search.
+
+    Attributes
+    ----------
+    c : (c,) array
+        Unknowns.
+    x : (N, 3n) array
+        Motion [m].
+    derivatives : (N, 3n, c) array
+        Derivatives of the motion by the unknowns.
+    multipliers : (k,) array
+        Multipliers of the limits.
+    status : {"converged", "flat", "iteration limit", "interrupted", "stalled"}
+        How the search ended; "flat": three iterations did not improve the plan by
+        `ReducedTolerances.progress`.
+    history : list of float
+        Objective at each iterate.
+    """
+
+    c: Array
+    x: Array
+    derivatives: Array
+    multipliers: Array
+    status: str
+    history: list[float] = field(default_factory=list)
+
+
+class HandLimitsExcludeTask(Exception):
+    """No motion of the hand satisfies its limits and its given end."""
+
+
+def triangular(matrix: Array, residual: Array) -> tuple[Array, Array]:
+    """Return the triangle R (c, c) and the vector q (c,) with ‖matrix d + residual‖² = ‖R d + q‖² +
+    constant, for a matrix (m, c) of full rank with m > c.
+
+    Normal equations would square the condition number, and lose the effort of the hand beside
+    residuals with small deviations.
+    """
+    count = matrix.shape[1]
+    factor = np.linalg.qr(np.column_stack([matrix, residual]), mode="r")
+    return factor[:count, :count], factor[:count, count]
+
+
+def minimise_within_limits(
+    root: Array, offset: Array, limits: LinearisedLimits
+) -> tuple[Array, Array]:
+    """Return the step d (c,) that minimises ½ ‖R d + q‖² within linearised limits, and the
+    multipliers of these: of each vector's norm, then of each row.
+
+    Limits of norms are second-order cones; Clarabel solves the conic program.
+
+    Parameters
+    ----------
+    root : (c, c) array
+        Triangle R.
+    offset : (c,) array
+        Vector q.
+    limits : LinearisedLimits
+        Limits near the unknowns.
+
+    Raises
+    ------
+    HandLimitsExcludeTask
+        If no step satisfies the limits.
+    """
+    count = len(offset)
+    vectors = len(limits.vectors)
+    free = -solve_triangular(root, offset)
+    norms = np.linalg.norm(limits.vectors + limits.vector_slopes @ free, axis=1)
+    most = max(norms.max(initial=0.0), 1 + (limits.rows + limits.row_slopes @ free).max(initial=-1))
+    if most <= 1.0:
+        return free, np.zeros(vectors + len(limits.rows))
+    size = float(np.linalg.norm(offset))
+    slopes = np.zeros((vectors, 4, count))
+    slopes[:, 1:] = -limits.vector_slopes
+    values = np.ones((vectors, 4))
+    # About the free minimum.
+    values[:, 1:] = limits.vectors + limits.vector_slopes @ free
+    rows = sp.csc_array(np.concatenate([limits.row_slopes, slopes.reshape(-1, count)]))
+    # The unknowns d and u = R d, in units of the present residual: R itself, not RᵀR.
+    matrix = sp.block_array([[sp.csc_array(root) / size, -sp.eye_array(count)], [rows, None]])
+    bounds = np.concatenate(
+        [np.zeros(count), -(limits.rows + limits.row_slopes @ free), values.ravel()]
+    )
+    objective = sp.diags_array(np.repeat([0.0, 1.0], count), format="csc")
+    cones = [clarabel.ZeroConeT(count), clarabel.NonnegativeConeT(len(limits.rows))]
+    cones += [clarabel.SecondOrderConeT(4)] * vectors
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = SOLVER_TOLERANCE
+    solver = clarabel.DefaultSolver(
+        sp.csc_matrix(objective),
+        np.zeros(2 * count),
+        sp.csc_matrix(matrix),
+        bounds,
+        cones,
+        settings,
+    )
+    answer = solver.solve()
+    status = str(answer.status)
+    if "Infeasible" in status:
+        raise HandLimitsExcludeTask
+    if status not in ("Solved", "AlmostSolved", "InsufficientProgress"):
+        raise RuntimeError(f"Clarabel ended with {status}")
+    duals = size**2 * np.array(answer.z)[count:]
+    of_rows = duals[: len(limits.rows)]
+    of_norms = duals[len(limits.rows) :].reshape(vectors, 4)[:, 0]
+    return free + np.array(answer.x)[:count], np.concatenate([of_norms, of_rows])
+
+
+def smoothest_motion(program: PlannedProgram) -> Array:
+    """Return the unknowns of the motion with the least jerk within the limits: no motion, unless
+    the end of the hand is given.
+
+    Raises
+    ------
+    HandLimitsExcludeTask
+        If no motion satisfies the limits.
+    """
+    matrix, constant = program.effort
+    scale = 1.0 / max(float(np.abs(matrix).max()), 1e-300)
+    matrix, constant = scale * matrix, scale * constant
+    c = np.zeros(matrix.shape[1])
+    for _ in range(MOST_LINEARISATIONS):
+        root, offset = triangular(matrix, matrix @ c + constant)
+        step, _ = minimise_within_limits(root, offset, program.hand_limits.linearise(c))
+        c = c + step
+        if np.abs(step).max() < 1e-8:
+            break
+    return c
+
+
+def solve_reduced(
+    program: PlannedProgram,
+    start: Array | None = None,
+    tolerances: ReducedTolerances | None = None,
+    watch: Watch | None = None,
+) -> ReducedAnswer:
+    """Solve a plan; Ctrl-C ends the search with the best plan so far.
+
+    Parameters
+    ----------
+    program : PlannedProgram
+        The problem.
+    start : (c,) array, optional
+        Initial unknowns within the limits; those of the smoothest motion by default.
+    tolerances : ReducedTolerances, optional
+        Tolerances of the search.
+    watch : callable, optional
+        Called with the number of each iterate and its objective.
+
+    Raises
+    ------
+    HandLimitsExcludeTask
+        If no motion satisfies the limits.
+    SimulationError
+        If the first motion cannot be simulated.
+    """
+    limits = tolerances or ReducedTolerances()
+    c = smoothest_motion(program) if start is None else start
+    x = program.simulate(c)
+    matrix, target = program.residuals
+    by_jerk, jerk = program.effort
+    value = program.objective(c, x)
+    derivatives = np.zeros((*x.shape, len(c)))
+    multipliers = np.zeros(len(program.hand_limits.names))
+    answer = ReducedAnswer(c, x, derivatives, multipliers, "iteration limit", [value])
+    damping, failures = 0.0, 0
+    try:
+        while len(answer.history) <= limits.iterations:
+            if watch is not None:
+                watch(len(answer.history) - 1, value)
+            derivatives = program.driven.respond(program.drive(c), x)
+            answer.derivatives = derivatives
+            rows = np.vstack([matrix @ derivatives.reshape(x.size, len(c)), by_jerk])
+            residual = np.concatenate([matrix @ x.ravel() - target, by_jerk @ c + jerk])
+            undamped, present = triangular(rows, residual)
+            near = program.hand_limits.linearise(c)
+            while True:
+                root, offset = undamped, present
+                if damping:
+                    lengths = np.sqrt(damping) * np.linalg.norm(undamped, axis=0)
+                    root, offset = triangular(
+                        np.vstack([undamped, np.diag(lengths)]),
+                        np.concatenate([present, np.zeros(len(c))]),
+                    )
+                step, trial_multipliers = minimise_within_limits(root, offset, near)
+                trial = c + step
+                change = undamped @ step
+                predicted = -float(change @ (2 * present + change))
+                size = float(np.abs(step).max())
+                if size <= limits.step or predicted <= limits.decrease * (value + 1e-300):
+                    answer.multipliers = trial_multipliers
+                    answer.status = "converged" if damping < 1e-3 else "stalled"
+                    if damping < 1e-3:
+                        return answer
+                moved, decrease = x, -np.inf
+                if program.hand_limits.shares(trial).max() <= LARGEST_SHARE:
+                    with suppress(SimulationError):
+                        moved = program.simulate(trial, near=x + derivatives @ step)
+                        decrease = value - program.objective(trial, moved)
+                if decrease > 1e-4 * predicted:
+                    break
+                failures += 1
+                if failures > limits.failures or answer.status == "stalled":
+                    answer.status = "stalled"
+                    return answer
+                damping = max(4 * damping, 1e-3)
+            ratio = decrease / predicted
+            damping = damping / 5 if ratio > 0.5 else damping
+            damping = 0.0 if damping < 1e-6 else damping
+            failures = 0
+            c, x, value = trial, moved, value - decrease
+            answer.c, answer.x, answer.multipliers = c, x, trial_multipliers
+            answer.history.append(value)
+            past = answer.history[-4:]
+            if len(past) == 4 and past[0] - value < limits.progress * past[0]:
+                answer.status = "flat"
+                break
+        answer.derivatives = program.driven.respond(program.drive(c), x)
+    except KeyboardInterrupt:
+        answer.status = "interrupted"
+        answer.derivatives = program.driven.respond(program.drive(answer.c), answer.x)
+    return answer

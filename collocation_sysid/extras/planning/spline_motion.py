@@ -1,0 +1,346 @@
+"""Motion of a hand as cubic B-splines of its six coordinates, from rest to rest.
+
+The coordinates are a shift d(t) and a rotation vector r(t) relative to the initial pose, so that the
+hand is at p₀ + d(t) with the orientation exp(r(t)) R₀. Velocity and acceleration are zero at both
+ends, because the first three and the last three coefficients of a clamped cubic spline are equal
+there; after the end the hand stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
+
+from ...common.array_types import Array, Index
+from ..design.hand_limits import WITHIN, HandBounds
+from ..design.hand_motion import TimeDerivatives
+
+# Expression (k,), which must not be positive, of the position (3,) and the rotation (3, 3).
+PoseLimit = Callable[[ca.SX, ca.SX], Any]
+
+DEGREE = 3
+# Points of an interval of the spline at which limits hold; its knots are among them, where the
+# acceleration has its peaks.
+LIMIT_POINTS = 6
+# Points of an interval at which the limits are checked.
+CHECK_POINTS = 40
+# Coefficients at each end that are equal, so that velocity and acceleration vanish.
+EQUAL = 3
+# Squared angle below which the factors of rotations are evaluated by their series [rad²].
+SMALL_SQUARE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class SplineSpace:
+    """Cubic splines of the six coordinates of a hand that begin and end at rest.
+
+    The unknowns are scaled coefficients, those of the free coordinates, time by time: first the
+    inner coefficients, and last the value at the end unless it is given.
+
+    Attributes
+    ----------
+    duration_s : float
+        Duration of the motion [s].
+    intervals : int
+        Number of intervals of the spline.
+    free : (k,) array of int
+        Indices of the coordinates that may move.
+    end : (6,) array
+        Given values at the end [m, rad]; NaN where the value is free. Coordinates that are not free
+        have zero.
+    units : (6,) array
+        Units of the coefficients [m, rad].
+    """
+
+    duration_s: float
+    intervals: int
+    free: Index
+    end: Array
+    units: Array
+
+    @cached_property
+    def knots_s(self) -> Array:
+        """Knots (intervals + 7,) [s], those at the ends repeated."""
+        inner = np.linspace(0.0, self.duration_s, self.intervals + 1)
+        ends = np.repeat(inner[[0, -1]], DEGREE)
+        return np.concatenate([ends[:DEGREE], inner, ends[DEGREE:]])
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns c."""
+        return self._map.shape[2]
+
+    @cached_property
+    def _map(self) -> Array:
+        """Matrix (intervals + 3, 6, c) from unknowns to coefficients, without those given."""
+        count = self.intervals + DEGREE
+        columns = []
+        for row in range(EQUAL, count - EQUAL + 1):
+            rows = slice(row, row + 1) if row < count - EQUAL else slice(row, None)
+            for axis in self.free:
+                if row == count - EQUAL and np.isfinite(self.end[axis]):
+                    continue
+                column = np.zeros((count, 6))
+                column[rows, axis] = self.units[axis]
+                columns.append(column)
+        return np.stack(columns, axis=2)
+
+    @cached_property
+    def _given(self) -> Array:
+        """Coefficients (intervals + 3, 6) of the motion with zero unknowns."""
+        given = np.zeros((self.intervals + DEGREE, 6))
+        given[-EQUAL:] = np.nan_to_num(self.end)
+        return given
+
+    def basis(self, t_s: Array, order: int = 0) -> Array:
+        """Return the derivatives of an order of the B-splines (T, intervals + 3) at times, which
+        are constant beyond the ends.
+        """
+        inside = np.clip(t_s, 0.0, self.duration_s)
+        rows = np.asarray(
+            BSpline(self.knots_s, np.eye(self.intervals + DEGREE), DEGREE)(inside, order)
+        )
+        if order:
+            rows[(t_s < 0.0) | (t_s > self.duration_s)] = 0.0
+        return rows
+
+    def affine(self, t_s: Array, order: int = 0) -> tuple[Array, Array]:
+        """Return the coordinates, or their derivatives of an order, as an affine function of the
+        unknowns: matrix (T, 6, c) and constant (T, 6).
+        """
+        basis = self.basis(t_s, order)
+        return np.tensordot(basis, self._map, axes=1), basis @ self._given
+
+    def motion(self, unknowns: Array) -> SplineMotion:
+        """Return the motion of unknowns (c,)."""
+        return SplineMotion(self, self._given + self._map @ unknowns)
+
+    def jerk(self) -> tuple[Array, Array]:
+        """Return the jerk in each interval as an affine function of the unknowns: matrix
+        (intervals, 6, c) and constant (intervals, 6) [m/s³, rad/s³].
+        """
+        middles = (np.arange(self.intervals) + 0.5) * self.duration_s / self.intervals
+        return self.affine(middles, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class SplineMotion:
+    """Motion of a hand.
+
+    Attributes
+    ----------
+    space : SplineSpace
+        Space of splines.
+    coefficients : (intervals + 3, 6) array
+        Coefficients of shift [m] and rotation vector [rad].
+    """
+
+    space: SplineSpace
+    coefficients: Array
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the motion [s]."""
+        return self.space.duration_s
+
+    @cached_property
+    def grid_s(self) -> Array:
+        """Times from 0 to the duration [s] that resolve all peaks of the motion."""
+        return np.linspace(0.0, self.duration_s, CHECK_POINTS * self.space.intervals + 1)
+
+    def derivatives(self, t_s: Array) -> TimeDerivatives:
+        """Return the coordinates (T, 6) and their first and second derivatives at times since the
+        start [s].
+        """
+        value, first, second = (
+            self.space.basis(t_s, order) @ self.coefficients for order in range(3)
+        )
+        return TimeDerivatives(value, first, second)
+
+
+@dataclass(frozen=True, eq=False)
+class HandFrame:
+    """Initial pose of a hand, and what it holds.
+
+    Attributes
+    ----------
+    rotation : (3, 3) array
+        Initial orientation R₀ of the grasped body.
+    position_m : (3,) array
+        Initial position p₀ of the hand, the middle of the grasped nodes.
+    arms_m : (n, 3) array
+        Grasped nodes relative to the hand, in the initial orientation.
+    """
+
+    rotation: Array
+    position_m: Array
+    arms_m: Array
+
+    def positions(self, coordinates: Array) -> tuple[Array, Array]:
+        """Return the positions of the grasped nodes (T, n, 3) [m] at coordinates (T, 6), and their
+        derivatives (T, n, 3, 6) by the coordinates.
+        """
+        turns = coordinates[:, 3:]
+        turned = np.einsum("tij,nj->tni", Rotation.from_rotvec(turns).as_matrix(), self.arms_m)
+        positions = turned + (self.position_m + coordinates[:, :3])[:, None]
+        slopes = np.zeros((*positions.shape, 6))
+        slopes[..., :3] = np.eye(3)
+        jacobians = left_jacobians(turns)
+        # A change w of the orientation moves an arm a by w × a.
+        for axis in range(3):
+            slopes[..., 3 + axis] = np.cross(jacobians[:, None, :, axis], turned)
+        return positions, slopes
+
+    def weighted_hessian(self, coordinates: Array, weights: Array) -> Array:
+        """Return Σ weights · ∂²position/∂coordinates² (T, 6, 6), for weights (T, n, 3)."""
+        moments = np.einsum("tni,nj->tij", weights, self.arms_m)
+        stacked = np.concatenate(
+            [coordinates[:, 3:].T, moments.transpose(0, 2, 1).reshape(len(moments), 9).T]
+        )
+        curvature = np.zeros((len(moments), 6, 6))
+        values = _turn_curvature().map(stacked.shape[1])(stacked).full()
+        curvature[:, 3:, 3:] = values.reshape(3, -1, 3).transpose(1, 0, 2)
+        return curvature
+
+
+def left_jacobians(turns: Array) -> Array:
+    """Return the left Jacobians (T, 3, 3) of the exponential map at rotation vectors (T, 3): a
+    change d of the vector turns by J d in the fixed frame.
+    """
+    square = np.sum(turns**2, axis=1)
+    small = square < SMALL_SQUARE
+    safe = np.sqrt(np.where(small, 1.0, square))
+    a = np.where(small, 1 / 2 - square / 24 + square**2 / 720, (1 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1 / 6 - square / 120 + square**2 / 5040, (safe - np.sin(safe)) / safe**3)
+    cross = np.zeros((len(turns), 3, 3))
+    for (i, j), (axis, sign) in {
+        (0, 1): (2, -1), (0, 2): (1, 1), (1, 0): (2, 1),
+        (1, 2): (0, -1), (2, 0): (1, -1), (2, 1): (0, 1),
+    }.items():  # fmt: skip
+        cross[:, i, j] = sign * turns[:, axis]
+    return np.eye(3) + a[:, None, None] * cross + b[:, None, None] * (cross @ cross)
+
+
+# Expressions --------------------------------------------------------------------------------------
+
+
+def _factors(square: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Return sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³ of θ², smooth at zero."""
+    small = square < SMALL_SQUARE
+    angle = ca.sqrt(ca.if_else(small, 1.0, square))
+    exact = (
+        ca.sin(angle) / angle,
+        (1 - ca.cos(angle)) / angle**2,
+        (angle - ca.sin(angle)) / angle**3,
+    )
+    series = (
+        1 - square / 6 + square**2 / 120,
+        1 / 2 - square / 24 + square**2 / 720,
+        1 / 6 - square / 120 + square**2 / 5040,
+    )
+    return tuple(  # type: ignore[return-value]
+        ca.if_else(small, near, far) for near, far in zip(series, exact, strict=True)
+    )
+
+
+def rotation_expression(turn: ca.SX) -> ca.SX:
+    """Return the rotation matrix exp(r) (3, 3) of a rotation vector r (3,)."""
+    sinc, a, _ = _factors(ca.sumsqr(turn))
+    cross = ca.skew(turn)
+    return ca.SX.eye(3) + sinc * cross + a * (cross @ cross)
+
+
+def _turn_curvature() -> ca.Function:
+    """Return the second derivatives (3, 3) of tr(exp(r) Mᵀ) by r, of r (3,) and M (9,)."""
+    data = ca.SX.sym("data", 12)
+    turn = data[:3]
+    trace = ca.sum1(ca.vec(rotation_expression(turn) * ca.reshape(data[3:], 3, 3)))
+    return ca.Function("turn_curvature", [data], [ca.hessian(trace, turn)[0]])
+
+
+@dataclass(frozen=True)
+class HandLimits:
+    """Limits of a hand at one time, of its coordinates and their two derivatives (18,).
+
+    Attributes
+    ----------
+    vectors : casadi.Function
+        Vectors (3 k,) whose norms must not exceed one.
+    vector_names : tuple of str
+        Name of the limit of each vector.
+    rows : casadi.Function
+        Values (m,) that must not be positive.
+    row_names : tuple of str
+        Name of the limit of each value.
+    """
+
+    vectors: ca.Function
+    vector_names: tuple[str, ...]
+    rows: ca.Function
+    row_names: tuple[str, ...]
+
+    @classmethod
+    def from_bounds(
+        cls, bounds: HandBounds, frame: HandFrame, free: Index, pose_limits: PoseLimit | None = None
+    ) -> HandLimits:
+        """Build from the limits of the robot; those of coordinates that cannot move are left out.
+
+        Parameters
+        ----------
+        bounds : HandBounds
+            Limits of the robot.
+        frame : HandFrame
+            Initial pose.
+        free : (k,) array of int
+            Coordinates that may move.
+        pose_limits : callable, optional
+            Further limits, of position (3,) [m] and rotation (3, 3) of the hand.
+        """
+        state = ca.SX.sym("state", 18)
+        value, first, second = state[:6], state[6:12], state[12:]
+        limits = bounds.limits
+        rows: list[tuple[str, Any]] = []
+        for axis in range(3):
+            if axis in free:
+                rows.append(("workspace_m", value[axis] / (WITHIN * bounds.high_m[axis]) - 1))
+                rows.append(("workspace_m", value[axis] / (WITHIN * bounds.low_m[axis]) - 1))
+        moves, turns = (np.isin(free, axes).any() for axes in ((0, 1, 2), (3, 4, 5)))
+        vectors: list[tuple[str, Any, float]] = []
+        if moves:
+            vectors += [
+                ("speed_m_s", first[:3], limits.speed_m_s),
+                ("acceleration_m_s2", second[:3], limits.acceleration_m_s2),
+            ]
+        if turns:
+            turn, rate, growth = value[3:], first[3:], second[3:]
+            _, a, b = _factors(ca.sumsqr(turn))
+            across = ca.cross(turn, rate)
+            spin = rate + a * across + b * ca.cross(turn, across)
+            acceleration = ca.jtimes(spin, turn, rate) + ca.jtimes(spin, rate, growth)
+            angular = {
+                "rotation_deg": turn,
+                "angular_speed_deg_s": spin,
+                "angular_acceleration_deg_s2": acceleration,
+            }
+            vectors += [
+                (name, each, float(np.radians(getattr(limits, name))))
+                for name, each in angular.items()
+            ]
+        if pose_limits is not None:
+            rotation = rotation_expression(value[3:]) @ ca.DM(frame.rotation)
+            extra = ca.vertcat(pose_limits(value[:3] + ca.DM(frame.position_m), rotation))
+            rows += [("joint_limits", extra[k]) for k in range(extra.numel())]
+        scaled = [each / (WITHIN * most) for _, each, most in vectors]
+        return cls(
+            ca.Function("vectors", [state], [ca.vertcat(*scaled)]),
+            tuple(name for name, _, _ in vectors),
+            ca.Function("rows", [state], [ca.vertcat(*(each for _, each in rows))]),
+            tuple(name for name, _ in rows),
+        )

@@ -1,0 +1,436 @@
+"""Task of a planned motion (task.toml): what points of the body do, and how the hand may help.
+
+The tables describe what is wanted; `Task.references_for` turns them into references of points of a
+given body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+
+from ...common.array_types import Array
+from ...common.schema_tables import Section, Vector, require_one
+from ...common.validated_types import (
+    AtLeastOne,
+    Boundless,
+    Finite,
+    Flag,
+    NotNegative,
+    Positive,
+    Text,
+)
+from ...errors import InputError, hint_at, listed
+from ...problem.problem_reading import parse_toml, read_text
+from ...problem.validation_messages import explain_validation_error
+from ...recording.formats.text import decode, numeric_cells, read_bytes, read_table, times_in_column
+
+HandAxis = Literal["x", "y", "z", "rx", "ry", "rz"]
+AXES: tuple[HandAxis, ...] = ("x", "y", "z", "rx", "ry", "rz")
+POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+VELOCITY_COLUMNS = ("vx_m_s", "vy_m_s", "vz_m_s")
+Row = tuple[Boundless, Boundless, Boundless]
+
+
+class ReferenceSection(Section):
+    """What a point of the body shall do.
+
+    Attributes
+    ----------
+    point
+        Name of a marker of the problem.
+    point_m
+        Place [x, y, z] of the point on the undeformed body, in place of a marker.
+    name
+        Name of the point in files and pictures, for a point given by its place.
+    file
+        CSV with t_s and some of x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s; an empty cell or a missing
+        column leaves a coordinate free.
+    t_s
+        Times of the reference, in place of a file; the motion begins at 0.
+    position_m
+        Position [x, y, z] at each of `t_s`; nan leaves a coordinate free.
+    velocity_m_s
+        Velocity [x, y, z] at each of `t_s`; nan leaves a component free.
+    hold
+        Whether the point stays where it is before the motion, from `from_s` until `until_s`.
+    relative
+        Whether positions are relative to the place of the point before the motion.
+    from_s, until_s
+        First and last time at which the reference counts; all its times by default.
+    interpolation
+        Between the times of the reference: a smooth curve, straight lines, or none, so that the
+        reference counts at its times alone.
+    sigma_m
+        Deviation of a coordinate that is acceptable: deviations count in units of it.
+    sigma_m_s
+        The same for a component of the velocity.
+    """
+
+    point: Text | None = None
+    point_m: Vector | None = None
+    name: Text | None = None
+    file: Text | None = None
+    t_s: list[Finite] | None = None
+    position_m: list[Row] | None = None
+    velocity_m_s: list[Row] | None = None
+    hold: Flag = False
+    relative: Flag = False
+    from_s: NotNegative = 0.0
+    until_s: Positive | None = None
+    interpolation: Literal["smooth", "linear", "none"] = "smooth"
+    sigma_m: Positive = 1e-3
+    sigma_m_s: Positive = 1e-2
+
+    @model_validator(mode="after")
+    def _require_one_description(self) -> ReferenceSection:
+        require_one(self, "point", "point_m")
+        if self.point is not None and self.name is not None:
+            raise ValueError("name is of a point given by point_m; a marker has its own name")
+        stated = [
+            key for key, given in (("file", self.file), ("t_s", self.t_s), ("hold", self.hold))
+            if given
+        ]  # fmt: skip
+        if len(stated) != 1:
+            raise ValueError(
+                f"found {' and '.join(stated) or 'no reference'}; expected exactly one of file, "
+                "t_s with position_m or velocity_m_s, and hold = true"
+            )
+        for key in ("position_m", "velocity_m_s"):
+            rows = getattr(self, key)
+            if rows is not None and self.t_s is None:
+                raise ValueError(f"{key} has no times; expected t_s with as many entries")
+            if rows is not None and self.t_s is not None and len(rows) != len(self.t_s):
+                raise ValueError(
+                    f"{key} has {len(rows)} entries and t_s {len(self.t_s)}; expected as many"
+                )
+        if self.t_s is not None:
+            if self.position_m is None and self.velocity_m_s is None:
+                raise ValueError("t_s has no values; expected position_m or velocity_m_s")
+            if not (np.diff(self.t_s) > 0).all():
+                raise ValueError("t_s does not increase; expected ascending times")
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(
+                f"until_s = {self.until_s:g} is not after from_s = {self.from_s:g}; expected a "
+                "later time"
+            )
+        return self
+
+
+class EndSection(Section):
+    """State of the body after the motion of the hand.
+
+    Attributes
+    ----------
+    at_rest
+        Whether the body is at rest from the end of the motion on, without residual vibration.
+    window_s
+        Time after the motion over which the body is at rest; by default half a period of its lowest
+        natural frequency.
+    sigma_m
+        Amplitude of the residual vibration that is acceptable.
+    """
+
+    at_rest: Flag = True
+    window_s: Positive | None = None
+    sigma_m: Positive = 1e-4
+
+
+class HandSection(Section):
+    """Motion of the hand.
+
+    Attributes
+    ----------
+    free
+        Coordinates that may move: x, y, z of the middle of the grasped nodes (the default), and rx,
+        ry, rz of the rotation vector, relative to the initial pose in world axes.
+    intervals
+        Number of equal time intervals of the cubic spline of each coordinate.
+    end_m
+        Displacement [x, y, z] of the hand at the end; free by default.
+    end_rotation_deg
+        Rotation vector [x, y, z] of the hand at the end; free by default.
+    jerk_weight
+        Weight of the mean square jerk of the hand, in units of ten times the limit of the
+        acceleration over the duration.
+    """
+
+    free: Annotated[list[HandAxis], Field(min_length=1)] = Field(
+        default_factory=lambda: [*AXES[:3]]
+    )
+    intervals: Annotated[AtLeastOne, Field(ge=6, le=200)] = 16
+    end_m: Vector | None = None
+    end_rotation_deg: Vector | None = None
+    jerk_weight: Positive = 1e-3
+
+    @model_validator(mode="after")
+    def _require_consistent(self) -> HandSection:
+        if len({*self.free}) < len(self.free):
+            raise ValueError(f"free names a coordinate twice: {', '.join(self.free)}")
+        for key, axes in (("end_m", AXES[:3]), ("end_rotation_deg", AXES[3:])):
+            values = getattr(self, key)
+            for axis, value in zip(axes, values or (), strict=False):
+                if value and axis not in self.free:
+                    raise ValueError(
+                        f"{key} moves {axis}, which is not free; expected {axis} in free, or 0"
+                    )
+        return self
+
+
+class Task(Section):
+    """task.toml: a motion to be planned.
+
+    Attributes
+    ----------
+    duration_s
+        Duration of the motion of the hand [s].
+    sample_s
+        Time between the samples of the plan; that of the recording by default.
+    reference
+        [[reference]] tables: what points of the body shall do.
+    end
+        State of the body at the end.
+    hand
+        Motion of the hand.
+    """
+
+    duration_s: Positive
+    sample_s: Positive | None = None
+    reference: list[ReferenceSection] = Field(default_factory=list)
+    end: EndSection = Field(default_factory=EndSection)
+    hand: HandSection = Field(default_factory=HandSection)
+
+    @model_validator(mode="after")
+    def _require_purpose(self) -> Task:
+        hand = self.hand
+        if not self.reference and hand.end_m is None and hand.end_rotation_deg is None:
+            raise InputError(
+                "nothing to do; expected a [[reference]] table, or end_m in [hand]",
+                None,
+                where="reference",
+            )
+        for number, each in enumerate(self.reference, 1):
+            if each.from_s >= self.duration_s and self.end.window_s is None:
+                raise InputError(
+                    f"found from_s = {each.from_s:g}, but the motion ends at "
+                    f"{self.duration_s:g} s; expected an earlier time",
+                    None,
+                    where=f"reference {number}: from_s",
+                )
+        return self
+
+    @classmethod
+    def read(cls, path: str | Path) -> Task:
+        """Read task.toml and the files of its references.
+
+        Raises
+        ------
+        InputError
+            If a file is missing or has a key, column or value that is not allowed; the message
+            names the file, the key or line, what was found and what was expected.
+        """
+        file = Path(path)
+        content = parse_toml(read_text(file, "a task of a planned motion (TOML)"), file)
+        try:
+            task = cls.model_validate(content)
+        except ValidationError as error:
+            raise explain_validation_error(error, content, path=file, root=cls) from error
+        return task.model_copy(
+            update={"reference": [_with_values_of_file(each, file) for each in task.reference]}
+        )
+
+
+def _with_values_of_file(section: ReferenceSection, task: Path) -> ReferenceSection:
+    """Return the reference with times and values of its file in place of the file."""
+    if section.file is None:
+        return section
+    path = task.parent / section.file
+    table = read_table(decode(read_bytes(path)))
+    known = ("t_s", *POSITION_COLUMNS, *VELOCITY_COLUMNS)
+    for column in table.columns:
+        if column not in known:
+            raise InputError(
+                f"unknown column {column}{hint_at(column, known)}; expected t_s and some of "
+                f"{', '.join(known[1:])}",
+                path,
+            )
+    if "t_s" not in table.columns or len(table.columns) < 2:
+        raise InputError(
+            f"the columns are {', '.join(table.columns)}; expected t_s and some of "
+            f"{', '.join(known[1:])}",
+            path,
+        )
+    place = {name: table.columns.index(name) for name in table.columns}
+    columns = [place[name] for name in place if name != "t_s"]
+    try:
+        t_s = times_in_column(table, place["t_s"])
+        values = numeric_cells(table, columns, blank_allowed=True)
+    except InputError as error:
+        raise error.located(path) from error
+    if len(t_s) > 1 and not (np.diff(t_s) > 0).all():
+        raise InputError("t_s does not increase; expected ascending times", path)
+    by_name = dict(zip((n for n in place if n != "t_s"), values.T, strict=True))
+    missing = np.full(len(t_s), np.nan)
+    update: dict[str, Any] = {"file": None, "t_s": t_s.tolist()}
+    for key, names in (("position_m", POSITION_COLUMNS), ("velocity_m_s", VELOCITY_COLUMNS)):
+        if any(name in by_name for name in names):
+            rows = np.column_stack([by_name.get(name, missing) for name in names])
+            update[key] = [tuple(row) for row in rows.tolist()]
+    return section.model_copy(update=update)
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Reference of one point at the samples of a plan.
+
+    Attributes
+    ----------
+    name : str
+        Name of the point.
+    place_m : (3,) array
+        Place on the undeformed body [m].
+    position_m : (T, 3) array
+        Wanted positions; NaN where a coordinate is free.
+    velocity_m_s : (T, 3) array
+        Wanted velocities; NaN where a component is free.
+    sigma_m, sigma_m_s : float
+        Units of the deviations.
+    """
+
+    name: str
+    place_m: Array
+    position_m: Array
+    velocity_m_s: Array
+    sigma_m: float
+    sigma_m_s: float
+
+
+def point_names(task: Task) -> list[str]:
+    """Return the name of the point of each reference."""
+    return [
+        each.point or each.name or f"point_{number}"
+        for number, each in enumerate(task.reference, 1)
+    ]
+
+
+def point_places(task: Task, markers: Mapping[str, Array]) -> list[Array]:
+    """Return the place (3,) [m] of the point of each reference on the undeformed body.
+
+    Raises
+    ------
+    InputError
+        For a name that is no marker, or a marker without a known place.
+    """
+    places = []
+    for number, each in enumerate(task.reference, 1):
+        where = f"reference {number}: point"
+        if each.point_m is not None:
+            places.append(np.array(each.point_m))
+            continue
+        assert each.point is not None
+        if each.point not in markers:
+            known = f"one of the markers {listed(markers)}" if markers else "point_m: no markers"
+            hint = hint_at(each.point, markers)
+            raise InputError(f"no marker {each.point!r}{hint}; expected {known}", None, where=where)
+        if not np.isfinite(markers[each.point]).all():
+            raise InputError(
+                f"the place of the marker {each.point!r} on the body is not known; expected a run "
+                "that estimated it, or point_m",
+                None,
+                where=where,
+            )
+        places.append(markers[each.point])
+    return places
+
+
+def sampled_references(
+    task: Task, t_s: Array, places_m: list[Array], start_m: Array
+) -> list[Reference]:
+    """Return the references at the samples `t_s` (T,) of a plan, from 0 on.
+
+    Parameters
+    ----------
+    task : Task
+        Task whose references have values, see `Task.read`.
+    t_s : (T,) array
+        Times of the samples since the start [s].
+    places_m : list of (3,) arrays
+        Place of each point on the undeformed body.
+    start_m : (P, 3) array
+        Positions of the points before the motion [m].
+
+    Raises
+    ------
+    InputError
+        If the times of a reference are outside those of the plan.
+    """
+    references = []
+    pairs = zip(task.reference, point_names(task), places_m, start_m, strict=True)
+    for number, (each, name, place_m, first_m) in enumerate(pairs, 1):
+        position, velocity = (np.full((len(t_s), 3), np.nan) for _ in range(2))
+        until_s = np.inf if each.until_s is None else each.until_s
+        counts = (t_s >= each.from_s - 1e-9) & (t_s <= until_s + 1e-9)
+        if each.hold:
+            position[counts] = first_m
+        else:
+            assert each.t_s is not None
+            times = np.array(each.t_s)
+            if times[0] < -1e-9 or times[-1] > t_s[-1] + 1e-9:
+                raise InputError(
+                    f"the reference runs from {times[0]:g} s to {times[-1]:g} s, but the plan from "
+                    f"0 to {t_s[-1]:g} s; expected times within, or a longer duration_s",
+                    None,
+                    where=f"reference {number}: t_s",
+                )
+            for rows, target in ((each.position_m, position), (each.velocity_m_s, velocity)):
+                if rows is not None:
+                    target[:] = _interpolated(np.array(rows), times, t_s, each.interpolation)
+            if each.relative:
+                position += first_m
+            position[~counts] = velocity[~counts] = np.nan
+        if not np.isfinite(position).any() and not np.isfinite(velocity).any():
+            raise InputError(
+                "no coordinate of the reference counts at any sample of the plan; expected values "
+                f"at times from {t_s[0]:g} s to {t_s[-1]:g} s, from_s and until_s included",
+                None,
+                where=f"reference {number}",
+            )
+        references.append(
+            Reference(name, place_m, position, velocity, each.sigma_m, each.sigma_m_s)
+        )
+    return references
+
+
+def _interpolated(values: Array, times: Array, t_s: Array, kind: str) -> Array:
+    """Return values (m, 3) at `times` (m,) at the samples `t_s` (T,), NaN outside the times and
+    next to missing values; with the kind "none" at the samples nearest to the times alone.
+    """
+    result = np.full((len(t_s), 3), np.nan)
+    if kind == "none" or len(times) == 1:
+        nearest = np.abs(t_s[:, None] - times).argmin(axis=0)
+        result[nearest] = values
+        return result
+    inside = np.flatnonzero((t_s >= times[0] - 1e-9) & (t_s <= times[-1] + 1e-9))
+    for axis in range(3):
+        known = np.isfinite(values[:, axis])
+        if not known.any():
+            continue
+        result[inside, axis] = _curve(times[known], values[known, axis], t_s[inside], kind)
+        # A coordinate is free between two times of which one has no value.
+        left = np.clip(np.searchsorted(times, t_s[inside] + 1e-9) - 1, 0, len(times) - 1)
+        right = np.minimum(left + (t_s[inside] > times[left] + 1e-9), len(times) - 1)
+        result[inside[~(known[left] & known[right])], axis] = np.nan
+    return result
+
+
+def _curve(times: Array, values: Array, t_s: Array, kind: str) -> Array:
+    from scipy.interpolate import CubicSpline
+
+    if kind == "linear" or len(times) < 4:
+        return np.interp(t_s, times, values)
+    return np.asarray(CubicSpline(times, values)(t_s))

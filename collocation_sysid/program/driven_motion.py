@@ -1,0 +1,280 @@
+"""Motion of one experiment as a function of the prescribed positions of its grasped dofs.
+
+Methods that choose the motion of a grasp, instead of reading it from a recording, need the motion
+of the body, its derivatives by the prescribed positions and by the inputs of the equations of
+motion, and the sparse matrices of the collocation program. The parameters q are fixed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..common.array_types import Array, Index
+from ..errors import SimulationError
+from ..model.equations_at_parameters import EquationsAtParameters
+from ..model.grasp_constraint import PrescribedDisplacements
+from ..model.parameters import Parameters
+from ..model.schemes import Scheme
+from ..recording.experiment import Experiment
+from .collocation import Collocation
+from .forward.newton_solver import NewtonOptions
+from .forward.scheme_simulation import continue_simulation
+from .linear_algebra.lapack import one_blas_thread
+from .sweep import ForwardSubstitution, PrescribedColumns, Sweep, SweepColumns
+from .transcription import Transcription
+
+# Largest residual of the equations of motion of a corrected motion, over the unit of forces.
+CORRECTED = 1e-11
+# Most corrections of a motion by one forward sweep each, before it is simulated anew.
+MOST_CORRECTIONS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Prescribed positions and inputs that drive a motion, with their derivatives by controls.
+
+    Attributes
+    ----------
+    goals_m : (N, g) array
+        Prescribed positions of the grasped dofs at the grid times [m].
+    by_control : (N, g, c) array
+        Their derivatives by the c controls; empty, c = 0, where none are needed.
+    inputs : (N, k) array
+        Values of the k controlled inputs (amplitudes of actuators) at the evaluations; k may be 0.
+    inputs_by_control : (N, k, c) array
+        Their derivatives by the controls.
+    """
+
+    goals_m: Array
+    by_control: Array
+    inputs: Array
+    inputs_by_control: Array
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenMotion:
+    """Motion of one experiment as a function of a `Drive`, at fixed parameters.
+
+    Attributes
+    ----------
+    transcription : Transcription
+        Discretised experiment without nuisance parameters of the motion.
+    q : (nq,) array
+        Parameters in the solver's coordinates.
+    input_columns : (k,) array of int
+        Controlled entries of the inputs u.
+    """
+
+    transcription: Transcription
+    q: Array
+    input_columns: Index
+
+    @classmethod
+    def from_experiment(
+        cls,
+        experiment: Experiment,
+        parameters: Parameters,
+        scheme: str | Scheme,
+        substeps: int,
+        q: Array,
+        actuators: tuple[int, ...] = (),
+    ) -> DrivenMotion:
+        """Discretise an experiment; all prescribed displacements become constraints of the
+        collocation program.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            Experiment whose `nuisance` has no deviations.
+        parameters : Parameters
+            Shared parameters, with guesses.
+        scheme : str or Scheme
+            Time discretisation.
+        substeps : int
+            Time steps between samples.
+        q : (nq,) array
+            Parameters in the solver's coordinates.
+        actuators : tuple of int
+            Indices of the controlled actuators among `Experiment.actuators`.
+        """
+        program = Collocation(
+            [experiment], parameters, scheme=scheme, substeps=substeps, has_grasp_constraints=True
+        )
+        (transcription,) = program.transcriptions
+        first = sum(each.size for each in transcription.inputs.groups)
+        first -= len(experiment.actuators)
+        return cls(transcription, q, np.array([first + k for k in actuators], dtype=np.int64))
+
+    @property
+    def t_s(self) -> Array:
+        """Grid times (N,) [s]."""
+        return self.transcription.dynamics.t_s
+
+    @property
+    def evaluated_s(self) -> Array:
+        """Times (N,) of the evaluations of the forces [s]."""
+        return self.transcription.dynamics.evaluated_s
+
+    @property
+    def dofs(self) -> Index:
+        """Grasped dofs (g,), ascending."""
+        return self.transcription.prescribed_motion.dofs
+
+    @cached_property
+    def _stated(self) -> EquationsAtParameters:
+        return self.transcription.equations_at(self.q, self.transcription.compute_guess_phi())
+
+    @property
+    def stated_goals_m(self) -> Array:
+        """Prescribed positions (N, g) of the grasped dofs as the experiment states them [m]."""
+        return self._stated.prescribed.positions_m
+
+    @cached_property
+    def _sweep(self) -> Sweep:
+        return Sweep(self.transcription)
+
+    def equations(self, drive: Drive) -> EquationsAtParameters:
+        """Return the equations of motion under a drive; the derivatives are by the controls in
+        place of the parameters.
+        """
+        stated = self._stated
+        count = drive.by_control.shape[2]
+        u, _ = stated.inputs.evaluate_at(stated.p)
+        by_control = np.zeros((*u.shape, count))
+        dynamics = stated.dynamics
+        if len(self.input_columns):
+            u = np.array(u)
+            u[:, self.input_columns] = drive.inputs
+            by_control[:, self.input_columns] = drive.inputs_by_control
+            dynamics = dynamics.with_inputs(u)
+        else:
+            by_control = np.broadcast_to(by_control[:1], by_control.shape)
+        goals = np.full((len(self.t_s), self.transcription.dof_count), np.nan)
+        goals[:, self.dofs] = drive.goals_m
+        return replace(
+            stated,
+            input_derivatives=by_control,
+            dynamics=replace(dynamics, prescribed_m=goals),
+            prescribed=PrescribedDisplacements(self.dofs, drive.goals_m, by_phi=drive.by_control),
+        )
+
+    def simulate(
+        self, drive: Drive, start: Array | None = None, near: Array | None = None
+    ) -> Array:
+        """Return the positions (N, 3n) [m] of the motion under a drive.
+
+        Parameters
+        ----------
+        drive : Drive
+            The drive.
+        start : (3n,) array, optional
+            Positions at the first time, where they are known from another drive that begins in the
+            same way.
+        near : (N, 3n) array, optional
+            Motion under a similar drive, corrected to first order: it is corrected further by
+            forward sweeps, which take less time than a simulation.
+
+        Raises
+        ------
+        SimulationError
+            If a time step fails.
+        """
+        equations = self.equations(drive)
+        if near is not None:
+            corrected = self._corrected(equations, near)
+            if corrected is not None:
+                return corrected
+        x, failure = continue_simulation(
+            self.transcription.experiment,
+            equations.dynamics,
+            known=None if start is None else start[None],
+            options=NewtonOptions(),
+        )
+        if failure is not None:
+            raise failure
+        return x
+
+    def _corrected(self, equations: EquationsAtParameters, near: Array) -> Array | None:
+        """Return the motion from Newton's method on all time steps at once, None if it does not
+        converge quickly.
+        """
+        goals = equations.dynamics.prescribed_m
+        x = np.where(np.isnan(goals), near, goals)
+        alone = replace(
+            equations,
+            prescribed=replace(equations.prescribed, by_phi=equations.prescribed.by_phi[:, :, :0]),
+            input_derivatives=equations.input_derivatives[..., :0],
+        )
+        previous = np.inf
+        for _ in range(MOST_CORRECTIONS):
+            try:
+                with np.errstate(all="ignore"):
+                    step, _, violation = self._respond(alone, x)
+            except SimulationError:
+                return None
+            if not np.isfinite(violation) or violation > 0.5 * previous:
+                return None
+            x = x + step
+            size = float(np.abs(step).max())
+            if violation <= CORRECTED * self.transcription.force_n or (
+                size <= 1e-12 * self.transcription.length_m
+            ):
+                return x
+            previous = violation
+            # The next step is the square of this one, relative to the elements.
+            if size < 1e-6 * self.transcription.length_m:
+                return x
+        return None
+
+    def respond(self, drive: Drive, x: Array) -> Array:
+        """Return the derivatives (N, 3n, c) of a motion x (N, 3n) [m] by the controls."""
+        return self._respond(self.equations(drive), x)[1]
+
+    @one_blas_thread()
+    def _respond(self, equations: EquationsAtParameters, x: Array) -> tuple[Array, Array, float]:
+        """Return the feasibility step (N, 3n), the derivatives (N, 3n, c), and the largest residual
+        of the equations of motion [N].
+        """
+        sweep = self._sweep
+        goals = equations.prescribed.positions_m
+        by_control = equations.prescribed.by_phi
+        changes = np.concatenate([np.zeros((*goals.shape, 1)), by_control], axis=2)
+        changes[..., 0] = np.nan_to_num(goals - x[:, self.dofs])
+        columns = SweepColumns(
+            equations,
+            changes.shape[2],
+            has_step=True,
+            prescribed=PrescribedColumns.from_columns(sweep, self.dofs, columns=changes),
+        )
+        out = np.zeros((*x.shape, changes.shape[2]))
+        march = ForwardSubstitution(sweep, columns)
+        for t, _ in enumerate(march.iterate_rows(x, out=out)):
+            if t < sweep.dynamics.first_row:
+                out[t] = march.past[0]
+        return out[..., 0], out[..., 1:], march.violation_n
+
+    def respond_to_parameters(self, drive: Drive, x: Array) -> Array:
+        """Return the derivatives (N, 3n, nq) of a motion x (N, 3n) [m] by the parameters q."""
+        stated = self._stated
+        equations = self.equations(drive)
+        _, by_q = stated.inputs.evaluate_at(stated.p)
+        if len(self.input_columns):
+            by_q = np.array(by_q)
+            by_q[:, self.input_columns] = 0.0
+        equations = replace(equations, input_derivatives=by_q)
+        return np.array(
+            [
+                *self._sweep.sensitivities(
+                    x,
+                    replace(
+                        equations,
+                        prescribed=replace(
+                            equations.prescribed, by_phi=equations.prescribed.by_phi[:, :, :0]
+                        ),
+                    ),
+                )
+            ]
+        )

@@ -1,0 +1,518 @@
+"""Planned motions: task files, derivatives, an analytical optimum, limits, and files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kit.problem_files import run_command, write_problem
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+import collocation_sysid as cs
+from collocation_sysid.errors import InputError
+from collocation_sysid.extras.design.hand_limits import Limits
+from collocation_sysid.extras.planning import reduced_solver
+from collocation_sysid.extras.planning.motion_plan import MotionPlan, plan_motion
+from collocation_sysid.extras.planning.plan_folder import command_times_s, plan_json
+from collocation_sysid.extras.planning.planned_body import PlannedBody
+from collocation_sysid.extras.planning.planned_program import PlannedProgram
+from collocation_sysid.extras.planning.reduced_solver import ReducedTolerances, solve_reduced
+from collocation_sysid.extras.planning.spline_motion import rotation_expression
+from collocation_sysid.extras.planning.task import Task, sampled_references
+
+LIMITS = Limits.model_validate(
+    {
+        "workspace_m": ((-0.3, -0.3, -0.3), (0.3, 0.3, 0.4)),
+        "speed_m_s": 1.5,
+        "acceleration_m_s2": 15.0,
+        "rotation_deg": 60.0,
+        "angular_speed_deg_s": 360.0,
+        "angular_acceleration_deg_s2": 3000.0,
+    }
+)
+TRUTH = {"young_pa": 2e4, "poisson": 0.4, "gamma_r_s": 0.01, "gamma_m_1_s": 0.1}
+TIGHT = ReducedTolerances(progress=0.0)
+
+
+@cache
+def hung_bar() -> cs.Problem:
+    """A bar of 20 nodes hung by its upper face, whose lower end is tracked."""
+    body = cs.Body(cs.box_mesh((0.02, 0.02, 0.12), (1, 1, 4)), density_kg_m3=800.0)
+    t_s = 0.02 * np.arange(11)
+    hand = cs.PoseSequence(t_s, np.zeros((11, 3)), np.tile([0, 0, 0, 1.0], (11, 1)))
+    upper = np.flatnonzero(body.nodes_m[:, 2] > 0.119)
+    tracked = cs.Markers(t_s, np.zeros((11, 1, 3)), 1e-3, ["tip"], places_m=[[0.01, 0.01, 0.0]])
+    experiment = cs.Experiment(
+        body,
+        t_s,
+        [cs.Grasp(upper, hand)],
+        tracked,
+        nuisance=cs.Nuisance.none(),
+        air_density_kg_m3="none",
+    )
+    return cs.Problem([experiment], {n: cs.Unknown(v) for n, v in TRUTH.items()}, substeps=1)
+
+
+def task(**changes) -> Task:
+    """The tip moves along an arc of 50 mm and rests."""
+    share = np.linspace(0, 1, 21)
+    smooth = 10 * share**3 - 15 * share**4 + 6 * share**5
+    places = np.column_stack([0.05 * smooth, 0.02 * np.sin(np.pi * smooth), 0 * smooth])
+    usual = {
+        "duration_s": 0.8,
+        "sample_s": 0.02,
+        "reference": [
+            {
+                "point": "tip",
+                "t_s": (0.8 * share).tolist(),
+                "position_m": [tuple(each) for each in places.tolist()],
+                "relative": True,
+                "sigma_m": 2e-4,
+            }
+        ],
+        "hand": {"intervals": 16},
+    }
+    return Task.model_validate(usual | changes)
+
+
+def program(**changes) -> PlannedProgram:
+    return PlannedProgram.from_task(PlannedBody.read(hung_bar()), task(**changes), LIMITS)
+
+
+@cache
+def bar_plan() -> MotionPlan:
+    return plan_motion(hung_bar(), task(), LIMITS, tolerances=TIGHT)
+
+
+# Derivatives --------------------------------------------------------------------------------------
+
+
+def test_derivatives_of_the_motion_are_those_of_simulations():
+    planned = program(hand={"intervals": 8, "free": ["x", "y", "z", "rx", "ry", "rz"]})
+    rng = np.random.default_rng(0)
+    c, way = 0.05 * rng.normal(size=(2, planned.space.size))
+    x = planned.simulate(c)
+    found = planned.driven.respond(planned.drive(c), x) @ way
+    h = 1e-4
+    differences = (planned.simulate(c + h * way) - planned.simulate(c - h * way)) / (2 * h)
+    assert np.abs(found - differences).max() < 1e-6 * np.abs(differences).max()
+
+
+def test_a_motion_corrected_by_sweeps_is_the_simulated_one():
+    planned = program()
+    c = 0.05 * np.random.default_rng(1).normal(size=planned.space.size)
+    x = planned.simulate(c)
+    step = 0.01 * np.random.default_rng(2).normal(size=len(c))
+    near = x + planned.driven.respond(planned.drive(c), x) @ step
+    simulated = planned.simulate(c + step)
+    assert np.abs(near - simulated).max() > 1e-7  # the correction has something to do
+    assert np.abs(planned.simulate(c + step, near=near) - simulated).max() < 1e-11
+
+
+def test_derivatives_by_constants_are_those_of_simulations():
+    planned = program()
+    c = 0.05 * np.random.default_rng(1).normal(size=planned.space.size)
+    drive = planned.drive(c)
+    found = planned.driven.respond_to_parameters(drive, planned.simulate(c))
+    h = 1e-4
+    for k in range(len(planned.driven.q)):
+        step = h * np.eye(len(planned.driven.q))[k]
+        ends = [
+            replace(planned.driven, q=planned.driven.q + sign * step).simulate(drive)
+            for sign in (1, -1)
+        ]
+        differences = (ends[0] - ends[1]) / (2 * h)
+        assert np.abs(found[..., k] - differences).max() < 1e-5 * np.abs(differences).max() + 1e-12
+
+
+def test_derivatives_of_hand_positions_and_limits_are_their_differences():
+    planned = program(hand={"intervals": 8, "free": ["x", "y", "z", "rx", "ry", "rz"]})
+    rng = np.random.default_rng(0)
+    frame = planned.frame
+    places = rng.normal(size=(5, 6)) * [0.1, 0.1, 0.1, 0.8, 0.8, 0.8]
+    places[0, 3:] *= 1e-4  # the series
+    weights = rng.normal(size=(5, len(frame.arms_m), 3))
+    way, h = rng.normal(size=(5, 6)), 1e-6
+    ends = [frame.positions(places + sign * h * way) for sign in (1, -1)]
+    by_way = np.einsum("tnic,tc->tni", frame.positions(places)[1], way)
+    assert np.allclose(by_way, (ends[0][0] - ends[1][0]) / (2 * h), atol=1e-8)
+    slopes = [np.einsum("tni,tnic->tc", weights, each[1]) for each in ends]
+    curvature = np.einsum("tij,tj->ti", frame.weighted_hessian(places, weights), way)
+    assert np.allclose(curvature, (slopes[0] - slopes[1]) / (2 * h), atol=1e-7)
+    c, step = 0.05 * rng.normal(size=(2, planned.space.size))
+    limits = planned.hand_limits
+    near = limits.linearise(c)
+    ends = [limits.linearise(c + sign * h * step) for sign in (1, -1)]
+    for values, by_c in ((0, near.vector_slopes @ step), (2, near.row_slopes @ step)):
+        difference = (ends[0][values] - ends[1][values]) / (2 * h)
+        assert np.abs(by_c - difference).max() < 1e-7 * np.abs(difference).max() + 1e-9
+
+
+def test_the_expression_of_a_rotation_is_that_of_scipy():
+    import casadi as ca
+
+    for turn in ([0.3, -1.2, 0.7], [1e-3, 2e-3, 0.0], [0.0, 0.0, 0.0]):
+        found = ca.evalf(rotation_expression(ca.SX(turn))).full()
+        assert np.allclose(found, Rotation.from_rotvec(turn).as_matrix(), atol=1e-14)
+
+
+# Optima -------------------------------------------------------------------------------------------
+
+
+def test_a_mass_on_a_spring_moves_with_the_least_jerk_of_the_closed_form():
+    """A light bar with a mass at its end: hand p, mass y with y'' = ω² (p − y), least ∫ p'''² dt
+    from rest to rest over 10 mm, from the controllability Gramian.
+    """
+    length_m, side_m, mass_kg, omega = 1.0, 0.02, 0.4, 2 * np.pi * 5.0
+    young_pa = omega**2 * mass_kg * length_m / side_m**2
+    body = cs.Body(cs.box_mesh((length_m, side_m, side_m), (1, 1, 1)), density_kg_m3=1.0)
+    t_s = 0.002 * np.arange(11)
+    ends = [np.flatnonzero(np.abs(body.nodes_m[:, 0] - x) < 1e-9) for x in (0.0, length_m)]
+    guides = [
+        cs.Grasp(ends[1], cs.PoseSequence.fixed(), axes="yz"),
+        cs.Grasp(ends[0], cs.PoseSequence.fixed()),
+    ]
+    experiment = cs.Experiment(
+        body,
+        t_s,
+        guides,
+        cs.Markers(t_s, np.zeros((11, 1, 3)), 1e-3, ["mass"], places_m=[[length_m, 0, 0]]),
+        gravity_m_s2=(0, 0, 0),
+        masses=[cs.PointMass(ends[1], mass_kg)],
+        nuisance=cs.Nuisance.none(),
+        air_density_kg_m3="none",
+    )
+    constants = {"young_pa": young_pa, "poisson": 0.0, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    way_m, duration_s = 0.01, 0.3
+    wanted = Task.model_validate(
+        {
+            "duration_s": duration_s,
+            "end": {"sigma_m": 1e-3},
+            "hand": {
+                "free": ["x"],
+                "end_m": (way_m, 0.0, 0.0),
+                "intervals": 30,
+                "jerk_weight": 1.0,
+            },
+        }
+    )
+    plan = plan_motion(cs.Problem([experiment], constants, substeps=1), wanted, LIMITS,
+                       tolerances=TIGHT)  # fmt: skip
+    assert plan.program.lowest_hz == pytest.approx(5.0, rel=2e-3)
+
+    matrix = np.zeros((5, 5))
+    matrix[0, 1] = matrix[1, 2] = matrix[3, 4] = 1.0
+    matrix[4, 0], matrix[4, 3] = omega**2, -(omega**2)
+    force = np.array([0, 0, 1.0, 0, 0])
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    times = duration_s * (nodes + 1) / 2
+    rays = np.array([expm(matrix * (duration_s - t)) @ force for t in times])
+    gramian = np.einsum("t,ti,tj->ij", duration_s / 2 * weights, rays, rays)
+    adjoint = np.linalg.solve(gramian, [way_m, 0, 0, way_m, 0])
+
+    # Van Loan: state and adjoint together.
+    both = np.block([[matrix, np.outer(force, force)], [np.zeros((5, 5)), -matrix.T]])
+    start = np.concatenate([np.zeros(5), expm(matrix.T * duration_s) @ adjoint])
+    at = np.linspace(0, duration_s, 31)
+    exact = np.array([(expm(both * t) @ start)[0] for t in at])
+    assert exact[-1] == pytest.approx(way_m)
+    found = plan.motion.derivatives(at).value[:, 0]
+    assert np.abs(found - exact).max() < 3e-3 * way_m
+    jerk = plan.program.space.jerk()
+    squares = (jerk[0] @ plan.answer.c + jerk[1])[:, 0] ** 2
+    assert squares.mean() * duration_s == pytest.approx(
+        np.array([way_m, 0, 0, way_m, 0]) @ adjoint, rel=0.02
+    )
+    assert plan.residual_vibration_m < 1e-3 * way_m
+
+
+def test_a_plan_is_a_stationary_point_of_the_simulated_objective():
+    plan = bar_plan()
+    assert plan.answer.status == "converged"
+    planned, c = plan.program, plan.answer.c
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        way, h = rng.normal(size=len(c)), 1e-4
+        up, down = (planned.objective(c + s * h * way, planned.simulate(c + s * h * way))
+                    for s in (1, -1))  # fmt: skip
+        middle = planned.objective(c, plan.answer.x)
+        # The slope is zero against what a step changes.
+        assert abs(up - down) < 1e-3 * (up + down - 2 * middle)
+
+
+def test_the_tip_follows_its_reference_better_than_with_a_rigid_hand_motion():
+    plan = bar_plan()
+    (reference,) = plan.program.references
+    error = plan.tracking_error(reference)
+    planned = plan.program
+    # The hand moves as the tip shall: a body without inertia would follow.
+    moved = reference.position_m - reference.position_m[0]
+    matrix, constant = planned.space.affine(plan.t_s)
+    c = np.linalg.lstsq(
+        matrix[:41, :3].reshape(-1, planned.space.size),
+        (moved - constant[:, :3])[:41].ravel(),
+        rcond=None,
+    )[0]
+    rigid = planned.simulate(c) @ planned.point_weights("tip").toarray().T
+    counted = np.isfinite(reference.position_m).all(axis=1)
+    distance = np.linalg.norm((rigid[planned.sample_rows] - reference.position_m)[counted], axis=1)
+    assert error.rms_m < 0.2 * np.sqrt(np.mean(distance**2))
+
+
+def test_limits_that_bind_are_respected_between_grid_points_too():
+    narrow = LIMITS.model_copy(
+        update={"speed_m_s": 0.11, "acceleration_m_s2": 0.9, "angular_acceleration_deg_s2": 300.0}
+    )
+    free = ["x", "y", "z", "rx", "ry", "rz"]
+    wanted = task(hand={"intervals": 10, "free": free})
+    seen = []
+
+    planned = PlannedProgram.from_task(PlannedBody.read(hung_bar()), wanted, narrow)
+    answer = solve_reduced(planned, watch=lambda number, value: seen.append(value))
+    shares = planned.bounds.shares(planned.space.motion(answer.c))
+    assert max(shares.values()) <= 1.0
+    assert max(shares.values()) > 0.98
+    assert seen == sorted(seen, reverse=True)
+
+
+def test_limits_of_joints_are_a_function_of_the_pose():
+    def within_reach(position_m, rotation):
+        return position_m[0] - 0.02
+
+    x = plan_motion(
+        hung_bar(), task(), LIMITS, pose_limits=within_reach
+    ).motion.derivatives(np.linspace(0, 0.8, 200)).value[:, 0]  # fmt: skip
+    start_m = PlannedBody.read(hung_bar()).hand_m[0]
+    assert x.max() + start_m <= 0.02 + 1e-6  # limits hold at the points of a grid
+    assert x.max() + start_m > 0.019
+    assert bar_plan().motion.derivatives(np.linspace(0, 0.8, 200)).value[:, 0].max() > 0.03
+
+
+def test_limits_without_any_motion_are_named():
+    wanted = task(duration_s=0.22, reference=[], hand={"end_m": (0.25, 0.0, 0.0), "intervals": 10})
+    with pytest.raises(InputError, match=r"no motion of 0\.22 s .* end_m .* longer duration_s"):
+        plan_motion(hung_bar(), wanted, LIMITS)
+
+
+def test_ctrl_c_keeps_the_best_plan(monkeypatch):
+    def interrupt(number, value):
+        if number == 2:
+            raise KeyboardInterrupt
+
+    plan = plan_motion(hung_bar(), task(), LIMITS, watch=interrupt)
+    assert plan.interrupted
+    assert len(plan.answer.history) == 3
+    assert max(plan.shares.values()) <= 1.0
+    assert reduced_solver.LARGEST_SHARE > 1.0
+
+
+# Uncertainty --------------------------------------------------------------------------------------
+
+
+def test_the_band_is_the_spread_of_points_over_draws_of_the_constants():
+    body = PlannedBody.read(hung_bar())
+    covariance = np.diag([0.02, 0.01, 0.1, 0.1]) ** 2
+    plan = bar_plan()
+    known = replace(plan, program=replace(plan.program, body=replace(body, covariance=covariance)))
+    planned = known.program
+    at_tip = planned.point_weights("tip").toarray()
+    drive = planned.drive(plan.answer.c)
+    rng = np.random.default_rng(0)
+    draws = [
+        (replace(planned.driven, q=planned.driven.q + np.sqrt(np.diag(covariance)) * rng.normal(size=4))
+         .simulate(drive)[planned.sample_rows] @ at_tip.T)
+        for _ in range(60)
+    ]  # fmt: skip
+    spread = np.std(draws, axis=0)
+    predicted = known.constants_std_m["tip"]
+    peak = predicted[:, 0].argmax()
+    assert spread[peak, 0] == pytest.approx(predicted[peak, 0], rel=0.25)
+    name, share = known.limiting_constant
+    assert name == "young_pa"
+    assert 0.5 < share <= 1.0
+    assert known.tracking_error(planned.references[0]).band_m > 0
+
+
+def test_without_a_run_the_uncertainty_is_unknown():
+    assert bar_plan().limiting_constant is None
+    assert bar_plan().tracking_error(bar_plan().program.references[0]).band_m is None
+
+
+# Task files ---------------------------------------------------------------------------------------
+
+GOOD = """\
+duration_s = 0.8
+sample_s = 0.02
+[[reference]]
+point = "low"
+t_s = [0.8]
+position_m = [[0.02, 0.0, nan]]
+relative = true
+[hand]
+intervals = 8
+"""
+LIMITS_TEXT = """\
+workspace_m = [[-0.3, -0.3, -0.3], [0.3, 0.3, 0.4]]
+speed_m_s = 1.5
+acceleration_m_s2 = 15.0
+rotation_deg = 60.0
+angular_speed_deg_s = 360.0
+angular_acceleration_deg_s2 = 3000.0
+"""
+MISTAKES = {
+    "duration_s = 0.8": [
+        ("", "duration_s: missing"),
+        ("duration_s = -1.0", "duration_s: found -1.0; expected a number above 0"),
+        ('duration_s = "1"', "expected a number"),
+        ("duration_s = 0.8\nduratoin_s = 1.0", "unknown key.*duration_s"),
+        ("duration_s = 0.8 0.9", "task.toml"),
+    ],
+    'point = "low"': [
+        ("", "neither point nor point_m|expected .*point"),
+        ('point = "low"\npoint_m = [0, 0, 0.0]', "point and point_m|expected"),
+        ('point = "low"\nname = "tip"', "name is of a point given by point_m"),
+        ('pont = "low"', "unknown key"),
+    ],
+    "t_s = [0.8]": [
+        ("t_s = [0.4, 0.8]", "position_m has 1 entries and t_s 2"),
+        ("", "no reference|position_m has no times"),
+        ('t_s = [0.8]\nfile = "tip.csv"', "found file and t_s; expected exactly one"),
+        ("t_s = [0.8]\nhold = true", "found t_s and hold"),
+        ("t_s = [0.8]\nuntil_s = 0.1\nfrom_s = 0.2", "until_s = 0.1 is not after from_s = 0.2"),
+        ("t_s = [0.8]\nsigma_m = 0.0", "sigma_m: found 0.0; expected a number above 0"),
+    ],
+    "position_m = [[0.02, 0.0, nan]]": [
+        ("", "t_s has no values; expected position_m or velocity_m_s"),
+        ("position_m = [[0.02, 0.0]]", "position_m"),
+    ],
+    "intervals = 8": [
+        ("intervals = 3", "intervals: found 3; expected a number of at least 6"),
+        ('free = ["x", "w"]', "free"),
+        ('free = ["x", "x"]', "names a coordinate twice"),
+        ('free = ["x"]\nend_m = [0.0, 0.1, 0.0]', "end_m moves y, which is not free"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("line", "instead", "message"),
+    [(line, *each) for line, mistakes in MISTAKES.items() for each in mistakes],
+)
+def test_mistakes_in_task_files_are_explained(tmp_path: Path, line, instead, message):
+    file = tmp_path / "task.toml"
+    file.write_text(GOOD)
+    Task.read(file)
+    file.write_text(GOOD.replace(line, instead))
+    with pytest.raises(InputError, match=f"(?s){message}") as caught:
+        Task.read(file)
+    assert "task.toml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reference": [{"point": "tpi", "hold": True}]}, "no marker 'tpi'.*tip"),
+        ({"sample_s": 0.4}, "2 samples of 0.4 s; expected 10 to"),
+        ({"hand": {"end_m": (0.5, 0.0, 0.0)}}, "outside the workspace"),
+        (
+            {"hand": {"free": ["rx"], "end_rotation_deg": (70.0, 0.0, 0.0)}},
+            "turns by 70.*rotation_deg = 60",
+        ),
+        ({"end": {"window_s": 0.02}}, "window_s = 0.02, which is 1 samples"),
+        (
+            {"reference": [{"point": "tip", "t_s": [5.0], "position_m": [(0.0, 0.0, 0.0)]}]},
+            "runs from 5 s to 5 s, but the plan from 0",
+        ),
+        (
+            {"reference": [{"point_m": (1.0, 0.0, 0.0), "hold": True}]},
+            "away from the body",
+        ),
+    ],
+)  # fmt: skip
+def test_tasks_that_do_not_fit_the_body_are_explained(changes, message):
+    with pytest.raises(InputError, match=f"(?s){message}"):
+        program(**changes)
+
+
+def test_references_of_a_file_leave_empty_cells_free(tmp_path: Path):
+    (tmp_path / "tip.csv").write_text("t_s,x_m,z_m\n0,0,0\n0.4,0.01,\n0.8,0.02,0.01\n")
+    (tmp_path / "task.toml").write_text(
+        GOOD.replace("t_s = [0.8]", 'file = "tip.csv"\ninterpolation = "linear"').replace(
+            "position_m = [[0.02, 0.0, nan]]\n", ""
+        )
+    )
+    read = Task.read(tmp_path / "task.toml")
+    t_s = np.linspace(0, 1.0, 51)
+    (found,) = sampled_references(read, t_s, [np.zeros(3)], np.array([[1.0, 2.0, 3.0]]))
+    assert found.position_m[10, 0] == pytest.approx(1.005)
+    assert np.isnan(found.position_m[:, 1]).all()
+    assert np.isnan(found.position_m[10, 2])  # between times of which one has no value
+    assert found.position_m[40, 2] == pytest.approx(3.01)
+    assert np.isnan(found.position_m[41:]).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t_s,x_mm\n0,1\n1,2\n", "unknown column x_mm"),
+        ("x_m\n0\n1\n", "expected t_s and some of"),
+        ("t_s,x_m\n0,1\n0,2\n", "increas"),
+        ("t_s,x_m\n0,1\n1,two\n", "line 3"),
+    ],
+)
+def test_mistakes_in_files_of_references_are_explained(tmp_path: Path, text, message):
+    (tmp_path / "tip.csv").write_text(text)
+    (tmp_path / "task.toml").write_text(
+        GOOD.replace("t_s = [0.8]", 'file = "tip.csv"').replace(
+            "position_m = [[0.02, 0.0, nan]]\n", ""
+        )
+    )
+    with pytest.raises(InputError, match=message) as caught:
+        Task.read(tmp_path / "task.toml")
+    assert "tip.csv" in str(caught.value)
+
+
+# Files --------------------------------------------------------------------------------------------
+
+
+def test_poses_at_any_rate_move_the_body_as_planned():
+    plan = bar_plan()
+    t_s = command_times_s(plan, 400.0)
+    assert t_s[1] == pytest.approx(1 / 400)
+    assert t_s[-1] >= plan.t_s[-1] - 1e-9
+    body = plan.program.body
+    executed = body.experiment(plan.poses(t_s), plan.t_s, {"tip": np.array([0.01, 0.01, 0.0])})
+    moved = cs.simulate(executed, TRUTH, "midpoint", substeps=4).markers_m[:, 0]
+    assert np.abs(moved - plan.points_m["tip"]).max() < 2e-6
+
+
+@pytest.mark.long
+def test_the_command_writes_the_plan(tmp_path: Path):
+    problem = write_problem(tmp_path, {"swing": 10})
+    (tmp_path / "task.toml").write_text(GOOD)
+    (tmp_path / "limits.toml").write_text(LIMITS_TEXT)
+    words = ["plan", str(problem), str(tmp_path / "task.toml"), "--limits",
+             str(tmp_path / "limits.toml"), "--out", str(tmp_path / "out")]  # fmt: skip
+    outcome = run_command(*words, "--no-film", "--rate", "250")
+    assert outcome.code == 0, outcome.err
+    content = json.loads((tmp_path / "out" / "plan.json").read_text())
+    assert content["references"][0]["rms_m"] < 1e-4
+    for name in ("poses.csv", "hand.csv", "predicted_points.csv", "hand.png", "tracking.png"):
+        assert (tmp_path / "out" / name).stat().st_size
+    (tmp_path / "task.toml").write_text(GOOD.replace("low", "lowest"))
+    wrong = run_command(*words[:-1], str(tmp_path / "other"))
+    assert wrong.code == 2
+    assert "task.toml" in wrong.err
+    assert not (tmp_path / "other").exists()
+
+
+def test_the_content_of_plan_json_is_that_of_the_plan():
+    content = plan_json(bar_plan())
+    assert content["references"][0]["point"] == "tip"
+    assert content["limits"]["speed_m_s"]["share_used"] == bar_plan().shares["speed_m_s"]
+    assert content["status"] == "converged"
