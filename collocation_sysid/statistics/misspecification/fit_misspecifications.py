@@ -218,12 +218,14 @@ def _refit_hypotheses(
         *whole.accepted(_hysteresis_hypotheses(solution, experiment)),
         *trial.accepted(
             [
+                # A body far from its stated pose: mirror images, before others use up the sweeps.
+                *(mirrored if is_far else ()),
                 *lags,
                 *_slip_hypotheses(first, fitted_m, of=of),
                 *_grasp_layer_hypotheses(first, of),  # few, before others use up the sweeps
                 *turned,
                 *bodies,
-                *mirrored,
+                *(() if is_far else mirrored),
             ]
         ),
         *partly.accepted(coarse_mesh_hypotheses(solution, of)),
