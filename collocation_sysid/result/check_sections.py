@@ -315,7 +315,9 @@ def _guess_rows(findings: CheckResult) -> dict[str, str]:
 
 def _cost_text(cost: MethodCost) -> str:
     memory = (
-        f"{cost.memory_mb:.0f} MB" if cost.memory_mb < 1e3 else f"{cost.memory_mb / 1e3:.2g} GB"
+        f"{max(1.0, cost.memory_mb):.0f} MB"
+        if cost.memory_mb < 1e3
+        else f"{cost.memory_mb / 1e3:.2g} GB"
     )
     return f"about {duration(cost.time_s)} and {memory}"
 
