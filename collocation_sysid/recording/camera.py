@@ -168,10 +168,10 @@ class Camera:
             angle = (math.atan if isinstance(x, ca.SX) else math.arctan)(r)
             k1, k2, k3, k4 = self._coefficients(4)
             a2 = angle * angle
-            factor = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) / r
+            factor: Any = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) / r
             return factor * x, factor * y
         k1, k2, p1, p2, k3, *rational = self._coefficients(8)
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        radial: Any = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         if any(rational):
             k4, k5, k6 = rational
             radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))

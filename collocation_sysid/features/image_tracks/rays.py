@@ -54,7 +54,7 @@ def ray_hits(
 
 def points_on_surface(
     origins: Array, directions: Array, nodes_m: Array, surface: Index
-) -> tuple[Array, Array, Array]:
+) -> tuple[Index, Array, Array]:
     """Return where rays first meet a surface.
 
     Parameters

@@ -248,7 +248,7 @@ def track_hypotheses(
     """
     sigma = reading.sensor.sigma_px
     names = reading.sensor.names
-    compared = reading.is_compared[: len(predicted), :, :2].all(axis=2)
+    compared = np.asarray(reading.is_compared[: len(predicted), :, :2].all(axis=2))
     measured = np.where(compared[..., None], reading.measured[: len(predicted), :, :2], np.nan)
     used = np.flatnonzero(compared.any(axis=0)).tolist()
     off = (measured - predicted) / sigma
@@ -260,7 +260,7 @@ def track_hypotheses(
             if own < SUSPICIOUS or {i, j} & exchanged:
                 continue
             crossed = (measured[:, [j, i]] - predicted[:, [i, j]]) / sigma
-            known = np.isfinite(crossed).all(axis=(1, 2))
+            known = np.asarray(np.isfinite(crossed).all(axis=(1, 2)))
             if not known.any():
                 continue
             other = float(np.sqrt(2 * np.mean(crossed[known] ** 2)))

@@ -39,6 +39,8 @@ TURNS_HIDDEN = -0.1
 SMOOTH = 0.7
 # Iterations that align a camera with the first image.
 ALIGNMENT_EVALUATIONS = 60
+# Share of the visible samples up to which changes are ignored.
+SETTLED = 0.01
 # Distance in mean edges in front of a point at which another part of the surface hides it.
 OCCLUSION_EDGES = 0.3
 
@@ -223,7 +225,7 @@ class TrackedPlaces(Correspondences):
         found = find_places(experiment, shape_at)
         body = experiment.body
         places = np.array([found.places_m[name] for name in tracks.names])
-        is_placed = np.isfinite(places).all(axis=1)
+        is_placed = np.asarray(np.isfinite(places).all(axis=1))
         places[~is_placed] = body.nodes_m[body.mesh.surface[0, 0]]
         sigmas = np.where(is_placed, tracks.place_sigmas_m(experiment), 0.0)
         camera = replace(tracks.camera, pose=found.poses[tracks.name])
@@ -302,7 +304,7 @@ class TrackedPlaces(Correspondences):
 
     def with_visibility(self, shapes_m: Array) -> TrackedPlaces:
         """Return the correspondences with the points that are visible in the first s shapes (s, n,
-        3) [m]; self if they are the same.
+        3) [m]; self if hardly any sample changes, so that the loss does not jump for ever.
 
         A point is hidden if its face looks away from the camera, or another part of the body is in
         front of it; not by obstacles.
@@ -329,7 +331,7 @@ class TrackedPlaces(Correspondences):
             triangles = shapes_m[k][surface]
             hidden = is_occluded(points[k, candidates], eyes, triangles, margin_m)
             visible[k, candidates[hidden]] = False
-        if np.array_equal(visible, before):
+        if np.sum(visible != before) <= SETTLED * np.sum(before & self.tracks.is_seen[:count]):
             return self
         return replace(self, is_visible=np.concatenate([visible, self.is_visible[count:]]))
 

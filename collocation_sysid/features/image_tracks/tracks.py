@@ -234,7 +234,7 @@ class ImageTracks(CustomSensor):
     @property
     def is_place_known(self) -> NDArray[np.bool_]:
         """Mask (N,) of the points with a stated place."""
-        return np.isfinite(self.known_places_m).all(axis=1)
+        return np.asarray(np.isfinite(self.known_places_m).all(axis=1))
 
     @property
     def is_seen(self) -> NDArray[np.bool_]:
@@ -243,7 +243,7 @@ class ImageTracks(CustomSensor):
         """
         if self.pixels is None:
             return np.ones((len(self.t_s), len(self.names)), dtype=bool)
-        return np.isfinite(self.pixels).all(axis=2)
+        return np.asarray(np.isfinite(self.pixels).all(axis=2))
 
     # Nuisance parameters ----------------------------------------------------------------------
 
