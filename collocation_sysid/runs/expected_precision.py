@@ -212,8 +212,10 @@ def _other_test(experiment: Experiment, test: str, values: Mapping[str, float]) 
     assert stress.values is not None
     relative = stress.sigma / np.nanmax(np.abs(stress.values))
     strain, _ = specimen_strains(experiment)
-    body = cell_body(test, part.material, damping=part.damping, made=experiment.body.made)
-    blank = Specimen(test, strain, np.zeros_like(strain), 1.0)
+    body = cell_body(
+        test, part.material, prony=part.prony, damping=part.damping, made=experiment.body.made
+    )
+    blank = Specimen(test, strain, np.zeros_like(strain), 1.0, t_s=experiment.t_s)
     added = blank.experiment(body=body, name=f"added {test}")
     (stresses_pa,) = simulate(added, values).custom_sensor_values
     specimen = replace(blank, sigma_pa=float(relative * np.abs(stresses_pa).max()))

@@ -11,7 +11,11 @@ import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.result.pictures.confidence import combinations_picture
-from collocation_sysid.runs.expected_precision import expected_precision, with_measurements
+from collocation_sysid.runs.expected_precision import (
+    added_measurements,
+    expected_precision,
+    with_measurements,
+)
 from collocation_sysid.statistics.combinations import (
     Direction,
     find_combinations,
@@ -205,3 +209,17 @@ def test_another_test_is_named_that_would_determine_both_constants():
     k = expected.names.index(added.name)
     reach = Z95 * np.sqrt(expected.covariance[k, k])
     assert np.log(added.factor) == pytest.approx(reach, rel=0.05)
+
+
+def test_the_other_test_of_a_material_with_memory_has_its_memory_and_times():
+    times_s = np.linspace(0.0, 3.0, 7)
+    pull = cs.Specimen("uniaxial", 0.01 * times_s, 1e3 * times_s, 10.0, t_s=times_s)
+    unknown = {"young_pa": cs.Unknown(1e5), "b.share": cs.Unknown(0.5), "b.tau_s": cs.Unknown(1.0)}
+    fixed = {"poisson": 0.49, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    problem = cs.Problem([pull.experiment(prony=("b",))], unknown | fixed)
+    collocation = problem.collocation()
+    variables, _ = initial_variables(collocation)
+    for _, experiments in added_measurements(collocation, variables):
+        *_, added = experiments
+        np.testing.assert_array_equal(added.t_s, times_s)
+        assert added.body.parts[0].prony == experiments[0].body.parts[0].prony
