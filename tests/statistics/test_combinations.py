@@ -168,6 +168,7 @@ def specimen_program(test, material, truth, free, strain):
     return problem, collocation, z
 
 
+@pytest.mark.long
 def test_a_tension_test_determines_young_modulus_of_two_moduli():
     """E = μ (3 λ + 2 μ) / (λ + μ): at λ = μ, ∂E/∂λ = 1/4 and ∂E/∂μ = 9/4."""
     truth = {"lambda_pa": 1e5, "mu_pa": 1e5}
@@ -223,3 +224,35 @@ def test_the_other_test_of_a_material_with_memory_has_its_memory_and_times():
         *_, added = experiments
         np.testing.assert_array_equal(added.t_s, times_s)
         assert added.body.parts[0].prony == experiments[0].body.parts[0].prony
+
+
+# Of a body with a mesh ----------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_without_a_force_a_hanging_body_determines_stiffness_over_density():
+    """In vacuum, displacements under weight depend on E/ρ; a force sensor determines both."""
+    body = cs.Body(cs.box_mesh((0.02, 0.02, 0.1), (1, 1, 3)), density_kg_m3=1000.0)
+    body = body.with_free_densities([""])
+    held = cs.Grasp(np.flatnonzero(body.nodes_m[:, 2] > 0.099), cs.PoseSequence.fixed())
+    places_m = body.nodes_m[body.nodes_m[:, 2] < 0.001]
+    markers = cs.Markers(np.zeros(1), np.zeros((1, len(places_m), 3)), 1e-6, places_m=places_m)
+    hanging = cs.Experiment(
+        body, np.zeros(1), [held], markers, nuisance=cs.Nuisance.none(), kind="static",
+        air_density_kg_m3="none",
+    )  # fmt: skip
+    truth = {"poisson": 0.4, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    unknown = {"young_pa": cs.Unknown(2e4), "density_kg_m3": cs.Unknown(1000.0)}
+    collocation = cs.Problem([hanging], truth | unknown).collocation()
+    z, failures = initial_variables(collocation)
+    assert not failures
+    exact = dict.fromkeys(cs.Problem([hanging], truth | unknown).assumed_deviations)
+    found = expected_precision(collocation, z, exact).combinations()
+    (each,) = with_measurements(found, collocation, z, exact)
+    assert each.determined.formula() in ("E / ρ", "ρ / E")
+    assert each.determined.powers == pytest.approx((1.0, -1.0), rel=1e-3)
+    assert each.loosest.factor > 1e4
+    sensor, _ = each.fixes
+    assert sensor.what == "a force sensor at the grasp (noise 1% of the largest force)"
+    # The force is the weight: the logarithm of ρ, and with it that of E, has the deviation 1 %.
+    assert np.log(sensor.factor) == pytest.approx(Z95 * 0.01, rel=0.2)
