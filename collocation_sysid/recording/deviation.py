@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -190,7 +190,7 @@ class Deviation:
     remedy: str = ""
     of: Component = "recording"
     axes: str = ""
-    effect: Callable[[Any, int], Any] | None = None
+    effect: Callable[..., object] | None = None
     of_specimens: bool = False
     is_one_sided: bool = False
     redefines: tuple[str, ...] = ()
@@ -210,7 +210,7 @@ class Deviation:
     same: Callable[..., dict[str, object]] = lambda experiment: {}
     reading: Callable[[ca.SX, ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
     clock: Callable[[ca.SX, ca.SX, RecordingQuantities], ca.SX] | None = None
-    stiffness: Callable[[Any, Array], Array] | None = None
+    stiffness: Callable[..., Array] | None = None
     largest: float = np.inf
 
     def __post_init__(self) -> None:

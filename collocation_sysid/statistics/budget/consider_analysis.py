@@ -216,17 +216,23 @@ def changed_residuals(
         at = ExperimentAtAnswer(
             part, collocation.parameters, surface_correlation=surface_correlation
         )
-        is_specimen = part.transcription.experiment.specimen is not None
         effects = [
-            (
-                row.effect(at, axis) if row.effect and is_specimen <= row.of_specimens else None,
-                sigma,
-            )
+            (_effect_of(row, at, axis), sigma)
             for row, sigma in assumptions
             for axis in range(len(row.list_components()))
         ]
         changes += _changes_by_effects(at, effects)
     return ResidualChanges(names, changes)
+
+
+def _effect_of(row: Deviation, at: ExperimentAtAnswer, axis: int) -> Effect | None:
+    """Return the effect of an axis of a deviation; None if it has none in this experiment."""
+    is_specimen = at.iterate.transcription.experiment.specimen is not None
+    if row.effect is None or (is_specimen and not row.of_specimens):
+        return None
+    effect = row.effect(at, axis)
+    assert effect is None or isinstance(effect, Effect)
+    return effect
 
 
 def _changes_by_effects(
