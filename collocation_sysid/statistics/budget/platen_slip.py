@@ -17,13 +17,13 @@ from ...common.array_types import Array, Index
 from ...model.forces import Forces
 from ...program.experiment_iterate import ExperimentIterate
 from ...program.forward.initial_equilibrium import static_equations
-from ...program.forward.newton_solver import NewtonFailure, NewtonSolver
+from ...program.forward.newton_solver import Linearise, NewtonFailure, NewtonSolver, Residual
 from ...recording.experiment import FLATNESS, Experiment
 from ...recording.grasp import Grasp, free_rigid_modes
 from ...recording.measurement_selection import is_load_only
 
-# Number of steps in which a face that slid returns to where it would stick.
-STICKING_STEPS = 4
+# Numbers of increments from one equilibrium with sticking faces to the next that are tried.
+STICKING_INCREMENTS = (1, 4, 16)
 # Largest tensile reaction of a face over its largest compressive one for which it may slide: above,
 # the face is bonded, since a platen does not pull. Errors of the zero remain below.
 LARGEST_TENSION = 0.2
@@ -119,23 +119,39 @@ def sticking_change_n(iterate: ExperimentIterate, theta: Array) -> Array | None:
     is_held[prescribed.dofs] = is_held[dofs] = True
     solver = NewtonSolver(experiment, prescribed=is_held)
     change_n = np.zeros_like(iterate.x)
+    x = start_m
     for row, (time_s, slid_m) in enumerate(zip(experiment.t_s, iterate.x, strict=True)):
         forces = Forces.from_experiment(experiment, float(time_s), theta=theta)
         equations = static_equations(forces, 1.0, free=solver.free)
-        x = slid_m
-        try:
-            for share in np.linspace(0, 1, STICKING_STEPS + 1)[1:]:
-                goal_m = slid_m.copy()
-                goal_m[dofs] += share * (start_m[dofs] - slid_m[dofs])
-                x = solver.solve_equilibrium(
-                    x, *equations, prescribed_m=goal_m[solver.is_prescribed]
-                )
-        except NewtonFailure:
+        goal_m = slid_m.copy()
+        goal_m[dofs] = start_m[dofs]
+        stuck_m = _moved_equilibrium(solver, equations, x, goal_m)
+        if stuck_m is None:
             return None
+        x = stuck_m
         still = np.zeros((2, x.size))
         stuck_n, slid_n = body.force(np.stack([x, slid_m]), still, theta=theta)
         change_n[row, prescribed.dofs] = (stuck_n - slid_n)[prescribed.dofs]
     return change_n
+
+
+def _moved_equilibrium(
+    solver: NewtonSolver, equations: tuple[Residual, Linearise], x: Array, goal_m: Array
+) -> Array | None:
+    """Return the equilibrium (3n,) [m] with the prescribed dofs where `goal_m` (3n,) has them, by
+    as few increments from the equilibrium x (3n,) as lead there; None if none do.
+    """
+    held = solver.is_prescribed
+    for count in STICKING_INCREMENTS:
+        state = x
+        try:
+            for share in np.linspace(0, 1, count + 1)[1:]:
+                between_m = x[held] + share * (goal_m - x)[held]
+                state = solver.solve_equilibrium(state, *equations, prescribed_m=between_m)
+        except NewtonFailure:
+            continue
+        return state
+    return None
 
 
 def pressed_axis(dofs: Index, positions_m: Array) -> int | None:
