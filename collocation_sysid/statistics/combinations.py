@@ -103,7 +103,7 @@ class Direction:
         order = np.argsort(-sizes, kind="stable")
         kept = order[sizes[order] >= smallest * sizes.max()]
         w = weights[kept] / weights[kept[0]]
-        own = tuple(names[k] for k in kept.tolist())
+        own = tuple(names[int(k)] for k in kept)
         variance = max(0.0, weights @ covariance @ weights) / weights[kept[0]] ** 2
         form: Form = "product"
         if not (values[kept] > 0).all():
@@ -268,7 +268,7 @@ def find_combinations(
         variances, vectors = _eigenpairs(scaled[np.ix_(inside, inside)])
         if variances[0] > LARGEST_SHARE:
             continue  # the constants left out belong to it
-        own = [names[k] for k in members.tolist()]
+        own = [names[int(k)] for k in members]
         weights = vectors[0] / deviations[members]
         best = Direction.from_weights(own, values[members], weights, within, smallest=0.0)
         loosest = Direction.from_weights(own, values[members], _eigenpairs(within)[1][-1], within)
