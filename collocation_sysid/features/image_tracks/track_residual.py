@@ -147,6 +147,14 @@ class ImageTrackResidual(CustomSensorResidual, CorrespondenceResidual):
         focal_px = self.sensor.camera.require_matrix()[0, 0]
         return np.repeat(self.sigmas * away_m / focal_px, GROUP)
 
+    @property
+    def uncompared_count(self) -> int:
+        """Number of pixel coordinates of points on the body that are left out because the body
+        hides them.
+        """
+        places = self.correspondences
+        return 2 * int(np.sum(self.sensor.is_seen & places.is_placed & ~places.is_visible))
+
     # Correspondences --------------------------------------------------------------------------
 
     @property
