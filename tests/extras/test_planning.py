@@ -343,6 +343,47 @@ def test_without_a_run_the_uncertainty_is_unknown():
     assert bar_plan().tracking_error(bar_plan().program.references[0]).band_m is None
 
 
+@pytest.mark.long
+def test_a_run_gives_estimates_covariance_and_the_poses_of_its_gripper(tmp_path: Path):
+    """A hand–eye transform that the run estimated is taken out of the poses for the robot."""
+    problem = hung_bar()
+    (still,) = problem.experiments
+    t_s = 0.02 * np.arange(26)
+    sway = 0.02 * (1 - np.cos(12 * t_s))
+    hand = cs.PoseSequence(t_s, np.outer(sway, [1, 0.5, 0.2]), np.tile([0, 0, 0, 1.0], (26, 1)))
+    nodes_m = still.body.nodes_m
+    low_m = nodes_m[nodes_m[:, 2] < 0.001]
+    markers = cs.Markers(t_s, np.zeros((26, 4, 3)), 5e-4, places_m=low_m)
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()
+    middle_m = nodes_m[still.grasps[0].nodes].mean(axis=0)
+    turned[:3, 3] = middle_m - turned[:3, :3] @ middle_m
+    grasps = [cs.Grasp(still.grasps[0].nodes, poses) for poses in (hand, hand.after(turned))]
+    nuisance = cs.Nuisance.none(hand_eye_rad=0.2)
+    stated, true = (
+        cs.Experiment(still.body, t_s, [each], markers, nuisance=nuisance, air_density_kg_m3="none")
+        for each in grasps
+    )
+    rng = np.random.default_rng(0)
+    seen = cs.simulate(true, TRUTH, "midpoint", substeps=1).markers_m
+    recorded = cs.with_markers(stated, seen + 5e-4 * rng.normal(size=seen.shape))
+    run = cs.run(cs.Problem([recorded], problem.parameters, substeps=1))
+    body = PlannedBody.read(run)
+    assert body.q == pytest.approx(run.solution.q)
+    low, high = run.interval("young_pa")
+    half_width = 1.96 * np.sqrt(body.covariance[0, 0])
+    assert np.log(high / low) / 2 == pytest.approx(half_width, rel=0.1)
+    planned = PlannedProgram.from_task(
+        body, task(reference=[{"point_m": (0.01, 0.01, 0.0), "hold": True}]), LIMITS
+    )
+    poses = planned.poses(np.zeros(planned.space.size), np.array([0.0, 0.1]))
+    gripper = body.gripper_poses(poses)
+    assert np.abs(gripper.positions_m - hand.positions_m[0]).max() < 1e-9
+    assert np.abs(np.abs(gripper.quaternions_xyzw) - [0, 0, 0, 1]).max() < 1e-9
+    tilt = Rotation.from_quat(poses.quaternions_xyzw[0]).as_rotvec()
+    assert tilt == pytest.approx([0.0, 0.1, 0.0], abs=0.02)
+
+
 # Task files ---------------------------------------------------------------------------------------
 
 GOOD = """\

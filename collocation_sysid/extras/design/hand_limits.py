@@ -174,9 +174,11 @@ class CheckedMotion(Protocol):
     @property
     def grid_s(self) -> Array:
         """Times (T,) since the start [s]."""
+        ...
 
-    def derivatives(self, t_s: Array) -> TimeDerivatives:
+    def derivatives(self, t_s: Array, /) -> TimeDerivatives:
         """Return the coordinates (T, 6) and their first and second derivatives."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

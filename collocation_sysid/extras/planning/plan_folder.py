@@ -11,7 +11,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.display import Line, Shown, Table
 from ...common.serialisation import as_json
-from ...fem.laws.constants import symbol_with_unit
+from ...fem.laws.constants import symbol_of
 from ...recording import write_markers_csv, write_poses_csv
 from ...recording.recording_writers import write_columns_csv
 from ...result.animation import film
@@ -90,8 +90,8 @@ def command_times_s(plan: MotionPlan, rate_hz: float | None = None) -> Array:
     end of the plan.
     """
     last_s = plan.t_s[-1]
-    rate_hz = rate_hz or 4 / plan.t_s[1]
-    return np.arange(int(np.ceil(last_s * rate_hz - 1e-9)) + 1) / rate_hz
+    rate = float(4 / plan.t_s[1]) if rate_hz is None else rate_hz
+    return np.arange(int(np.ceil(last_s * rate - 1e-9)) + 1) / rate
 
 
 def hand_columns(plan: MotionPlan, t_s: Array) -> dict[str, Array]:
@@ -192,7 +192,7 @@ def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
         shown.append(f"residual vibration: {1e3 * plan.residual_vibration_m:.3g} mm")
     if (limiting := plan.limiting_constant) is not None:
         shown.append(
-            f"the uncertainty of {symbol_with_unit(limiting[0])} limits the plan "
+            f"the uncertainty of {symbol_of(limiting[0])} limits the plan "
             f"({100 * limiting[1]:.0f} % of the variance)"
         )
     shown.append(f"time steps change the points by {1e3 * plan.time_step_error_m:.2g} mm")

@@ -252,7 +252,7 @@ class PlannedProgram:
         lowest_hz = _lowest_frequency_hz(brief, start)
         window = _window_samples(task, sample_s, lowest_hz)
         experiment, driven = standing(count + 1 + window)
-        since_s = sample_s * np.arange(count + 1 + window)
+        since_s = np.asarray(sample_s * np.arange(count + 1 + window), dtype=np.float64)
         started = experiment.markers.predict_positions(start.reshape(1, -1, 3))[0]
         index = {name: k for k, name in enumerate(points)}
         first = started[[index[name] for name in names]] if names else np.zeros((0, 3))

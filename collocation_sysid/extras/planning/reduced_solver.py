@@ -103,7 +103,7 @@ def triangular(matrix: Array, residual: Array) -> tuple[Array, Array]:
     residuals with small deviations.
     """
     count = matrix.shape[1]
-    factor = np.linalg.qr(np.column_stack([matrix, residual]), mode="r")
+    factor = np.asarray(np.linalg.qr(np.column_stack([matrix, residual]), mode="r"))
     return factor[:count, :count], factor[:count, count]
 
 
