@@ -103,9 +103,10 @@ class DepthSection(MeasurementSection, of=Depth):
         """Return the camera of the table, completed by the content of its file; raise an
         `InputError` at `where` if it is incomplete.
         """
-        names = ("matrix", "pose", "distortion")
-        arguments: dict[str, Any] = {name: getattr(content, name) for name in names}
-        arguments |= declared_in(self.camera, where=where)
+        arguments: dict[str, Any] = declared_in(self.camera, where=where)
+        for name in ("matrix", "pose", "distortion"):
+            if name not in self.camera.model_fields_set:  # a default does not replace the file's
+                arguments[name] = getattr(content, name)
         if self.camera.poses is not None:
             file = existing_file(folder.path, self.camera.poses, key=f"{where}.poses")
             arguments["poses"] = read_poses(file)

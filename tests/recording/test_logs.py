@@ -439,7 +439,8 @@ def test_a_problem_states_depth_by_the_topic_of_a_log(tmp_path: Path) -> None:
     file = write_problem(tmp_path, {"swing": 12})
     of, flat = Messages(), np.full((120, 160), 400, dtype="<u2")
     square = [[100, 0, 80], [0, 100, 60], [0, 0, 1]]
-    messages = [of.camera(0.0, square)]
+    bent = [0.1, -0.02, 1e-3, 2e-3, 0.003]
+    messages = [of.camera(0.0, square, bent)]
     messages += [of.image(t, "16UC1", flat, "/camera/depth") for t in (0.0, 0.02, 0.04, 9.0)]
     bag(tmp_path / "trial", messages)
     stated = '[[experiment.depth]]\nfile = "trial#/camera/depth"\nsigma_m = 0.001\n'
@@ -447,6 +448,7 @@ def test_a_problem_states_depth_by_the_topic_of_a_log(tmp_path: Path) -> None:
     (depth,) = Problem.read(file).experiments[0].depths
     np.testing.assert_allclose(depth.t_s, (0.0, 0.02, 0.04), atol=1e-9)
     np.testing.assert_array_equal(depth.camera.matrix, square)
+    np.testing.assert_array_equal(depth.camera.distortion, bent)
     np.testing.assert_allclose(depth.points_m[0][:, 2], 0.4)
     camera = "camera = { matrix = [[50, 0, 80], [0, 50, 60], [0, 0, 1]] }\n"
     bag(tmp_path / "halved", [of.camera(0.0, square, shape=(60, 80)), *messages[1:]])

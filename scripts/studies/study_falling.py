@@ -1,0 +1,82 @@
+"""Young's modulus of a block that falls on a plane: error, interval and coverage, for twins.
+
+    nice python scripts study_falling [--seeds 20] [--rates 120 240] [--guesses none 1e6]
+
+A block of 0.1 m with E = 200 kPa falls by 0.15 m on a plane with friction. Points of its surface are
+measured with a noise of 1 mm. The twin is simulated on a finer mesh and with finer time steps than
+those of the fit, which chooses its number of time steps itself. E, ν and γ_r are estimated, E without
+a guess or from a wrong one. The table has the common logarithm of E over its true value, the factor
+between the ends of the combined interval, and whether it contains the true value.
+"""
+
+from __future__ import annotations
+
+import time
+from itertools import product
+
+import numpy as np
+from script_arguments import make_parser
+
+import collocation_sysid as cs
+
+SIDE_M, DROP_M, DURATION_S, SIGMA_M = 0.1, 0.15, 0.4, 1e-3
+TRUTH = {"young_pa": 2e5, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.1}
+FREE = ("young_pa", "poisson", "gamma_r_s")
+# Steps per second of the simulated twins.
+TWIN_HZ = 7680
+# Corners, middles of edges and of faces.
+PLACES_M = [
+    [SIDE_M * x / 2, SIDE_M * y / 2, SIDE_M * z / 2]
+    for x, y, z in product(range(3), repeat=3)
+    if (x, y, z) != (1, 1, 1)
+]
+
+
+def falling_block(cells: int, t_s: np.ndarray) -> cs.Experiment:
+    """Return the experiment with empty tracks, with so many cells along an edge."""
+    body = cs.Body(cs.box_mesh((SIDE_M,) * 3, (cells,) * 3), density_kg_m3=1000.0)
+    floor = cs.Obstacle(shape=cs.Plane((0, 0, 1), (0, 0, -DROP_M)), friction=0.3, name="floor")
+    unseen_m = np.zeros((len(t_s), len(PLACES_M), 3))
+    return cs.Experiment(
+        body,
+        t_s,
+        [floor],
+        cs.Markers(t_s, unseen_m, SIGMA_M, places_m=PLACES_M),
+        start="undeformed",
+        air_density_kg_m3="none",
+        nuisance=cs.Nuisance.none(),
+    )
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--rates", type=int, nargs="+", default=[120, 240])
+    parser.add_argument("--guesses", nargs="+", default=["none", "1e6"])
+    parser.add_argument("--cells", type=int, default=3, help="of the fit along an edge")
+    arguments = parser.parse_args()
+    print("rate [Hz] | guess [Pa] | seed | steps | status | log10 error | factor | holds | CPU [s]")
+    for rate_hz in arguments.rates:
+        t_s = np.arange(round(DURATION_S * rate_hz)) / rate_hz
+        twin = falling_block(arguments.cells + 1, t_s)
+        exact_m = cs.simulate(twin, TRUTH, "bdf2", substeps=TWIN_HZ // rate_hz).markers_m
+        for guess, seed in product(arguments.guesses, range(arguments.seeds)):
+            noise_m = SIGMA_M * np.random.default_rng(seed).normal(size=exact_m.shape)
+            fall = cs.with_markers(falling_block(arguments.cells, t_s), exact_m + noise_m)
+            unknown = {name: cs.Unknown() for name in FREE}
+            if guess != "none":
+                unknown["young_pa"] = cs.Unknown(float(guess))
+            began_s = time.process_time()
+            run = cs.run(cs.Problem([fall], TRUTH | unknown, scheme="bdf2"))
+            low, high = run.interval("young_pa")
+            error = np.log10(run.parameters["young_pa"] / TRUTH["young_pa"])
+            print(
+                f"{rate_hz} | {guess} | {seed} | {run.solution.collocation.substeps} | "
+                f"{run.solution.status.value} | {error:+.3f} | {high / low:.2f} | "
+                f"{low <= TRUTH['young_pa'] <= high} | {time.process_time() - began_s:.0f}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
