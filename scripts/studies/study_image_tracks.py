@@ -155,7 +155,7 @@ def identify(cameras: int, number: int, options: argparse.Namespace) -> list[tup
 
 def main() -> None:
     """Print a table with one row for each number of cameras."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--twins", type=int, default=24)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--places", choices=("known", "unknown"), default="known")

@@ -208,7 +208,7 @@ def stated_points(text: str) -> tuple[list[str], np.ndarray]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Track the points of a video and write their table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("video", type=Path, help="video, or folder of images")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--mask", type=Path, help="image that is not black where the body is")

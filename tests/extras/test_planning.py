@@ -299,7 +299,7 @@ def test_limits_without_any_motion_are_named():
         plan_motion(hung_bar(), wanted, LIMITS)
 
 
-def test_ctrl_c_keeps_the_best_plan(monkeypatch):
+def test_ctrl_c_keeps_the_best_plan():
     def interrupt(number, value):
         if number == 2:
             raise KeyboardInterrupt
@@ -309,6 +309,21 @@ def test_ctrl_c_keeps_the_best_plan(monkeypatch):
     assert len(plan.answer.history) == 3
     assert max(plan.shares.values()) <= 1.0
     assert reduced_solver.LARGEST_SHARE > 1.0
+
+
+def test_a_conic_program_without_a_solution_keeps_the_best_plan(monkeypatch):
+    def fail(number, value):
+        if number == 2:
+            monkeypatch.setattr(reduced_solver, "minimise_within_limits", unsolved)
+
+    def unsolved(*_):
+        raise np.linalg.LinAlgError("the conic program was not solved")
+
+    plan = plan_motion(hung_bar(), task(), LIMITS, watch=fail)
+    assert plan.answer.status == "stalled"
+    assert len(plan.answer.history) == 3
+    with pytest.raises(InputError, match="not solved; state wider limits"):
+        plan_motion(hung_bar(), task(), LIMITS)
 
 
 # Uncertainty --------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ al., A micro Lie theory, 2018, eq. 145): with a = (1 − cos θ)/θ² and b = (�
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -163,7 +162,7 @@ class HandMotion:
         factors = np.repeat([translation, rotation], 3)[:, None]
         return replace(self, amplitude=factors * self.amplitude)
 
-    @cached_property
+    @property
     def grid_s(self) -> Array:
         """Times (T,) from 0 to the duration [s], evenly spaced, that resolve all peaks of the
         motion.

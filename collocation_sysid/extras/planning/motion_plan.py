@@ -279,6 +279,8 @@ def plan_motion(
         answer = solve_reduced(program, tolerances=tolerances, watch=watch)
     except HandLimitsExcludeTask as error:
         raise InputError(_contradiction(program), None, where="hand") from error
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"{error}; state wider limits", None, where="hand") from error
     seconds = time.perf_counter() - began_s
     say("simulating the plan with fine time steps")
     return MotionPlan(program, answer, _finely_simulated(program, answer.c), seconds)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import casadi as ca
 import numpy as np
@@ -426,7 +426,7 @@ class PlannedProgram:
             (weight, (np.arange(len(free)), free)), shape=(len(free), transcription.dof_count)
         )
         matrix = sp.csr_array(sp.kron(difference, of_dofs))
-        return ResidualRows("rest", matrix, np.zeros(matrix.shape[0]))
+        return ResidualRows("rest", matrix, np.zeros(len(rows) * len(free)))
 
     def objective_parts(self, c: Array, x: Array) -> dict[str, float]:
         """Return the parts of the objective at unknowns c and motion x (N, 3n): of each reference,
@@ -459,7 +459,8 @@ def _row_products(left: sp.csr_array, right: sp.csr_array) -> sp.csr_array:
     """Return the matrix (k, a · b) whose rows are the Kronecker products of the rows of two matrices
     (k, a) and (k, b).
     """
-    count, width = int(left.shape[0]), int(right.shape[1])
+    count, many = cast(tuple[int, int], left.shape)
+    width = cast(tuple[int, int], right.shape)[1]
     entries = sp.coo_array(left)
     first, place = entries.coords
     counts = np.diff(right.indptr)[first]
@@ -468,7 +469,7 @@ def _row_products(left: sp.csr_array, right: sp.csr_array) -> sp.csr_array:
     source = right.indptr[rows] + offsets
     columns = np.repeat(place, counts) * width + right.indices[source]
     values = np.repeat(entries.data, counts) * right.data[source]
-    return sp.csr_array((values, (rows, columns)), shape=(count, int(left.shape[1]) * width))
+    return sp.csr_array((values, (rows, columns)), shape=(count, many * width))
 
 
 def _farthest_node(body: PlannedBody) -> dict[str, Array]:

@@ -12,8 +12,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any
 
-import clarabel
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solve_triangular
@@ -128,6 +129,8 @@ def minimise_within_limits(
     ------
     HandLimitsExcludeTask
         If no step satisfies the limits.
+    LinAlgError
+        If the conic program is not solved.
     """
     count = len(offset)
     vectors = len(limits.vectors)
@@ -149,6 +152,7 @@ def minimise_within_limits(
         [np.zeros(count), -(limits.rows + limits.row_slopes @ free), values.ravel()]
     )
     objective = sp.diags_array(np.repeat([0.0, 1.0], count), format="csc")
+    clarabel: Any = import_module("clarabel")  # a compiled module without types
     cones = [clarabel.ZeroConeT(count), clarabel.NonnegativeConeT(len(limits.rows))]
     cones += [clarabel.SecondOrderConeT(4)] * vectors
     settings = clarabel.DefaultSettings()
@@ -167,7 +171,9 @@ def minimise_within_limits(
     if "Infeasible" in status:
         raise HandLimitsExcludeTask
     if status not in ("Solved", "AlmostSolved", "InsufficientProgress"):
-        raise RuntimeError(f"Clarabel ended with {status}")
+        raise np.linalg.LinAlgError(
+            f"no motion within the limits of the hand was found: Clarabel ended with {status}"
+        )
     duals = size**2 * np.array(answer.z)[count:]
     of_rows = duals[: len(limits.rows)]
     of_norms = duals[len(limits.rows) :].reshape(vectors, 4)[:, 0]
@@ -284,6 +290,8 @@ def solve_reduced(
                 answer.status = "flat"
                 break
         answer.derivatives = program.driven.respond(program.drive(c), x)
+    except np.linalg.LinAlgError:  # the best plan remains
+        answer.status = "stalled"
     except KeyboardInterrupt:
         answer.status = "interrupted"
         answer.derivatives = program.driven.respond(program.drive(answer.c), answer.x)

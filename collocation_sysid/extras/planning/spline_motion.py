@@ -150,7 +150,7 @@ class SplineMotion:
         """Duration of the motion [s]."""
         return self.space.duration_s
 
-    @cached_property
+    @property
     def grid_s(self) -> Array:
         """Times from 0 to the duration [s] that resolve all peaks of the motion."""
         return np.linspace(0.0, self.duration_s, CHECK_POINTS * self.space.intervals + 1)
