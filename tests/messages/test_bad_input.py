@@ -287,10 +287,6 @@ PARAMETERS = [
         options=settings("parameters.mu_pa.guess=1"),
     ),
     bad(
-        "guess-out-of-the-assumed-bounds", "mu_pa", "guess = 1e+10", "1e+09", "default value",
-        edit=replace_text(MU, "mu_pa = { guess = 1e10 }"),
-    ),
-    bad(
         "lower-above-upper", "parameters.mu_pa", "lower = 100000", "lower < upper",
         options=settings("parameters.mu_pa.lower=1e5"),
     ),

@@ -664,7 +664,7 @@ def test_faces_are_found_without_any_length():
     assert len(Face("side_x").resolve_faces(mesh)) == 8
     with pytest.raises(InputError, match="the face top selects nodes, and no cells"):
         Face("top").resolve_cells(mesh)
-    with pytest.raises(InputError, match="expected one of top, bottom, side_x, side_y"):
+    with pytest.raises(InputError, match="expected 'top', 'bottom', 'side_x' or 'side_y'"):
         Face("left")  # pyright: ignore[reportArgumentType]
 
 

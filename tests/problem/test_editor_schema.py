@@ -23,7 +23,11 @@ from collocation_sysid.problem.new_problem import TEMPLATES, create_problem
 from collocation_sysid.problem.problem_reading import read_problem_file
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = [each for each in (ROOT / "problems").glob("*/*.toml") if each.name != "limits.toml"]
+SHIPPED = [
+    each
+    for each in (ROOT / "problems").glob("*/*.toml")
+    if each.name not in ("limits.toml", "task.toml")
+]
 
 
 def first_line(file: Path) -> str:

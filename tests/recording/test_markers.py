@@ -171,7 +171,7 @@ def test_a_marker_without_position_is_refused_by_name():
 def test_an_unknown_attachment_is_refused():
     body = box_body()
     attach: Any = "nearest"
-    with pytest.raises(InputError, match="auto, vertex, embedded"):
+    with pytest.raises(InputError, match="'auto', 'vertex' or 'embedded'"):
         place_markers([[0.1, 0.1, 0.1]], body.nodes_m, body, attach=attach)
 
 

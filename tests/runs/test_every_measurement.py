@@ -381,7 +381,7 @@ CHECKS = {
         depth="statistics/test_wrong_depth_images.py::test_check_names_a_flipped_image",
     ),
     "mistakes in the description of body": elsewhere(
-        markers="statistics/test_wrong_tracks.py::test_hidden_errors_of_a_bent_bar_are_named",
+        markers="statistics/test_body_causes.py::test_hidden_errors_of_a_bent_bar_are_named",
         all="statistics/test_sensor_causes.py::test_a_wrong_grasp_is_named_without_markers",
     ),
     "filtered signals": filtered,

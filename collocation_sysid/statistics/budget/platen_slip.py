@@ -117,18 +117,22 @@ def sticking_change_n(iterate: ExperimentIterate, theta: Array) -> Array | None:
     start_m = body.nodes_m.ravel()
     is_held = np.zeros(start_m.size, dtype=bool)
     is_held[prescribed.dofs] = is_held[dofs] = True
-    solver = NewtonSolver(experiment, prescribed=is_held)
+    # Faces that hold every node leave no equilibrium to compute.
+    solver = None if is_held.all() else NewtonSolver(experiment, prescribed=is_held)
     change_n = np.zeros_like(iterate.x)
     x = start_m
     for row, (time_s, slid_m) in enumerate(zip(experiment.t_s, iterate.x, strict=True)):
-        forces = Forces.from_experiment(experiment, float(time_s), theta=theta)
-        equations = static_equations(forces, 1.0, free=solver.free)
         goal_m = slid_m.copy()
         goal_m[dofs] = start_m[dofs]
-        stuck_m = _moved_equilibrium(solver, equations, x, goal_m)
-        if stuck_m is None:
-            return None
-        x = stuck_m
+        if solver is None:
+            x = goal_m
+        else:
+            forces = Forces.from_experiment(experiment, float(time_s), theta=theta)
+            equations = static_equations(forces, 1.0, free=solver.free)
+            stuck_m = _moved_equilibrium(solver, equations, x, goal_m)
+            if stuck_m is None:
+                return None
+            x = stuck_m
         still = np.zeros((2, x.size))
         stuck_n, slid_n = body.force(np.stack([x, slid_m]), still, theta=theta)
         change_n[row, prescribed.dofs] = (stuck_n - slid_n)[prescribed.dofs]
