@@ -247,8 +247,9 @@ def _ideal_predictions(motion: Trajectory) -> tuple[Array, ...]:
     samples; none, (S, 0), of unlabelled points.
     """
     stated = motion.experiment
+    known = [row for row in stated.nuisance.own if row.name in stated.known_deviations]
     experiment = replace(
-        stated, nuisance=Nuisance.none(), markers=replace(stated.markers, offsets_s=None)
+        stated, nuisance=Nuisance.none(own=known), markers=replace(stated.markers, offsets_s=None)
     )
     grid = MotionGrid.at_samples(experiment, motion.reactions[0])
     association = Association(MarkerAssociation.from_experiment(experiment))

@@ -119,7 +119,7 @@ class Direction:
         """Return the combination as text, such as "λ + 0.9 μ" or "E · ν^0.22"."""
         symbols = [symbol_of(name) for name in self.names]
         if self.form == "unstated" and len(symbols) > 1:
-            return f"one combination of {', '.join(symbols)}"
+            return f"a combination of {', '.join(symbols)}"
         if self.form == "sum":
             terms = (
                 symbol if f"{factor:.2g}" == "1" else f"{factor:.2g} {symbol}"
@@ -188,7 +188,7 @@ class Combination:
         """Return what is determined and what is not, as a sentence without a full stop."""
         formula = self.determined.formula()
         if self.determined.form == "unstated":
-            return f"the data determine only {formula}"
+            return f"the data determine {formula} better than each of them"
         if self.modulus is not None:
             formula = f"{symbol_of(self.modulus)} (about {formula})"
         loose = precision_text(self.loosest.factor)

@@ -115,7 +115,18 @@ def test_the_conda_recipe_has_the_same_dependencies():
 def test_every_dependency_states_its_licence():
     page = (ROOT / "docs" / "licences.md").read_text()
     extras = PROJECT["optional-dependencies"]
-    told = "surface c3d tracks video logs cluster film usd mujoco large".split()
+    told = [
+        "surface",
+        "c3d",
+        "tracks",
+        "video",
+        "logs",
+        "cluster",
+        "film",
+        "usd",
+        "mujoco",
+        "large",
+    ]
     for requirement in [
         *PROJECT["dependencies"],
         *(each for extra in told for each in extras[extra]),

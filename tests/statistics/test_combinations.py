@@ -110,7 +110,7 @@ def test_a_third_with_a_fifth_of_the_others_share_belongs_to_the_combination():
 
 def test_values_that_are_not_positive_have_no_powers():
     (found,) = combinations(pair(np.array([1.0, 1.0]), 1e-3, 1.0), values=(1.0, -1.0))
-    assert found.sentence() == "the data determine only one combination of λ, μ"
+    assert found.sentence() == "the data determine a combination of λ, μ better than each of them"
 
 
 def test_a_modulus_that_is_known_as_well_names_the_combination():
