@@ -408,12 +408,12 @@ TOPICS: dict[str, Topic] = {
     "stability": Topic(
         "Unstable states",
         "material",
-        remedy="Does the body buckle there? If not, the damping law generates energy: use damping = "
-        '"kelvin-voigt", which cannot, and make sure that moduli and densities are plausible.',
+        remedy="Does the body buckle there? If not, check moduli and densities, and the damping law: "
+        'only "kelvin-voigt" never generates energy.',
         messages={
             "grows": "the motion of '{experiment}' is unstable at t = {time_s:.3g} s: disturbances "
-            "grow at a rate of {growth_1_s:.2g} 1/s. If the body does not buckle there, use "
-            'damping = "kelvin-voigt", and check moduli and densities',
+            "grow at a rate of {growth_1_s:.2g} 1/s. If the body does not buckle there, "
+            'check moduli and densities, and the damping law: only "kelvin-voigt" never generates energy',
             "branch": "the equilibria of '{experiment}' from {time_s:.4g} s on are not those that "
             "its loads lead to from the samples before, and depend on mesh and rounding: {why}",
             "material": "the material {material}{where} is unstable at strains of '{experiment}' "
