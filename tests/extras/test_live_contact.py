@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from kit.frames import NO_TIME, frames_of
 from kit.problems import nodes_where
 
 import collocation_sysid as cs
+from collocation_sysid.extras.live import estimator
 from collocation_sysid.extras.live.estimator import LiveEstimator
 from collocation_sysid.extras.live.live_model import model_from_problem
 
@@ -21,7 +23,7 @@ EDGE_M, SIGMA_M, SIGMA_N = 0.05, 1e-4, 0.01
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def touching(name: str, nuisance: cs.Nuisance) -> cs.Problem:
+def touching(name: str, nuisance: cs.Nuisance, substeps: int | Literal["auto"] = 1) -> cs.Problem:
     """A block that a gripper presses on a table that rubs and feels, or a ball into it."""
     body = cs.Body(cs.box_mesh((EDGE_M,) * 3, (1, 1, 2)), density_kg_m3=400.0)
     t_s = np.linspace(0.0, 0.24, 16)
@@ -54,7 +56,7 @@ def touching(name: str, nuisance: cs.Nuisance) -> cs.Problem:
         table = replace(table, wrench=replace(forces, values=felt))
         seen_there = seen_there.with_obstacles([table])
     known = cs.Parameters.from_mapping({**TRUTH, **UNKNOWN, **sought})
-    return cs.Problem([seen_there], known, scheme="bdf2")
+    return cs.Problem([seen_there], known, scheme="bdf2", substeps=substeps)
 
 
 CASES = {
@@ -85,6 +87,17 @@ def test_live_contact_ends_where_the_batch_ends(name: str):
         assert abs(last.value - known.value) < 3 * known.statistical_std_error
         assert abs(end.value - known.value) < 1e-3 * known.statistical_std_error
         assert end.statistical_std_error == pytest.approx(known.statistical_std_error, rel=1e-3)
+
+
+@pytest.mark.long
+def test_a_frame_ends_although_each_pass_asks_for_another(monkeypatch):
+    monkeypatch.setattr(estimator, "MOST_PASSES", 5)
+    problem = touching("table", cs.Nuisance.none(obstacle_offset_m=2e-4), substeps="auto")
+    live = LiveEstimator(problem, NO_TIME)
+    live.budget_s = np.inf
+    for _, frame in zip(range(5), frames_of(problem, live), strict=False):
+        update = live.process_frame(frame)
+    assert np.isfinite(update.estimates["young_pa"].value)
 
 
 def test_an_obstacle_whose_delay_is_estimated_is_refused():

@@ -67,6 +67,8 @@ REPEAT_DISTANCE = 0.1
 RELINEARISE_DISTANCE = 1.0
 # The same distance for the first pass, which receives the frames.
 RELINEARISE_DISTANCE_FIRST = 3.0
+# Largest number of passes that begin in one frame: impacts may let each pass ask for another one.
+MOST_PASSES = 100
 # Initial radius of the trust region, see `methods.minimise`.
 INITIAL_RADIUS = 1.0
 # Largest radius of the trust region.
@@ -882,11 +884,15 @@ class LiveEstimator:
         further row is affordable. Passes, estimate and budget are changed. Without effect before
         the first pass.
         """
+        started = 0
         while self.first_pass is not None:
             pass_began = self.clock()
-            if self.second_pass is None and self._affordable_rows(
-                done, pass_began - began + self.budget.turn_s
+            if (
+                self.second_pass is None
+                and started < MOST_PASSES
+                and self._affordable_rows(done, pass_began - began + self.budget.turn_s)
             ):
+                started += 1
                 self.second_pass = self._start_second_pass(self.first_pass, notes)
                 self.budget.record_relinearisation(self.clock() - pass_began)
             second_pass = self.second_pass
