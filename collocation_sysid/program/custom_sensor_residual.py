@@ -23,7 +23,7 @@ from ..recording.experiment import Experiment
 from ..recording.placement import place_markers
 from ..recording.sample_times import TIME_TOLERANCE_S
 from .association import Association
-from .correspondences import Correspondences
+from .correspondences import CorrespondenceResidual, Correspondences
 from .markers.marker_association import MarkerAssociation
 from .measurement_model import MeasurementModel
 from .measurement_residual import (
@@ -173,9 +173,7 @@ class CustomSensorResidual(MeasurementResidual):
         sample depends.
         """
         first = int(self.is_compared.any(axis=(1, 2)).argmax())
-        return float(
-            self.observable_s[self._stencil.indices[first, 0, -1] // self.observable.vector_count]
-        )
+        return float(self.observable_s[self._times[first, -1]])
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the user's expression (m,), padded with zeros to a multiple of three numbers.
@@ -231,6 +229,27 @@ class CustomSensorResidual(MeasurementResidual):
     def numbers(self, predicted: Array) -> Array:
         """Return predictions (S, G, 3) as the numbers (S, m) of the sensor, without padding."""
         return super().numbers(predicted)[:, : self.sensor.measured_values.shape[1]]
+
+
+@dataclass(frozen=True, eq=False)
+class CorrespondingSensorResidual(CustomSensorResidual, CorrespondenceResidual):
+    """Measurement model of a custom sensor whose correspondences follow the shapes of the body."""
+
+    @property
+    def first_row(self) -> int:
+        """Index of the last time of the observable from which the first sample is computed."""
+        return int(self._times[0, -1])
+
+    def _shapes(self, x: Array) -> Array:
+        """Return the nodes (s, n, 3) [m] at those first samples that rows x (rows, 3n) reach."""
+        known = int(np.count_nonzero(self._times[:, -1] < len(x)))
+        nodes_m = x.reshape(len(x), -1, 3)
+        distances_s = self.observable_s[self._times] - self.t_s[:, None]
+        shapes = [
+            np.tensordot(lagrange_weights(0.0, late_s.tolist()), nodes_m[times], 1)
+            for times, late_s in zip(self._times[:known], distances_s[:known], strict=True)
+        ]
+        return np.reshape(shapes, (known, *nodes_m.shape[1:]))
 
 
 def is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:

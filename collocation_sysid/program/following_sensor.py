@@ -14,11 +14,11 @@ from ..fem.body import Body
 from ..recording.custom_sensor import FollowingSensor
 from ..recording.placement import Placement
 from .association import Association
-from .correspondences import CorrespondenceResidual, Correspondences
-from .custom_sensor_residual import CustomSensorResidual
+from .correspondences import Correspondences
+from .custom_sensor_residual import CorrespondingSensorResidual
 from .markers.marker_association import MarkerAssociation
 from .measurement_model import CorrespondenceModel
-from .measurement_residual import GROUP, ResidualExpression, SampledMotion, lagrange_weights
+from .measurement_residual import GROUP, ResidualExpression, SampledMotion
 from .observables import PointPositions
 
 
@@ -60,7 +60,7 @@ class NodesOfSamples(Correspondences):
 
 
 @dataclass(frozen=True, eq=False)
-class FollowingSensorResidual(CustomSensorResidual, CorrespondenceResidual):
+class FollowingSensorResidual(CorrespondingSensorResidual):
     """Residual of a custom sensor at given nodes; its observable are all nodes of the body."""
 
     correspondences: NodesOfSamples
@@ -69,11 +69,6 @@ class FollowingSensorResidual(CustomSensorResidual, CorrespondenceResidual):
     def point_indices(self) -> NDArray[np.integer]:
         """Nodes (S, P) of each sample."""
         return self.correspondences.nodes
-
-    @property
-    def first_row(self) -> int:
-        """Index of the last time of the observable from which the first sample is computed."""
-        return int(self._times[0, -1])
 
     @property
     def observable_sigmas(self) -> Array:
@@ -90,17 +85,6 @@ class FollowingSensorResidual(CustomSensorResidual, CorrespondenceResidual):
         np.add.at(squares, components, np.sum(np.nan_to_num(by_nodes) ** 2, axis=1))
         with np.errstate(divide="ignore"):
             return 1 / np.sqrt(squares / max(1, self.is_compared.sum()))
-
-    def _shapes(self, x: Array) -> Array:
-        """Return the nodes (s, n, 3) [m] at those first samples that rows x (rows, 3n) reach."""
-        known = int(np.count_nonzero(self._times[:, -1] < len(x)))
-        nodes_m = x.reshape(len(x), -1, 3)
-        distances_s = self.observable_s[self._times] - self.t_s[:, None]
-        shapes = [
-            np.tensordot(lagrange_weights(0.0, late_s.tolist()), nodes_m[times], 1)
-            for times, late_s in zip(self._times[:known], distances_s[:known], strict=True)
-        ]
-        return np.reshape(shapes, (known, *nodes_m.shape[1:]))
 
     def reassociated(self, x: Array, phi: Array) -> NodesOfSamples:
         """Return the nodes of the shapes that the first rows x reach."""

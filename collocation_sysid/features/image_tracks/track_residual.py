@@ -20,8 +20,8 @@ import numpy as np
 
 from ...common.array_types import Array, Index
 from ...program.association import Association
-from ...program.correspondences import CorrespondenceResidual, Correspondences
-from ...program.custom_sensor_residual import CustomSensorResidual, is_within
+from ...program.correspondences import Correspondences
+from ...program.custom_sensor_residual import CorrespondingSensorResidual, is_within
 from ...program.measurement_model import CorrespondenceModel
 from ...program.measurement_residual import GROUP, ResidualExpression, RowStencil, lagrange_weights
 from ...program.observables import PointPositions
@@ -37,7 +37,7 @@ LEAST_DEPTH_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class ImageTrackResidual(CustomSensorResidual, CorrespondenceResidual):
+class ImageTrackResidual(CorrespondingSensorResidual):
     """Residual of the tracks of one camera; its entities are the points, its observable their
     positions.
     """
@@ -132,12 +132,6 @@ class ImageTrackResidual(CustomSensorResidual, CorrespondenceResidual):
         return predicted[..., :2].reshape(len(predicted), -1)
 
     @property
-    def first_needed_s(self) -> float:
-        """Time [s] of the last row of the motion on which the first compared image depends."""
-        first = int(self.is_compared.any(axis=(1, 2)).argmax())
-        return float(self.observable_s[self._times[first, -1]])
-
-    @property
     def observable_sigmas(self) -> Array:
         """Standard deviations (3N,) of the positions as one pixel determines them, along any axis:
         σ times the distance of the body from the camera over the focal length.
@@ -156,22 +150,6 @@ class ImageTrackResidual(CustomSensorResidual, CorrespondenceResidual):
         return 2 * int(np.sum(self.sensor.is_seen & places.is_placed & ~places.is_visible))
 
     # Correspondences --------------------------------------------------------------------------
-
-    @property
-    def first_row(self) -> int:
-        """Index of the last time of the observable from which the first image is computed."""
-        return int(self._times[0, -1])
-
-    def _shapes(self, x: Array) -> Array:
-        """Return the nodes (s, n, 3) [m] at those first images that rows x (rows, 3n) reach."""
-        known = int(np.count_nonzero(self._times[:, -1] < len(x)))
-        nodes_m = x.reshape(len(x), -1, 3)
-        distances_s = self.observable_s[self._times] - self.t_s[:, None]
-        shapes = [
-            np.tensordot(lagrange_weights(0.0, late_s.tolist()), nodes_m[times], 1)
-            for times, late_s in zip(self._times[:known], distances_s[:known], strict=True)
-        ]
-        return np.reshape(shapes, (known, *nodes_m.shape[1:]))
 
     def reassociated(self, x: Array, phi: Array) -> TrackedPlaces:
         """Return places and visible points for the shapes that the first rows reach."""
