@@ -316,6 +316,24 @@ class Problem:
             chosen.require(each for each in self.experiments if not each.validation)
         return cast(Method, chosen)
 
+    def require_guesses(self, why: str, otherwise: str = "") -> None:
+        """Raise an `InputError`, naming the parameter and the remedy, if one has no guess.
+
+        Parameters
+        ----------
+        why : str
+            Why a value is needed, as a clause that begins with "and" or "but".
+        otherwise : str
+            Another remedy, behind that of a stated guess.
+        """
+        if names := self.parameters.list_names_without_guess():
+            key = f"parameters.{names[0]}"
+            raise InputError(
+                f"this parameter has no guess, {why}; expected --set {key}.guess=VALUE{otherwise}",
+                self.path,
+                where=key,
+            )
+
     def _validate(self) -> None:
         """Raise `InputError` if experiments, parameters and options do not fit together; return
         nothing.

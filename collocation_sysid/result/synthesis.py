@@ -162,7 +162,7 @@ def write_data(
     """
     place = Path(folder)
     recipe = recipe or Recipe()
-    _require_guesses(problem)
+    problem.require_guesses("and a simulation needs a value")
     sections = _experiment_sections(problem)
     names = [_table_names(each, sections.get(each.name)) for each in problem.experiments]
     _require_separate_files(problem, names)
@@ -313,18 +313,6 @@ def _wrench_layouts(section: ExperimentSection | None) -> list[ForceSensorSectio
     """
     moved = section.moved_sections if section is not None else []
     return [each.sensor for each in moved if each.sensor is not None]
-
-
-def _require_guesses(problem: Problem) -> None:
-    """Raise an `InputError`, naming the parameter and the remedy, if a parameter has no guess."""
-    if names := problem.parameters.list_names_without_guess():
-        key = f"parameters.{names[0]}"
-        raise InputError(
-            "this parameter has no guess, and a simulation needs a value; expected --set "
-            f"{key}.guess=VALUE",
-            problem.path,
-            where=key,
-        )
 
 
 def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> None:

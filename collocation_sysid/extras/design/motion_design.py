@@ -392,7 +392,10 @@ def design_motion(
         say("identifying the parameters from the existing recordings")
         draws, known = _draws_from_recordings(problem, options)
     else:
-        _require_guesses(problem)
+        problem.require_guesses(
+            "but a motion is designed for a value of each parameter",
+            ", or --add to identify the parameter first",
+        )
         draws = prior_draws(
             problem.parameters, options.spread, pairs=options.pairs, seed=options.seed
         )
@@ -521,18 +524,6 @@ def _select_experiment(problem: Problem, name: str | None) -> Experiment:
     named = {each.name: each for each in moving}
     require_among(name, named, source=problem.path, where="--experiment")
     return named[name]
-
-
-def _require_guesses(problem: Problem) -> None:
-    """Raise `InputError` if a parameter has no guess."""
-    if names := problem.parameters.list_names_without_guess():
-        key = f"parameters.{names[0]}"
-        raise InputError(
-            "this parameter has no guess, but a motion is designed for a value of each parameter; "
-            f"expected --set {key}.guess=VALUE, or --add to identify the parameter first",
-            problem.path,
-            where=key,
-        )
 
 
 def _no_motion_message(best: SearchResult) -> str:

@@ -95,14 +95,9 @@ class PlannedBody:
 
     @classmethod
     def _from_problem(cls, problem: Problem, experiment: str | None) -> PlannedBody:
-        if names := problem.parameters.list_names_without_guess():
-            key = f"parameters.{names[0]}"
-            raise InputError(
-                "this parameter has no guess, but a motion is planned for a value of each "
-                f"parameter; expected --set {key}.guess=VALUE, or a run that identified it",
-                problem.path,
-                where=key,
-            )
+        problem.require_guesses(
+            "but a motion is planned for a value of each parameter", ", or a run that identified it"
+        )
         template = _select(problem, problem.experiments, experiment)
         places = _stated_places(template)
         return cls(problem, template, problem.parameters.guess_q, None, places)
