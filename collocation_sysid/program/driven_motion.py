@@ -1,8 +1,7 @@
 """Motion of one experiment as a function of the prescribed positions of its grasped dofs.
 
 Methods that choose the motion of a grasp, instead of reading it from a recording, need the motion
-of the body, its derivatives by the prescribed positions and by the inputs of the equations of
-motion, and the sparse matrices of the collocation program. The parameters q are fixed.
+of the body and its derivatives by the prescribed positions. The parameters q are fixed.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ MOST_CORRECTIONS = 4
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Prescribed positions and inputs that drive a motion, with their derivatives by controls.
+    """Prescribed positions that drive a motion, with their derivatives by controls.
 
     Attributes
     ----------
@@ -42,16 +41,15 @@ class Drive:
         Prescribed positions of the grasped dofs at the grid times [m].
     by_control : (N, g, c) array
         Their derivatives by the c controls; empty, c = 0, where none are needed.
-    inputs : (N, k) array
-        Values of the k controlled inputs (amplitudes of actuators) at the evaluations; k may be 0.
-    inputs_by_control : (N, k, c) array
-        Their derivatives by the controls.
     """
 
     goals_m: Array
     by_control: Array
-    inputs: Array
-    inputs_by_control: Array
+
+    @property
+    def without_controls(self) -> Drive:
+        """The same positions without derivatives."""
+        return Drive(self.goals_m, self.by_control[..., :0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +62,10 @@ class DrivenMotion:
         Discretised experiment without nuisance parameters of the motion.
     q : (nq,) array
         Parameters in the solver's coordinates.
-    input_columns : (k,) array of int
-        Controlled entries of the inputs u.
     """
 
     transcription: Transcription
     q: Array
-    input_columns: Index
 
     @classmethod
     def from_experiment(
@@ -80,7 +75,6 @@ class DrivenMotion:
         scheme: str | Scheme,
         substeps: int,
         q: Array,
-        actuators: tuple[int, ...] = (),
     ) -> DrivenMotion:
         """Discretise an experiment; all prescribed displacements become constraints of the
         collocation program.
@@ -97,26 +91,17 @@ class DrivenMotion:
             Time steps between samples.
         q : (nq,) array
             Parameters in the solver's coordinates.
-        actuators : tuple of int
-            Indices of the controlled actuators among `Experiment.actuators`.
         """
         program = Collocation(
             [experiment], parameters, scheme=scheme, substeps=substeps, has_grasp_constraints=True
         )
         (transcription,) = program.transcriptions
-        first = sum(each.size for each in transcription.inputs.groups)
-        first -= len(experiment.actuators)
-        return cls(transcription, q, np.array([first + k for k in actuators], dtype=np.int64))
+        return cls(transcription, q)
 
     @property
     def t_s(self) -> Array:
         """Grid times (N,) [s]."""
         return self.transcription.dynamics.t_s
-
-    @property
-    def evaluated_s(self) -> Array:
-        """Times (N,) of the evaluations of the forces [s]."""
-        return self.transcription.dynamics.evaluated_s
 
     @property
     def dofs(self) -> Index:
@@ -141,23 +126,15 @@ class DrivenMotion:
         place of the parameters.
         """
         stated = self._stated
-        count = drive.by_control.shape[2]
         u, _ = stated.inputs.evaluate_at(stated.p)
-        by_control = np.zeros((*u.shape, count))
-        dynamics = stated.dynamics
-        if len(self.input_columns):
-            u = np.array(u)
-            u[:, self.input_columns] = drive.inputs
-            by_control[:, self.input_columns] = drive.inputs_by_control
-            dynamics = dynamics.with_inputs(u)
-        else:
-            by_control = np.broadcast_to(by_control[:1], by_control.shape)
+        # The inputs do not depend on the controls.
+        by_control = np.broadcast_to(0.0, (*u.shape, drive.by_control.shape[2]))
         goals = np.full((len(self.t_s), self.transcription.dof_count), np.nan)
         goals[:, self.dofs] = drive.goals_m
         return replace(
             stated,
             input_derivatives=by_control,
-            dynamics=replace(dynamics, prescribed_m=goals),
+            dynamics=replace(stated.dynamics, prescribed_m=goals),
             prescribed=PrescribedDisplacements(self.dofs, drive.goals_m, by_phi=drive.by_control),
         )
 
@@ -182,7 +159,7 @@ class DrivenMotion:
         SimulationError
             If a time step fails.
         """
-        equations = self.equations(drive)
+        equations = self.equations(drive.without_controls)
         if near is not None:
             corrected = self._corrected(equations, near)
             if corrected is not None:
@@ -199,20 +176,15 @@ class DrivenMotion:
 
     def _corrected(self, equations: EquationsAtParameters, near: Array) -> Array | None:
         """Return the motion from Newton's method on all time steps at once, None if it does not
-        converge quickly.
+        converge quickly; the equations have no controls.
         """
         goals = equations.dynamics.prescribed_m
         x = np.where(np.isnan(goals), near, goals)
-        alone = replace(
-            equations,
-            prescribed=replace(equations.prescribed, by_phi=equations.prescribed.by_phi[:, :, :0]),
-            input_derivatives=equations.input_derivatives[..., :0],
-        )
         previous = np.inf
         for _ in range(MOST_CORRECTIONS):
             try:
                 with np.errstate(all="ignore"):
-                    step, _, violation = self._respond(alone, x)
+                    step, _, violation = self._respond(equations, x)
             except SimulationError:
                 return None
             if not np.isfinite(violation) or violation > 0.5 * previous:
@@ -259,22 +231,6 @@ class DrivenMotion:
     def respond_to_parameters(self, drive: Drive, x: Array) -> Array:
         """Return the derivatives (N, 3n, nq) of a motion x (N, 3n) [m] by the parameters q."""
         stated = self._stated
-        equations = self.equations(drive)
         _, by_q = stated.inputs.evaluate_at(stated.p)
-        if len(self.input_columns):
-            by_q = np.array(by_q)
-            by_q[:, self.input_columns] = 0.0
-        equations = replace(equations, input_derivatives=by_q)
-        return np.array(
-            [
-                *self._sweep.sensitivities(
-                    x,
-                    replace(
-                        equations,
-                        prescribed=replace(
-                            equations.prescribed, by_phi=equations.prescribed.by_phi[:, :, :0]
-                        ),
-                    ),
-                )
-            ]
-        )
+        equations = replace(self.equations(drive.without_controls), input_derivatives=by_q)
+        return np.array([*self._sweep.sensitivities(x, equations)])

@@ -19,6 +19,7 @@ from ...problem import Problem
 from ...program.simulation import Trajectory, simulate
 from ...recording import PoseSequence
 from ...runs.solved_problem import SolvedProblem
+from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.hand_limits import REACHED, Limits
 from .planned_body import PlannedBody
 from .planned_program import POSES_PER_SAMPLE, PlannedProgram
@@ -34,8 +35,6 @@ from .task import Reference, Task
 
 # Time steps of the simulation that checks a plan, for each of the plan's.
 FINER = 4
-# Half width of a 95 % interval over the standard deviation.
-HALF_WIDTH_95 = 1.959964
 
 
 @dataclass(frozen=True)
@@ -201,7 +200,7 @@ class MotionPlan:
         return TrackingError(
             rms,
             float(distance.max()),
-            HALF_WIDTH_95 * float(spread.max()),
+            NORMAL_95 * float(spread.max()),
             float(np.sqrt(np.mean(distance**2 + np.sum(spread**2, axis=1)))),
         )
 
@@ -290,19 +289,10 @@ def _finely_simulated(program: PlannedProgram, c: Array) -> Trajectory:
     """Return the simulation of a plan with `FINER` time steps for each of the plan's."""
     since_s = program.experiment.t_s - program.experiment.t_s[0]
     fine_s = np.linspace(0.0, since_s[-1], POSES_PER_SAMPLE * (len(since_s) - 1) + 1)
-    experiment = program.body.experiment(
-        program.poses(c, fine_s),
-        program.experiment.t_s,
-        dict(
-            zip(
-                program.experiment.markers.names,
-                program.experiment.markers.predict_positions(program.experiment.body.nodes_m[None])[
-                    0
-                ],
-                strict=True,
-            )
-        ),
-    )
+    markers = program.experiment.markers
+    places_m = markers.predict_positions(program.experiment.body.nodes_m)
+    points = dict(zip(markers.names, places_m, strict=True))
+    experiment = program.body.experiment(program.poses(c, fine_s), program.experiment.t_s, points)
     problem = program.body.problem
     values = problem.parameters.values(program.body.q)
     substeps = FINER * program.driven.transcription.substeps

@@ -14,8 +14,9 @@ from ...result.figure_style import (
     own_settings,
     style_axes,
 )
+from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.design_page import motion_picture_of
-from .motion_plan import HALF_WIDTH_95, MotionPlan
+from .motion_plan import MotionPlan
 
 
 @own_settings()
@@ -45,7 +46,7 @@ def tracking_picture(plan: MotionPlan) -> Figure:
             wanted = 1e3 * (reference.position_m[:, axis] - points[0, axis])
             panel.plot(plan.t_s, wanted, color=colour, lw=LINE_PT, ls="--")
             if std is not None:
-                half = 1e3 * HALF_WIDTH_95 * std[reference.name][:, axis]
+                half = 1e3 * NORMAL_95 * std[reference.name][:, axis]
                 panel.fill_between(
                     plan.t_s, middle - half, middle + half, color=colour, alpha=0.2, lw=0
                 )

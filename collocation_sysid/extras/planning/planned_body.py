@@ -175,7 +175,9 @@ class PlannedBody:
         grasp = self.template.grasps[self.grasp_number]
         return np.asarray(self.template.body.nodes_m[grasp.nodes].mean(axis=0), dtype=np.float64)
 
-    def experiment(self, poses: PoseSequence, t_s: Array, points: dict[str, Array]) -> Experiment:
+    def experiment(
+        self, poses: PoseSequence | None, t_s: Array, points: dict[str, Array]
+    ) -> Experiment:
         """Return the experiment of a plan: the recording with other poses of the planned grasp and
         other times, from equilibrium, with points in place of the measurements.
 
@@ -183,8 +185,8 @@ class PlannedBody:
 
         Parameters
         ----------
-        poses : PoseSequence
-            Poses of the planned grasp over the times.
+        poses : PoseSequence or None
+            Poses of the planned grasp over the times; None if it stays where it is, too.
         t_s : (T,) array
             Times, from the first sample of the recording on.
         points : dict of name to (3,) array
@@ -193,7 +195,8 @@ class PlannedBody:
         template = self.template
         grasps = []
         for number, grasp in enumerate(template.grasps):
-            moved = poses if number == self.grasp_number else _standing(grasp.poses, t_s)
+            is_planned = number == self.grasp_number and poses is not None
+            moved = poses if is_planned else _standing(grasp.poses, t_s)
             grasps.append(replace(grasp, poses=moved, wrench=None))
         changes: dict[str, Any] = {
             "start_positions_m": None,

@@ -21,6 +21,7 @@ from typing import NamedTuple, cast
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
+from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...common.time_dependence import at_times
@@ -235,10 +236,7 @@ class PlannedProgram:
         def standing(samples: int) -> tuple[Experiment, DrivenMotion]:
             """Return the experiment with `samples` samples in which the hand stands."""
             t_s = template.t_s[0] + sample_s * np.arange(samples)
-            matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = rotation, translation
-            poses = PoseSequence.from_matrices(t_s[:1], matrix[None])
-            experiment = body.experiment(poses, t_s, points)
+            experiment = body.experiment(None, t_s, points)
             return experiment, DrivenMotion.from_experiment(
                 experiment,
                 body.problem.parameters,
@@ -248,7 +246,8 @@ class PlannedProgram:
             )
 
         _, brief = standing(3)
-        start = brief.simulate(_standing_drive(brief))[0]
+        goals = brief.stated_goals_m
+        start = brief.simulate(Drive(goals, np.zeros((*goals.shape, 0))))[0]
         lowest_hz = _lowest_frequency_hz(brief, start)
         window = _window_samples(task, sample_s, lowest_hz)
         experiment, driven = standing(count + 1 + window)
@@ -301,8 +300,7 @@ class PlannedProgram:
         by_control = np.zeros((*goals.shape, len(c)))
         goals[:, self.planned_columns] = positions.reshape(rows, -1)
         by_control[:, self.planned_columns] = slopes.reshape(rows, -1, 6) @ matrix
-        nothing = np.zeros((rows, 0, len(c)))
-        return Drive(goals, by_control, np.zeros((rows, 0)), nothing)
+        return Drive(goals, by_control)
 
     def coordinates(self, c: Array, t_s: Array) -> Array:
         """Return the coordinates (T, 6) of the hand at times since the start."""
@@ -313,8 +311,6 @@ class PlannedProgram:
         them: a grasped node at X of the undeformed body is at R X + p. Times of the poses are those
         of the experiment.
         """
-        from scipy.spatial.transform import Rotation
-
         coordinates = self.coordinates(c, t_s)
         turned = Rotation.from_rotvec(coordinates[:, 3:]) * Rotation.from_matrix(
             self.frame.rotation
@@ -418,10 +414,9 @@ class PlannedProgram:
         rows = np.arange(first, len(self.grid_since_s) - 1)
         omega = 2 * np.pi * self.lowest_hz
         scale = 1 / (omega * self.task.end.sigma_m * step_s * np.sqrt(len(rows)))
-        difference = _selection(rows + 1, len(self.grid_since_s), np.full(len(rows), scale))
-        difference = difference - _selection(
-            rows, len(self.grid_since_s), np.full(len(rows), scale)
-        )
+        weights = np.full(len(rows), scale)
+        difference = _selection(rows + 1, len(self.grid_since_s), weights)
+        difference = difference - _selection(rows, len(self.grid_since_s), weights)
         of_dofs = sp.csr_array(
             (weight, (np.arange(len(free)), free)), shape=(len(free), transcription.dof_count)
         )
@@ -477,12 +472,6 @@ def _farthest_node(body: PlannedBody) -> dict[str, Array]:
     nodes_m = body.template.body.nodes.points_m
     farthest = np.linalg.norm(nodes_m - body.hand_m, axis=1).argmax()
     return {"farthest node": nodes_m[farthest]}
-
-
-def _standing_drive(driven: DrivenMotion) -> Drive:
-    goals = driven.stated_goals_m
-    rows = len(goals)
-    return Drive(goals, np.zeros((*goals.shape, 0)), np.zeros((rows, 0)), np.zeros((rows, 0, 0)))
 
 
 def _space(task: Task, bounds: HandBounds) -> SplineSpace:

@@ -16,7 +16,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ..design.hand_limits import WITHIN, HandBounds
@@ -187,15 +186,12 @@ class HandFrame:
         """Return the positions of the grasped nodes (T, n, 3) [m] at coordinates (T, 6), and their
         derivatives (T, n, 3, 6) by the coordinates.
         """
-        turns = coordinates[:, 3:]
-        turned = np.einsum("tij,nj->tni", Rotation.from_rotvec(turns).as_matrix(), self.arms_m)
+        rotations, by_turn = _turns(coordinates[:, 3:])
+        turned = np.einsum("tij,nj->tni", rotations, self.arms_m)
         positions = turned + (self.position_m + coordinates[:, :3])[:, None]
         slopes = np.zeros((*positions.shape, 6))
         slopes[..., :3] = np.eye(3)
-        jacobians = left_jacobians(turns)
-        # A change w of the orientation moves an arm a by w × a.
-        for axis in range(3):
-            slopes[..., 3 + axis] = np.cross(jacobians[:, None, :, axis], turned)
+        slopes[..., 3:] = np.einsum("tijk,nj->tnik", by_turn, self.arms_m)
         return positions, slopes
 
     def weighted_hessian(self, coordinates: Array, weights: Array) -> Array:
@@ -208,24 +204,6 @@ class HandFrame:
         values = _turn_curvature().map(stacked.shape[1])(stacked).full()
         curvature[:, 3:, 3:] = values.reshape(3, -1, 3).transpose(1, 0, 2)
         return curvature
-
-
-def left_jacobians(turns: Array) -> Array:
-    """Return the left Jacobians (T, 3, 3) of the exponential map at rotation vectors (T, 3): a
-    change d of the vector turns by J d in the fixed frame.
-    """
-    square = np.sum(turns**2, axis=1)
-    small = square < SMALL_SQUARE
-    safe = np.sqrt(np.where(small, 1.0, square))
-    a = np.where(small, 1 / 2 - square / 24 + square**2 / 720, (1 - np.cos(safe)) / safe**2)
-    b = np.where(small, 1 / 6 - square / 120 + square**2 / 5040, (safe - np.sin(safe)) / safe**3)
-    cross = np.zeros((len(turns), 3, 3))
-    for (i, j), (axis, sign) in {
-        (0, 1): (2, -1), (0, 2): (1, 1), (1, 0): (2, 1),
-        (1, 2): (0, -1), (2, 0): (1, -1), (2, 1): (0, 1),
-    }.items():  # fmt: skip
-        cross[:, i, j] = sign * turns[:, axis]
-    return np.eye(3) + a[:, None, None] * cross + b[:, None, None] * (cross @ cross)
 
 
 # Expressions --------------------------------------------------------------------------------------
@@ -255,6 +233,18 @@ def rotation_expression(turn: ca.SX) -> ca.SX:
     sinc, a, _ = _factors(ca.sumsqr(turn))
     cross = ca.skew(turn)
     return ca.SX.eye(3) + sinc * cross + a * (cross @ cross)
+
+
+def _turns(vectors: Array) -> tuple[Array, Array]:
+    """Return the rotation matrices (T, 3, 3) of rotation vectors (T, 3), and their derivatives
+    (T, 3, 3, 3) by these.
+    """
+    turn = ca.SX.sym("turn", 3)
+    rows = ca.vec(rotation_expression(turn).T)
+    function = ca.Function("turns", [turn], [rows, ca.densify(ca.jacobian(rows, turn))])
+    values, slopes = (each.full() for each in function.map(len(vectors))(vectors.T))
+    by_turn = slopes.reshape(3, 3, len(vectors), 3).transpose(2, 0, 1, 3)
+    return values.T.reshape(-1, 3, 3), by_turn
 
 
 def _turn_curvature() -> ca.Function:
