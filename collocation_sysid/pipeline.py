@@ -222,12 +222,7 @@ def run(
             )
             if problem.substeps == "auto":
                 answer, fit = _fine_enough(
-                    answer,
-                    fit,
-                    solver=problem.solver(method),
-                    watch=watch,
-                    say=say,
-                    scheduler=scheduler,
+                    answer, fit, solver=solver, watch=watch, say=say, scheduler=scheduler
                 )
             answer = _with_problem_notes(answer)
             if answer.uncertainty is not None and fit is not None:

@@ -132,22 +132,22 @@ def solve(
     for experiment in problem.experiments:
         experiment.require_measured_values()
     solver = problem.solver(method)
-    if isinstance(solver, ReducedSpace):
-        try:
-            with time_limit(solver.max_time_s):
-                solution = _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
-        except TimeLimitReached:
-            raise InputError(
-                f"no start of the search was found within {solver.max_time_s:g} s; raise the limit, "
-                f"or give guesses{_incompressible_remedy(problem)}",
-                problem.path,
-                where="solver.reduced-space.max_time_s",
-            ) from None
-        if solution.status is Status.TIME_LIMIT:
-            remedy = _incompressible_remedy(problem)
-            solution = replace(solution, message=solution.message.rstrip(".") + f"{remedy}.")
-        return solution
-    return _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+    if not isinstance(solver, ReducedSpace):
+        return _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+    try:
+        with time_limit(solver.max_time_s):
+            solution = _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+    except TimeLimitReached:
+        raise InputError(
+            f"no start of the search was found within {solver.max_time_s:g} s; raise the limit, "
+            f"or give guesses{_incompressible_remedy(problem)}",
+            problem.path,
+            where="solver.reduced-space.max_time_s",
+        ) from None
+    if solution.status is Status.TIME_LIMIT:
+        remedy = _incompressible_remedy(problem)
+        solution = replace(solution, message=solution.message.rstrip(".") + f"{remedy}.")
+    return solution
 
 
 def _incompressible_remedy(problem: Problem) -> str:

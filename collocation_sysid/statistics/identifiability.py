@@ -9,14 +9,12 @@ import numpy as np
 from ..errors import listed
 from ..fem.laws.constants import without_region
 from ..fem.laws.moduli import ELASTIC
-from .combinations import Combination
+from .combinations import HOPELESS, PERCENT, Combination
 from .estimates import Estimate
 from .uncertainty import Uncertainty
 
 # Interval as a factor up to which a parameter is well determined.
 WELL_FIXED = 1.25
-# Interval as a factor above which it is useless.
-HOPELESS = 1e4
 
 
 def identifiability_sentences(
@@ -102,6 +100,6 @@ def _precision_text(factor: float) -> str:
     """Return an interval's half width, given as a factor of 1 or more, as text: in per cent below
     1.5, "no useful range" from `HOPELESS` on.
     """
-    if factor < 1.5:
+    if factor < PERCENT:
         return f"±{100 * (factor - 1):.2g} %"
     return f"within a factor of {factor:.2g}" if factor < HOPELESS else "no useful range"

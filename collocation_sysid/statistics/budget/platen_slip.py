@@ -55,8 +55,8 @@ def slip_displacements_m(
     """
     experiment = iterate.transcription.experiment
     prescribed = iterate.equations.prescribed
-    axis = pressed_axis(prescribed.dofs, prescribed.positions_m)
-    if axis is None or experiment.obstacles or not is_load_only(experiment):
+    axis = _axis_between_platens(iterate)
+    if axis is None:
         return None
     faces = sliding_faces(experiment, prescribed.dofs, reactions_n=reactions_n, axis=axis)
     released = _released_dofs(experiment, faces, axis=axis)
@@ -106,8 +106,8 @@ def sticking_change_n(iterate: ExperimentIterate, theta: Array) -> Array | None:
     """
     experiment = iterate.transcription.experiment
     prescribed = iterate.equations.prescribed
-    axis = pressed_axis(prescribed.dofs, prescribed.positions_m)
-    if axis is None or experiment.obstacles or not is_load_only(experiment):
+    axis = _axis_between_platens(iterate)
+    if axis is None:
         return None
     sliding = [each for each in experiment.body_grasps if tuple(each.axis_indices) == (axis,)]
     dofs = np.setdiff1d(_tangential_dofs(experiment, sliding, axis), prescribed.dofs)
@@ -137,6 +137,16 @@ def sticking_change_n(iterate: ExperimentIterate, theta: Array) -> Array | None:
         stuck_n, slid_n = body.force(np.stack([x, slid_m]), still, theta=theta)
         change_n[row, prescribed.dofs] = (stuck_n - slid_n)[prescribed.dofs]
     return change_n
+
+
+def _axis_between_platens(iterate: ExperimentIterate) -> int | None:
+    """Return the axis along which grips press the body; None if there is none, if obstacles touch
+    the body, or if other measurements than loads show the grip.
+    """
+    experiment, prescribed = iterate.transcription.experiment, iterate.equations.prescribed
+    if experiment.obstacles or not is_load_only(experiment):
+        return None
+    return pressed_axis(prescribed.dofs, prescribed.positions_m)
 
 
 def _moved_equilibrium(
