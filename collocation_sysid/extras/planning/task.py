@@ -1,6 +1,6 @@
 """Task of a planned motion (task.toml): what points of the body do, and how the hand may help.
 
-The tables describe what is wanted; `Task.references_for` turns them into references of points of a
+The tables describe what is wanted; `sampled_references` turns them into references of points of a
 given body.
 """
 
