@@ -110,12 +110,7 @@ def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], Non
 
 
 def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
-    """Yield the parameters of a command, from which typer makes its options.
-
-    A field that is itself a dataclass of options yields one parameter for each of its fields. Help
-    and names of an option are those of its annotation if that has a help text, else of the section
-    "Attributes" of `kind`, which must have an entry then.
-    """
+    """Yield the parameters of a command, from which typer makes its options."""
     documented = attributes(kind)
     for name, default, hint, marks in _typed_fields(kind):
         if is_dataclass(hint):
@@ -170,11 +165,8 @@ def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
 
 @cache
 def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
-    """Return name, default, type and annotations of each field, those of a class before its bases'.
-
-    The annotations are those of an Annotated type, which are separated from it. In a union, each
-    Annotated member is replaced by its type, and None stays. The default is `dataclasses.MISSING`
-    for a field that is required.
+    """Return name, default, type and annotations of each field, those of a class before its
+    bases'.
     """
     hints = get_type_hints(kind, include_extras=True)
     defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]

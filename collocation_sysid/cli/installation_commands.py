@@ -74,9 +74,7 @@ def installation_sections(report: InstallationReport) -> list[Shown]:
 
 
 def _requirement_text(dependency: Dependency) -> str:
-    """Return the range of required versions, empty for any; with the remedy where the installed one
-    is not suitable.
-    """
+    """Return the range of required versions, empty for any."""
     if dependency.is_suitable:
         return dependency.required
     package = f"{dependency.name}{dependency.required}"
@@ -84,9 +82,7 @@ def _requirement_text(dependency: Dependency) -> str:
 
 
 def _solver_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of the solvers, value by name; a single row if CasADi cannot be
-    imported.
-    """
+    """Return the table rows of the solvers, value by name."""
     if report.solvers is None:
         return {"solvers": "unknown, because CasADi cannot be imported"}
     linear = ", ".join(report.solvers.ipopt_linear) or "none that works"
@@ -99,9 +95,7 @@ def _solver_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _kernel_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of the compiler and the cache of kernels, value by name; a single row
-    if llvmlite cannot be imported.
-    """
+    """Return the table rows of the compiler and the cache of kernels, value by name."""
     kernels = report.kernels
     if kernels is None:
         return {
@@ -130,8 +124,6 @@ def _thread_rows(report: InstallationReport) -> dict[str, str]:
 def _conclusion(report: InstallationReport) -> Line:
     """Return the outcome of the self test and of the whole check as a line: "good", or "doubtful"
     if the installation does not work.
-
-    Only the latter names the required packages that are missing or unsuitable, if there are any.
     """
     test = report.self_test
     outcome = "passed" if test.is_passed else "FAILED"

@@ -175,10 +175,7 @@ def _draw_pictures(
     finished: Run, folder: Path, options: SolveCommand, until_saved: ExitStack
 ) -> Result | None:
     """Draw the pictures of a finished run into its folder if `options` ask for them, and return its
-    result with the time that they took; None after an interrupt, of which a message on stderr says
-    how to go on.
-
-    `until_saved`, which defers interrupts, is closed before.
+    result with the time that they took.
     """
     from ..result.solve_progress import SolveProgress
 
@@ -257,8 +254,6 @@ def simulate(options: SimulateCommand) -> None:
 def _draw_instability(error: SimulationError, folder: Path) -> None:
     """Write a picture of the mode in which the body loses its stability to instability.png in the
     folder, which is made if necessary, and print its name on stderr.
-
-    `error` must have such a mode in `stability_loss`.
     """
     from ..result.figure_style import RESOLUTION_DPI
     from ..result.pictures.instability import instability_picture
@@ -335,9 +330,7 @@ def check(options: CheckCommand) -> None:
 
 def _write_camera_overlays(problem: Problem, folder: Path, quiet: bool) -> None:
     """Write a picture of each camera's first image with the undeformed body into the folder, and
-    print the names of the files. Progress is shown unless `quiet`.
-
-    The folder is made if necessary. Nothing is written or printed without cameras.
+    print the names of the files.
     """
     if not any(each.camera_names for each in problem.experiments):
         return

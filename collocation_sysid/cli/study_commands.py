@@ -254,8 +254,7 @@ def _run_study(
 
     The folder is `options.out`, by default runs/NAME-KIND. With `options.dry_run` the planned runs
     are only listed, with those that are finished marked, and nothing is written. Runs that fail do
-    not end the study: they are in the tables. Without any record no tables are
-    written.
+    not end the study: they are in the tables. Without any record no tables are written.
     """
     from ..extras.studies.study_page import (
         load_report,

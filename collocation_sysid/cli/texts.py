@@ -130,13 +130,7 @@ def explain(options: ExplainCommand) -> None:
 
 
 def _known_topic(topic: str) -> str:
-    """Return the topic, or its part before " of ", as in "area_error of stress".
-
-    Raises
-    ------
-    InputError
-        Unless a page, a key of the problem file, or a word of the output has this name.
-    """
+    """Return the topic, or its part before " of ", as in "area_error of stress"."""
     from ..problem.key_descriptions import all_keys, find_keys
 
     for each in (topic, topic.split(" of ")[0]):

@@ -21,15 +21,14 @@ Shape = tuple[int | None, ...]
 def float_array(
     values: ArrayLike, name: str, shapes: Shape | Sequence[Shape] = (), finite: bool = True
 ) -> Array:
-    """Return a float copy of an array; tables and arrays of pandas, xarray and similar libraries are
-    accepted.
+    """Return a float copy of an array; tables and arrays of pandas, xarray and similar libraries
+    are accepted.
 
     Masked entries become NaN. Numbers whose meaning would be lost are refused: complex numbers,
     truth values, texts, times, and quantities with a unit of their own.
 
     Parameters
     ----------
-    values : array_like
     name : str
         What the array is, for messages.
     shapes : tuple of int or None, or several of these
@@ -79,7 +78,6 @@ def read_only_floats(
 
     Parameters
     ----------
-    values : array
     shape : tuple of int or None
         Expected shape; None allows any length.
     name : str
@@ -161,7 +159,6 @@ def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str
 
     Parameters
     ----------
-    values : array_like
     shape : tuple of int or None
         Expected shape, of three axes; None allows any length.
     name : str

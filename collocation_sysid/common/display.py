@@ -61,9 +61,7 @@ class Line:
     name: str = ""
 
     def to_spans(self) -> tuple[Span, ...]:
-        """Return the sentence as pieces, each with a style of its own; a text is one piece without
-        style.
-        """
+        """Return the sentence as pieces, each with a style of its own."""
         return (Span(self.text),) if isinstance(self.text, str) else self.text
 
 
@@ -456,9 +454,7 @@ def _span(span: Span) -> str:
 
 
 def _html_rows(table: Table) -> str:
-    """Return headings and rows of a table as HTML; without headings, the first cell of each row is
-    its heading.
-    """
+    """Return headings and rows of a table as HTML."""
     head = "".join(
         f"<th{_class('n' if table.is_number(k) else '')}>{escape(each)}</th>"
         for k, each in enumerate(table.heads)
@@ -525,9 +521,7 @@ def escape_markdown(text: str) -> str:
 
 
 def _markdown_span(span: Span) -> str:
-    """Return a piece of a sentence as Markdown: bold for "strong", code for "code", else plain;
-    targets of links are omitted.
-    """
+    """Return a piece of a sentence as Markdown: bold for "strong", code for "code", else plain."""
     text = span.text.strip()
     if not text or span.style not in ("strong", "code"):
         return _spaced_like(span.text, escape_markdown(text))

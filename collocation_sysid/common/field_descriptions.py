@@ -46,10 +46,6 @@ class FieldOfRow(NamedTuple):
 
     Attributes
     ----------
-    annotation : type
-        Type of the values.
-    default : object
-        Default value.
     form : str
         Type in the documentation.
     description : str

@@ -127,10 +127,7 @@ class Section(BaseModel):
 
 
 def _keys_by_name(section: type[Section]) -> dict[str, Key]:
-    """Return the keys of the class of which a section is the table, by the name of the field.
-
-    The forms of a class without `declarations.key` are the annotations of its fields.
-    """
+    """Return the keys of the class of which a section is the table, by the name of the field."""
     if not is_dataclass(section.of):
         return {}
     if keys := dict(keys_of(section.of)):

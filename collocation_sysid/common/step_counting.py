@@ -43,7 +43,6 @@ class _Phase:
 
     Attributes
     ----------
-    unit : StepUnit
     total : int
         Number of steps.
     completed : float

@@ -46,7 +46,6 @@ def over_time(axis: int = 0, *, is_load: bool = False) -> Mapping[str, TimeDepen
 
     Parameters
     ----------
-    axis : int
     is_load : bool
         Whether `scale_loads` multiplies it.
     """
@@ -128,9 +127,7 @@ def values_over_time(instance: Any) -> dict[str, Any]:
 
 
 def _changed(instance: T, function: Callable[..., Any], *others: T) -> T:
-    """Return an object with a function applied to its marked fields other than None; itself if no
-    value changes.
-    """
+    """Return an object with a function applied to its marked fields other than None."""
     changes = {}
     for name, mark in _marks(type(instance)).items():
         value, *rest = (getattr(each, name) for each in (instance, *others))

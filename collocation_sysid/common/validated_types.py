@@ -104,7 +104,6 @@ def expectation(faults: Sequence[Mapping[str, Any]], found: Any) -> str:
     ----------
     faults : sequence of mapping
         Entries of pydantic's `ValidationError.errors()`, one for each form that is accepted.
-    found : object
     """
     literals = (fault["ctx"]["expected"] for fault in faults if fault["type"] == "literal_error")
     words = [word for text in literals for word in re.findall("'(.*?)'", text)]

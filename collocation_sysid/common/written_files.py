@@ -88,8 +88,6 @@ def is_written_here(file: Path, folder: Path | None = None) -> bool:
 
     Parameters
     ----------
-    file : Path
-        The file.
     folder : Path, optional
         The folder with the list, at or above the file; the file's own folder by default.
     """
@@ -124,9 +122,7 @@ def foreign_files(folder: Path) -> Iterator[Path]:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Yield everything below a folder except folders, lists and ignored names, by name; links are
-    yielded, not followed.
-    """
+    """Yield everything below a folder except folders, lists and ignored names, by name."""
     for entry in sorted(os.scandir(folder), key=lambda each: each.name):
         path = folder / entry.name
         if entry.is_dir(follow_symlinks=False):
@@ -138,9 +134,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _home(file: Path, folder: Path) -> Path:
-    """Return the nearest folder above a file that has a list, not above `folder`; `folder` if there
-    is none.
-    """
+    """Return the nearest folder above a file that has a list, not above `folder`."""
     for parent in file.parents:
         if parent == folder or (parent / LIST_FILE).is_file():
             return parent

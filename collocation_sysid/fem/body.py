@@ -623,9 +623,7 @@ class Body(Discretisation):
         )
 
     def _part_masses(self, theta: Theta) -> list[Array]:
-        """Return for each part the mass of every dof (3n,) [kg], without tied masses; zero outside
-        the part.
-        """
+        """Return for each part the mass of every dof (3n,) [kg], without tied masses."""
         masses = []
         for part, volume, slopes in zip(
             self.parts, self._lumped_m3, self._mass_slopes, strict=True
@@ -775,7 +773,6 @@ class Body(Discretisation):
         ----------
         x, v : (1, 3n)
             Positions [m] and velocities [m/s].
-        theta : (k,)
         velocity_slope : float
             Derivative of the velocities by the positions [1/s]. Rayleigh's forces −γ_r K v then
             count with the stress that their derivative K contains.
@@ -1058,10 +1055,6 @@ class Body(Discretisation):
     def _damped_masses(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
         """Yield for each part the index in θ of its γ_m, and the mass (3n,) or (T, 3n) [kg] damped
         by it.
-
-        A tied mass, `tied_kg` (3n,) or (T, 3n) [kg], is damped like the node to which it is tied,
-        in proportion to the stated masses of the parts that share the node. None stands for no tied
-        mass.
         """
         for k, damped in enumerate(self._part_masses(theta)):
             if tied_kg is not None:
@@ -1086,8 +1079,7 @@ class Body(Discretisation):
         self, theta: Theta, tied_kg: Array | None
     ) -> Iterator[tuple[int, Array]]:
         """Yield index in θ and derivative, (3n,) or (T, 3n), of `_damping_coefficients` at `theta`
-        by each γ_m and by each constant of a density; an index can occur more than once, then
-        derivatives add up. `tied_kg` is that of `_damped_masses`.
+        by each γ_m and by each constant of a density.
         """
         yield from self._damped_masses(theta, tied_kg)
         for gamma, own in zip(self._gamma_m_indices, self._mass_slopes, strict=True):

@@ -107,7 +107,6 @@ def coarsen_body(body: Body, node_count: int, node_sets: Sequence[Index]) -> Coa
 
     Parameters
     ----------
-    body : Body
     node_count : int
         Desired number of nodes, mid nodes included; there may be more.
     node_sets : sequence of (k,) int

@@ -42,15 +42,8 @@ KERNEL_NAMES = {"element_force": "force"}
 class Discretisation(ConstantsModel):
     """Mesh of elements with quadrature points, and evaluators of sums over elements.
 
-    Parameters
-    ----------
-    parts, forces : see `ConstantsModel`
-    mesh, element, evaluator, threads : see `Body`
-
     Attributes
     ----------
-    nodes : ElementNodes
-        Nodes of the elements.
     nodes_m : (n, 3)
         Undeformed node positions, including obstacle frames [m].
     frames : (k, 4)
@@ -194,7 +187,6 @@ class Discretisation(ConstantsModel):
         ----------
         number : int
             Index of the part.
-        theta : (k,)
         internal_variables : (T, any), optional
             Internal variables of the points; not used for a stress-free shape that is not the mesh.
         with_second_derivatives : bool
@@ -383,9 +375,7 @@ class Discretisation(ConstantsModel):
     # Assembly -------------------------------------------------------------------------------
 
     def _states(self, *fields: ArrayLike) -> list[Array]:
-        """Return every node field, (n, 3), (T, n, 3) or (T, 3n), as (T, 3n), contiguous; native
-        code relies on these shapes.
-        """
+        """Return every node field, (n, 3), (T, n, 3) or (T, 3n), as (T, 3n), contiguous."""
         nodes = len(self.nodes_m)
         arrays = [np.ascontiguousarray(field, dtype=float) for field in fields]
         for array in arrays:
@@ -415,10 +405,7 @@ class Discretisation(ConstantsModel):
         out: Array | None = None,
         memory_input: MemoryInput | None = None,
     ) -> Array:
-        """Evaluate a kernel on all parts and add up the results (T, width).
-
-        Evaluators are made at the first use of a kernel and kept.
-        """
+        """Evaluate a kernel on all parts and add up the results (T, width)."""
         if len(theta) != len(self.constants):
             raise InputError(
                 f"found {len(theta)} values of constants; expected {len(self.constants)}, in this "
@@ -481,10 +468,7 @@ class Discretisation(ConstantsModel):
         }[name]
 
     def _batch(self, name: str, number: int) -> KernelBatch:
-        """Return the batch of a kernel for a part: where each output goes in the result row.
-
-        A row holds vectors, lower triangles, and columns for all of θ.
-        """
+        """Return the batch of a kernel for a part: where each output goes in the result row."""
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[KERNEL_NAMES.get(name, name)](self.element, self.law(number, memory))
@@ -580,12 +564,7 @@ class Discretisation(ConstantsModel):
 
 
 def _with_field_columns(places: Index, own: Index, output: str, constants: int) -> Index:
-    """Return the positions (E, …) of derivatives by θ and by the logarithm of each cell.
-
-    The logarithm follows the last constant. For "theta_theta" the result has the rows of a square
-    matrix of order `constants` + 1, one after the other; for other outputs it is `places`, then
-    `own`.
-    """
+    """Return the positions (E, …) of derivatives by θ and by the logarithm of each cell."""
     if output != "theta_theta":
         return np.hstack([places, own])
     count = len(places)

@@ -66,7 +66,6 @@ class Element:
 
     Attributes
     ----------
-    name : str
     nodes : int
         Nodes per element, the four corners first.
     shape_functions : callable
@@ -179,7 +178,6 @@ def reference_geometry(points_m: Array, cells: NDArray[np.int64], element: Eleme
         Undeformed node positions.
     cells : (E, nodes)
         Node indices, corners first; sides are straight.
-    element : Element
 
     Returns
     -------

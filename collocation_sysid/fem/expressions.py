@@ -52,8 +52,6 @@ class PointLaw:
 
     Attributes
     ----------
-    material : Material
-    damping : DampingLaw
     has_memory : bool
         Whether the point has a memory.
     scaled_indices : tuple of int
@@ -82,18 +80,7 @@ class PointLaw:
         return self.material.psi(F, theta[: len(self.material.constants)])
 
     def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
-        """Return the density ψ_d of the potential of the damping law; 0 if it has none.
-
-        Parameters
-        ----------
-        psi : SX
-            Energy density as an expression in F.
-        F, rate : SX
-            Stacked deformation gradient, with m if the dilatation is averaged, and its rate;
-            further symbols of `psi` and their rates may follow if the law accepts them.
-        theta : (k,) SX
-            Constants of the law.
-        """
+        """Return the density ψ_d of the potential of the damping law; 0 if it has none."""
         potential = self.damping.potential
         return potential(psi, F, rate, **self._damping_constants(theta)) if potential else ca.SX(0)
 
@@ -106,7 +93,6 @@ class PointLaw:
         ----------
         F, rate : (9,) SX
             Stacked deformation gradient and its rate.
-        theta : (k,) SX
         """
         if not self.damping.stress:
             return None
@@ -136,8 +122,6 @@ def quadrature_point(
 
     Parameters
     ----------
-    element : Element
-    law : PointLaw
     *fields : str
         Node fields: "x", and if needed "v" and "w".
     internal_variable_count : int, optional
@@ -215,11 +199,7 @@ def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _damping_potential(point: QuadraturePoint, law: PointLaw, energy: ca.SX) -> ca.SX:
-    """Return the damping potential V ψ_d of a point from its elastic energy V ψ; 0 if it has none.
-
-    A law that treats all symbols alike also gets the symbols of energies and their rates. Any
-    other gets the energy as an expression without them.
-    """
+    """Return the damping potential V ψ_d of a point from its elastic energy V ψ."""
     strain = point.stack_strain_symbols()
     rate = ca.vertcat(point.gradients["v"], *point.stretches[1:2])
     if law.damping.accepts_symbols:
@@ -274,8 +254,7 @@ def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | None:
     """Return V P_v (9,) of a point and its derivative (9, 9) by F, with the viscous first
-    Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law has a
-    potential.
+    Piola–Kirchhoff stress P_v and the volume V of the point.
     """
     stress_and_slope = law.damping_stress(
         ca.vec(point.compute_material_gradient()),

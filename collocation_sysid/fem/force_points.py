@@ -137,7 +137,6 @@ class ForcePoints:
             Matrices of the instances.
         chosen : array of int, optional
             Indices of the instances; all by default.
-        skew : bool
         """
         columns, rows = np.triu_indices(len(blocks))
         values = blocks[rows, columns] + (-1 if skew else 1) * blocks[columns, rows]
@@ -146,10 +145,7 @@ class ForcePoints:
         to[:, places[nonempty]] += (assembly @ values.T).T / 2
 
     def _operator_for(self, what: str, chosen: Index | None) -> Any:
-        """Return the columns or rows of a matrix that belong to chosen instances.
-
-        The latest are cached.
-        """
+        """Return the columns or rows of a matrix that belong to chosen instances."""
         key = what, None if chosen is None else chosen.tobytes()
         if key not in self._operators:
             if len(self._operators) >= CACHED_MATRICES:
@@ -213,8 +209,6 @@ class ForcePoints:
     def _assembly_matrix(self, skew: bool) -> sp.csc_array:
         """Return the sparse matrix that sums lower triangles (i, d(d + 1)/2) of all instances,
         stacked column after column, into the entries of the couplings.
-
-        With `skew`, an entry whose dofs are exchanged in the global triangle changes its sign.
         """
         entries = self.nonzero_weights
         order = np.argsort(entries.instance, kind="stable")

@@ -185,10 +185,7 @@ def from_lower_triangle(matrix: ca.SX) -> ca.SX:
 
 
 def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:
-    """Return an output of an element with the contribution of the coupling between its points.
-
-    The docstring of the module defines A, C and D.
-    """
+    """Return an output of an element with the contribution of the coupling between its points."""
     if how == "none":
         return output
     if how == "nodes":
@@ -332,7 +329,6 @@ class QuadraturePoint:
 
         Parameters
         ----------
-        element : Element
         constants : int
             Length of θ.
         *fields : str

@@ -137,8 +137,6 @@ class NodeForce:
             See `NodeForce`.
         *constants : Constant
             Definitions of constants whose bounds, symbols or scales do not follow from the names.
-        nodes : Selection or (k,) int array, optional
-            None for all.
         name : str, optional
             Name for messages; that of the function by default.
         on : {"nodes", "faces"}
@@ -345,7 +343,6 @@ class LocatedForce:
 
     Attributes
     ----------
-    force : NodeForce
     points : ForcePoints
         The nodes, or those of each face.
     data : (8, i)
@@ -367,8 +364,6 @@ class LocatedForce:
 
         Parameters
         ----------
-        force : NodeForce
-        mesh : ElementNodes
         chosen : (k,) int
             Indices of the selected nodes.
         volume_m3 : (n,)
@@ -407,21 +402,14 @@ def _as_column(values: Column) -> ca.SX:
 
 
 def face_middle(values: ca.SX) -> ca.SX:
-    """Return the mean (3,) over the last three nodes of a face of a nodal vector (3k,), k = 3 or 6.
-
-    These nodes share the force on the face: the corners, or the mid nodes of a quadratic face.
+    """Return the mean (3,) over the last three nodes of a face of a nodal vector (3k,), k = 3 or
+    6.
     """
     return ca.sum2(ca.reshape(values, 3, values.numel() // 3)[:, -3:]) / 3
 
 
 def area_vector(places: Sequence[ca.SX]) -> ca.SX:
-    """Return the normal of a face times its area (3,).
-
-    Parameters
-    ----------
-    places : sequence of (3,) SX
-        Corners a, b, c, and the nodes on ab, bc, ca of a quadratic face.
-    """
+    """Return the normal of a face times its area (3,)."""
     corners = places[:3]
     middles = places[3:]
     pairs = zip(corners, middles, strict=True) if middles else ((corner,) for corner in corners)

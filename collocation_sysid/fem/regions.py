@@ -88,8 +88,6 @@ class BodyPart:
         Name of the region; "" for the cells outside all regions.
     cells : (k,)
         Cell indices, ascending.
-    material : Material
-    damping : DampingLaw
     density_kg_m3 : float
         Stated density; not used where the density is free.
     prony : tuple of Prony
@@ -180,13 +178,11 @@ def parts_from_regions(
 
     Parameters
     ----------
-    mesh : TetMesh
     material, damping, prony
         Laws of the cells outside all regions, and defaults of the regions.
     density_kg_m3, mass_kg : float or None
         Density outside regions with a density [kg/m³], or mass of the whole body [kg]; exactly one
         of them.
-    regions : sequence of Region
     field : Field, optional
         Field of the cells outside all regions; regions do not inherit it.
 
@@ -351,7 +347,6 @@ class ConstantsModel:
 
     Parameters
     ----------
-    parts : tuple of BodyPart
     forces : tuple of NodeForce
         Custom forces.
     frictions : tuple of Constant

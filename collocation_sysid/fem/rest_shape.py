@@ -555,9 +555,7 @@ class InverseEquilibrium:
         return RestShape(x, by_input.reshape(-1, *self.points_m.shape))
 
     def _predict(self, theta: Array) -> Array | None:
-        """Return X (n, 3) [m] at θ to first order from the latest solution; None if there is none,
-        θ differs too much, or an element would be nearly inverted.
-        """
+        """Return X (n, 3) [m] at θ to first order from the latest solution."""
         if not self._shapes:
             return None
         key, shape = next(reversed(self._shapes.items()))
@@ -594,12 +592,7 @@ class InverseEquilibrium:
         return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
 
     def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
-        """Return X (n, 3) [m] at a given weight (3n,) [N], from `start` (n, 3); None if Newton's
-        method does not converge.
-
-        A step is accepted if the next one, with the same factors, is shorter (Deuflhard's natural
-        monotonicity test), and no element is nearly inverted.
-        """
+        """Return X (n, 3) [m] at a given weight (3n,) [N], from `start` (n, 3)."""
         x = start.copy()
         for _ in range(OPTIONS.iterations):
             at = self._assemble_forces(x, theta, slopes=True)

@@ -149,9 +149,7 @@ class PolylineLength:
 
 
 def _directions_and_lengths(vectors: Array) -> tuple[Array, Array]:
-    """Return directions (T, J, 3) and lengths (T, J, 1) of vectors; directions of length zero are
-    NaN.
-    """
+    """Return directions (T, J, 3) and lengths (T, J, 1) of vectors."""
     length = np.linalg.norm(vectors, axis=2, keepdims=True)
     return vectors / length, length
 

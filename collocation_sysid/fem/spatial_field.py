@@ -127,7 +127,6 @@ class Laplacian:
 
         Parameters
         ----------
-        mesh : TetMesh
         cells : (k,) int
             Indices of the cells.
         count : int
@@ -226,8 +225,6 @@ class FieldModes:
 
     Attributes
     ----------
-    field : Field
-    laplacian : Laplacian
     scaled_indices : tuple of int
         Indices of the constants of material and damping law that the field multiplies; empty for a
         density.
@@ -251,8 +248,6 @@ class FieldModes:
 
         Parameters
         ----------
-        field : Field
-        mesh : TetMesh
         cells : (E,) int
             Indices of the cells.
         law : tuple of Constant
@@ -302,7 +297,6 @@ class FieldModes:
 
         Parameters
         ----------
-        coefficients : (k,)
         weights : (T, E)
             Weights of the cells.
         """
@@ -381,7 +375,6 @@ class FieldAssembly:
 
     Attributes
     ----------
-    field : FieldModes
     dofs : (E, d)
         Dofs of the nodes of each cell.
     size : int
@@ -394,10 +387,7 @@ class FieldAssembly:
 
     @cached_property
     def _incidence(self) -> sp.csr_array:
-        """Sparse matrix (size, E) with an entry for each dof of each cell. The entry of dof
-        `dofs[e, a]` and cell e has the value 1 + e d + a: its place in a row (E · d,) of
-        `assemble_nodal`, counted from 1.
-        """
+        """Sparse matrix (size, E) with an entry for each dof of each cell."""
         cells, dofs_per_cell = self.dofs.shape
         rows = self.dofs.ravel()
         columns = np.repeat(np.arange(cells), dofs_per_cell)

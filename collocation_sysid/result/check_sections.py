@@ -30,7 +30,6 @@ def quick_check_tables(quick_check: QuickCheck, details: bool = False) -> list[S
 
     Parameters
     ----------
-    quick_check : QuickCheck
     details : bool
         Whether the quality of the elements and the grasps of each recording are shown, too.
     """
@@ -48,8 +47,6 @@ def full_check_tables(findings: CheckResult, details: bool = False) -> list[Show
 
     Parameters
     ----------
-    findings : CheckResult
-        Result of the check.
     details : bool
         Whether notes, other modes, all methods, and the sizes of the program are shown, too.
     """
@@ -117,10 +114,7 @@ def _point_masses(body: BodyCheck) -> str:
 
 def _body_section(body: BodyCheck, details: bool) -> Table:
     """Return the table "Body": size, volume, mass, mesh, with `details` element quality, the rest
-    shape if the mesh was made under gravity, and fields; what is not known of its origin is asked.
-
-    For specimens, which have no mesh, it is the table "Specimens" with the names of the experiments
-    alone.
+    shape if the mesh was made under gravity, and fields.
     """
     if body.is_homogeneous:
         names = ", ".join(f"'{name}'" for name in body.experiments)
@@ -180,12 +174,7 @@ def _motion_rows(findings: CheckResult) -> dict[str, str]:
 
 
 def _motion_section(findings: CheckResult) -> list[Shown]:
-    """Return the table of natural modes; empty if all experiments are static.
-
-    The table has the lowest modes, at most `SHOWN_MODES`, of the first fitted recording that is not
-    static. If there are others, a line with the first mode [Hz] of each follows, at most
-    `SHOWN_RECORDINGS`; those without a mode are left out.
-    """
+    """Return the table of natural modes; empty if all experiments are static."""
     if not findings.motions:  # equilibria only
         return []
     motion, *others = findings.motions
@@ -219,8 +208,7 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
 
 def _measurements_section(findings: QuickCheck, details: bool) -> Table:
     """Return the table of at most `SHOWN_RECORDINGS` recordings with samples, markers and grasps,
-    and of the air densities of all. Without `details`, grasps that are described in the same words
-    appear once.
+    and of the air densities of all.
     """
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
@@ -249,9 +237,7 @@ def _measurements_section(findings: QuickCheck, details: bool) -> Table:
 
 
 def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
-    """Return table rows with a sentence on each grasp of an experiment, by label; several grasps
-    are numbered from 1. Empty without grasps.
-    """
+    """Return table rows with a sentence on each grasp of an experiment, by label."""
     own = [grasp_sentence(grasp) for grasp in holds if grasp.experiment == experiment]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}
@@ -259,9 +245,7 @@ def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
 
 
 def _air_description(density_kg_m3: float) -> str:
-    """Return how the model contains the surrounding air of a density [kg/m³], in words; zero stands
-    for a vacuum.
-    """
+    """Return how the model contains the surrounding air of a density [kg/m³], in words."""
     if not density_kg_m3:
         return "none (as in a vacuum)"
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
@@ -269,8 +253,7 @@ def _air_description(density_kg_m3: float) -> str:
 
 def _marker_summary(recording: RecordingCheck) -> str:
     """Return how many markers a recording has, how many samples are missing, the marker farthest
-    from the body with its distance [mm], and the other instruments, in words; without markers the
-    instruments alone.
+    from the body with its distance [mm], and the other instruments, in words.
     """
     if not recording.markers:
         besides = "" if recording.test else ", no markers"

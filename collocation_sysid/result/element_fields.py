@@ -113,14 +113,7 @@ class ElementFields:
 
 def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the compiled function "fields", the values of `FIELD_NAMES` in this order at a
-    quadrature point times its undeformed volume; see `ElementKernel` for the inputs.
-
-    Parameters
-    ----------
-    element : Element
-        Kind of the elements.
-    law : PointLaw
-        Law with the energy density at a point, and its constants.
+    quadrature point times its undeformed volume.
     """
     point = quadrature_point(element, law, "x")
     fields = ca.vertcat(*_point_fields(law, point.scale_constants()))
@@ -136,11 +129,7 @@ _DEFORMATION_GRADIENT = ca.SX.sym("F", 9)
 
 
 def _point_fields(law: PointLaw, constants: ca.SX) -> tuple[ca.SX, ...]:
-    """Return det F, the energy density and the von Mises stress as expressions.
-
-    They depend on the symbol `_DEFORMATION_GRADIENT`, which has the nine components of the
-    deformation gradient column after column, and on `constants`, the constants of the law.
-    """
+    """Return det F, the energy density and the von Mises stress as expressions."""
     f = ca.reshape(_DEFORMATION_GRADIENT, 3, 3)
     j = ca.det(f)
     psi = law.psi(f, constants)

@@ -166,7 +166,6 @@ def add_legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
 
     Parameters
     ----------
-    axes : Axes
     columns : int
         Number of entries in a row.
     height : float
@@ -184,7 +183,6 @@ def add_figure_legend(figure: Figure, columns: int, **how: Any) -> None:
 
     Parameters
     ----------
-    figure : Figure
     columns : int
         Number of entries in a row.
     **how

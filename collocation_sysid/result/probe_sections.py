@@ -125,9 +125,6 @@ def is_first_to_correct(result: Result) -> bool:
 def _shown_estimates(result: Result) -> list[str]:
     """Return the names of the estimates that the table of probes has as columns, at most
     `MAX_ESTIMATES`.
-
-    They are those with a statistical interval: Young's modulus of the whole body first, then
-    parameters; other derived moduli, also those of regions, are left out.
     """
     known = [n for n, each in result.collect_estimates().items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]

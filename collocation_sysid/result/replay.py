@@ -367,10 +367,7 @@ class MotionRecord:
 
 def _obstacle_outlines(experiment: Experiment) -> Array | None:
     """Return the outlines of all obstacles at their stated poses at each sample, (T, o, 3) [m] in
-    the world; None without obstacles.
-
-    They are lines, with a row of NaN after each; that of a plane is a square somewhat larger than
-    the body.
+    the world.
     """
     body = experiment.body.nodes.points_m
     outlines = []

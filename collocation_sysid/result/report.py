@@ -49,8 +49,6 @@ class StudySummary:
     ----------
     title : str
         Title of the study.
-    problem : str
-        Name of the problem.
     headline : tuple of str
         Sentences with the main results.
     runs : tuple of mapping
@@ -115,10 +113,7 @@ def report_text(report: TitledParts, file: Path) -> str:
 
 
 def report_html(report: TitledParts) -> str:
-    """Return a report as the HTML text of one page that contains its pictures.
-
-    Nothing is loaded from a network; pictures are embedded.
-    """
+    """Return a report as the HTML text of one page that contains its pictures."""
     page = files("collocation_sysid.result").joinpath("report.html").read_text("utf-8")
     # A text cannot hold these places, since "<" is escaped.
     page = page.replace("<!--TITLE-->", escape(report.title))

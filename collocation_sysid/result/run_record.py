@@ -46,17 +46,14 @@ def write_run(
     ``refinement.json`` if the discretisation error was measured, ``trajectory.npz``, and
     ``frames/`` with ``trajectory.pvd`` for ParaView. With several fitted experiments, the name of
     the experiment precedes the names of its arrays, and each has a subfolder with its frames;
-    arrays of an experiment for validation always have its name. `draw_run` adds
-    the pictures after the folder is in its place, so that an error while drawing does not lose the
-    result.
+    arrays of an experiment for validation always have its name. `draw_run` adds the pictures after
+    the folder is in its place, so that an error while drawing does not lose the result.
 
     If the disk is full or fails, the run is kept in a folder for temporary files, or as much of it
     as that has room for; the message names it.
 
     Parameters
     ----------
-    solved : SolvedProblem
-        The solved problem.
     folder : str or Path
         Made with its parents if missing; an earlier, unchanged run at this place is replaced.
     frames, pictures : bool
@@ -128,8 +125,6 @@ def draw_run(
 
     Parameters
     ----------
-    solved : SolvedProblem
-        The solved problem.
     folder : Path
         The folder that `write_run` wrote for this solved problem.
     report : callable, optional
@@ -175,8 +170,6 @@ def write_pictures(
 
     Parameters
     ----------
-    finished : SolvedProblem
-        The solved problem.
     result : Result
         Content of its ``result.json``.
     folder : Path
@@ -202,10 +195,6 @@ def write_pictures(
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     """Return the cell data that are the same in every frame, by name: "region" (index of the part),
     if there are several, and spatially varying constants of a body.
-
-    Each array (E,) has one entry for each element. A constant has four arrays: its estimate, the
-    ends of its 95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior
-    standard deviation (suffix ``_over_prior``); they are NaN in other regions.
     """
     data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
     for name, values in _field_estimates(finished, body).items():
@@ -215,25 +204,7 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
 
 
 def write_all_frames(finished: SolvedProblem, place: Path) -> None:
-    """Write the ParaView frames of every fitted experiment, see `write_frames`; existing ones are
-    replaced.
-
-    With several fitted experiments each has a subfolder of its name, which is made if missing.
-    Besides the data of `write_frames` and `_constant_cell_data`, the frames have the residuals of
-    the equations of motion, "residual_force_n" [N], which are zero at prescribed dofs.
-
-    Parameters
-    ----------
-    finished : SolvedProblem
-        The solved problem.
-    place : Path
-        Existing folder to write into.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
-    """
+    """Write the ParaView frames of every fitted experiment, see `write_frames`."""
     for part in finished.solution.parts:
         transcription = part.transcription
         positions = part.x.reshape(len(part.x), -1, 3)
@@ -302,9 +273,6 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
 def _visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return the points of each camera of an experiment on the fitted surface, or else on the
     simulated one.
-
-    The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`. The
-    mapping is empty where neither surface is known, or without cameras.
     """
     if not experiment.camera_names:
         return {}
@@ -315,9 +283,7 @@ def _visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str
 
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
     """Return the estimates (E, 4) of each spatially varying constant of a body, by name of the
-    field; empty if there is none.
-
-    The columns are those of `MotionRecord.fields`. Rows of elements in other regions are NaN.
+    field.
     """
     estimates = {}
     for part in body.parts:
@@ -331,8 +297,7 @@ def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
 
 def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     """Return the estimated places (M, 3) [m] of the markers of an experiment on the undeformed
-    body, in the order of its marker names; None for a validation experiment whose forward
-    simulation failed.
+    body, in the order of its marker names.
     """
     if experiment in finished.places:
         places = [place.position_m for place in finished.places[experiment].values()]

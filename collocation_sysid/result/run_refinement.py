@@ -118,21 +118,7 @@ def refine_run(
 
 
 def with_refinement(before: Result, refinement: Refinement, parameters: Parameters) -> Result:
-    """Return a result with the measured discretisation error in place of the estimated one; nothing
-    is written.
-
-    Values, intervals and budget of the estimates whose error was measured are updated, and so is
-    the verdict with its concerns; other estimates are unchanged.
-
-    Parameters
-    ----------
-    before : Result
-        Content of ``result.json`` after the solve; not modified.
-    refinement : Refinement
-        The measured discretisation errors.
-    parameters : Parameters
-        Parameters of the problem, with their coordinates and bounds.
-    """
+    """Return a result with the measured discretisation error in place of the estimated one."""
     optimum = _estimates_at_optimum(before, parameters)
 
     def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:
@@ -207,8 +193,7 @@ def _updated_shares(
     shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
 ) -> dict[str, float]:
     """Return the contributions to an estimate's variance with the measured discretisation error,
-    largest first; they sum to one. Without a combined standard error before or after they are
-    unchanged.
+    largest first.
     """
     if not before.combined_std_error or not after.combined_std_error:
         return dict(shares)
@@ -225,9 +210,7 @@ def _updated_shares(
 
 
 def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
-    """Return the levels that an earlier call finished, with the values of `names` alone; empty
-    without a file.
-    """
+    """Return the levels that an earlier call finished, with the values of `names` alone."""
     if not file.is_file():
         return []
     require_own(file)

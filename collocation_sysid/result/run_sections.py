@@ -240,8 +240,7 @@ def stated_as_undetermined(result: Result) -> set[str]:
 
 def _undetermined_sentence(result: Result) -> list[str]:
     """Return a sentence that names the estimates whose interval is wider than their value, without
-    those that a reason of the verdict names, with the largest contribution to each variance; empty
-    if there is no such estimate.
+    those that a reason of the verdict names, with the largest contribution to each variance.
     """
     stated = stated_as_undetermined(result)
     sources = []
@@ -281,9 +280,6 @@ def _largest_contributions(result: Result) -> list[str]:
     """Return the main sources of uncertainty of the estimates whose uncertainty is mostly
     systematic, that is whose combined standard uncertainty exceeds `SYSTEMATIC_RATIO` times the
     statistical one.
-
-    There is one sentence for each of at most `SHOWN_BUDGETS` estimates, the most systematic first,
-    then the remedies of the largest contributions that the user may remove by a statement.
     """
     ratios = {
         name: each.combined_std_error / each.statistical_std_error
@@ -423,9 +419,7 @@ def refinement_table(result: Result) -> Table | Line:
 
 
 def _interval_text(ends: tuple[float, float] | None, factor: float, deviation: float | None) -> str:
-    """Return the ends of an interval, multiplied by a factor, to the place of a deviation; "" for
-    None.
-    """
+    """Return the ends of an interval, multiplied by a factor, to the place of a deviation."""
     if ends is None:
         return ""
     low, high = (rounded(factor * end, deviation) for end in ends)
@@ -589,9 +583,7 @@ def _error_bars(result: Result) -> Iterator[Shown]:
 
 
 def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield for each experiment a table of the estimated places of its markers [mm]; an experiment
-    without markers is left out.
-    """
+    """Yield for each experiment a table of the estimated places of its markers [mm]."""
     explanation = (
         "Positions on the undeformed body in millimetres, each with its standard error. "
         "Positions that were not given have a prior as wide as the body."
@@ -656,9 +648,6 @@ def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
 def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
     """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
     first.
-
-    At most `SHOWN_ERRORS` are returned; empty without fitted markers. Of each marker, two listed
-    errors are more than `ERROR_SPACING_SAMPLES` samples apart.
     """
     arrays = read_arrays(run)
     worst = []

@@ -45,30 +45,7 @@ def write_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write an unstructured grid of one cell type as a .vtu file, VTK XML with base64 data.
-
-    Parameters
-    ----------
-    path : str or Path
-        File to write; an existing one is replaced.
-    points_m : (n, 3)
-        Positions of the points [m].
-    cells : (E, nodes per cell)
-        Point indices of each cell, in the order of meshio for this type.
-    meshio_type : {"tetra", "tetra10"}
-        Kind of the cells.
-    point_data : mapping of name to (n,) or (n, k), optional
-        Data at the points.
-    cell_data : mapping of name to (E,) or (E, k), optional
-        Data of the cells.
-
-    Raises
-    ------
-    InputError
-        For an unknown cell type, or data of another length.
-    OSError
-        If the file cannot be written, as without its folder.
-    """
+    """Write an unstructured grid of one cell type as a .vtu file, VTK XML with base64 data."""
     import meshio  # which takes a while to import
 
     if meshio_type not in VTK_CELL_TYPES:
@@ -87,9 +64,7 @@ def write_vtu(
 def _checked_arrays(
     kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
 ) -> dict[str, NDArray]:
-    """Return data as arrays with names escaped for XML; booleans, which VTK does not have, become
-    8-bit integers, and other types are neither converted nor checked.
-    """
+    """Return data as arrays with names escaped for XML."""
     arrays = {name: np.asarray(values) for name, values in data.items()}
     for name, array in arrays.items():
         if array.ndim not in (1, 2) or len(array) != count:
@@ -104,21 +79,7 @@ def _checked_arrays(
 
 
 def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:
-    """Write the list of frames that ParaView opens as one animation; an existing file is replaced.
-
-    Parameters
-    ----------
-    path : str or Path
-        File to write.
-    frames : sequence of (float, str or Path)
-        Time [s] and file of each frame; files are stored relative to the folder of `path`, and
-        need not exist yet.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written, as without its folder.
-    """
+    """Write the list of frames that ParaView opens as one animation."""
     folder = Path(path).parent.resolve()
     lines = []
     for t_s, file in frames:
@@ -402,9 +363,7 @@ def require_only_written(folder: Path) -> None:
 
 
 def _replace_folder(new: Path, target: Path, backup: Path) -> None:
-    """Rename the folder `new` to `target`; an existing `target` is moved to `backup`, which must
-    not exist, and removed once that succeeded.
-    """
+    """Rename the folder `new` to `target`."""
     if not target.exists():
         new.rename(target)
         return

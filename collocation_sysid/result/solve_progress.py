@@ -48,8 +48,6 @@ class Heartbeat:
     ----------
     current_activity : callable
         Returns the current activity as text.
-    show_line : callable
-        Shows a line.
     first_s : float, optional
         Time of the first line [s]; `FIRST_LINE_S` by default.
     """
@@ -95,7 +93,6 @@ class SolveProgress(Watched):
 
     Parameters
     ----------
-    console : Console
     problem : Problem, optional
         Its notes are shown at the beginning.
     verbose : bool
@@ -222,11 +219,7 @@ class SolveProgress(Watched):
         self._state = describe
 
     def _update_activity(self, activity: str, line: str = "") -> None:
-        """Show the current activity in the display, and print `line` if verbose and not empty.
-
-        A new activity restarts its elapsed time; the state of the previous one is no longer shown,
-        see `state`, also if the activity is the same.
-        """
+        """Show the current activity in the display, and print `line` if verbose and not empty."""
         if activity != self._doing:
             self._activity_began_s = time.monotonic()
         self._doing = activity

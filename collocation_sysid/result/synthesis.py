@@ -308,19 +308,13 @@ def _write_specimen(
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[ForceSensorSection]:
-    """Return the table layout of each force sensor, those of grasps before those of obstacles;
-    empty if `section` is None, for a problem without a file.
-    """
+    """Return the table layout of each force sensor, those of grasps before those of obstacles."""
     moved = section.moved_sections if section is not None else []
     return [each.sensor for each in moved if each.sensor is not None]
 
 
 def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> None:
-    """Refuse to write into a folder with files of others, or over a file that the problem reads.
-
-    A file that the problem reads may be a measured recording. The problem's own folder may have
-    other files.
-    """
+    """Refuse to write into a folder with files of others, or over a file that the problem reads."""
     require_no_link(place)
     read = {file.resolve() for file in problem.origin.files} if problem.origin else set()
     for file in files:
@@ -342,9 +336,7 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
 
 
 def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection | SpecimenSection]:
-    """Return the table of each experiment in the problem file, by name of the experiment; empty for
-    a problem without a file.
-    """
+    """Return the table of each experiment in the problem file, by name of the experiment."""
     if (origin := problem.origin) is None:
         return {}
     file = ProblemFile.model_validate(parse_toml(origin.text, origin.path))
@@ -354,15 +346,7 @@ def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection | Spec
 def _table_names(
     experiment: Experiment, section: ExperimentSection | SpecimenSection | None
 ) -> dict[str, str]:
-    """Return the names of the files of an experiment, by their content.
-
-    Contents are "markers", "poses", "poses_2", …, "wrench", "wrench_2", … and "reading_NAME" for
-    each custom sensor; the names are EXPERIMENT_CONTENT.csv. Poses are listed for grasps that read
-    them or their markers from a file, without `section` for all grasps. The tables of a test bench
-    (displacement and force) have the names in the problem file, also as keys. A specimen has one
-    file, by the content "specimen", with the name in the problem file, or EXPERIMENT.csv without
-    `section`.
-    """
+    """Return the names of the files of an experiment, by their content."""
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         if isinstance(section, SpecimenSection):
             return {_SPECIMEN_KEY: Path(str(section.file)).name}
@@ -392,10 +376,7 @@ def _numbered_key(kind: str, index: int) -> str:
 
 
 def _require_separate_files(problem: Problem, names: Sequence[Mapping[str, str]]) -> None:
-    """Refuse experiments that read the same file, because a simulation writes one for each.
-
-    `names` are the results of `_table_names`, one for each experiment of the problem.
-    """
+    """Refuse experiments that read the same file, because a simulation writes one for each."""
     owners: dict[str, str] = {}
     for experiment, files in zip(problem.experiments, names, strict=True):
         for name in files.values():

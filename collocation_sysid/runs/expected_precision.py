@@ -89,8 +89,6 @@ def expected_precision(
 
     Parameters
     ----------
-    collocation : Collocation
-    z : (variables,) array
     deviations : mapping of str to float or None
         Standard deviations of the assumptions of the budget.
 
@@ -140,8 +138,6 @@ def with_measurements(
 
     Parameters
     ----------
-    combinations : sequence of Combination
-    collocation : Collocation
     z : (variables,) array
         Variables that satisfy the equations of motion.
     deviations : mapping of str to float or None

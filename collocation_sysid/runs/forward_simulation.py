@@ -234,34 +234,7 @@ def simulate_with_parameters(
     parameters: Mapping[str, float],
     report: Callable[[float], None] | None = None,
 ) -> ForwardSimulation:
-    """Simulate a recording with given parameters, and compare it with the measurements.
-
-    Parameters
-    ----------
-    problem : Problem
-        The integrator and step of `problem.rollout` are used: Newmark's scheme by default, and a
-        finer step than in the fit.
-    experiment : Experiment
-        The recording, with which the simulation is compared.
-    transcription : Transcription
-        The recording as it was fitted, see `transcription_and_nuisance`.
-    phi : (k,) array
-        Nuisance parameters of the recording, in units of their prior standard deviations.
-    parameters : mapping of name to value
-        All parameters of the problem, in SI units.
-    report : callable, optional
-        Called with the completed share, from 0 to 1.
-
-    Returns
-    -------
-    ForwardSimulation
-        `nuisance`, `places_m`, `own` and `copy_error` are empty or None.
-
-    Raises
-    ------
-    InputError, SimulationError
-        Where the simulation fails.
-    """
+    """Simulate a recording with given parameters, and compare it with the measurements."""
     integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
     corrected = with_contact_energy(transcription.corrected_experiment(phi))
     trajectory = simulate(
@@ -292,14 +265,6 @@ def transcription_and_nuisance(
 ) -> tuple[Transcription, Array]:
     """Return an experiment's transcription and the nuisance parameters φ (k,) with which it is
     simulated, in units of their prior standard deviations.
-
-    For a fitted experiment φ is the estimate, for validation see `predicted_nuisance`. `experiment`
-    must belong to the problem of `solution`.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If a solve for an onset is interrupted.
     """
     transcription, own_phi = fitted_nuisance(experiment, solution)
     return transcription, predicted_nuisance(transcription, own_phi, solution=solution)
@@ -326,11 +291,6 @@ def fitted_nuisance(experiment: Experiment, solution: Solution) -> tuple[Transcr
     the estimate, or for validation by a solve in reduced space with the material at its estimate.
 
     k is 0 without any. Whether that solve converged is not checked.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If that solve is interrupted.
     """
     if (part := solution.part_of(experiment.name)) is not None:
         return part.transcription, part.phi
@@ -363,7 +323,6 @@ def step_error(
 
     Parameters
     ----------
-    problem : Problem
     solution : Solution
         Converged solution.
     fit : LinearisedFit
@@ -430,9 +389,6 @@ def _step_error_share(problem: Problem, transcription: Transcription) -> float |
 def _step_s(problem: Problem, transcription: Transcription) -> float:
     """Return the step of the forward simulation of the recording of `transcription` [s]: the one of
     `problem.rollout`, by default finer than the grid of the fit.
-
-    The default is the sample interval over four, or over twice the substeps of the fit if these are
-    more, unless that makes more than the largest number of steps.
     """
     count = min(max(4, 2 * transcription.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or transcription.experiment.timestep_s / count

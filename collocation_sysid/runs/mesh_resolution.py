@@ -54,7 +54,6 @@ def estimate_mesh_error(
 
     Parameters
     ----------
-    problem : Problem
     solution : Solution
         Converged solution.
     fit : LinearisedFit
@@ -116,7 +115,6 @@ def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) ->
 
     Parameters
     ----------
-    problem : Problem
     refinement : Refinement or None
         Discretisation errors of the estimates.
     """
@@ -136,8 +134,7 @@ def _is_reason(few: Concern, refinement: Refinement | None) -> bool:
 
 def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> Iterator[Concern]:
     """Yield a concern about the estimated elastic constant whose change on a finer mesh is largest,
-    if that is more than `LARGEST_CHANGE` of its value. Constants on a linear scale do not count,
-    since they may be near zero, and of derived moduli only E: λ changes without limit near ν = ½.
+    if that is more than `LARGEST_CHANGE` of its value.
     """
     if refinement is None:
         return
@@ -172,8 +169,6 @@ def mesh_resolution_notes(problem: Problem, refinement: Refinement | None = None
 def _coarse_mesh_concerns(problem: Problem) -> Iterator[Concern]:
     """Yield a concern for each fitted body with a mesh that is too coarse for its bending, and of
     which an elastic constant is estimated.
-
-    Cells of specimens are left out: their deformation is homogeneous.
     """
     fitted = [each for each in problem.experiments if not each.validation]
     estimated = {without_region(item.name) for item in problem.parameters.free}

@@ -228,11 +228,7 @@ def _solve_refined_problem(
 
 
 def _level_summary(kind: str, level: int, solution: Solution) -> RefinementLevel:
-    """Return size, cost and estimates of a solved level.
-
-    Nodes and time steps are sums over the bodies and the fitted experiments; the values, also of
-    fixed parameters and derived moduli, are physical.
-    """
+    """Return size, cost and estimates of a solved level."""
     transcriptions = solution.collocation.transcriptions
     return RefinementLevel(
         refined=kind,

@@ -52,8 +52,6 @@ class ContrastPrior:
 
     Attributes
     ----------
-    mean : float
-        Mean.
     deviation : float
         Standard deviation; tiny for a given contrast.
     """
@@ -116,8 +114,6 @@ class ElementSurrogate:
         Faces between elements of the part.
     prior : ContrastPrior
         Prior of the logarithm of the contrast.
-    exponent : float
-        Exponent γ.
     errors : ApproximationError
         Errors of the linearised residuals.
     """
@@ -244,16 +240,7 @@ class ElementSurrogate:
         )
 
     def simulate_errors(self, logarithms: Array, changes: Array) -> SimulatedSamples:
-        """Simulate samples, and return the errors of the linearised residuals; samples that cannot
-        be simulated are left out.
-
-        Parameters
-        ----------
-        logarithms : (K, E) array
-            Logarithms relative to the mean in each element.
-        changes : (K, p) array
-            Changes of the other parameters.
-        """
+        """Simulate samples, and return the errors of the linearised residuals."""
         simulated = []
         residuals = []
         for each, change in zip(logarithms, changes, strict=True):
@@ -430,19 +417,6 @@ def exact_residuals(
 ) -> Array:
     """Return the residuals (n,) of all measurements at simulated trajectories, in the order and
     with the weights of `linearise_fit`.
-
-    Parameters
-    ----------
-    collocation : Collocation
-    p : (np,) array
-        All parameters.
-    guess : sequence of (N, 3n) array, optional
-        Trajectories at similar parameters [m].
-
-    Raises
-    ------
-    SimulationError
-        If the body cannot be simulated at p.
     """
     positions, failure = simulate_trajectories(collocation, p, guess=guess)
     if failure is not None:

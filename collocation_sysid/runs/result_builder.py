@@ -163,10 +163,7 @@ def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
 
 
 def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
-    """Return the statistics behind the error bars; None without error bars.
-
-    Coefficients of fields are left out of the matrices.
-    """
+    """Return the statistics behind the error bars; None without error bars."""
     known = answer.uncertainty
     if known is None:
         return None
@@ -234,9 +231,8 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
 
 
 def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreement] | None:
-    """Return the estimates from single recordings, to first order, and their agreement, by
-    scalar parameter; None if this was not evaluated. Values are NaN for recordings that do not
-    determine the parameter.
+    """Return the estimates from single recordings, to first order, and their agreement, by scalar
+    parameter.
     """
     if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
         return None
@@ -304,8 +300,7 @@ def _sensor_errors(error: PredictionErrors) -> dict[str, Any]:
 
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
     """Return the errors of the forward simulations of all experiments, with the RMS over all marker
-    samples and the maximum over the fitted ones; both None if none of these has markers and a
-    simulation.
+    samples and the maximum over the fitted ones.
     """
     experiments = {}
     squares = []
@@ -324,9 +319,7 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
 
 
 def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
-    """Return the errors of the forward simulation of an experiment; if it failed, only the reason
-    and whether the experiment was fitted. `answer.rollouts` must have an entry for it.
-    """
+    """Return the errors of the forward simulation of an experiment."""
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):
@@ -353,9 +346,6 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
 def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
     """Return the nuisance parameters of the fitted experiments, without the places of markers, by
     experiment and label.
-
-    Values, prior standard deviations and standard errors are in the unit of the label; the standard
-    error is None without error bars. Experiments without such parameters have no entry.
     """
     deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
     named: dict[str, dict[str, NuisanceResult]] = {}
@@ -395,10 +385,6 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
 def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
     """Yield sentences on the nuisance parameters of an experiment except the places, with estimate
     and prior.
-
-    `Deviation.by` decides for each kind: "length" gives one sentence on the longest of its
-    vectors, "worst" one on the value farthest from its prior, in standard deviations, anything else
-    one on each value.
     """
     nuisance = part.transcription.nuisance
     values = part.phi * nuisance.scales
@@ -426,9 +412,6 @@ def _nuisance_sentence(
     """Return a sentence with the size of a nuisance parameter, or of a vector of them, its standard
     error if known, its prior, and, for kinds whose sentence has a place for it, whether it is at
     its bound.
-
-    The tare is multiplied by the symmetry of the experiment: the sensor measures the load of the
-    whole specimen.
     """
     nuisance = part.transcription.nuisance
     k = components[0]

@@ -248,9 +248,7 @@ class SolvedProblem:
         return modulus_axis_sentence(self.systematic_effects, self.estimates, anisotropy)
 
     def collect_discretisation_errors(self) -> Mapping[str, DiscretisationError]:
-        """Return the known discretisation errors, by name of the estimate; empty without
-        `refinement`.
-        """
+        """Return the known discretisation errors, by name of the estimate."""
         return {} if self.refinement is None else self.refinement.errors
 
     @cached_property
@@ -559,9 +557,7 @@ class SolvedProblem:
         return by_value
 
     def _collect_relative_deviations(self) -> Array:
-        """Return the combined standard uncertainties (k,) of the relative coordinates; NaN where
-        there is none.
-        """
+        """Return the combined standard uncertainties (k,) of the relative coordinates."""
         known = [_or_nan(self.estimates[n].combined_std_error) for n in self._estimated_names]
         return np.abs(self._relative_by_value()) * np.array(known)
 
@@ -677,9 +673,7 @@ class SolvedProblem:
         return pandas.DataFrame.from_dict(rows, orient="index")
 
     def _row(self, name: str) -> dict[str, float | str]:
-        """Return the row of the estimate `name`, which must exist, in `to_frame`, by column; NaN
-        for unknown numbers.
-        """
+        """Return the row of the estimate `name`, which must exist, in `to_frame`, by column."""
         each = self.estimates[name]
         combined = each.combined95 or (np.nan, np.nan)
         statistical = each.statistical95 or (np.nan, np.nan)

@@ -199,10 +199,7 @@ def _solve_by(
 
 def _likeliest_lengths(problem: Problem, solution: Solution) -> dict[str, float] | None:
     """Return the most likely of the correlation lengths [m] that the fields of a problem allow, by
-    name of the field; None if there is no choice or the solution did not converge.
-
-    The likelihood of each length follows to first order from the solution, see
-    `statistics.field_estimates`.
+    name of the field.
     """
     fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     has_choice = any(len(field.field.lengths_m) > 1 for field in fields)
@@ -219,10 +216,7 @@ def _solve_by_coarse_start(
     problem: Problem, solver: ReducedSpace, watch: Watch | None, workers: ExperimentExecutor | None
 ) -> Solution | None:
     """Solve a problem with fixed correlation lengths on a coarser mesh first, and from there on its
-    own; None if the method's options or the sizes of the bodies do not call for a coarse start.
-
-    After an interrupt of the coarse solve its point is returned as an interrupted solution, see
-    `interrupted_solution`. The arguments are those of `_solve_once`.
+    own.
     """
     coarse_start = plan_coarse_start(problem, solver)
     if coarse_start is None:
@@ -254,10 +248,7 @@ def _solve_on_coarse_mesh(
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
-    """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
-    if it did not converge. The problem is `coarse_start.problem`, solved from its guesses or a
-    scan; the other arguments are those of `_solve_once`.
-    """
+    """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`."""
     tolerance = max(solver.tolerance, COARSE_TOLERANCE)
     with search_activity(f"coarse start on {coarse_start.describe_size()}"):
         try:
@@ -327,12 +318,8 @@ def _solve_once(
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
-    """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier solution.
-
-    A coarse start is tried first if the method asks for one and there is no earlier solution, then
-    a start with thinned clouds of cameras. If the search from guesses fails, a scan follows;
-    if it converges near ν = ½ in reduced space and without an earlier solution, a second start is
-    tried.
+    """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier
+    solution.
     """
     notes: list[str] = []
     if start is None and isinstance(solver, ReducedSpace):
@@ -475,9 +462,7 @@ def _program_and_start(
 
 
 def _feature_notes(solution: Solution) -> list[str]:
-    """Return the notes of all features on the fitted experiments of a solution, in their order;
-    empty without any.
-    """
+    """Return the notes of all features on the fitted experiments of a solution, in their order."""
     parts = solution.parts
     lost = [note for part in parts for note in lost_samples(part.transcription.experiment)]
     return lost + [note for part in parts for feature in FEATURES for note in feature.notes(part)]
@@ -522,15 +507,6 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
     Otherwise `first` itself is returned; after an interrupt of another search a copy of the best
     one with the status and message of the interrupt. The history, counts and times of the result
     are those of its own search alone. Exceptions of the method are not caught.
-
-    Parameters
-    ----------
-    solver : Method
-        Method to use, also with workers, see `with_workers`.
-    first : Solution
-        Solution of the first search.
-    watch : callable or None
-        Called with every iteration of the other searches.
     """
     best = _better_of(solver, first, watch, choose=second_start)
     return continued_beyond_bounds(solver, best, watch)

@@ -64,8 +64,6 @@ class _PhaseSearch:
     ----------
     name : str
         Name of its constant, with the region in front.
-    contrast : str
-        Name of the contrast.
     modes : TwoPhaseModes
         Shapes of the field.
     number : int
@@ -196,11 +194,7 @@ class _SampledPosterior:
 def _sample_posterior(
     problem: Problem, search: _PhaseSearch, solution: Solution, smooth: _SmoothFitQuality
 ) -> _SampledPosterior:
-    """Sample the posterior of phases and parameters, from the solution with a smooth field on.
-
-    Each round linearises the measurements, samples, simulates a sample of each chain, and samples
-    again with the linearised measurements corrected by these simulations.
-    """
+    """Sample the posterior of phases and parameters, from the solution with a smooth field on."""
     in_logarithms = _linearise_at(problem, search, solution=solution)
     phases = initial_phases(
         in_logarithms.information(), in_logarithms.faces, volumes_m3=search.modes.volumes_m3
@@ -426,9 +420,7 @@ def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
 
 
 def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
-    """Return a copy of the solution with bodies whose two-phase fields have these samples;
-    variables and associations are the same.
-    """
+    """Return a copy of the solution with bodies whose two-phase fields have these samples."""
     collocation = solution.collocation
     bodies: dict[int, Body] = {}
     for body in dict.fromkeys(transcription.body for transcription in collocation.transcriptions):

@@ -168,8 +168,7 @@ def _outlier_counts(solution: Solution) -> tuple[int, int]:
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
     """Yield concerns about implausible sizes and densities, or else about an implausible stiffness
-    at the estimates, of each fitted body, and about an unknown scale of the moduli; all are
-    doubtful, except densities that are unusual for the way in which a body was made.
+    at the estimates, of each fitted body, and about an unknown scale of the moduli.
     """
     for body in dict.fromkeys(
         transcription.body for transcription in solution.collocation.transcriptions
@@ -188,8 +187,6 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
     """Yield a concern for each static experiment whose `sigma_m`, relative to the size of the body,
     is larger than the noise of cameras.
-
-    In motions the autocorrelation of the residuals shows this; static experiments have none.
     """
     for experiment in (
         transcription.experiment for transcription in solution.collocation.transcriptions
@@ -252,7 +249,6 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
 
     Parameters
     ----------
-    solution : Solution
     uncertainty : Uncertainty or None
         Its degrees of freedom say how much the parameters absorb; for None they absorb nothing.
     """

@@ -41,15 +41,14 @@ def check_damping(
     """Check a damping law: derivatives, dissipation, objectivity, compiled forces, pickling.
 
     The stress or potential can be evaluated, and its result has the right shape. At random
-    deformations the stress P_v is linear in the rate Ḟ, ∂P_v/∂Ḟ is symmetric, and a
-    stated ∂P_v/∂F is the derivative of P_v by CasADi's automatic derivative and by central
-    differences. The power P_v:Ḟ is not negative for any Ḟ, and a superposed spinning rotation
-    only rotates P_v. The compiled forces of a small body with this law are checked as by
-    `check_material`, and a missing constant is refused by its name.
+    deformations the stress P_v is linear in the rate Ḟ, ∂P_v/∂Ḟ is symmetric, and a stated ∂P_v/∂F
+    is the derivative of P_v by CasADi's automatic derivative and by central differences. The power
+    P_v:Ḟ is not negative for any Ḟ, and a superposed spinning rotation only rotates P_v. The
+    compiled forces of a small body with this law are checked as by `check_material`, and a missing
+    constant is refused by its name.
 
     Parameters
     ----------
-    law : str or DampingLaw
     material : str, Material or callable
         Material whose energy density the law gets.
     constants : mapping of name to float, optional
@@ -142,8 +141,6 @@ class DampingStress:
 
     Attributes
     ----------
-    law : DampingLaw
-    material : Material
     values : (k,) array
         Values of the constants of the material, then of the law.
     """

@@ -23,7 +23,6 @@ def directional_derivative(
     ----------
     function : callable
         Function of an array like `point` that returns an array of any shape.
-    point : array
     direction : array like `point`
         Size of a large change of `point`.
     step : float
@@ -55,29 +54,7 @@ def assert_derivative(
     scale: ArrayLike = 1.0,
     directions: int = 2,
 ) -> None:
-    """Compare a derivative with central differences of the function in random normal directions.
-
-    Parameters
-    ----------
-    function : callable
-        Function of an array like `point`.
-    jacobian_times : callable
-        Product of its derivative at `point` with a direction, of the same shape as the function.
-    point : array
-    rng : numpy.random.Generator
-        Source of the directions.
-    tolerance : float
-        Largest norm of the error, relative to the norm of the difference quotient.
-    scale : array or float
-        Size of a large change of `point`; a thousandth of it is one step.
-    directions : int
-        Number of directions.
-
-    Raises
-    ------
-    AssertionError
-        If the error exceeds the tolerance, or shapes differ.
-    """
+    """Compare a derivative with central differences of the function in random normal directions."""
     for _ in range(directions):
         direction = np.asarray(scale) * rng.standard_normal(np.shape(point))
         expected = directional_derivative(function, point, direction=direction)

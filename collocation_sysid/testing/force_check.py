@@ -152,7 +152,6 @@ class ForceLaw:
 
     Attributes
     ----------
-    force : NodeForce
     values : (k,) array
         Values of its constants.
 
@@ -277,10 +276,8 @@ def _column(values: Any) -> Any:
 def _check_derivatives(
     check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], where: str
 ) -> None:
-    """Compare value and derivatives of the generated force with the plain law and with differences.
-
-    First and second derivatives are compared with automatic differentiation and with central
-    differences, by all entries of u.
+    """Compare value and derivatives of the generated force with the plain law and with
+    differences.
     """
     u, data = state
     columns = data[:, None]

@@ -42,8 +42,6 @@ def damping_stress(
 
     Parameters
     ----------
-    law : DampingLaw
-    material : Material
     symbols : list of SX
         F (9,), its rate (9,), the constants of the material and those of the law.
 
@@ -100,9 +98,7 @@ class PlainInternalForce:
 
     @cached_property
     def _symbols(self) -> list[ca.SX]:
-        """Symbols of one element: x, v and weights w (3·nodes,), geometry (columns: points; rows:
-        shape gradients, then the volume), and the constants of material and damping law.
-        """
+        """Symbols of one element: x, v and weights w (3·nodes,), geometry (columns: points."""
         _, points, width = self.body.geometry.shape
         size = 3 * self.body.element.nodes
         part = self.body.parts[0]
@@ -206,15 +202,12 @@ def check_internal_forces(
 ) -> None:
     """Compare the compiled forces of a small body and all their derivatives with the plain formula.
 
-    Derivatives are compared with central differences, too; for elements that average the
-    dilatation with these alone. They are compared in a deformed shape with random velocities and
-    in the undeformed shape at rest, where principal stretches coincide and forces vanish.
+    Derivatives are compared with central differences, too; for elements that average the dilatation
+    with these alone. They are compared in a deformed shape with random velocities and in the
+    undeformed shape at rest, where principal stretches coincide and forces vanish.
 
     Parameters
     ----------
-    check : PropertyCheck
-    material : Material
-    damping : DampingLaw
     values : dict of str to float
         Values of constants by name; others are those of a soft foam.
     element : str

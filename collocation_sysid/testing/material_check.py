@@ -149,7 +149,6 @@ class EnergyDerivatives:
 
     Attributes
     ----------
-    material : Material
     values : (k,) array
         Values of its constants.
     """
@@ -187,14 +186,7 @@ class EnergyDerivatives:
         return StressState(outputs[0].ravel(), outputs[1].ravel(), tangent=outputs[2])
 
     def evaluate_kernel(self, F: Array, values: Array | None = None) -> StressState:
-        """Return energy, stress, stiffness and `by_constants`, differentiated as in kernels.
-
-        Parameters
-        ----------
-        F : (9,) array
-        values : (k,) array, optional
-            Values of the constants in place of those of this object.
-        """
+        """Return energy, stress, stiffness and `by_constants`, differentiated as in kernels."""
         constants = self.values if values is None else values
         outputs = [each.full() for each in self._kernel_function.call([F, constants])]
         return StressState(
@@ -219,8 +211,6 @@ def deformation_gradients(
 
     Parameters
     ----------
-    rng : numpy.random.Generator
-    count : int
     largest_strain : float
         Entries of F − I are uniform between minus and plus this; draws with a smaller determinant
         are repeated.
@@ -311,8 +301,7 @@ def _check_kernel_derivatives(
     check: PropertyCheck, law: EnergyDerivatives, F: Array, where: str
 ) -> None:
     """Require that energy, stress and stiffness of kernels are those of
-    `EnergyDerivatives.evaluate`, and that ∂P/∂θ agrees with central differences by the
-    constants.
+    `EnergyDerivatives.evaluate`, and that ∂P/∂θ agrees with central differences by the constants.
     """
     plain = law.evaluate(F)
     kernel = law.evaluate_kernel(F)

@@ -146,9 +146,6 @@ def _check_answer(
 def _check_history(check: PropertyCheck, solution: Solution, lines: list[Iteration]) -> None:
     """Require a history that `watch` got line by line, with losses that decrease, and a finite
     loss.
-
-    Losses are compared between lines about the complete recording: the last of them must not
-    exceed the first.
     """
     if not solution.history:
         check.fail("the history of the solve is empty", 0, expected="at least one line")
@@ -179,10 +176,6 @@ def _check_history(check: PropertyCheck, solution: Solution, lines: list[Iterati
 def _check_options(check: PropertyCheck, method: Any) -> None:
     """Require that wrong options of a method are refused by name, and a round trip through a
     problem file.
-
-    An unknown option, and the text "text" as the value of each option that is a number or boolean,
-    must be refused. Options that are None or callable are left out of the problem file; tuples are
-    written as lists.
     """
     kind = type(method)
     key = f"solver.{method.name}"

@@ -17,7 +17,6 @@ def check_missing_constant(check: PropertyCheck, values: Mapping[str, float], **
 
     Parameters
     ----------
-    check : PropertyCheck
     values : mapping of name to float
         Constants of the extension; nothing is checked if there are none.
     **laws : object

@@ -92,12 +92,7 @@ def check_nuisance(
 
 
 def _with_row(experiment: Experiment, row: Deviation) -> Experiment:
-    """Return the experiment in which the parameter of a row is estimated; the argument is not
-    modified.
-
-    A row of the package gets its usual standard deviation, or else the considered one, or else
-    `USUAL_SIGMA`; another row is added to the own ones of the experiment.
-    """
+    """Return the experiment in which the parameter of a row is estimated."""
     nuisance = experiment.nuisance
     if row not in KINDS:
         return replace(experiment, nuisance=replace(nuisance, own=(*nuisance.own, row)))
@@ -128,9 +123,6 @@ def _read(row: Deviation, y: Array, values: Array, t_s: float, data: NuisanceMap
 def _check_reading(check: PropertyCheck, row: Deviation, collocation: Collocation) -> None:
     """Require that zero has no effect, that derivatives are right, and that predicted markers are
     the reading.
-
-    First and second derivatives of the row's reading by position and values are compared with
-    central differences at one random place, at the mean time of the recording.
     """
     assert row.reading is not None
     (transcription,) = collocation.transcriptions
@@ -184,8 +176,6 @@ def _check_predicted_reading(
 ) -> None:
     """Require that predicted markers are the reading of those without the parameter, at every
     sample.
-
-    Values of the parameter of all markers so far are random; others are zero.
     """
     residual = _marker_residual(collocation)
     data = residual.nuisance

@@ -121,7 +121,6 @@ class PropertyCheck:
             Function of an array like `point`, which returns m numbers.
         derivative : (m, n) array
             Derivative by the n entries of `point`.
-        point : (n,) array
         statement : str
             What it means if they differ.
         scale : (n,) array or float
@@ -178,7 +177,6 @@ class PropertyCheck:
             Function of an array like `point`.
         product : array
             Derivative times `direction`.
-        point, direction : array
         statement : str
             What it means if they differ.
         tolerance : float

@@ -28,8 +28,6 @@ def check_pickling(check: PropertyCheck, extension: T, evaluate: Callable[[T], A
 
     Parameters
     ----------
-    check : PropertyCheck
-    extension : object
     evaluate : callable
         Values of the extension at a state.
 
@@ -71,7 +69,6 @@ def check_problem_file(
 
     Parameters
     ----------
-    check : PropertyCheck
     file : str or Path
         Python file of the extension.
     table : mapping

@@ -155,15 +155,12 @@ class PlainRows:
 
     Attributes
     ----------
-    scheme : Scheme
     force : callable
         ``force(xi, nu)`` → force at a position ξ and a velocity ν of one evaluation.
     mass : float or array
         Mass of each dof.
     timestep_s : float
         Step Δt [s].
-    start_velocity : float or array
-        Velocity at the start.
     """
 
     scheme: Scheme

@@ -97,7 +97,6 @@ class SensorExpression:
 
     Attributes
     ----------
-    sensor : CustomSensor
     t_s : float
         Time at which the expression is evaluated [s].
     """
@@ -108,8 +107,7 @@ class SensorExpression:
 
     def make_inputs(self) -> dict[str, Array]:
         """Return the undeformed values of the inputs by name: for a sensor on P points positions
-        and zeros of velocity and acceleration, (3, P) each; at a grasp ones (3, 1) for force and
-        torque.
+        and zeros of velocity and acceleration, (3, P) each.
         """
         _, *names = (each.name for each in fields(self.sensor.quantities))
         if self.sensor.grasp is not None:
@@ -141,7 +139,6 @@ class SensorExpression:
 
         Parameters
         ----------
-        u : array
         t_s : float, optional
             Time of the sample; that of the random states by default.
         """

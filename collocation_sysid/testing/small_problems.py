@@ -50,19 +50,7 @@ def smooth_poses(
     turn_rad: Sequence[float] = (0.2, -0.15, 0.3),
     angular_frequency_rad_s: float = 20.0,
 ) -> PoseSequence:
-    """Return a periodic motion that starts at rest from the identity, sampled from its formula.
-
-    Translation and rotation vector are (1 − cos ωt) times `sway_m` and `turn_rad`.
-
-    Parameters
-    ----------
-    t_s : (T,) array
-        Times [s].
-    sway_m, turn_rad : three floats
-        Half the largest translation [m] and rotation vector [rad].
-    angular_frequency_rad_s : float
-        ω [rad/s].
-    """
+    """Return a periodic motion that starts at rest from the identity, sampled from its formula."""
     share = 1 - np.cos(angular_frequency_rad_s * t_s)
     rotations = Rotation.from_rotvec(np.outer(share, turn_rad))
     positions_m = np.outer(share, sway_m)
@@ -79,7 +67,6 @@ def usual_constants(
 
     Parameters
     ----------
-    constants : sequence of Constant
     values : mapping of name to value, optional
         Stated values.
     """
@@ -111,7 +98,6 @@ def swung_experiment(body: Body, **changes: Any) -> Experiment:
 
     Parameters
     ----------
-    body : Body
     changes : Any
         Arguments of `Experiment` that replace those of this one.
 
@@ -139,7 +125,6 @@ def program_of(experiment: Experiment, values: Mapping[str, float]) -> Collocati
 
     Parameters
     ----------
-    experiment : Experiment
     values : mapping of name to float
         Guesses; constants without one have the values of a soft foam.
 
@@ -167,7 +152,6 @@ def shaken_variables(collocation: Collocation, rng: np.random.Generator) -> Arra
     ----------
     collocation : Collocation
         Program, with or without lifted variables.
-    rng : numpy.random.Generator
     """
     positions = []
     for transcription in collocation.transcriptions:

@@ -33,7 +33,6 @@ class StoredRecording:
         Name in the names of files.
     is_held_out : bool
         Whether the constants were identified without the recording.
-    signals : RecordingSignals
     """
 
     body: str
@@ -48,8 +47,6 @@ class BenchmarkContent:
 
     Attributes
     ----------
-    folder : Path
-    bodies : tuple of str
     recordings : tuple of StoredRecording
         Recordings of all bodies.
     """

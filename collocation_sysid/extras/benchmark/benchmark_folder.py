@@ -44,12 +44,8 @@ class BodyTask:
 
     Attributes
     ----------
-    body : BenchmarkBody
-    entry : CatalogueEntry
-    problem : Problem
     values : mapping of name to float
         Values of all parameters of the problem.
-    signals : mapping of recording name to RecordingSignals
     """
 
     body: BenchmarkBody
@@ -188,9 +184,7 @@ def _write_body(task: BodyTask, folder: Path) -> None:
 
 
 def _mesh(experiment: Experiment) -> TetMesh:
-    """Return the mesh of the body of an experiment; for a material test without a mesh a cube of
-    `CUBE_DIVISIONS`, with sides of `CELL_SIZE_M` and a corner at the origin.
-    """
+    """Return the mesh of the body of an experiment."""
     if experiment.specimen is None:
         return experiment.body.mesh
     return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0))
@@ -199,9 +193,6 @@ def _mesh(experiment: Experiment) -> TetMesh:
 def _body_content(task: BodyTask) -> dict[str, Any]:
     """Return the content of body.json without its "recordings": names, source, licence, law,
     damping, element, density and constants of a body.
-
-    "damping" and "damping_force" are None for a static test, "element" and "density_kg_m3" for a
-    specimen without a mesh.
     """
     experiment = task.make_experiments()[0]
     body = experiment.body
@@ -232,12 +223,6 @@ def _body_content(task: BodyTask) -> dict[str, Any]:
 def _write_recording(task: BodyTask, experiment: Experiment, folder: Path) -> dict[str, Any]:
     """Write the tables of a recording to the existing folder of its body, and return its entry of
     "recordings" in body.json.
-
-    The keys of the entry are "name", "file_name", "is_held_out", "kind", "start" (None for a static
-    test), "gravity_m_s2", "air_density_kg_m3", "quantity", "key", "columns", "sigma" and "files";
-    with a mesh also "grasps", and "symmetry" unless markers were measured. "files" are names in
-    this folder by role: "times", "measured", "simulated", "undeformed", and "stretches" of a
-    specimen without a mesh or "markers" where markers were measured.
     """
     signals = task.signals[experiment.name]
     measured = signals.measured
@@ -278,8 +263,6 @@ def _write_recording(task: BodyTask, experiment: Experiment, folder: Path) -> di
 def _write_grasps(experiment: Experiment, folder: Path, name: str) -> list[dict[str, Any]]:
     """Write the nodes and poses of the grasps, and return what is written about them as JSON: for
     each grasp its "axes" and the file names "nodes" and "poses", None for a grasp at rest.
-
-    Nodes are those of the linear mesh, numbered from 0; nodes on edges are left out.
     """
     grasps = []
     corner_count = len(experiment.body.mesh.points_m)

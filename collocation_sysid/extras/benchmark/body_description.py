@@ -96,10 +96,8 @@ def body_readme(content: Mapping[str, Any]) -> str:
 
 
 def _introduction(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield Markdown paragraphs on the specimen, the note if it is not empty, source and licence.
-
-    `content` is that of body.json; its "specimen", "is_measured", "note", "source" and "licence"
-    are used.
+    """Yield Markdown paragraphs on the specimen, the note if it is not empty, source and
+    licence.
     """
     kind = (
         "Measured data."
@@ -147,9 +145,6 @@ def _material(content: Mapping[str, Any]) -> Iterator[str]:
 def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
     """Yield lines of the Markdown section on the mesh: its files, which homogeneous tests have too,
     and what it was used for.
-
-    `content` is that of body.json, of which "element" is used: the name of the element, or None for
-    a homogeneous test.
     """
     yield "## Mesh\n"
     yield "`mesh.vtu`, and the same as tables: `nodes.csv` with the undeformed, stress-free nodes, and"
@@ -168,9 +163,6 @@ def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
 def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
     """Yield lines of the Markdown section on a recording: its task, its files and the format of the
     prediction.
-
-    `recording` is an entry of "recordings" in body.json, see `_write_recording` of
-    `benchmark_folder`.
     """
     name = recording["file_name"]
     files = recording["files"]
@@ -200,8 +192,6 @@ def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
 def _homogeneous_test(files: Mapping[str, str]) -> Iterator[str]:
     """Yield two lines of Markdown on a material test without a mesh: the stretches that are given,
     and the stresses to be predicted.
-
-    `files` are names of files by role, of which "stretches" and "times" are used.
     """
     yield (
         f"- `{files['stretches']}` has the stretches along x, y and z of each sample. Where a cell is "
@@ -216,8 +206,6 @@ def _homogeneous_test(files: Mapping[str, str]) -> Iterator[str]:
 def _motion(recording: Mapping[str, Any]) -> Iterator[str]:
     """Yield lines of Markdown on gravity, start, air and grasps of a recording of a body with a
     mesh, and on the forces to be predicted if its "quantity" is "forces".
-
-    `recording` is an entry of "recordings" in body.json.
     """
     gravity = ", ".join(f"{value:.6g}" for value in recording["gravity_m_s2"])
     yield f"- Gravity: [{gravity}] m/s²."

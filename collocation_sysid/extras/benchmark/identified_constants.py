@@ -23,7 +23,6 @@ class IdentifiedConstant:
         Name in problem files, with its unit.
     unit : str
         Unit of the values; "1" for ratios.
-    value : float
     combined95 : (lower, upper) or None
         Combined 95 % interval; None if the constant was stated, or has no interval.
     is_stated : bool
@@ -60,7 +59,6 @@ class CatalogueEntry:
         Whether the recordings are measurements.
     law, damping : tuple of str
         Material laws and damping laws of the regions.
-    constants : tuple of IdentifiedConstant
     fitted_recordings : tuple of str
         Recordings from which the constants were identified.
     """

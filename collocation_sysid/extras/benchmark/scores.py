@@ -24,7 +24,6 @@ class Score:
 
     Attributes
     ----------
-    body, recording : str
     source : str
         "prediction", "collocation_sysid" for the forward simulation of this package, or
         "undeformed body" for the undeformed body, which its grasp moves rigidly and has no loads.
@@ -168,9 +167,7 @@ def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
 
 
 def _errors(predicted: Signal, measured: Signal) -> Array:
-    """Return predicted minus measured values (T, C) in the unit of the signals; NaN where nothing
-    was measured.
-    """
+    """Return predicted minus measured values (T, C) in the unit of the signals."""
     return predicted.values - measured.values
 
 

@@ -65,7 +65,6 @@ class RecordingSignals:
 
     Attributes
     ----------
-    measured : Signal
     sigma : (C,) array
         Stated standard deviation of each column.
     simulated : Signal
@@ -161,9 +160,6 @@ def _stress_signals(experiment: Experiment, trajectory: Trajectory) -> Recording
 def _force_signals(experiment: Experiment, trajectory: Trajectory) -> RecordingSignals:
     """Return the measured components of the forces [N] of the grasps on the complete specimen:
     measured, simulated, and zero for the undeformed body.
-
-    The columns are named after the number of the grasp, from 1, such as "grasp_1_fz_n". Values are
-    multiplied by the symmetry of the sensor, torques are left out.
     """
     columns: list[str] = []
     measured: list[Array] = []

@@ -190,11 +190,6 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     defaults of experiments in the table of each experiment. Estimated parameters get guesses at the
     middle draw, coefficients of fields none. Existing recordings are kept only if they are used
     (`Design.added`).
-
-    The table of the new recording, the last one, is a copy of the template's that reads poses and
-    measurements from the files of the design in `folder`, see `_designed_table`. Its name is
-    "designed", or "designed_2" and so on if that name is used. Other file names become relative to
-    `folder`, an absolute path. The problem must have been read from a file.
     """
     origin = design.recording.problem.origin
     recording = design.recording
@@ -225,10 +220,9 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
     from the files of the design beside the problem file.
 
     Keys that select samples are removed (`OF_TIME`), and so are keys that describe the original
-    file of poses in the table of the first grasp (`OF_POSES`). Tables of markers and of the
-    wrench of that grasp lose the keys that describe their files (`OF_MARKERS`, `OF_WRENCH`); the
-    wrench is in newtons and for the modelled part of the body, so that its sigmas are divided by
-    "symmetry".
+    file of poses in the table of the first grasp (`OF_POSES`). Tables of markers and of the wrench
+    of that grasp lose the keys that describe their files (`OF_MARKERS`, `OF_WRENCH`); the wrench is
+    in newtons and for the modelled part of the body, so that its sigmas are divided by "symmetry".
     """
     for key in OF_TIME:
         table.pop(key, None)
@@ -251,10 +245,7 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
 
 def _relative_to(value: Any, old: Path, new: Path) -> Any:
     """Return nested content of a problem with file names relative to the folder `new` instead of
-    `old`, in new lists and dictionaries; whether the files exist does not matter.
-
-    File names are the texts at the keys in `OF_FILES`, at any level; absolute ones become relative,
-    too. What is at the key "columns" and all other values are returned as they are.
+    `old`, in new lists and dictionaries.
     """
     if isinstance(value, list):
         return [_relative_to(each, old, new=new) for each in value]

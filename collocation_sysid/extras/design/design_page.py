@@ -47,8 +47,7 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
 def _error_table(design: Design) -> Table:
     """Return the table of error bars before and after the design, a line for each parameter or
     modulus: value, relative errors in percent, their range over the draws of θ, and the factor by
-    which the error is reduced. Without error bars before the design, "error before" and the factor
-    are empty.
+    which the error is reduced.
     """
     heads = ("", "value", "error before", "error after", "range over the prior", "reduction factor")
     before = design.before
@@ -70,20 +69,15 @@ def _error_table(design: Design) -> Table:
 
 
 def _percent(share: float) -> str:
-    """Return a relative error `share` as text in percent; empty for NaN, "not determined" from 1000
-    % on.
-    """
+    """Return a relative error `share` as text in percent."""
     if np.isnan(share):
         return ""
     return f"{100 * share:.3g} %" if share < 10 else "not determined"
 
 
 def _column_note(design: Design) -> str:
-    """Return a sentence that says what the columns "before" and "after" of the error bars refer to.
-
-    If existing recordings are used (`Design.added`) they are these alone, and with the designed
-    motion in addition. Otherwise they are the motion in the problem, with its duration, and the
-    designed motion alone; if `Design.before` is None, the sentence is on "after" alone.
+    """Return a sentence that says what the columns "before" and "after" of the error bars refer
+    to.
     """
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"

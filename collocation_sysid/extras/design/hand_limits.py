@@ -227,9 +227,6 @@ class HandBounds:
     def _translation_shares(self, course: TimeDerivatives) -> dict[str, float]:
         """Return the largest translation, speed and acceleration as shares of their limits, by name
         of the limit: "workspace_m", "speed_m_s" and "acceleration_m_s2".
-
-        The share of the translation is the largest along any axis, relative to the distance of the
-        initial position from that side of the workspace; the others are norms.
         """
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits

@@ -204,9 +204,6 @@ class HandMotion:
     def _window(self, t: Array) -> TimeDerivatives:
         """Return the window w (T, 1) at times t (T,) [s] since the start, and its first two
         derivatives.
-
-        With u from 0 to 1 it rises as 10 u³ − 15 u⁴ + 6 u⁵ within `rise_s`, and falls likewise; in
-        between it is one, and after `active_s` zero.
         """
         rising = t <= self.active_s / 2
         u = np.clip(np.where(rising, t, self.active_s - t) / self.rise_s, 0.0, 1.0)
@@ -234,9 +231,7 @@ def angular_motion(r: Array, rate: Array, curvature: Array) -> tuple[Array, Arra
 
 
 def _jacobian_factors(angle: Array) -> JacobianFactors:
-    """Return the factors of the left Jacobian, each of the shape of the angles θ ≥ 0 [rad]; below
-    0.01 rad from their series.
-    """
+    """Return the factors of the left Jacobian, each of the shape of the angles θ ≥ 0 [rad]."""
     small = angle < 1e-2
     x = np.where(small, 1.0, angle)
     sine = np.sin(x)

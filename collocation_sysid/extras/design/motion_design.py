@@ -116,8 +116,6 @@ class Design:
     ----------
     recording : FutureRecording
         Recording to be made.
-    motion : HandMotion
-        Motion of the hand.
     experiment : Experiment
         Experiment to be recorded, with simulated markers, without noise, instead of measured ones.
     predicted : Trajectory
@@ -135,8 +133,6 @@ class Design:
         Limits of the robot.
     shares : mapping of str to float
         Largest value over the limit, by name of the limit.
-    best : SearchResult
-        Result of the search.
     draws : int
         Number of draws of θ.
     """
@@ -249,18 +245,6 @@ class MotionObjective:
         Views of cameras are not considered. The result has no coefficients, and an empty history,
         if a force is measured too, the memory would be too large, or the simulation fails. Ctrl-C
         ends the search with the best so far.
-
-        Parameters
-        ----------
-        options : DesignOptions
-            `TO_FIRST_ORDER` times its `evaluations` are made, with its waves and seed.
-        say : callable
-            Function that is called with the progress, a text.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            If it is interrupted before the first evaluation.
         """
         sensed = self.recording.template.grasps[0].has_sensor()
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
@@ -483,10 +467,6 @@ def _error_bars(objective: MotionObjective, results: list[SimulatedMotion]) -> E
 def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
     """Solve the existing recordings; return draws of the parameters q around the estimate, and the
     information of the recordings.
-
-    q are the solver's coordinates: logarithms, or values of linear parameters. The draws are 1 + 2
-    · `options.pairs` arrays (nq,), the estimate first. Poorly determined parameters are drawn no
-    wider than `options.spread`. The information (nq, nq) is about q, without priors.
     """
     solution = solve(problem)
     solution.unless_interrupted()
@@ -528,8 +508,7 @@ def _select_experiment(problem: Problem, name: str | None) -> Experiment:
 
 def _no_motion_message(best: SearchResult) -> str:
     """Return a message that says why no motion was found, with a remedy: no simulation reached its
-    end, or markers left the views. `best` is the result of the search, whose value is at least
-    `FORBIDDEN`.
+    end, or markers left the views.
     """
     tried = f"none of the {len(best.history)} motions that were tried"
     if best.value >= 2 * FORBIDDEN:

@@ -191,14 +191,7 @@ class PredictedErrors:
         return cls(covariance, values, slopes=slopes, estimated_count=estimated_count)
 
     def slopes_of(self, names: Sequence[str]) -> Array:
-        """Return the rows (k, nq) of `slopes` for these names; for all estimated parameters if
-        `names` is empty.
-
-        Raises
-        ------
-        KeyError
-            For an unknown name.
-        """
+        """Return the rows (k, nq) of `slopes` for these names."""
         chosen = names or list(self.slopes)[: self.estimated_count]
         return np.array([self.slopes[name] for name in chosen])
 
@@ -342,12 +335,7 @@ class FutureRecording:
             raise error.located(self.problem.path, f"experiment '{self.template.name}'") from error
 
     def _validate(self) -> None:
-        """Raise an `InputError` if a motion cannot be designed for the experiment.
-
-        The template must move and have exactly one grasp, which holds along all axes and all the
-        time; there must be 3 to `MOST_SAMPLES` samples (the error names --duration). Nothing else
-        is checked, such as markers or obstacles.
-        """
+        """Raise an `InputError` if a motion cannot be designed for the experiment."""
         template = self.template
         if template.is_static:
             raise InputError(

@@ -53,7 +53,6 @@ def write_export(body: IdentifiedBody, target_name: str, folder: str | Path) -> 
 
     Parameters
     ----------
-    body : IdentifiedBody
     target_name : str
         Name of a target in `TARGETS`, such as "mujoco".
     folder : str or Path
@@ -139,8 +138,6 @@ def verify_export(
     ----------
     body : IdentifiedBody
         The body that was exported.
-    target_name : str
-        Name of a target in `TARGETS`.
     folder : str or Path
         Folder of `write_export`; the target runs in a temporary copy.
 
@@ -179,13 +176,7 @@ def comparison_table(name: str, comparisons: Sequence[PredictionComparison]) -> 
 
 
 def target_named(name: str) -> ExportTarget:
-    """Return the target in `TARGETS` called `name`.
-
-    Raises
-    ------
-    InputError
-        If there is no target of that name.
-    """
+    """Return the target in `TARGETS` called `name`."""
     if name not in TARGETS:
         known = (*TARGETS, rerun_recording.TARGET)
         raise InputError(f"no target {name!r}; available: {', '.join(known)}{hint_at(name, known)}")

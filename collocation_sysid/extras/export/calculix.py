@@ -102,10 +102,7 @@ def _step_times_s(body: IdentifiedBody) -> Array:
 
 def _obstacle_cards(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
     """Return the obstacles as cards, which precede the steps: a tetrahedron under each facet, a
-    common material, and a contact pair for each obstacle; empty without obstacles.
-
-    The pressure is linear in the penetration, with friction if the obstacle has some. The step
-    prescribes all nodes of the tetrahedra.
+    common material, and a contact pair for each obstacle.
     """
     deck = ""
     tetrahedra = body.body.mesh.tetrahedra

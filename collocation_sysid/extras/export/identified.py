@@ -80,14 +80,10 @@ class IdentifiedRegion:
         Name of the region; "body" for elements outside all regions.
     cells : (k,)
         Indices of its elements.
-    material : str
-        Name of the material.
     constants : mapping of name to value
         Constants of the material.
     lambda_pa, mu_pa, young_pa, poisson : float
         Elastic constants at rest and small strain, of the long-term energy.
-    density_kg_m3 : float
-        Density.
     damping : str
         Name of the damping law.
     gamma_r_s, gamma_m_1_s : float
@@ -133,11 +129,6 @@ def without_obstacles(experiment: Experiment) -> Experiment:
     Measurements are replaced by one marker at the first node with zeros as positions, because an
     experiment must have some and all of them may be of the obstacles. Initial positions and
     velocities are those of the body's nodes alone.
-
-    Raises
-    ------
-    InputError
-        If the body then has no initial equilibrium, because only obstacles support it.
     """
     body = experiment.body
     t_s = experiment.t_s

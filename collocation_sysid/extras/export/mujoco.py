@@ -150,8 +150,7 @@ def _geom_attributes(solid: Solid) -> str:
 
 def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
     """Return the XML of the constraints between the mocap bodies of the grasps and the bodies that
-    carry grasped nodes; empty without grasps. They are as stiff as the timestep `step_s` [s]
-    allows.
+    carry grasped nodes.
     """
     return "".join(
         f'<weld body1="hand{k}" body2="grasp{k}" relpose="0 0 0 1 0 0 0" '
@@ -170,9 +169,7 @@ def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
 
 
 def _node_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the free nodes (not held along all axes), each a body on three slides; the
-    name of the body contains the index of the node from 0: "node0", "node1", …
-    """
+    """Return the XML of the free nodes (not held along all axes), each a body on three slides."""
     lines = ""
     mass = body.total_node_mass_kg
     for n in np.flatnonzero(~body.is_node_prescribed):
@@ -225,9 +222,6 @@ def _mean_edge_m(body: IdentifiedBody) -> float:
 def _keyframe_xml(body: IdentifiedBody) -> str:
     """Return the XML of the key frame "start", the state at the first sample: poses of the grasps,
     then displacements of the free nodes, and their velocities.
-
-    Displacements from `IdentifiedBody.nodes_m` are the simulated ones, or zero if the run has no
-    forward simulation; velocities are the declared initial ones, or zero.
     """
     free = ~body.is_node_prescribed
     shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
@@ -243,9 +237,6 @@ def _keyframe_xml(body: IdentifiedBody) -> str:
 def _stable_step_s(body: IdentifiedBody) -> float:
     """Return a timestep [s] that divides the sampling interval and keeps the explicit integration
     stable.
-
-    It is at most `STEP_SAFETY_FACTOR` times the stability limit at the largest natural frequency of
-    the undeformed body without grasps, with the largest γ_r of all regions.
     """
     state = body.body.nodes_m.reshape(1, -1)
     at = body.body.linearise(state, np.zeros_like(state), theta=body.theta)
@@ -315,8 +306,6 @@ def _compare_first_frequency(
 ) -> PredictionComparison:
     """Return the comparison of the first natural frequency of the undeformed body in MuJoCo and
     here [Hz], in vacuum and without rigid modes.
-
-    The stiffness in MuJoCo follows from central differences of its forces.
     """
     data = mujoco.MjData(model)
     free = ~body.is_node_prescribed
@@ -347,11 +336,7 @@ def _compare_first_frequency(
 
 
 def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> PredictionComparison:
-    """Return the comparison of the RMS deformation over the recording in MuJoCo and here [m].
-
-    Deformation is the distance of free nodes from the rigidly moved body. The equality constraints
-    of `model` are switched off, in place, and grasped bodies are moved directly.
-    """
+    """Return the comparison of the RMS deformation over the recording in MuJoCo and here [m]."""
     e = body.experiment
     free = ~body.is_node_prescribed
     data = mujoco.MjData(model)

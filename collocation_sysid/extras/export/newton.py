@@ -215,10 +215,6 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
     """Return shape, size, position and rotation of an obstacle at time `t_s` [s], and its friction,
     for the JSON file.
-
-    Keys are "name", "kind" (see `Primitive`), "size" (arguments of Newton's shape by name [m], with
-    half lengths; zeros for a plane, which is infinite), "place_m" (3,), "quaternion_xyzw" (4,) and
-    "friction". Position and quaternion are arrays, which `content` converts for JSON.
     """
     shape = Primitive.from_solid(obstacle.shape)
     place_m, turn = shape.pose_at(obstacle, t_s)

@@ -99,8 +99,7 @@ def write_rerun(run: str | Path, folder: str | Path, experiment: str | None = No
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
     """Return the von Mises stress (T, F) [Pa] on the F triangles of the surface of an experiment,
-    at each sample that of the nearest frame; None if the run has no frames of it or damaged ones,
-    or the experiment was not fitted.
+    at each sample that of the nearest frame.
     """
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
@@ -112,8 +111,7 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
 
 def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
     """Return the smallest and largest stress [Pa] of all experiments as ends of their common colour
-    scale; 0 and 1 if none is known. Entries of `stresses` are (T, F) arrays, or None; NaN does not
-    count.
+    scale.
     """
     known = [each for each in stresses if each is not None and np.isfinite(each).any()]
     if not known:
@@ -124,27 +122,7 @@ def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
 def vertex_colours(
     faces: NDArray[np.integer], values: Array, limits: tuple[float, float], count: int
 ) -> NDArray[np.uint8]:
-    """Return the colours of vertices from values on the triangles around them.
-
-    The value of a vertex is the mean over the triangles around it; values beyond the limits have
-    the colour of the nearest limit, and so have vertices without a triangle at the value 0.
-
-    Parameters
-    ----------
-    faces : (F, 3)
-        Vertices of the triangles.
-    values : (T, F)
-        Values on the triangles; NaN counts as the lower limit.
-    limits : (low, high)
-        Ends of the colour scale (cividis).
-    count : int
-        Number n of vertices.
-
-    Returns
-    -------
-    (T, n, 4)
-        Red, green, blue and opacity, from 0 to 255.
-    """
+    """Return the colours of vertices from values on the triangles around them."""
     low, high = limits
     finite = np.nan_to_num(values, nan=low)
     sums = np.zeros((len(values), count))
@@ -230,15 +208,6 @@ class _Recording:
         """Write the motion of an experiment into the recording: the deforming surface, grasped
         nodes, markers (measured, fitted, simulated), points of depth cameras, obstacles, residuals
         and measured forces, each if it exists.
-
-        Parameters
-        ----------
-        replay : MotionRecord
-            Experiment with a fitted or simulated trajectory.
-        stress : (T, F) array or None
-            Von Mises stress on the surface [Pa], which colours it; None for a grey surface.
-        limits : (low, high)
-            Ends of the colour scale [Pa]; not used without stress.
         """
         name = replay.name
         self.stream.log(self._path(name), self._up_axis(replay.up), static=True)
@@ -376,9 +345,7 @@ class _Recording:
                     self._write_curve(path, t_s, values=curve)
 
     def _write_curve(self, path: str, t_s: Array, values: Sequence[float] | Array) -> None:
-        """Write a number `values` (T,) over the times `t_s` (T,) [s] under the entity `path`; times
-        at which it is not finite are left out.
-        """
+        """Write a number `values` (T,) over the times `t_s` (T,) [s] under the entity `path`."""
         curve = np.asarray(values, dtype=float)
         is_finite = np.isfinite(curve)
         if is_finite.any():
@@ -386,9 +353,7 @@ class _Recording:
             self._send(path, t_s[is_finite], columns=columns, counts=None)
 
     def _send(self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None) -> None:
-        """Send columns of the entity `path` at the times `t_s` (T,) [s]; `counts` are the numbers
-        of rows per time, None for one row each.
-        """
+        """Send columns of the entity `path` at the times `t_s` (T,) [s]."""
         times = [self.rr.TimeColumn(TIMELINE, duration=t_s)]
         data = columns if counts is None else columns.partition(counts)
         self.stream.send_columns(path, times, data)

@@ -135,12 +135,7 @@ def _import_usd() -> Any:
 
 
 def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
-    """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
-
-    The default positions, with which a simulator begins, are `start_positions_m`; the forward
-    simulation, if there is one, is stored as time samples for playback. Several regions become
-    subsets of tetrahedra; the body has the material of the region with most tetrahedra.
-    """
+    """Add the tetrahedra, masses, materials and simulated motion of the body to the stage."""
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
     body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
     mesh = pxr.UsdGeom.TetMesh.Define(stage, "/World/Body/Mesh")
@@ -191,9 +186,6 @@ def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
 def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
     """Add the material of a region to the stage under /World/Materials/`name`, in place, and return
     it.
-
-    Elastic constants and density are in the attributes of the schemas, all other constants and the
-    damping in custom attributes. `pxr` are the modules of `_import_usd`.
     """
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
@@ -217,17 +209,13 @@ def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> 
 
 
 def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
-    """Bind a physics material to a prim, in place; materials bound to its descendants prevail.
-    `pxr` are the modules of `_import_usd`.
-    """
+    """Bind a physics material to a prim, in place."""
     binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
 def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
-    """Set the uniform token attribute `name` of a prim to `text`, in place; `pxr` are the modules
-    of `_import_usd`.
-    """
+    """Set the uniform token attribute `name` of a prim to `text`, in place."""
     kind = pxr.Sdf.ValueTypeNames.Token
     fixed = pxr.Sdf.VariabilityUniform
     prim.CreateAttribute(name, kind, False, fixed).Set(text)
@@ -266,12 +254,7 @@ def _add_gripper(
 
 
 def _set_poses(pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array) -> None:
-    """Place a prim at positions (T, 3) [m] and rotations (T) at times (T,) [s]; its default pose is
-    that of the first row.
-
-    With empty `t_s` there is one row, which holds for all time. The prim is modified in place;
-    `pxr` are the modules of `_import_usd`.
-    """
+    """Place a prim at positions (T, 3) [m] and rotations (T) at times (T,) [s]."""
     codes = (_rate_hz(t_s) * t_s).tolist()
     wxyz = rotations.as_quat(scalar_first=True)
     place = prim.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)

@@ -473,9 +473,6 @@ class LiveEstimator:
     def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
         """Compute the rows in the window again, without a time limit, until no further pass is
         needed or `FINAL_PASSES` times as many rows as the window has are computed.
-
-        The state of the estimator is changed as by `_repeat_rows`: passes are accepted or rejected
-        and the estimate moves. The attribute `rows` is the same afterwards.
         """
         rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:
@@ -485,11 +482,7 @@ class LiveEstimator:
 
     def _checked_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
         """Return the frame with NaN for markers that are implausibly far from the last known
-        position of every moving grasp, and notes on them; the frame itself is not changed.
-
-        Markers are excluded beyond a distance that follows from `REACH_BODY_SIZES`; before the
-        first pose none is. A wrench without a sensor in the problem is noted once. `counts`,
-        `samples` and the last known positions are updated.
+        position of every moving grasp, and notes on them.
         """
         notes = []
         if frame.has_wrench and not self.model.experiment.sensors_by_grasp:
@@ -509,9 +502,7 @@ class LiveEstimator:
         return frame, notes
 
     def _note_outliers(self, is_outlier: NDArray[np.bool_]) -> str:
-        """Add the number of outliers to the counts, and return a note with their names;
-        `is_outlier` (M,) says which markers are, at least one.
-        """
+        """Add the number of outliers to the counts, and return a note with their names."""
         self.counts["wild"] += int(is_outlier.sum())
         names = ", ".join(self.names[m] for m in np.flatnonzero(is_outlier))
         return (
@@ -553,11 +544,7 @@ class LiveEstimator:
     def _add_samples(
         self, readings: Sequence[Sample], squares: list[Array], rows: int = 0
     ) -> list[str]:
-        """Add samples to the first pass and to the log, and return notes on outliers.
-
-        Outliers among the markers are counted and become NaN. Without a pass nothing is added; if
-        the pass has failed, all samples are added to the log alone, as they are.
-        """
+        """Add samples to the first pass and to the log, and return notes on outliers."""
         first_pass = self.first_pass
         if first_pass is None:
             return []
@@ -689,8 +676,7 @@ class LiveEstimator:
 
     def _restart(self) -> None:
         """Keep the information of all samples so far as a prior, discard passes, log and frames,
-        and wait for a new start; the estimate stays. The restart is counted in `counts`, as "begun
-        anew".
+        and wait for a new start.
         """
         if self.first_pass is not None:
             self.prior = self.first_pass.condense_measurements()
@@ -702,10 +688,6 @@ class LiveEstimator:
     def _rows_before_motion(self, frame: Frame, notes: list[str]) -> list[LoggedRow]:
         """Start anew if the motion begins with this frame after a long rest, and return the rows of
         the last frames at rest, with their samples.
-
-        Otherwise, and while there is no first pass, the list is empty. Starting anew discards
-        estimate and information, see `_start_anew`, and the frames at rest are added to the buffer
-        again; this frame is not.
         """
         frames = self._initial_rest.frames_before_motion(frame)
         if not frames or self.first_pass is None:
@@ -737,9 +719,6 @@ class LiveEstimator:
     def _start_anew(self) -> None:
         """Discard passes, log, frames and information, the prior included, and return to the
         initial guess or to a new search for it.
-
-        Trust region and scatter are as at the beginning, and a further search is allowed; other
-        counts, the samples so far and places of markers on the body stay.
         """
         model = self.model
         self.first_pass = self.second_pass = None
@@ -760,8 +739,6 @@ class LiveEstimator:
     def distance_from_linearisation(self) -> float:
         """Return the largest distance of the estimate from the linearisation points of the rows in
         the window, in standard errors of single material parameters.
-
-        Infinite if there is no pass, or if it failed.
         """
         if self.first_pass is None or self.first_pass.has_failed:
             return np.inf
@@ -782,8 +759,7 @@ class LiveEstimator:
 
     def _update_estimate(self) -> None:
         """Set the estimate `p` (P,) to the minimum of the joint quadratic loss of the first and the
-        second pass, within bounds and trust region; without effect before the first pass, or if
-        that failed.
+        second pass, within bounds and trust region.
         """
         if self.first_pass is not None and not self.first_pass.has_failed:
             self._combined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
@@ -801,12 +777,7 @@ class LiveEstimator:
 
     def _next_linearisation_point(self, first_pass: WindowPass) -> Array:
         """Return the next linearisation point p (P,) of a pass, in the solver's coordinates
-        (logarithms, or values of linear parameters; not transformed).
-
-        It minimises the joint quadratic loss of the first and the second pass, plus a prior about
-        the linearisation point of the first one, within the bounds and the trust region about that
-        point. The prior keeps poorly determined parameters there, and is weaker the more rows are
-        in the window. Nothing is changed.
+        (logarithms, or values of linear parameters.
         """
         size = self.model.parameter_count
         samples = len(self.log) / self.model.collocation.substeps
@@ -826,9 +797,6 @@ class LiveEstimator:
         standard errors and intervals, and without coefficients of fields, and the only concern is
         the reason. Otherwise the concerns are those of the data and of the estimates; a pose that
         is missing too long and a search that goes on add one.
-
-        Calls with a successful pass are counted in `counts`, and every `SCATTER_INTERVAL_FRAMES`
-        such calls the scatter of the residuals, `scatter`, is computed again.
         """
         code = ""
         if self.first_pass is None:
@@ -857,8 +825,6 @@ class LiveEstimator:
     def _estimates_at(self, known: SquareRootInformation, p: Array) -> dict[str, Estimate]:
         """Return estimates with standard errors and 95 % intervals by name, in the units of the
         problem, without the coefficients of fields.
-
-        Their variances are scaled by `variance_factor` with the present scatter of the residuals.
         """
         collocation = self.model.collocation
         nq = self.model.collocation.nq
@@ -878,12 +844,7 @@ class LiveEstimator:
     # Passing again ----------------------------------------------------------------------------
 
     def _repeat_rows(self, began: float, notes: list[str], done: int = 0) -> int:
-        """Continue the second pass, or start one, within the rest of the frame's budget.
-
-        Passes follow one another, the trials of a search included, until none is needed or no
-        further row is affordable. Passes, estimate and budget are changed. Without effect before
-        the first pass.
-        """
+        """Continue the second pass, or start one, within the rest of the frame's budget."""
         started = 0
         while self.first_pass is not None:
             pass_began = self.clock()
@@ -912,9 +873,7 @@ class LiveEstimator:
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
-        """Complete a second pass that lags by few rows, if there is time, before new rows come; it
-        is then accepted or rejected.
-        """
+        """Complete a second pass that lags by few rows, if there is time, before new rows come."""
         second_pass = self.second_pass
         if second_pass is None or second_pass.base is None:
             return 0
@@ -1012,12 +971,6 @@ class LiveEstimator:
     ) -> None:
         """Move the linearisation point of a pass towards the estimate if it is far and there is
         time.
-
-        The new point is that of `_next_linearisation_point`; the old one stays unless it is far
-        from both, the estimate and the new point.
-
-        Without effect if fewer than `StreamingModel.rows_per_chunk` rows were computed since the
-        last change. With a fixed number of rows per frame there is always time.
         """
         current_point = [pass_to_move.sweep.transformed]
         if (
@@ -1095,11 +1048,8 @@ class LiveEstimator:
         self._update_estimate()
 
     def _drop_old_rows(self) -> None:
-        """Remove the oldest blocks of rows from the first pass and the log if the window is full;
-        their information becomes part of the prior of the pass.
-
-        While a second pass needs them, they stay, up to twice the window; beyond that the second
-        pass is discarded. A failed first pass with that many rows is restarted, see `_restart`.
+        """Remove the oldest blocks of rows from the first pass and the log if the window is
+        full.
         """
         if self.first_pass is None:
             return

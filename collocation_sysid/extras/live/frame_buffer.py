@@ -259,10 +259,7 @@ class FrameBuffer:
         return notes
 
     def _add_pose(self, t_s: float, positions_m: Array, quaternions: Array) -> None:
-        """Store a pose, with the sign of each quaternion nearest to the previous one.
-
-        The time of the first pose becomes `start_s`.
-        """
+        """Store a pose, with the sign of each quaternion nearest to the previous one."""
         if self._poses:
             before = self._poses[-1][2]
             signs = np.where(np.sum(quaternions * before, axis=1) < 0, -1.0, 1.0)
@@ -279,13 +276,7 @@ class FrameBuffer:
         return self.start_s + row * self.interval_s / self.substeps
 
     def _completed_rows(self) -> list[LoggedRow]:
-        """Return the new rows, up to the last pose, and increase `rows` by their number; none
-        before the first pose.
-
-        Each row has the rotations and positions of the moving grasps, interpolated by `_pose_at`,
-        and the samples of markers and instruments that can be evaluated after it, which are removed
-        from the buffer (`_available_samples`).
-        """
+        """Return the new rows, up to the last pose, and increase `rows` by their number."""
         rows: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:
             return []
@@ -308,11 +299,6 @@ class FrameBuffer:
     def _pose_at(self, t_s: float) -> tuple[Array, Array]:
         """Return positions (G, 3) [m] and quaternions (G, 4) x y z w, not normalised, of the moving
         grasps at the time t_s [s], interpolated through the last poses, at most four.
-
-        The interpolation is a polynomial through all of them (cubic for four), or linear between
-        the last two if there is a gap of more than `LARGEST_CUBIC_GAP` samples among them. A pose
-        at t_s itself is returned as it is. There must be at least one pose; with one it holds at
-        all times.
         """
         for at_s, positions_m, quaternions in self._poses:
             if abs(at_s - t_s) <= TIME_TOLERANCE_S:
@@ -332,9 +318,6 @@ class FrameBuffer:
     def _available_samples(self) -> list[Sample]:
         """Return the waiting samples that can be evaluated with the rows so far, and remove them
         from the buffer.
-
-        Samples before the start are discarded once they could be evaluated. Empty, and without
-        effect, before the first row.
         """
         if self.start_s is None or not self.rows:
             return []
@@ -344,9 +327,7 @@ class FrameBuffer:
         latest_s = now_s - self.neighbouring_samples * self.interval_s + room_s
 
         def ready(of: int, t_s: float) -> bool:
-            """Return whether the rows that a sample at t_s needs are available; `of` is the number
-            of its instrument, 0 for markers.
-            """
+            """Return whether the rows that a sample at t_s needs are available."""
             if not of:
                 return t_s <= latest_s
             instrument = self.instruments[of - 1]

@@ -409,11 +409,7 @@ class FrameReader:
             raise InputError(f"{where}: {error.message}") from error
 
     def _parse_object(self, json_object: Mapping[str, Any]) -> Frame:
-        """Return the frame of a JSON object, with poses of the body.
-
-        The keys are "t_s", "pose", "markers", "wrench" and "readings"; all but "t_s" may be omitted
-        or null, which means that nothing was measured.
-        """
+        """Return the frame of a JSON object, with poses of the body."""
         if unknown := [key for key in json_object if key not in _KEYS]:
             raise InputError(
                 f"found the key {reprlib.repr(unknown[0])}; expected some of {', '.join(_KEYS)}"
@@ -450,12 +446,7 @@ class FrameReader:
         return positions, quaternions
 
     def _parse_row(self, cells: list[str]) -> Frame | None:
-        """Return the frame of a row of a table, with poses of the body; None for the first row, the
-        header, whose columns are stored.
-
-        The pose is missing if any cell of any moving grasp is NaN or empty. Columns of markers and
-        instruments may be absent. An instrument without any number in the row has no sample.
-        """
+        """Return the frame of a row of a table, with poses of the body."""
         if self._columns is None:
             self._columns = self._checked_header(cells)
             return None
@@ -488,29 +479,20 @@ class FrameReader:
         )
 
     def _pose_columns(self, number: int) -> list[str]:
-        """Return the seven column names of the pose of a grasp, by its number from 1.
-
-        They are "x_m", "y_m", "z_m", "qx", "qy", "qz" and "qw"; if several grasps move, each begins
-        with the number and a dot, such as "2.x_m".
-        """
+        """Return the seven column names of the pose of a grasp, by its number from 1."""
         before = "" if len(self.grasps) == 1 else f"{number}."
         return [before + name for name in POSE]
 
     def _list_instrument_columns(self) -> list[Sequence[str]]:
         """Return the column names of each instrument: custom sensors, then the six of each sensor
-        of a grasp, "fx_n" to "tz_nm"; the latter with the number of the grasp and a dot in front if
-        there are several.
+        of a grasp, "fx_n" to "tz_nm".
         """
         before = ["" if len(self.wrenches) == 1 else f"{number}." for number in self.wrenches]
         of_wrenches = [[each + name for name in WRENCH_COLUMNS] for each in before]
         return [*(gauge.columns for gauge in self.gauges), *of_wrenches]
 
     def _checked_header(self, columns: list[str]) -> list[str]:
-        """Return the columns of a header, as they are.
-
-        Needed are "t_s" and the pose of each moving grasp; three columns of each marker, such as
-        "m1_x", and those of instruments are allowed.
-        """
+        """Return the columns of a header, as they are."""
         needed = ["t_s", *(name for k in self.grasps for name in self._pose_columns(k))]
         if missing := [name for name in needed if name not in columns]:
             raise InputError(

@@ -38,8 +38,6 @@ class InitialRest:
 
     Attributes
     ----------
-    body_size_m : float
-        Size of the body.
     sigma_m : (M,) array
         Noise of the markers [m].
     is_over : bool
@@ -88,9 +86,6 @@ class InitialRest:
     def _largest_displacement_at_rest_m(self) -> float:
         """Return the displacement [m] up to which a grasp is at rest: a share of the body's size,
         or a multiple of the noise of the poses if that is larger.
-
-        The noise follows from the differences between consecutive poses of the first frames, at
-        least two.
         """
         steps_m = [
             self._displacement_m(after, reference=before) for before, after in pairwise(self._first)

@@ -43,17 +43,8 @@ FRAMES_A_SECOND = 25
 
 
 def sparkline(values: Sequence[float], columns: int = COLUMNS) -> str:
-    """Return the last values as a line of bars, on a logarithmic scale if all of them are positive.
-
-    The smallest of these values has the lowest bar, the largest the highest. Equal values, or any
-    NaN among them, give bars of middle height; no values, an empty text.
-
-    Parameters
-    ----------
-    values : sequence of float
-        Values without infinities.
-    columns : int
-        Largest number of bars.
+    """Return the last values as a line of bars, on a logarithmic scale if all of them are
+    positive.
     """
     last = np.array(values[-columns:], dtype=float)
     if not len(last):
@@ -174,9 +165,7 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
 def _draw_parameter(
     figure: Figure, k: int, count: int, name: str, t_s: Array, updates: Sequence[LiveUpdate]
 ) -> tuple[list, list[Array]]:
-    """Add the axes of a parameter to a figure; return the three lines of its value and of the ends
-    of its interval, without data yet, and their data (T,), NaN for ends that are unknown.
-    """
+    """Add the axes of a parameter to a figure."""
     estimates = [update.estimates[name] for update in updates]
     value = np.array([each.value for each in estimates])
     ends = np.array([each.statistical95 or (np.nan, np.nan) for each in estimates])

@@ -46,8 +46,6 @@ def write_plan(
 
     Parameters
     ----------
-    plan : MotionPlan
-        The plan.
     folder : str or Path
         Folder, which may contain an earlier plan; that is replaced.
     rate_hz : float, optional

@@ -290,9 +290,7 @@ def _stated_places(experiment: Experiment) -> dict[str, Array]:
 
 
 def _combined_covariance(result: Result, problem: Problem) -> Array | None:
-    """Return the combined covariance (nq, nq) of q, zero for coefficients of fields; the statistical
-    one if systematic effects were not evaluated, None without any.
-    """
+    """Return the combined covariance (nq, nq) of q, zero for coefficients of fields."""
     uncertainty = result.uncertainty
     if uncertainty is None:
         return None

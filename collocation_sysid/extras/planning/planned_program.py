@@ -162,10 +162,6 @@ class PlannedProgram:
 
     Attributes
     ----------
-    body : PlannedBody
-        The body.
-    task : Task
-        The task.
     limits : Limits
         Limits of the robot.
     experiment : Experiment
@@ -514,14 +510,7 @@ def _lowest_frequency_hz(driven: DrivenMotion, start: Array) -> float:
 
 
 def _window_samples(task: Task, sample_s: float, lowest_hz: float) -> int:
-    """Return the number of samples after the motion in which the body is at rest; 0 if it need not
-    be.
-
-    Raises
-    ------
-    InputError
-        If the window has too few samples, or the body does not oscillate and none is stated.
-    """
+    """Return the number of samples after the motion in which the body is at rest."""
     end = task.end
     if not end.at_rest:
         return 0

@@ -135,8 +135,6 @@ class SplineMotion:
 
     Attributes
     ----------
-    space : SplineSpace
-        Space of splines.
     coefficients : (intervals + 3, 6) array
         Coefficients of shift [m] and rotation vector [rad].
     """

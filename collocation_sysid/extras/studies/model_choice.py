@@ -102,8 +102,7 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
 
 def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
     """Return the row of a model from its fits, without the columns that compare models
-    ("independent", "delta_aic", "log_ratio", "log_ratio_error", "chosen"); see `model_rows` for the
-    others.
+    ("independent", "delta_aic", "log_ratio", "log_ratio_error", "chosen").
     """
     complete_fit = fits.get("", {})
     predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
@@ -130,9 +129,7 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
 
 
 def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the RMS over the samples of all predictions, in their common unit; None if there is no
-    prediction, one of them is missing, or their units differ.
-    """
+    """Return the RMS over the samples of all predictions, in their common unit."""
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
     if len({each["unit"] for each in predictions}) > 1:
@@ -142,13 +139,7 @@ def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def _add_criterion(rows: Sequence[Row]) -> None:
-    """Add "delta_aic" and "independent" to each row, in place.
-
-    "delta_aic" is Akaike's criterion less the smallest of all models; None for models that did not
-    converge or have no evidence. "independent" is equal for all models: the equivalent number of
-    independent measurements of the converged model with the smallest misfit, with which all
-    criteria are computed; None if no converged model has evidence.
-    """
+    """Add "delta_aic" and "independent" to each row, in place."""
     known = [row for row in rows if row["converged"] and row["evidence"]]
     evidences = [Evidence(**row["evidence"]) for row in known]
     best = min(evidences, key=lambda e: e.misfit, default=None)
@@ -163,10 +154,6 @@ def _add_criterion(rows: Sequence[Row]) -> None:
 def _add_ratios(rows: Sequence[Row]) -> None:
     """Add "log_ratio", the logarithm of the ratio of its prediction error to the smallest one, and
     its standard error "log_ratio_error" to each row, in place.
-
-    The smallest is that of the converged models. Both are None for rows whose "held_out_rms" is
-    None, and for all rows if no converged model predicts all held-out data. Models that did not
-    converge may have a negative "log_ratio".
     """
     best = _best_prediction(rows)
     for row in rows:
@@ -209,14 +196,6 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
     """Return the model to use: the one with fewest parameters among the converged models that
     predict as well as the best within `LIKELY` standard errors, of several the one with the
     smallest error.
-
-    If no converged model has predicted all held-out data it is the one with the least AIC; None if
-    none has an AIC either.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `model_rows`, which must have "delta_aic" and "log_ratio"; not modified.
     """
     best = _best_prediction(rows)
     if best is None:
@@ -229,8 +208,6 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
 def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
     """Return the converged models, in their order, whose prediction error is equal to the best one
     within `errors` standard errors, or practically equal (`EQUIVALENT_ERROR`).
-
-    Models whose "log_ratio" is None are left out. `rows` are those of `model_rows`.
     """
     return [
         row
@@ -498,11 +475,7 @@ class Evidence:
 
 
 def evidence_from_fit(fit: LinearisedFit) -> Evidence:
-    """Return the evidence of a model from its linearised fit at the solution.
-
-    The equivalent number of independent measurements follows from the correlation of the residuals
-    of each block; it is the number of measurements if the residuals are zero up to rounding.
-    """
+    """Return the evidence of a model from its linearised fit at the solution."""
     factored = factorise_information(fit)
     rounding = ROUNDING**2 * fit.count_measurements()
     independent = float(fit.count_measurements())
@@ -551,8 +524,6 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
     ----------
     problem : Problem
         Problem with the model; not modified.
-    method : str
-        Name of the method.
     test_name : str
         Fitted recording that is predicted, see `reserve_test_data`; "" to fit all.
 
@@ -656,11 +627,6 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
     If it is the only fitted recording, the measurements after two thirds of its duration are
     removed, see `without_later_measurements`. Otherwise the recording becomes one for validation,
     and the time is −∞. `problem` is not modified.
-
-    Raises
-    ------
-    StopIteration
-        If the problem has no recording with this name.
     """
     chosen = next(e for e in problem.experiments if e.name == name)
     if len(fitted_recordings(problem)) > 1:

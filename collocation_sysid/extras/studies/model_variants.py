@@ -245,19 +245,6 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
 
     Labels are the names of the files without suffix, or the paths of all of them if two have the
     same name. Files are not read, and overrides are stored in the models, not applied.
-
-    Parameters
-    ----------
-    problems : sequence of Problem
-        At least one problem, each with its file.
-    overrides : sequence of str
-        Overrides "key=value", the same for all files.
-
-    Raises
-    ------
-    InputError
-        If the files do not fit the same recordings and samples, so that neither predictions nor AIC
-        could be compared, or a file is given twice.
     """
     first, *others = map(_measured_counts, problems)
     for problem, measured in zip(problems[1:], others, strict=True):
@@ -369,10 +356,6 @@ def _with_part_material(
     """Return a copy of the parameters with another material in the part whose constants have this
     prefix.
 
-    Constants of the part that the material neither has nor accepts in place of its own
-    (`elastic_names`) are left out; other parameters stay. Added under the prefix, each with the
-    table of `_starting_guess`, are
-
     - the shear modulus, if the material has it, and the part has neither it nor Young's modulus;
       those that parts share count only if the part has no constants of its own at all,
     - Poisson's ratio, if the material has a compressibility, for which the part neither has nor
@@ -399,9 +382,7 @@ def _with_part_material(
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
-    """Return the shear modulus at small strain [Pa] that follows from guesses or fixed values; None
-    if unknown.
-    """
+    """Return the shear modulus at small strain [Pa] that follows from guesses or fixed values."""
 
     def guess(name: str) -> float:
         """Return the guess or fixed value of a constant; NaN if it has none."""
@@ -431,8 +412,6 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
     """Return the table of the constant `name`: with a guess that gives the shear modulus `shear_pa`
     [Pa], or empty, for a scan, if that is None or the constant has no usual value.
-
-    A constant whose usual value is zero also gets a typical size, `LESS` times the shear modulus.
     """
     if shear_pa is None:
         return {}
@@ -462,9 +441,7 @@ def _with_memory(
     tables: Sequence[Mapping[str, Any]],
     times_s: tuple[float, float],
 ) -> dict[str, Any]:
-    """Return the parameters with a share and a time constant of each branch; those that the file
-    has are kept.
-    """
+    """Return the parameters with a share and a time constant of each branch."""
     names = [each["name"] for each in tables]
     removed_names = {name for name in old if name not in names}
     unchanged = {
@@ -481,10 +458,7 @@ def _with_memory(
 
 
 def as_inline_toml(value: Any) -> str:
-    """Return a value in TOML's inline syntax, on one line; mappings, lists, tuples, texts, booleans
-    and numbers are supported. None and other types are not: their text is no TOML, without an
-    error.
-    """
+    """Return a value in TOML's inline syntax, on one line."""
     if isinstance(value, Mapping):
         return (
             "{"

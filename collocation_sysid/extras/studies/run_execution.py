@@ -97,12 +97,7 @@ def execute(
 def _attempt(
     planned: dict[str, Any], time_limit_s: float | None, stopped: Callable[[], bool]
 ) -> Record:
-    """Execute a run once, in a process with one thread, and return its record.
-
-    After a time limit it is the record with the best iterate, if the process wrote one, with the
-    outcome `TIMEOUT`; an error that the process reported stays an error. Without a record of the
-    process the outcome is `TIMEOUT`, `STOPPED` or `CRASHED`.
-    """
+    """Execute a run once, in a process with one thread, and return its record."""
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         file = Path(place) / "record.json"
         with open(Path(place) / "stderr", "w+b") as stderr:
@@ -143,11 +138,7 @@ def _watch(
     time_limit_s: float | None,
     is_stopped: Callable[[], bool],
 ) -> Record | None:
-    """Send the run to the process and wait for its end, the time limit, or a stop.
-
-    At the time limit the process is asked to end and waited for, at most `GRACE_S`. A process that
-    is to be stopped is left running; the caller kills it.
-    """
+    """Send the run to the process and wait for its end, the time limit, or a stop."""
     assert process.stdin is not None
     deadline = None if time_limit_s is None else time.monotonic() + time_limit_s
     with contextlib.suppress(BrokenPipeError):
@@ -174,8 +165,7 @@ def _watch(
 
 def _crash_message(code: int, stderr: IO[bytes]) -> str:
     """Return how a process with this exit code ended (negative for a signal), with the last line of
-    its error output, if there is any. `stderr` is the file with that output, which is read from its
-    start.
+    its error output, if there is any.
     """
     cause = killed_by(code) or f"the process ended with code {code}"
     stderr.seek(0)
@@ -352,9 +342,7 @@ def run_all(
 
 
 def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
-    """Return the record of a run from its finished future; if that raises, a record of a crash,
-    because its worker was lost.
-    """
+    """Return the record of a run from its finished future."""
     try:
         return future.result()
     except Exception as error:

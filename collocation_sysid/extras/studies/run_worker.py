@@ -42,20 +42,7 @@ def main() -> None:
 
 
 def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
-    """Execute a planned run and return its record; errors become part of the record.
-
-    Parameters
-    ----------
-    planned : dict
-        A `PlannedRun` as a dictionary.
-
-    Returns
-    -------
-    dict
-        "outcome" (`FINISHED` or `ERROR`) and "message". Of a finished run also "model", see
-        `fit_record`, if `test_name` is not None (a comparison of models), else "result" and "tip",
-        see `_tip_record`. Of an unexpected error also "traceback".
-    """
+    """Execute a planned run and return its record; errors become part of the record."""
     try:
         problem = Problem.read(
             planned["problem"], planned["overrides"], allow_code=planned["allow_code"]
@@ -80,9 +67,7 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
 
 def _tip_record(finished: Run) -> dict[str, Any] | None:
     """Return measured and simulated track of the marker farthest from the grasp in the undeformed
-    body, of the first fitted experiment, for JSON; None without markers.
-
-    The distance is that from the mean of the grasped nodes, or of all nodes without a grasp.
+    body, of the first fitted experiment, for JSON.
     """
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers

@@ -86,11 +86,7 @@ def read_truth(
 
 
 def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
-    """Return the file, and its values by name, of a source of true values.
-
-    A text `item` with "=" is read as name=value pairs, separated by commas, with values as text;
-    the file is then None. Any other text is the path of a TOML file.
-    """
+    """Return the file, and its values by name, of a source of true values."""
     if "=" in item:
         pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
         return None, {name.strip(): value.strip() for name, _, value in pairs}
@@ -226,9 +222,7 @@ def _range_values(key: str, text: str) -> Iterable[str]:
 
 
 def _split_values(text: str) -> list[str]:
-    """Split text at the commas that are outside brackets, braces and quotes; items are stripped,
-    empty ones left out.
-    """
+    """Split text at the commas that are outside brackets, braces and quotes."""
     items = [""]
     open_brackets = 0
     quote = ""

@@ -58,16 +58,12 @@ class StudyReport:
 
     Attributes
     ----------
-    title : str
-        Title.
     kind : {METHOD_STUDY, MODEL_STUDY, SWEEP_STUDY}
         Kind of study.
     planned : tuple of PlannedRun
         Runs of the study.
     records : mapping of str to Record
         Records of finished runs by key.
-    yardstick : SuccessCriterion
-        Criterion of success.
     """
 
     title: str
@@ -89,9 +85,7 @@ class StudyReport:
 
     def build_views(self) -> list[Table]:
         """Return the tables for the terminal, each within 80 columns, with short headings: of a
-        comparison of methods success, quality and cost; of a comparison of models fit, prediction
-        and parameters, and estimates in which equally good laws disagree, if there are any; of a
-        sweep estimates, and quality and cost.
+        comparison of methods success, quality and cost.
         """
         if self.kind == METHOD_STUDY:
             return comparison_views(method_rows(self.list_rows()))
@@ -189,8 +183,6 @@ def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
 
     Parameters
     ----------
-    report : StudyReport
-        The study.
     folder : Path
         Folder to which it was written, for the last line; nothing is written here.
     """
@@ -241,8 +233,6 @@ def write_report(report: StudyReport, folder: Path) -> None:
 
     Parameters
     ----------
-    report : StudyReport
-        The study.
     folder : Path
         Folder, made if missing.
 
@@ -303,11 +293,7 @@ def report_json(report: StudyReport) -> dict[str, Any]:
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """Return rows as CSV text, a header and one line for each row; the columns are those of all
-    rows, in the order of their first occurrence. Values that a row lacks, and None, are empty;
-    other values are written as text by `str`, also lists and mappings. Without rows the text is an
-    empty line.
-    """
+    """Return rows as CSV text, a header and one line for each row."""
     columns = dict.fromkeys(name for row in rows for name in row)
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
@@ -318,8 +304,7 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 def report_section(report: StudyReport) -> TitledParts:
     """Return sentences, notes, tables (`StudyReport.build_views()`) and failures of a study as a
-    section with its title, for a paper's appendix or an issue; without failures it has no part on
-    them.
+    section with its title, for a paper's appendix or an issue.
     """
     failures = (Items(tuple(report.list_failures())),) if report.list_failures() else ()
     without = tuple(TitledParts("Runs without a result", (each,)) for each in failures)
@@ -344,12 +329,7 @@ Cell = Callable[[Row], str]
 
 def comparison_views(summaries: Sequence[Row]) -> list[Table]:
     """Return three tables, "Success", "Quality" and "Cost", with a line for each method and short
-    headings; the column of evaluations is left out if no method counts them.
-
-    Parameters
-    ----------
-    summaries : sequence of Row
-        Rows of `method_rows`, at least one; None is shown as a dash.
+    headings.
     """
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
@@ -383,11 +363,6 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
 def run_view(rows: Sequence[Row]) -> Table:
     """Return the table "Runs" of all runs of a comparison of methods, ordered by start, with
     headings in words.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row`, at least one; None is shown as a dash.
     """
     names = {"start": _text_cell("start"), "method": _text_cell("method")}
     cells: dict[str, Cell] = {
@@ -413,14 +388,7 @@ def _method_sentence(row: Row) -> str:
 
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
-    """Return how many runs converged, and how much each estimate varies between them, in words;
-    estimates of fewer than two runs are left out.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row`, at least one.
-    """
+    """Return how many runs converged, and how much each estimate varies between them, in words."""
     converged = [row for row in rows if row["converged"]]
     sentences = [f"{len(converged)} of {len(rows)} runs converged."]
     for name in parameters_in(rows):
@@ -437,13 +405,6 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
 def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
     """Return tables of estimates and quality, a line for each run with the values of the swept
     keys.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row`, at least one.
-    varied_keys : sequence of str
-        Swept keys.
     """
     places = {short: _varied_cell(key) for key, short in shortened_keys(varied_keys)}
     estimates: dict[str, Cell] = {}
@@ -526,8 +487,7 @@ def _transposed_view(
 
 def _ratio_text(row: Row) -> str:
     """Return the ratio of a model's prediction error to the best one as text, with its standard
-    error; "–" if "log_ratio" is None, because not all held-out data were predicted. `row` is one of
-    `model_rows`.
+    error.
     """
     if row["log_ratio"] is None:
         return "–"
@@ -577,8 +537,7 @@ def _number_cell(name: str, factor: float = 1.0, form: str = ".2g", among: str =
 
 def _bounded_cell(name: str) -> Cell:
     """Return the cell of the parameter `name`: a function of a row of `model_rows` that returns its
-    value as text, followed by "(at lower bound)" or "(at upper bound)" if it ended there; "–" if
-    the model has no such parameter.
+    value as text, followed by "(at lower bound)" or "(at upper bound)" if it ended there.
     """
     number = _number_cell(name, 1, form=".4g", among="parameters")
 
@@ -633,8 +592,7 @@ def _column_cell(name: str) -> Cell:
 
 def _estimate_cell(name: str) -> Cell:
     """Return the cell of the estimate of the parameter `name`: a function of a row of `run_row`
-    that returns its value, with the combined standard error if that is known, as text; "–" without
-    an estimate.
+    that returns its value, with the combined standard error if that is known, as text.
     """
 
     def cell(row: Row) -> str:

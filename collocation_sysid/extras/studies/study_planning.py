@@ -44,8 +44,6 @@ class PlannedRun:
         version.
     problem : str
         Absolute path of the problem file.
-    method : str
-        Name of the method.
     start : int
         Number of the start; 0 is the file's guess.
     overrides : tuple of str
@@ -180,8 +178,6 @@ def plan_comparison(
     ----------
     problem : Problem
         Problem read from its file with the same overrides.
-    methods : sequence of str
-        Names of methods.
     overrides : sequence of str
         Overrides "key=value".
     starts : Starts, optional
@@ -275,8 +271,6 @@ def plan_models(
     ----------
     problem : Problem
         Problem with the recordings.
-    variants : sequence of ModelVariant
-        Models.
     method : str, optional
         Name of the method; the file's own by default.
     allow_code : bool
@@ -361,8 +355,7 @@ def _planned_run(
 
 def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
     """Return SHA-256 hashes, by the name as it is written, of the files that the content of a
-    problem names, so that changed data give another run. A topic of a log with several files has
-    their hashes, separated by spaces. Names of missing files and of folders are left out.
+    problem names, so that changed data give another run.
     """
     hashes = {}
     for text in _texts(content):

@@ -145,9 +145,7 @@ def model_plots(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Figure]:
 
 
 def _model_ends(row: Row, panel: str) -> tuple[float, float, float] | None:
-    """Return low end, value and high end of a model in a panel of `model_plots`; None if the model
-    has no such value.
-    """
+    """Return low end, value and high end of a model in a panel of `model_plots`."""
     if panel == "prediction":
         if row["log_ratio"] is None or not np.isfinite(row["log_ratio_error"]):
             return None
@@ -162,9 +160,7 @@ def _model_ends(row: Row, panel: str) -> tuple[float, float, float] | None:
 
 
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
-    """Return colour and rows of each method by its name, in the order of their first rows; colours
-    repeat if there are more methods than colours. `rows` are those of `run_row`.
-    """
+    """Return colour and rows of each method by its name, in the order of their first rows."""
     methods = dict.fromkeys(row["method"] for row in rows)
     return {
         method: (
@@ -177,14 +173,7 @@ def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
 
 def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     """Return a figure of loss and violation of the equations of motion against time [s], a line per
-    run and a colour per method; values that are not positive are left out.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row` of runs with a result.
-    records : mapping of key of the run to Record
-        Records of these runs, with the history of each "result".
+    run and a colour per method.
     """
     figure = new_figure(PAGE_MM, 70)
     panels = figure.subplots(1, 2)
@@ -222,15 +211,6 @@ def success_by_distance(
 ) -> Figure:
     """Return a figure of the success rate of each method, with its 95 % interval, against the
     largest ratio of guess to reference, in `DISTANCE_BINS` logarithmic bins.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row`, at least one, with a guess of each parameter in `centre`.
-    centre : mapping of str to float
-        Positive reference of each parameter, at least one.
-    is_truth_known : bool
-        Whether the reference is the truth, otherwise the best estimate; for the title.
     """
     figure = new_figure(PAGE_MM / 2, 65)
     axes = figure.subplots()
@@ -317,9 +297,6 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], is_truth_known: boo
 def _ratio_axes(axes: Axes, factor: float) -> None:
     """Set both axes, in place, to a logarithmic scale around one, with ticks at 1 and at a round
     ratio and its inverse.
-
-    The scale ends at 0.8 / `factor` and 1.25 · `factor`; `factor`, the largest ratio that is drawn,
-    is at least 1.
     """
     digit = 10 ** np.floor(np.log10(factor))
     tick = max((t for t in (1.5, 2.0, 5.0, 10.0) if t * digit <= factor), default=1.0) * digit
@@ -336,16 +313,6 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
 def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     """Return a figure of the measured marker farthest from the grasp, and of its forward simulation
     with each method's best solution.
-
-    Measurements are those of the first row. Methods whose best run has no simulated track are left
-    out.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row` of runs with a result, at least one.
-    records : mapping of key of the run to Record
-        Records of these runs, each with a "tip" that is not None, see `run_worker`.
     """
     figure = new_figure(PAGE_MM, 65)
     panels = figure.subplots(1, 3, sharex=True)
@@ -393,13 +360,6 @@ def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure
 
     Estimates that did not converge are crosses, unknown ones are left out. Values of the first
     other key have colours.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row`, one for each run, at least one with a result.
-    varied_keys : sequence of str
-        Swept keys.
     """
     names = parameters_in(rows)
     width = max(PAGE_MM / 2, min(PAGE_MM, 80.0 * len(varied_keys)))

@@ -202,8 +202,6 @@ def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[st
     """Return the columns of the estimated parameters of a run: first ``guess_NAME`` of all, then
     for each ``value_NAME``, ``std_error_NAME``, ``low_NAME`` and ``high_NAME`` (combined standard
     error and interval), and ``error_NAME`` if its truth is known.
-
-    The error is that of the optimum, relative to the truth, without a sign.
     """
     row: Row = {}
     estimates = {} if result is None else result.parameters

@@ -22,7 +22,6 @@ class KernelBatch:
 
     Attributes
     ----------
-    kernel : ElementKernel
     cells : (E, nodes)
         Node indices.
     geometry : (E, q, 3·nodes + 1)
@@ -66,12 +65,7 @@ class VectorCodeError(InputError):
 
 
 class CasadiEvaluator:
-    """Evaluator of a `KernelBatch` by CasADi's virtual machine: slower, but always available.
-
-    Parameters
-    ----------
-    batch : KernelBatch
-    """
+    """Evaluator of a `KernelBatch` by CasADi's virtual machine: slower, but always available."""
 
     def __init__(self, batch: KernelBatch) -> None:
         count, points, size = batch.geometry.shape

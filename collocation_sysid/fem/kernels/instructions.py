@@ -66,10 +66,6 @@ def emit_function(
 
     Parameters
     ----------
-    builder : llvmlite IRBuilder
-    function : casadi.Function
-    vector : llvmlite type
-        Type of all values.
     read : callable
         Returns the value of (input, entry).
 
@@ -174,9 +170,7 @@ def _emit_comparison(sign: str) -> Emit:
 
 
 def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
-    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans; as in C,
-    NaN differs from everything, itself included.
-    """
+    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans."""
     return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
 
 

@@ -80,9 +80,7 @@ def _initialise() -> None:
 
 
 def _target_machine(quickly: bool) -> llvm.TargetMachine:
-    """Return a code generator for this CPU, without optimisation if `quickly`; the engine that uses
-    it owns and frees it.
-    """
+    """Return a code generator for this CPU, without optimisation if `quickly`."""
     _initialise()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(),
@@ -116,7 +114,6 @@ class NativeCode:
     key : str
         Identifies the code: as long as the files of this folder are unchanged, equal keys must mean
         equal code.
-    signature : tuple of ctypes types
     build : callable
         Returns the LLVM module that defines `name`; called only if nothing is cached.
     is_unoptimised : bool
@@ -145,12 +142,7 @@ def compile_function(code: NativeCode) -> CompiledFunction:
 
 
 class CompiledFunction:
-    """Native function, called through ctypes, which releases the interpreter lock.
-
-    Parameters
-    ----------
-    code : NativeCode
-    """
+    """Native function, called through ctypes, which releases the interpreter lock."""
 
     def __init__(self, code: NativeCode) -> None:
         machine = _target_machine(code.is_unoptimised)
@@ -199,9 +191,7 @@ def _source_digest() -> str:
 
 
 def compile_module(module: ir.Module, machine: llvm.TargetMachine, quickly: bool) -> bytes:
-    """Return the object code of an LLVM module for a machine, without optimisation if `quickly`;
-    the target triple of the module is set.
-    """
+    """Return the object code of an LLVM module for a machine, without optimisation if `quickly`."""
     module.triple = machine.triple
     parsed = llvm.parse_assembly(str(module))
     parsed.verify()
@@ -225,9 +215,7 @@ def cache_folder() -> Path:
 
 
 def load_object(key: str) -> bytes | None:
-    """Return the code stored for a key; None if there is none, if it is damaged, or if others could
-    have written it.
-    """
+    """Return the code stored for a key."""
     folder = cache_folder()
     if not folder.is_dir() or not _is_trusted(folder):
         return None
@@ -241,9 +229,7 @@ def load_object(key: str) -> bytes | None:
 
 
 def store_object(key: str, code: bytes) -> None:
-    """Store code in the cache under a key, in place of what is there; do nothing if the folder
-    cannot be written or trusted (the latter with a warning). The folder is created if missing.
-    """
+    """Store code in the cache under a key, in place of what is there."""
     folder = cache_folder()
     with suppress(OSError):
         for missing in [p for p in (folder, *folder.parents) if not p.exists()][::-1]:

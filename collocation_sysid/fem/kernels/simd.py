@@ -48,10 +48,6 @@ class SimdEvaluator:
     Arrays passed to a call must be contiguous float64 arrays of the right shapes; this is not
     checked.
 
-    Parameters
-    ----------
-    batch : KernelBatch
-
     Raises
     ------
     VectorCodeError
@@ -143,7 +139,6 @@ class _PhaseLayout:
 
     Parameters
     ----------
-    phase : Phase
     first : int
         Offset of the outputs of this phase in the totals.
     """
@@ -164,14 +159,6 @@ class _PhaseLayout:
     def output_offsets(self, first: int, how: Contraction, step: int) -> list[int]:
         """Return the offsets in the totals of outputs with a contraction, in steps of `step`
         entries.
-
-        Parameters
-        ----------
-        first : int
-            Index of the first output to include.
-        how : {"none", "nodes", "pairs"}
-            Contraction.
-        step : int
         """
         return [
             place
@@ -190,7 +177,6 @@ class _KernelEmitter:
 
     Parameters
     ----------
-    kernel : ElementKernel
     points : int
         Quadrature points of an element.
     lanes : int
@@ -358,9 +344,6 @@ class _KernelEmitter:
     def _load_point_data(self, memory: list, t: Value, point: Value) -> list:
         """Return the data of a quadrature point of W elements at time step t, a vector for each
         datum.
-
-        `memory` contains the length of a row, the positions in the row of each point's data, and
-        the rows of all time steps.
         """
         b = self.builder
         length, places, rows = memory
@@ -479,8 +462,7 @@ class _KernelEmitter:
 
     def _coefficients(self, coupling: ca.Function, totals: Value) -> list[dict[int, list]]:
         """Emit the evaluation of the coupling, and return for each output, by the index of the
-        column, a list of pairs: offset of a node vector in `totals`, and its coefficient. Zero
-        coefficients are left out.
+        column, a list of pairs: offset of a node vector in `totals`, and its coefficient.
         """
         outputs = [coupling.sparsity_out(k) for k in range(coupling.n_out())]
         entries = [list(zip(*output.get_triplet(), strict=True)) for output in outputs]

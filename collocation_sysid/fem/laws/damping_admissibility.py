@@ -90,8 +90,6 @@ def viscous_stress(
 
     Parameters
     ----------
-    damping : DampingLaw
-    material : Material
     F, rate : (9,) SX
         Symbols of the deformation gradient and its rate, stacked column after column.
     theta : (k,) SX

@@ -70,7 +70,6 @@ def principal_stretches(body: Body, positions: Array, theta: Array) -> Array:
 
     Parameters
     ----------
-    body : Body
     positions : (T, 3n)
         Node positions [m].
     theta : (k,)

@@ -53,7 +53,6 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Ele
     ----------
     name : str
         Name of the kernel.
-    point : QuadraturePoint
     outputs : dict
         Derivatives that are summed in each output.
     """
@@ -95,7 +94,6 @@ class _VolumeSums:
 
     Attributes
     ----------
-    point : QuadraturePoint
     volume : SX
         Symbol of the sum V.
     volumes : SX
@@ -148,11 +146,6 @@ class _VolumeSums:
     def volume_pieces(self, order: int) -> Pieces:
         """Return the pieces of the first phase: the volume of the mesh ("volume", summed to V), σ
         ("volumes", summed to s) and, if `order` is at least 1, ∂σ/∂x ("volumes_by_x").
-
-        Parameters
-        ----------
-        order : int
-            Highest order of the derivatives.
         """
         sums: Pieces = {
             "volume": ("none", self.point.mesh_volume),
@@ -181,7 +174,6 @@ class _ScalarDerivatives:
 
     Attributes
     ----------
-    shape : _VolumeSums
     scalar : SX
         Scalar g.
     number : int

@@ -100,7 +100,6 @@ class MemoryLayout:
 
     Attributes
     ----------
-    parts : tuple of BodyPart
     first_constants : (parts,)
         Index in θ of the first memory constant of each part.
     points_per_element : int
@@ -175,10 +174,6 @@ class MemoryLayout:
     def sum_over_branches(self, values: Array) -> Array:
         """Return the sums (…, width) over the branches of each point: the transpose of
         `to_branches`. For a single branch the argument itself is returned.
-
-        Parameters
-        ----------
-        values : (…, all branches)
         """
         if len(self.branches) == 1:
             return values

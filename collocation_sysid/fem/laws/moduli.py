@@ -30,7 +30,6 @@ class ConstantSource:
 
     Attributes
     ----------
-    material : Material
     names : mapping
         For each constant, by its name without region, the name of the parameter that gives it. For
         the elastic constants, the names of the pair that was given.
@@ -85,7 +84,6 @@ def find_source(
     ----------
     region : str
         Name of the region; "" for the rest of the body.
-    material : Material
     others : iterable of Constant
         Constants of the region beside those of its material.
     known : sequence of str
@@ -100,10 +98,7 @@ def find_source(
     """
 
     def name_of(own: str) -> str | None:
-        """Return the parameter that gives a constant, that of the region first.
-
-        None if there is none.
-        """
+        """Return the parameter that gives a constant, that of the region first."""
         prefixed = f"{region}.{own}" if region else own
         return prefixed if prefixed in known else own if own in known else None
 

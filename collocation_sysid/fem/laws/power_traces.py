@@ -172,9 +172,6 @@ def _weights(parity: Parity, alpha: ca.SX) -> ca.SX:
 def _value_weights(parity: Parity, alpha: ca.SX) -> ca.SX:
     """Return the weights (NODES + TAIL_TERMS,) of a sum after summation by parts: sinh(su)/s for
     the even sum, (cosh(su) − 1)/s for the odd one, with s = α / 2^(DOUBLINGS + 1).
-
-    They are values at the nodes, then those of the series beyond them, see `_exponentials`.
-    Exponents near zero are replaced by a small one.
     """
     s = alpha / 2 ** (DOUBLINGS + 1)
     safe_alpha = ca.if_else(
@@ -190,12 +187,7 @@ def _value_weights(parity: Parity, alpha: ca.SX) -> ca.SX:
 
 
 def _exponentials(alpha: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return e^(su) and e^(−su) for s = α / 2^(DOUBLINGS + 1), (NODES + TAIL_TERMS,) each.
-
-    The first NODES entries are the values at the nodes u > 0. The others are sums over all nodes
-    beyond the last: entry k contains the factor with which the kth term of the series of ln z,
-    which decays like e^(−ku), is weighted.
-    """
+    """Return e^(su) and e^(−su) for s = α / 2^(DOUBLINGS + 1), (NODES + TAIL_TERMS,) each."""
     ratio = ca.exp(SPACING / 2 ** (DOUBLINGS + 1) * alpha)
     powers = [ca.exp(SPACING / 2 ** (DOUBLINGS + 2) * alpha)]
     for _ in range(NODES):
@@ -212,10 +204,7 @@ def _exponentials(alpha: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def _integer_power_traces(first_excess: ca.SX, second_excess: ca.SX) -> ca.SX:
-    """Return tr C̄ᵏ − 3, k = 1 … TAIL_TERMS, by Newton's identities with det C̄ = 1.
-
-    With Ī₁ − 3 and Ī₂ − 3 exchanged the traces are those of C̄⁻ᵏ.
-    """
+    """Return tr C̄ᵏ − 3, k = 1 … TAIL_TERMS, by Newton's identities with det C̄ = 1."""
     first = first_excess + 3
     second = second_excess + 3
     traces = [ca.SX(3), first, first**2 - 2 * second]
@@ -225,10 +214,7 @@ def _integer_power_traces(first_excess: ca.SX, second_excess: ca.SX) -> ca.SX:
 
 
 def _doubled(excess: Partials, opposite: Partials, square: Partials) -> Partials:
-    """Return the partial derivatives of the scaled excess (tr C̄^(2s) − 3)/(2s)².
-
-    With x = tr C̄ˢ − 3 and y = tr C̄⁻ˢ − 3 the excess at 2s is 6x + x² − 2y.
-    """
+    """Return the partial derivatives of the scaled excess (tr C̄^(2s) − 3)/(2s)²."""
     product = _product(square, _product(excess, excess))
     return cache(lambda index: (6 * excess(index) + product(index) - 2 * opposite(index)) / 4)
 

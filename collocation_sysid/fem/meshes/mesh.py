@@ -159,7 +159,6 @@ class TetMesh:
 
         Parameters
         ----------
-        path : str or Path
         length_unit : {"m", "cm", "mm", "um", "in"}
             Unit of the coordinates in the file.
 
@@ -345,9 +344,7 @@ def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
-    """Return a contiguous array that cannot be modified; an argument that is contiguous is itself
-    made read-only and returned.
-    """
+    """Return a contiguous array that cannot be modified."""
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
     return array

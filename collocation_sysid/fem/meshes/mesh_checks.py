@@ -91,9 +91,7 @@ def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
 
 
 def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
-    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1; the
-    message says if they seem to count from 1.
-    """
+    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1."""
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):
         hint = (
@@ -114,7 +112,6 @@ def checked_arrays(
 
     Parameters
     ----------
-    arrays : mapping of name to array
     count : int
         Required first length.
     kind : str
@@ -257,9 +254,7 @@ def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
-    """Raise an `InputError` if a used node has coordinates that are not finite; `used` are the
-    indices of the nodes that an element has.
-    """
+    """Raise an `InputError` if a used node has coordinates that are not finite."""
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
         raise InputError(
@@ -325,7 +320,6 @@ def straightening_notes(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, .
 
     Parameters
     ----------
-    points_m : (n, 3)
     cells : (E, 10)
 
     Returns

@@ -185,7 +185,6 @@ def write_tetrahedra(
     ----------
     path : str or Path
         Replaced if it exists.
-    points_m : (n, 3)
     tetrahedra : (E, 4) int
     point_arrays, cell_arrays : mapping of name to array, optional
         Values of each point and each tetrahedron; none by default.
@@ -213,10 +212,7 @@ def _without_booleans(values: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
-    """Context that gives the content of a file.
-
-    Errors in the body of the context are reported as damage of the file.
-    """
+    """Context that gives the content of a file."""
     if not Path(path).is_file():
         raise InputError("there is no such file", path)
     require_regular(path)
@@ -232,8 +228,6 @@ def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
 def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
     """Context that turns a failure on an invalid file into one `InputError` with the path, and
     prints nothing.
-
-    An `OSError` while writing is raised unchanged.
     """
     captured = io.StringIO()
     try:
@@ -292,11 +286,7 @@ def _cell_sets(data: MeshContent) -> dict[str, list[np.ndarray]]:
 
 
 def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
-    """Return the physical groups of a .msh file by name, as boolean arrays block by block.
-
-    A group without a name is "physical_<tag>", followed by its dimension if other dimensions use
-    the tag.
-    """
+    """Return the physical groups of a .msh file by name, as boolean arrays block by block."""
     tags = [np.asarray(block).ravel() for block in data.cell_data.get("gmsh:physical", ())]
     if not tags:
         return {}
@@ -334,10 +324,7 @@ def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
 
 
 def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the values (E, …) on tetrahedra of arrays given block by block, by name.
-
-    Masks without a true value are omitted.
-    """
+    """Return the values (E, …) on tetrahedra of arrays given block by block, by name."""
     tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
     selected = {}
     for name, per_block in arrays.items():
@@ -376,9 +363,7 @@ def _cell_counts(data: MeshContent) -> Counter[str]:
 
 
 def _listed(counts: Mapping[str, int]) -> str:
-    """Return numbers of cells by type as text, such as "12 tetra, 3 line"; "no cells at all" if
-    empty.
-    """
+    """Return numbers of cells by type as text, such as "12 tetra, 3 line"."""
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 

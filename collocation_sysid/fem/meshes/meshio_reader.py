@@ -85,16 +85,7 @@ class CellBlock:
 
 @dataclass(frozen=True)
 class MeshContent:
-    """Content of a mesh or point file, with the names and forms of meshio.
-
-    Attributes
-    ----------
-    points : (n, k) array
-    cells : list of CellBlock
-    point_data, field_data, point_sets : mapping of name to array
-    cell_data : mapping of name to one array for each block
-    cell_sets : mapping of name to one array, or None, for each block
-    """
+    """Content of a mesh or point file, with the names and forms of meshio."""
 
     points: NDArray[Any]
     cells: list[CellBlock]

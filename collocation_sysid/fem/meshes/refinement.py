@@ -119,9 +119,6 @@ def refine_body(body: Body) -> Body:
 def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
     """Return the statement about the rest shape for the refined body: None if `body` has none,
     "stress_free", or the scan conditions with the held nodes of the refined `mesh`.
-
-    A box or a ball selects nodes by position and stays as it is. Of the middle of an edge, both
-    ends must be held.
     """
     if body.scan_conditions is None:
         return None if body.rest_shape is None else "stress_free"
@@ -134,10 +131,7 @@ def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["st
 
 
 def _refined_force(placed: LocatedForce, mesh: TetMesh, body: Body) -> NodeForce:
-    """Return a custom force for the refined body, at the corresponding nodes.
-
-    The middle of an edge is among them if both ends are.
-    """
+    """Return a custom force for the refined body, at the corresponding nodes."""
     chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
     nodes = chosen[: len(body.mesh.points_m)]
     chosen = np.concatenate([nodes, nodes[body.mesh.edges].all(axis=1)])

@@ -33,11 +33,6 @@ class _PositionSelection:
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`, mid nodes
         included.
-
-        Raises
-        ------
-        InputError
-            If no node is selected; the message names the nearest one.
         """
         hint = self._nearest_hint(nodes.points_m)
         return _indices_or_error(
@@ -45,23 +40,11 @@ class _PositionSelection:
         )
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the indices of the cells whose centres are inside, sorted int64.
-
-        Raises
-        ------
-        InputError
-            If no cell is selected.
-        """
+        """Return the indices of the cells whose centres are inside, sorted int64."""
         return _indices_or_error(self._contains(mesh.centres_m), mesh, what=str(self), of=OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
-        """Return the rows of `mesh.surface` whose three corners are inside, sorted int64.
-
-        Raises
-        ------
-        InputError
-            If no face is selected.
-        """
+        """Return the rows of `mesh.surface` whose three corners are inside, sorted int64."""
         return _select_faces(self._contains(mesh.points_m), mesh, what=str(self))
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:

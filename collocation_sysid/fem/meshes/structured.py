@@ -51,7 +51,6 @@ def cylinder_of_edge(
 
     Parameters
     ----------
-    diameter_m, height_m, edge_length_m : float
     quarter : bool
         Only x, y ≥ 0, between the planes of symmetry x = 0 and y = 0.
 

@@ -100,9 +100,6 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
 def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
     """Return the problem of all fitted experiments on their first samples, which contain at least
     `SHOWN_STEPS` time steps if the recordings do, and its variables.
-
-    The complete Jacobian may need gigabytes. Positions and shared parameters are those of z;
-    nuisance parameters are at their guesses, and measurements are associated with the body again.
     """
     count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
     few = [
@@ -122,9 +119,6 @@ def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array
 def _draw_magnitudes(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
     """Draw the magnitudes of a sparse matrix on a raster no finer than the picture, and return the
     image.
-
-    Each raster element has the largest magnitude of its entries, of which NaN counts as zero;
-    elements without an entry stay empty.
     """
     rows, columns = matrix.shape  # type: ignore[misc]
     entries = sp.coo_array(matrix)

@@ -97,11 +97,7 @@ def _continuation_stages(history: Sequence[Iteration]) -> list[slice]:
 def _mark_continuation_stages(
     panels: Sequence[Axes], history: Sequence[Iteration], stages: Sequence[slice]
 ) -> None:
-    """Mark the iterations at which the fit takes in more timesteps; loss and error increase there.
-
-    Lines are drawn between the stages, and the title of the first panel is set to the shares of
-    the timesteps.
-    """
+    """Mark the iterations at which the fit takes in more timesteps."""
     if len(stages) < 2:
         return
     for part in stages:

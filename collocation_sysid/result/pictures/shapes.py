@@ -235,8 +235,6 @@ def field_shapes(
     ----------
     replay : MotionRecord
         Experiment with shapes.
-    body : Body
-        Its body.
     constants : mapping of name to value
         Values of the body's constants by name, at which stresses and energies are computed.
     field : str or None

@@ -115,11 +115,7 @@ def is_unloading(at: Array) -> NDArray[np.bool_]:
 
 
 def _readable_unit(values: Array, unit: str) -> tuple[str, float]:
-    """Return a readable unit for values, and the factor to it.
-
-    Stresses ("Pa") get the largest unit in which the largest magnitude is at least `READABLE`;
-    other units are kept with the factor 1, and "1" becomes "".
-    """
+    """Return a readable unit for values, and the factor to it."""
     if unit != "Pa":
         return ("" if unit == "1" else unit), 1.0
     largest = float(np.nanmax(np.abs(values), initial=0.0))

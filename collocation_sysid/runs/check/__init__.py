@@ -90,8 +90,6 @@ class QuickCheck:
     ----------
     bodies : tuple of BodyCheck
         One for each body.
-    recordings : tuple of RecordingCheck, one for each experiment
-    holds : tuple of GraspCheck, one for each grasp
     """
 
     bodies: tuple[BodyCheck, ...]
@@ -141,7 +139,6 @@ class CheckResult(QuickCheck):
     rms_at_guess_m : float or None
         RMS distance of the markers in the simulation at the guess; None if only the first samples
         were simulated.
-    motions : tuple of ModesCheck, one for each fitted experiment that moves
     variables, constraints : int
         Size of the program without lifted variables.
     overstresses, wrenches : int
@@ -153,7 +150,6 @@ class CheckResult(QuickCheck):
         The chosen method.
     memory_mb : float or None
         Estimated memory of the chosen method; None if it is not among the `costs`.
-    costs : tuple of MethodCost, one for each method with a known cost
     jacobian_error, hessian_error : float
         Largest relative deviation from central differences along random directions.
     causes : tuple of Hypothesis
@@ -263,7 +259,6 @@ def check_problem(
 
     Parameters
     ----------
-    problem : Problem
     report_progress : callable, optional
         Called with progress messages.
     full : bool
@@ -401,8 +396,7 @@ def expected_search_s(problem: Problem) -> float | None:
 
 def _fit_to_markers_s(collocation: Collocation, total_s: float, samples: int) -> float:
     """Return the estimated time [s] to fit the first `samples` samples, each counted as one time
-    step, to the markers alone; `total_s` is the time to simulate the complete recordings [s] of
-    `collocation`.
+    step, to the markers alone.
     """
     share = min(1.0, samples / _grid_rows(collocation))
     return FIT_SIMULATIONS * total_s * share
@@ -464,8 +458,7 @@ def _program_fields(
 
 def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesCheck, ...]:
     """Return the natural modes at the guess of each fitted experiment that moves, in their order,
-    with the scheme and step of the collocation; static and held out experiments are left out. Every
-    parameter must have a guess.
+    with the scheme and step of the collocation.
     """
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses
@@ -507,9 +500,7 @@ def _concerns(
 
 
 def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
-    """Return the finding of each body at the guess, with the names of its experiments; every
-    parameter must have a guess.
-    """
+    """Return the finding of each body at the guess, with the names of its experiments."""
     guesses = problem.parameters.guesses
     names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
     specimens = {e.name for e in problem.experiments if e.specimen is not None}

@@ -120,19 +120,7 @@ def slenderness(mesh: TetMesh) -> Slenderness:
 def element_concerns(
     body: Body, theta: Array, shape: Slenderness, worst: ElementShape
 ) -> list[Concern]:
-    """Return concerns about flat elements, locking, and too few elements across the thickness.
-
-    Parameters
-    ----------
-    body : Body
-        Body with its mesh and elements.
-    theta : array
-        Constants θ at the guess.
-    shape : Slenderness
-        Slenderness of the body.
-    worst : ElementShape
-        Element of the lowest quality.
-    """
+    """Return concerns about flat elements, locking, and too few elements across the thickness."""
     name = body.element.name
     poisson = max(engineering_constants(*lame)[1] for lame in body.lame(theta).values())
     limit = LOCKING_POISSON.get(name, np.inf)
@@ -217,8 +205,6 @@ class BodyCheck:
 
     Attributes
     ----------
-    experiments : tuple of str
-        Names of its experiments.
     element : str
         Name of the element, such as "tet10".
     nodes, elements : int
@@ -227,11 +213,8 @@ class BodyCheck:
         Volume of the mesh, and mass at the guess, without point masses.
     point_masses_kg : mapping of str to float
         Sum of the point masses of each experiment that has any, by its name.
-    size_m : (x, y, z) extents of the mesh along the axes
     smallest_element_quality, median_element_quality : float
         Mean ratio, see `ElementShape`.
-    edges_m : shortest, mean and longest edge of the mesh
-    worst_elements : tuple of ElementShape, worst first
     cells_across : float
         Number of elements across the body's thickness.
     guess : mapping of name to float
@@ -307,11 +290,8 @@ def check_body(
 
     Parameters
     ----------
-    body : Body
     theta : array
         Constants θ at the guess.
-    experiments : tuple of str
-        Names of its experiments.
     is_homogeneous : bool
         Whether it is the cell of specimens, which has no discretisation error.
     point_masses_kg : mapping of str to float, optional
@@ -356,9 +336,7 @@ def check_body(
 
 
 def _rest_shape(body: Body) -> str | None:
-    """Return the kind of the stated rest shape, "stress_free" or "under_gravity"; None if none is
-    stated.
-    """
+    """Return the kind of the stated rest shape, "stress_free" or "under_gravity"."""
     if body.rest_shape is None:
         return None
     return "stress_free" if body.scan_conditions is None else "under_gravity"
@@ -387,8 +365,7 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
     """Return E [Pa] and ν at small strain of each part, then the constants of the body without
-    coefficients of fields, by name with the region; stated moduli replace computed ones. `theta`
-    (k,) are the constants.
+    coefficients of fields, by name with the region.
     """
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
@@ -414,8 +391,6 @@ class GraspCheck:
 
     Attributes
     ----------
-    experiment : str
-        Name of the experiment.
     nodes : int
         Number of nodes.
     low_m, high_m : (3,) corners of the box around them, on the undeformed body
@@ -446,7 +421,6 @@ def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck
 
     Parameters
     ----------
-    experiment : Experiment
     mean_edge_m : float
         Mean edge length of the mesh [m].
     """

@@ -38,7 +38,6 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
 
     Parameters
     ----------
-    problem : Problem
     collocation : Collocation
         Program of the problem, with guesses.
     method : Method
@@ -107,8 +106,6 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
 def _count_nonzeros(problem: Problem) -> NDArray[np.int64]:
     """Return the numbers of nonzeros of the Jacobian and of the Hessian's upper triangle of a
     problem with guesses, as int array (2,), by laying out its program without lifted variables.
-
-    That takes memory in proportion to the length of the recordings.
     """
     collocation = problem.collocation()
     structures = (collocation.jacobian_structure, collocation.hessian_structure)
@@ -145,8 +142,6 @@ class MethodCost:
 
     Attributes
     ----------
-    method : str
-        Name of the method.
     memory_mb : float
         Estimated memory [MB].
     time_s : float or None
@@ -212,8 +207,6 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
 
     Parameters
     ----------
-    chosen : MethodCost
-        Cost of the chosen method.
     others : sequence of MethodCost
         Costs of at least one method; the chosen one may be among them.
     """
@@ -235,8 +228,6 @@ def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Conc
 
     Parameters
     ----------
-    chosen : MethodCost
-        Cost of the chosen method.
     others : sequence of MethodCost
         Costs of all methods; the chosen one may be among them.
     """
@@ -274,12 +265,6 @@ def estimated_sweeps_s(
 def search_factor(experiment: Experiment, free_names: Set[str]) -> float:
     """Return the time of the search in an experiment over that of `TYPICAL_SWEEPS` sweeps, as
     measured for experiments of its kind.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    free_names : set of str
-        Names of the estimated parameters, which may be coefficients of friction.
     """
     factor = STATIC_FACTOR if experiment.is_static else 1.0
     if any(each.friction in free_names for each in experiment.obstacles):

@@ -51,12 +51,6 @@ def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[GraspGap]:
     None for grasps that are not selected by a box, that hold some axes only (platens and planes of
     symmetry), or whose nodes are one layer along the axis, and for faces of the box beyond which
     there is no body.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    grasp : Grasp
-        One of its grasps, with its nodes selected.
     """
     box = grasp.selection
     if not isinstance(box, Box) or len(grasp.axes) < 3:

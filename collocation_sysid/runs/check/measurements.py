@@ -51,8 +51,6 @@ class RecordingCheck:
 
     Attributes
     ----------
-    experiment : str
-        Name of the experiment.
     validation, static : bool
         Whether it is for validation, and whether it is a series of equilibria.
     duration_s, rate_hz : float
@@ -102,7 +100,6 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
 
     Parameters
     ----------
-    experiment : Experiment
     positions_m : (T, n, 3) array or None
         Its node positions in the simulation at the guess [m], at all samples or the first T; None
         without a simulation, and then no `start_miss_m` is known.
@@ -161,9 +158,7 @@ def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Conce
         return []
 
     def marker_data(marker: MarkerCheck, distance_m: float | None = 0.0) -> dict[str, Any]:
-        """Return the data of a concern about a marker; `distance_m` [m] is None or 0 if it does not
-        matter.
-        """
+        """Return the data of a concern about a marker."""
         by_mm = 1e3 * (distance_m or 0.0)
         frames = recording.frames
         named = {"marker": marker.name, "experiment": recording.experiment}

@@ -69,11 +69,8 @@ class ModesCheck:
 
     Attributes
     ----------
-    experiment : str
-        Name of the experiment.
     about : str
         State about which the body oscillates: "rest state" or "undeformed shape".
-    modes : tuple of ModeCheck, by frequency
     scheme : str
         Name of the time scheme.
     timestep_s : float
