@@ -8,7 +8,7 @@ replay), `benchmark_commands` (benchmark), `installation_commands` (doctor) and 
 `common` has exit codes and output, and `markdown` shows documentation on a terminal.
 
 Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
-130 interrupted.
+130 interrupted by Ctrl-C (SIGINT), 143 by SIGTERM.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typer.core import TyperGroup
 from typer.main import get_command, get_command_from_info
 
 from ..common.installation import package_version
-from ..common.signal_handling import heed_interrupts, leave
+from ..common.signal_handling import INTERRUPTS, heed_interrupts, leave
 from ..errors import InputError, SimulationError, hint_at
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
 
@@ -183,9 +183,9 @@ def main() -> None:
     try:
         _run_command()
     except KeyboardInterrupt:  # before or after the command itself
-        leave(EXIT_INTERRUPTED)
+        leave(128 + INTERRUPTS.number)
     except SystemExit as ended:
-        leave(ended.code or 0)
+        leave(128 + INTERRUPTS.number if ended.code == EXIT_INTERRUPTED else ended.code or 0)
 
 
 def _run_command() -> None:

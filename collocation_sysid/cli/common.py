@@ -18,7 +18,7 @@ error_console = PlainConsole(stderr=True)
 EXIT_NOT_CONVERGED = 1
 # Exit code of bad input, as of wrong usage in most command-line programs.
 EXIT_BAD_INPUT = 2
-# Exit code after Ctrl-C: 128 + SIGINT (2), as of shells.
+# Exit code after Ctrl-C: 128 + SIGINT (2), as of shells; `main` changes it after SIGTERM to 143.
 EXIT_INTERRUPTED = 130
 # Width of the output in columns if it is not a terminal: no line is longer.
 UNBROKEN_WIDTH = 100_000

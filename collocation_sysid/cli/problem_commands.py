@@ -98,7 +98,7 @@ def solve(options: SolveCommand) -> None:
     with --set, as in --set solver.reduced-space.tolerance=1e-6. The command methods lists them.
 
     The exit code is 0 if the search converged, 1 if it did not, or if the verdict is doubtful with
-    --strict, 2 for bad input, and 130 after an interrupt.
+    --strict, 2 for bad input, 130 after Ctrl-C, and 143 after SIGTERM.
     """
     from ..result.run_summary import next_step, run_summary
     from ..result.solve_progress import SolveProgress

@@ -33,26 +33,27 @@ class Interrupts:
     Libraries convert an exception within their imports into an error of their own, and CasADi drops
     one within its conversions. There the first signal is deferred until the import or the function
     has ended: it is sent again every `RETRY_S`. A second signal in this time raises at once. At the
-    end of a `deferred` block `KeyboardInterrupt` is raised if a signal came meanwhile.
+    end of a `deferred` block `KeyboardInterrupt` is raised if a signal came meanwhile. The last signal
+    is `number`.
     """
 
     def __init__(self) -> None:
         self._deferring = 0
         self._timer: threading.Timer | None = None
         self._tries_again = False
-        self._number = int(signal.SIGINT)
+        self.number = int(signal.SIGINT)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Raise `KeyboardInterrupt`, or defer the signal if `frame`, which it interrupted, is
         within an import, a function of CasADi or a `deferred` block.
         """
+        self.number = number
         is_second = self._timer is not None and not self._tries_again
         self._tries_again = False
         if not is_second and (self._deferring or _is_losing(frame)):
             self._repeat(number)
             return
         self.forget()
-        self._number = number
         raise KeyboardInterrupt
 
     @contextmanager
@@ -77,7 +78,7 @@ class Interrupts:
         a callback of the garbage collector; report other errors.
         """
         if failure.exc_type is KeyboardInterrupt:
-            self._repeat(self._number)
+            self._repeat(self.number)
         else:
             sys.__unraisablehook__(failure)
 
@@ -130,6 +131,7 @@ def heed_interrupts() -> Callable[[], None]:
     default_handlers = (signal.SIG_DFL, signal.default_int_handler)
     previous = {}
     previous_hook = sys.unraisablehook
+    INTERRUPTS.number = int(signal.SIGINT)
     if _in_main_thread():
         sys.unraisablehook = INTERRUPTS.note_unraisable
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.signal_handling import ABANDONED_THREAD, raises_interrupt
+from ..common.signal_handling import ABANDONED_THREAD, INTERRUPTS, raises_interrupt
 from ..errors import InputError
 from ..program.collocation import Collocation, convert_variables
 from .callbacks import HessianValues, IterationMonitor, NlpFunctions
@@ -294,6 +294,7 @@ def _interruptible(monitor: IterationMonitor) -> Iterator[None]:
         interrupt the process.
         """
         monitor.stop = True
+        INTERRUPTS.number = number
         signal.signal(number, signal.default_int_handler)
 
     for number in handlers:

@@ -1175,7 +1175,7 @@ INTERRUPTED_WITHIN_S = 8.0
 
 
 def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEnd]:
-    """Interrupt a solve once or twice; its exit code is 130, and it leaves no run or a complete
+    """Interrupt a solve once or twice; its exit code is 130 or 143, and it leaves no run or a complete
     one.
     """
     script = folder / "collocation-sysid"
@@ -1202,7 +1202,7 @@ def _interrupted(rng: Rng, folder: Path, limit_s: float) -> tuple[str, CommandEn
     outcome = ended.outcome()
     if outcome == "crash" and -(code or 0) in signals:  # before the signal handlers are installed
         outcome = "refused"
-    if outcome == "unclear" and code == 130:
+    if outcome == "unclear" and code in (130, 143):
         outcome = "refused"
     is_complete = not (folder / "out").exists() or (folder / "out" / "result.json").is_file()
     if outcome in ("refused", "accepted") and not (is_complete and not list(folder.glob(".out.*"))):

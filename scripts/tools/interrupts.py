@@ -3,8 +3,8 @@
 A small problem is solved once to measure its processor time. Then the command is started again and
 again, as a fork of this process so that its imports take no time, and gets SIGINT or SIGTERM in
 turn after a random part of that time, whatever else the machine does (on Linux). Right is the exit
-code 130 or 143 (0 if the command had ended before the signal), no traceback, and a run folder that
-is complete or absent, with nothing beside it.
+code 130 after SIGINT and 143 after SIGTERM (0 if the command had ended before the signal), no
+traceback, and a run folder that is complete or absent, with nothing beside it.
 
     python scripts interrupts --problem problem.toml --count 60
 """
@@ -55,7 +55,7 @@ def main() -> None:
             ended = wait_until(moment_s, process)
             os.kill(process, number)
             code = wait_for(process)
-            outcome = describe(code, folder, ended=ended)
+            outcome = describe(code, folder, right_code=0 if ended else 128 + number)
             counts[outcome] += 1
             if not outcome.endswith(", right"):
                 print(f"{k}: {number.name} after {moment_s:.2f} s: {outcome}")
@@ -110,9 +110,9 @@ def wait_for(process: int) -> int:
     return 128 + os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
 
 
-def describe(code: int, folder: Path, ended: bool) -> str:
-    """Return what a command has left: its exit code, folder and whether this is right, if it had
-    `ended` before the signal or not.
+def describe(code: int, folder: Path, right_code: int) -> str:
+    """Return what a command has left: its exit code, folder and whether this is right, with
+    `right_code` as the right exit code.
     """
     output = (folder / "output.txt").read_text()
     names = {each.name for each in folder.iterdir()} - {"output.txt"}
@@ -128,8 +128,7 @@ def describe(code: int, folder: Path, ended: bool) -> str:
     words = [f"exit code {code}", kept]
     if "Traceback" in output or "Exception ignored" in output:
         words.append("traceback")
-    is_right = code == 0 if ended else code in (130, 143)
-    if is_right and kept in ("no run", "complete run") and len(words) == 2:
+    if code == right_code and kept in ("no run", "complete run") and len(words) == 2:
         words.append("right")
     return ", ".join(words)
 

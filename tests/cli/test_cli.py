@@ -310,7 +310,7 @@ def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatc
     )
     monkeypatch.setattr(run_record, "write_pictures", lambda *_, **__: time.sleep(60))
     outcome = run_command("solve", "problem.toml", "--out", "run")
-    assert outcome.code == 130
+    assert outcome.code == 143
     assert "Verdict: check" in outcome.out
     assert "the result is kept in run" in outcome.err
     assert result_in(tiny / "run")["status"] == "converged"
@@ -363,7 +363,7 @@ def test_an_interruption_of_the_scan_is_reported(tiny, monkeypatch):
     monkeypatch.setattr(solving, "start_problem", interrupt)
     before = contents(tiny)
     outcome = run_command("solve", "problem.toml", "--out", "run")
-    assert outcome.code == 130
+    assert outcome.code == 143
     assert "interrupted: no result could be kept; nothing was written to run" in outcome.err
     assert contents(tiny) == before
 
