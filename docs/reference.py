@@ -183,7 +183,8 @@ def command_line() -> str:
     parts = [
         "# The command line",
         "Results are printed on stdout, progress and messages on stderr. Exit codes: 0 converged, "
-        "1 not converged or, with `solve --strict`, doubtful, 2 bad input, 130 interrupted by Ctrl-C, 143 by SIGTERM.",
+        "1 not converged or, with `solve --strict`, doubtful, 2 bad input, 130 interrupted by Ctrl-C, "
+        "143 by SIGTERM.",
     ]
     for name in sorted(group.list_commands(None)):
         command = group.get_command(None, name)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
-from ..common.display import short
+from ..common.display import quantity, short
 from ..common.serialisation import optional
 from ..model.contact.contact_summary import FrictionSummary
 from ..program.depth.surface_comparison import DepthError
@@ -61,7 +61,7 @@ class PredictionErrors:
         if forces := _forces_text(self.wrench_rms_n, self.wrench_rms_nm):
             texts.append(f"{forces} RMS")
         for reading, rms in (self.reading_rms or {}).items():
-            texts.append(f"{reading} {rms:.2g}{_unit_text(units, reading)} RMS")
+            texts.append(f"{reading} {quantity(rms, (units or {}).get(reading, ''))} RMS")
         for camera, distances in (self.depth or {}).items():
             texts.append(f"depth of {camera} {distances.text}")
         return "; ".join(texts)
@@ -73,12 +73,6 @@ def _forces_text(*sizes: float | None) -> str:
     """
     pairs = zip(sizes, ("N", "N m"), strict=True)
     return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
-
-
-def _unit_text(units: Mapping[str, str] | None, reading: str) -> str:
-    """Return the unit of a custom sensor after a space; "" if it states none."""
-    unit = (units or {}).get(reading, "")
-    return f" {unit}" if unit else ""
 
 
 @dataclass(frozen=True)
@@ -157,9 +151,9 @@ class FittedExperiment:
             sigma = _forces_text(self.wrench_sigma_n, self.wrench_sigma_nm)
             yield f"wrench of '{name}': {sizes} RMS (sigma {sigma})"
         for reading, rms in (self.reading_rms or {}).items():
-            unit = _unit_text(self.reading_unit, reading)
-            sigma = short((self.reading_sigma or {})[reading])
-            yield f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})"
+            unit = (self.reading_unit or {}).get(reading, "")
+            sigma = quantity((self.reading_sigma or {})[reading], unit)
+            yield f"{reading} of '{name}': {quantity(rms, unit)} RMS (sigma {sigma})"
         joules = "J in the modelled part" if is_symmetric else "J"
         for obstacle, friction in (self.friction or {}).items():
             yield (

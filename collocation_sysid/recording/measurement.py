@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, root_mean
+from ..common.display import quantity
 
 # Key of the mark in the metadata of a field.
 MARK = "measurements"
@@ -107,7 +108,7 @@ class Measurement:
         is finite.
         """
         known = difference[np.isfinite(difference)]
-        return f"{root_mean(known**2):.3g} {self.unit}".rstrip() + " RMS" if known.size else ""
+        return f"{quantity(root_mean(known**2), self.unit)} RMS" if known.size else ""
 
     @property
     def number_names(self) -> Sequence[str]:

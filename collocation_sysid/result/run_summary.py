@@ -11,7 +11,15 @@ from ..common.display import Line, Shown, Table, flattened_parts, number
 from ..common.serialisation import copy_fields
 from ..errors import listed
 from ..features.measurement_results import FittedExperiment, PredictionErrors, SimulatedExperiment
-from ..fem.laws.constants import INSTANTANEOUS, symbol_of, unit_of, without_region
+from ..fem.laws.constants import (
+    INSTANTANEOUS,
+    KAPPA,
+    POISSON,
+    is_damping,
+    symbol_of,
+    unit_of,
+    without_region,
+)
 from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
@@ -84,8 +92,7 @@ def next_step(result: Result, folder: Path, solve_command: str) -> str:
     run = shlex.quote(str(folder))
     if result.converged and is_deeper_check_worthwhile(result):
         return f"{solve_command} --probe (refits parts of the data and relaxes each assumption)"
-    meshed = any(each.test is None for each in result.fit.experiments.values())
-    refinable = meshed and result.budget and result.provenance.problem_file is not None
+    refinable = _has_mesh(result) and result.budget and result.provenance.problem_file is not None
     if (
         result.trust.verdict == "good"
         and refinable
@@ -141,6 +148,10 @@ def _estimates(result: Result) -> Iterator[Shown]:
     ]
     fixed = [name for name in shown if values[name].fixed and not values[name].tied]
     free = [name for name in shown if name not in fixed]
+    if KAPPA.name in fixed:  # which alone determines how nearly ν is one half
+        free = [name for name in free if name != POISSON.name or name in result.parameters]
+    if not _has_mesh(result):
+        fixed = [name for name in fixed if not is_damping(name)]
     if free:
         rows = []
         for name in free:
@@ -158,6 +169,11 @@ def _estimates(result: Result) -> Iterator[Shown]:
         )
         yield f"fixed: {', '.join(stated)}"
     yield from (field.sentence(name) for name, field in result.fields.items())
+
+
+def _has_mesh(result: Result) -> bool:
+    """Return whether a body with a mesh was fitted, and not homogeneous specimens alone."""
+    return any(each.test is None for each in result.fit.experiments.values())
 
 
 def _limit(result: Result) -> Iterator[str]:

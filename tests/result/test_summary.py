@@ -12,7 +12,14 @@ from kit.problems import TRUTH, hung_cube
 from kit.results import FIT, a_result, value
 
 import collocation_sysid as cs
-from collocation_sysid.common.display import plain_text, readable_stress, rounded, two_digits
+from collocation_sysid.common.display import (
+    number,
+    plain_text,
+    quantity,
+    readable_stress,
+    rounded,
+    two_digits,
+)
 from collocation_sysid.result.pictures.confidence import Confidence
 from collocation_sysid.result.run_sections import _cards
 from collocation_sysid.result.run_summary import next_step, run_summary
@@ -136,6 +143,34 @@ def test_a_fixed_bulk_modulus_does_not_choose_the_unit():
     shown = lines(replace(result, parameters={**result.parameters, "lambda_pa": fixed}))
     assert any(line.startswith("μ Pa ") for line in shown)
     assert any(line.startswith("fixed: λ 1e9 Pa") for line in shown)
+
+
+def test_a_summary_of_specimens_has_no_row_of_what_is_fixed_or_absent():
+    result = solved()
+    young = result.derived["young_pa"]
+    parameters = {"mu_pa": result.parameters["mu_pa"], "kappa_pa": replace(young, fixed=True)}
+    parameters |= {"gamma_r_s": replace(young, value=0.0, fixed=True)}
+    ((name, fitted),) = result.fit.experiments.items()
+    fit = replace(result.fit, experiments={name: replace(fitted, test="uniaxial")})
+    shown = lines(replace(result, parameters=parameters, fit=fit))
+    symbols = [line.split()[0] for line in shown if " … " in line]
+    assert symbols == ["μ", "E"]
+    assert [line for line in shown if line.startswith("fixed: ")] == [
+        f"fixed: κ {number(young.value)} Pa"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (638e3, "Pa", "638 kPa"),
+        (9506.0, "Pa", "9.5 kPa"),
+        (799.0, "Pa", "799 Pa"),
+        (0.02, "", "0.02"),
+    ],
+)
+def test_a_misfit_has_a_readable_unit(value: float, unit: str, text: str):
+    assert quantity(value, unit) == text
 
 
 def test_the_next_command_suits_the_result():

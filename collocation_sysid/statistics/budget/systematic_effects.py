@@ -948,8 +948,8 @@ ASSUMPTIONS = (
         considered=0.05,
         description="relative difference of the stiffness along one axis from that across it",
         assumed="the material is equally stiff along all axes",
-        remedy="record a second motion with the body held the other way round, or test specimens "
-        "cut along each axis",
+        remedy="repeat the recording with the body loaded along another axis, or test specimens cut "
+        "along each axis",
         effect=_anisotropy,
         axes="x y z",
         of_specimens=True,
