@@ -5,7 +5,7 @@ which finds the motion with which points of the body follow references.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated, Literal, cast
 
 import typer
 
@@ -125,6 +125,8 @@ class PlanCommand(OutputOptions):
         TOML file with the references of points of the body.
     limits : FILE
         TOML file with the limits of the robot, as of design.
+    solver : str
+        reduced-space, or interior-point: IPOPT after it, with all positions as variables.
     rate : HZ
         Rate of the poses for the robot.
     film : bool
@@ -134,6 +136,7 @@ class PlanCommand(OutputOptions):
     source: Annotated[Path, typer.Argument(metavar="PROBLEM_OR_RUN", help="Run folder or problem.")]
     task: Annotated[Path, typer.Argument(metavar="TASK.toml", help="The task file.")]
     limits: Path
+    solver: Literal["reduced-space", "interior-point"] = "reduced-space"
     rate: float | None = None
     experiment: OneExperiment = None
     allow_code: AllowCode = False
@@ -173,6 +176,7 @@ def plan(options: PlanCommand) -> None:
                 limits,
                 experiment=options.experiment,
                 allow_code=options.allow_code,
+                solver=options.solver,
                 say=progress.announce,
                 watch=lambda number, value: progress.announce(
                     f"iteration {number}, objective {value:.4g} (Ctrl-C keeps the best)"

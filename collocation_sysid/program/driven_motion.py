@@ -58,13 +58,14 @@ class DrivenMotion:
 
     Attributes
     ----------
-    transcription : Transcription
-        Discretised experiment without nuisance parameters of the motion.
+    collocation : Collocation
+        Program of one experiment without nuisance parameters, in which all prescribed displacements
+        are constraints.
     q : (nq,) array
         Parameters in the solver's coordinates.
     """
 
-    transcription: Transcription
+    collocation: Collocation
     q: Array
 
     @classmethod
@@ -95,8 +96,12 @@ class DrivenMotion:
         program = Collocation(
             [experiment], parameters, scheme=scheme, substeps=substeps, has_grasp_constraints=True
         )
-        (transcription,) = program.transcriptions
-        return cls(transcription, q)
+        return cls(program, q)
+
+    @property
+    def transcription(self) -> Transcription:
+        """Discretised experiment."""
+        return self.collocation.transcriptions[0]
 
     @property
     def t_s(self) -> Array:

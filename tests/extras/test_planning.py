@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from kit.problem_files import run_command, write_problem
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,7 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.design.hand_limits import Limits
 from collocation_sysid.extras.planning import reduced_solver
+from collocation_sysid.extras.planning.full_program import FullProgram, solve_full
 from collocation_sysid.extras.planning.motion_plan import MotionPlan, plan_motion
 from collocation_sysid.extras.planning.plan_folder import command_times_s, plan_json
 from collocation_sysid.extras.planning.planned_body import PlannedBody
@@ -293,6 +295,16 @@ def test_limits_of_joints_are_a_function_of_the_pose():
     assert bar_plan().motion.derivatives(np.linspace(0, 0.8, 200)).value[:, 0].max() > 0.03
 
 
+def test_components_of_the_end_may_be_free():
+    wanted = task(hand={"free": ["x", "z"], "end_m": (0.03, np.nan, np.nan), "intervals": 10})
+    planned = PlannedProgram.from_task(PlannedBody.read(hung_bar()), wanted, LIMITS)
+    assert planned.space.end[:3] == pytest.approx([0.03, 0.0, np.nan], nan_ok=True)
+    c = np.random.default_rng(0).normal(size=planned.space.size)
+    last = planned.coordinates(c, np.array([0.8]))[0]
+    assert last[:2] == pytest.approx([0.03, 0.0], abs=1e-12)
+    assert last[2] != 0.0
+
+
 def test_limits_without_any_motion_are_named():
     wanted = task(duration_s=0.22, reference=[], hand={"end_m": (0.25, 0.0, 0.0), "intervals": 10})
     with pytest.raises(InputError, match=r"no motion of 0\.22 s .* end_m .* longer duration_s"):
@@ -324,6 +336,70 @@ def test_a_conic_program_without_a_solution_keeps_the_best_plan(monkeypatch):
     assert len(plan.answer.history) == 3
     with pytest.raises(InputError, match="not solved; state wider limits"):
         plan_motion(hung_bar(), task(), LIMITS)
+
+
+# The full program ---------------------------------------------------------------------------------
+
+NARROW = LIMITS.model_copy(
+    update={"speed_m_s": 0.11, "acceleration_m_s2": 0.9, "angular_acceleration_deg_s2": 300.0}
+)
+SIX_AXES = ["x", "y", "z", "rx", "ry", "rz"]
+
+
+def test_derivatives_of_the_full_program_are_its_differences():
+    def within_reach(position_m, rotation):
+        return position_m[0] * rotation[0, 1] - 0.02
+
+    wanted = task(hand={"intervals": 8, "free": SIX_AXES}, duration_s=0.4, reference=[
+        {"point": "tip", "t_s": [0.4], "position_m": [(0.02, 0.0, np.nan)], "relative": True},
+        {"point": "tip", "t_s": [0.2], "velocity_m_s": [(0.1, 0.0, 0.0)]},
+    ])  # fmt: skip
+    planned = PlannedProgram.from_task(PlannedBody.read(hung_bar()), wanted, NARROW, within_reach)
+    full = FullProgram(planned)
+    rng = np.random.default_rng(0)
+    c = 0.05 * rng.normal(size=planned.space.size)
+    x = planned.simulate(c)
+    w = full.pack(c, x)
+    motion = full.constraint_values(w)[: full.motion_count]
+    assert np.abs(motion).max() < 1e-9  # a simulation satisfies the equations of motion
+    w += 1e-3 * rng.normal(size=len(w))
+    way, multipliers = rng.normal(size=len(w)), rng.normal(size=full.constraint_count)
+    h = 1e-6
+    ends = [w + sign * h * way for sign in (1, -1)]
+
+    def slope(function):
+        return (function(ends[0]) - function(ends[1])) / (2 * h)
+
+    gradient = full.gradient(w) @ way
+    assert gradient == pytest.approx(slope(full.objective), rel=1e-6)
+    found = full.jacobian(w) @ way
+    assert np.abs(found - slope(full.constraint_values)).max() < 1e-6 * np.abs(found).max()
+    indptr, indices = full.hessian_structure
+    values = np.empty(len(indices))
+    full.hessian_values(w, 0.7, multipliers, values)
+    upper = sp.csc_array((values, indices, indptr), shape=(len(w),) * 2)
+    product = (upper + sp.triu(upper, 1).T) @ way
+    differences = slope(lambda z: 0.7 * full.gradient(z) + full.jacobian(z).T @ multipliers)
+    for part in (slice(full.position_count), slice(full.position_count, None)):
+        error = np.abs(product - differences)[part].max()
+        assert error < 1e-6 * np.abs(differences[part]).max()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("free", [SIX_AXES[:3], ["x", "z", "ry"]])
+def test_both_solvers_find_the_same_motion(free):
+    wanted = task(hand={"intervals": 10, "free": free, "jerk_weight": 0.01})
+    planned = PlannedProgram.from_task(PlannedBody.read(hung_bar()), wanted, NARROW)
+    reduced = solve_reduced(planned, tolerances=TIGHT)
+    assert reduced.status == "converged"
+    assert planned.hand_limits.shares(reduced.c).max() > 1 - 1e-6  # limits bind
+    early = solve_reduced(planned, tolerances=replace(TIGHT, iterations=1))
+    assert np.abs(early.c - reduced.c).max() > 1e-4
+    full = solve_full(planned, early)
+    assert full.status == "converged"
+    assert np.abs(full.c - reduced.c).max() < 1e-6
+    assert np.abs(full.x - reduced.x).max() < 1e-6 * np.ptp(reduced.x)
+    assert planned.objective(full.c, full.x) == pytest.approx(reduced.history[-1], rel=1e-6)
 
 
 # Uncertainty --------------------------------------------------------------------------------------
@@ -451,6 +527,7 @@ MISTAKES = {
         ('free = ["x", "w"]', "free"),
         ('free = ["x", "x"]', "names a coordinate twice"),
         ('free = ["x"]\nend_m = [0.0, 0.1, 0.0]', "end_m moves y, which is not free"),
+        ("end_m = [inf, nan, 0.0]", "end_m has an infinite component; expected a number or nan"),
     ],
 }
 

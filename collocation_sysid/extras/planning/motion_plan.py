@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -21,11 +22,12 @@ from ...recording import PoseSequence
 from ...runs.solved_problem import SolvedProblem
 from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.hand_limits import REACHED, Limits
+from .full_program import solve_full
 from .planned_body import PlannedBody
 from .planned_program import POSES_PER_SAMPLE, PlannedProgram
 from .reduced_solver import (
     HandLimitsExcludeTask,
-    ReducedAnswer,
+    PlanAnswer,
     ReducedTolerances,
     Watch,
     solve_reduced,
@@ -33,6 +35,7 @@ from .reduced_solver import (
 from .spline_motion import PoseLimit, SplineMotion
 from .task import Reference, Task
 
+Solver = Literal["reduced-space", "interior-point"]
 # Time steps of the simulation that checks a plan, for each of the plan's.
 FINER = 4
 
@@ -66,7 +69,7 @@ class MotionPlan:
     ----------
     program : PlannedProgram
         The optimal-control problem.
-    answer : ReducedAnswer
+    answer : PlanAnswer
         Solution on the time grid of the plan.
     fine : Trajectory
         Simulation of the plan with `FINER` time steps for each of the plan's.
@@ -75,7 +78,7 @@ class MotionPlan:
     """
 
     program: PlannedProgram
-    answer: ReducedAnswer
+    answer: PlanAnswer
     fine: Trajectory
     seconds: float
 
@@ -224,6 +227,7 @@ def plan_motion(
     experiment: str | None = None,
     allow_code: bool = False,
     pose_limits: PoseLimit | None = None,
+    solver: Solver = "reduced-space",
     tolerances: ReducedTolerances | None = None,
     watch: Watch | None = None,
     say: Callable[[str], None] = lambda _: None,
@@ -249,8 +253,11 @@ def plan_motion(
         ``pose_limits(position_m, rotation) -> margins``: expressions in CasADi operations that must
         not be positive, of the position (3,) and the rotation matrix (3, 3) of the hand in the
         frame of the poses, such as limits of joints.
+    solver : {"reduced-space", "interior-point"}
+        Gauss–Newton steps in the space of the hand's unknowns, or IPOPT after these, with the
+        positions of all nodes as variables.
     tolerances : ReducedTolerances, optional
-        Tolerances of the search.
+        Tolerances of the search in the reduced space.
     watch : callable, optional
         Called with the number of each iterate and its objective.
     say : callable, optional
@@ -276,6 +283,9 @@ def plan_motion(
     say("searching for the motion")
     try:
         answer = solve_reduced(program, tolerances=tolerances, watch=watch)
+        if solver == "interior-point" and answer.status != "interrupted":
+            say("improving the motion by IPOPT")
+            answer = solve_full(program, answer, watch=watch)
     except HandLimitsExcludeTask as error:
         raise InputError(_contradiction(program), None, where="hand") from error
     except np.linalg.LinAlgError as error:

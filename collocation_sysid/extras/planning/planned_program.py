@@ -474,11 +474,11 @@ def _space(task: Task, bounds: HandBounds) -> SplineSpace:
     """Return the space of the hand's motions; an `InputError` if the end is beyond the workspace."""
     hand = task.hand
     free = np.array([AXES.index(axis) for axis in hand.free])
-    end = np.zeros(6)
-    end[free] = np.nan
+    end = np.full(6, np.nan)
     if hand.end_m is not None:
         end[:3] = hand.end_m
-        if not ((bounds.low_m < end[:3]) & (end[:3] < bounds.high_m)).all():
+        within = (bounds.low_m < end[:3]) & (end[:3] < bounds.high_m)
+        if not (within | np.isnan(end[:3])).all():
             raise InputError(
                 f"the hand ends {list(hand.end_m)} m from its start, outside the workspace; "
                 "expected an end within workspace_m of the limits",
@@ -487,7 +487,7 @@ def _space(task: Task, bounds: HandBounds) -> SplineSpace:
             )
     if hand.end_rotation_deg is not None:
         end[3:] = np.radians(hand.end_rotation_deg)
-        angle = float(np.linalg.norm(hand.end_rotation_deg))
+        angle = float(np.linalg.norm(np.nan_to_num(hand.end_rotation_deg)))
         if angle >= bounds.limits.rotation_deg:
             raise InputError(
                 f"the hand turns by {angle:g}° until its end; expected less than rotation_deg = "
@@ -495,6 +495,7 @@ def _space(task: Task, bounds: HandBounds) -> SplineSpace:
                 None,
                 where="hand.end_rotation_deg",
             )
+    end[np.setdiff1d(np.arange(6), free)] = 0.0
     reach = bounds.compute_reach()
     units = np.repeat(np.minimum(reach.value, reach.second * task.duration_s**2 / 4), 3)
     return SplineSpace(task.duration_s, hand.intervals, np.sort(free), end, units)

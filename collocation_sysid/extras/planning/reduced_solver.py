@@ -64,7 +64,7 @@ class ReducedTolerances:
 
 
 @dataclass(eq=False)
-class ReducedAnswer:
+class PlanAnswer:
     """Result of the search.
 
     Attributes
@@ -184,7 +184,7 @@ def solve_reduced(
     start: Array | None = None,
     tolerances: ReducedTolerances | None = None,
     watch: Watch | None = None,
-) -> ReducedAnswer:
+) -> PlanAnswer:
     """Solve a plan; Ctrl-C ends the search with the best plan so far.
 
     Parameters
@@ -213,7 +213,7 @@ def solve_reduced(
     value = program.objective(c, x)
     derivatives = np.zeros((*x.shape, len(c)))
     multipliers = np.zeros(len(program.hand_limits.names))
-    answer = ReducedAnswer(c, x, derivatives, multipliers, "iteration limit", [value])
+    answer = PlanAnswer(c, x, derivatives, multipliers, "iteration limit", [value])
     damping, failures = 0.0, 0
     try:
         while len(answer.history) <= limits.iterations:

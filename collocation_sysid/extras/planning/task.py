@@ -152,9 +152,9 @@ class HandSection(Section):
     intervals
         Number of equal time intervals of the cubic spline of each coordinate.
     end_m
-        Displacement [x, y, z] of the hand at the end; free by default.
+        Displacement [x, y, z] of the hand at the end; nan, the default, leaves a component free.
     end_rotation_deg
-        Rotation vector [x, y, z] of the hand at the end; free by default.
+        Rotation vector [x, y, z] of the hand at the end; nan, the default, leaves a component free.
     jerk_weight
         Weight of the mean square jerk of the hand, in units of ten times the limit of the
         acceleration over the duration.
@@ -164,8 +164,8 @@ class HandSection(Section):
         default_factory=lambda: [*AXES[:3]]
     )
     intervals: Annotated[AtLeastOne, Field(ge=6, le=200)] = 16
-    end_m: Vector | None = None
-    end_rotation_deg: Vector | None = None
+    end_m: Row | None = None
+    end_rotation_deg: Row | None = None
     jerk_weight: Positive = 1e-3
 
     @model_validator(mode="after")
@@ -175,7 +175,9 @@ class HandSection(Section):
         for key, axes in (("end_m", AXES[:3]), ("end_rotation_deg", AXES[3:])):
             values = getattr(self, key)
             for axis, value in zip(axes, values or (), strict=False):
-                if value and axis not in self.free:
+                if np.isinf(value):
+                    raise ValueError(f"{key} has an infinite component; expected a number or nan")
+                if value and not np.isnan(value) and axis not in self.free:
                     raise ValueError(
                         f"{key} moves {axis}, which is not free; expected {axis} in free, or 0"
                     )
