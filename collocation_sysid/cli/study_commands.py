@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 
 import typer
 
@@ -150,7 +152,7 @@ def compare_models(options: CompareModelsCommand) -> None:
     """
     if not options.with_ and {options.materials, options.damping, options.prony} == {None}:
         raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
-    from ..extras.studies.study_progress import expected_study_s
+    from ..extras.studies.study_progress import STUDY_FACTOR, expected_study_s
     from ..result.solve_progress import SolveProgress
     from ..runs.check import expected_search_s
 
@@ -170,21 +172,26 @@ def compare_models(options: CompareModelsCommand) -> None:
         SolveProgress(error_console, quiet=options.quiet, activity="reading the models"),
         counted_phase(StepUnit.PROBLEM, len(variants)),
     ):
+        began_s, used_s = perf_counter(), sum(os.times()[:4])
         searches_s = []
         for variant in variants:  # an impossible model would fail every run
             read = Problem.read(variant.path, variant.overrides, allow_code=options.allow_code)
             if is_announced:
                 searches_s.append(expected_search_s(read))
             complete_steps(StepUnit.PROBLEM)
+        used_s = max(sum(os.times()[:4]) - used_s, 0.5)
+        slowness = (perf_counter() - began_s) / used_s
     planned = plan_models(problem, variants, method=method, allow_code=options.allow_code)
     if is_announced:
         workers = 1 if options.limits.scheduler else options.limits.workers or available_threads()
-        total_s = expected_study_s(searches_s, len(planned), worker_count=workers)
+        total_s = expected_study_s(
+            searches_s, len(planned), worker_count=workers, slowness=slowness
+        )
         about = "the first fit shows how long they take"
         if total_s is not None:
             about = (
-                f"they take about {duration(total_s)} (rough estimate; a law that fits badly takes "
-                "several times as long)"
+                f"they take {duration(total_s / STUDY_FACTOR)} to {duration(STUDY_FACTOR * total_s)} "
+                "(rough estimate; a law that fits badly takes several times as long)"
             )
         error_console.print(
             f"{len(planned)} fits: {len(variants)} models, each to all data and without held-out "

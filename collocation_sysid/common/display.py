@@ -250,7 +250,7 @@ def duration(time_s: float | None) -> str:
     for unit, seconds in (("h", 3600), ("min", 60)):
         if time_s >= 2 * seconds:
             return f"{time_s / seconds:.2g} {unit}"
-    return f"{time_s:.1g} s" if time_s < 10 else f"{time_s:.0f} s"
+    return f"{time_s:.1g} s" if time_s < 9.5 else f"{time_s:.0f} s"
 
 
 def labelled(title: str, rows: dict[str, str]) -> Table:

@@ -160,6 +160,8 @@ def test_the_announced_time_has_the_start_of_each_run_and_the_number_of_runs_at_
     assert alone == pytest.approx(6 * (RUN_START_S + 2 * FIT_FACTOR))
     assert expected_study_s([1.0, 3.0], 6, worker_count=3) == pytest.approx(alone / 3)
     assert expected_study_s([None], 6, worker_count=1) is None
+    busy = expected_study_s([1.0], 1, worker_count=1, slowness=3.0)
+    assert busy == pytest.approx(3 * RUN_START_S + FIT_FACTOR)
 
 
 @pytest.mark.long

@@ -22,6 +22,11 @@ RUN_START_S = 2.7
 # Time of a run with its scan and checks over the expected time of its search: 0.3 to 6 for templates
 # of specimens, benches and swings; 10 and 50 for laws whose constants the swing does not determine.
 FIT_FACTOR = 4.0
+# Factor by which a comparison of models may take less or more time than `expected_study_s`: 0.6 to
+# 1.7 were measured for templates of a specimen, a bench and a swing, on a busy machine.
+STUDY_FACTOR = 2.0
+# Largest slowness of a machine that counts.
+LARGEST_SLOWNESS = 5.0
 # Hint beside each stage of a design.
 STOPPING = "Ctrl-C stops and keeps the best"
 
@@ -143,7 +148,7 @@ class DesignProgress(SolveProgress):
 
 
 def expected_study_s(
-    searches_s: Sequence[float | None], count: int, worker_count: int
+    searches_s: Sequence[float | None], count: int, worker_count: int, slowness: float = 1.0
 ) -> float | None:
     """Return the expected time of a comparison of models before any run [s]; None without the
     expected time of any search.
@@ -156,8 +161,12 @@ def expected_study_s(
         Number of runs.
     worker_count : int
         Number of runs that are executed at once.
+    slowness : float
+        Elapsed time over processor time, with which the searches were measured: more than 1 if
+        other programs use the processors. Values beyond 1 and `LARGEST_SLOWNESS` do not count.
     """
-    each_s = [RUN_START_S + FIT_FACTOR * search for search in searches_s if search is not None]
+    start_s = RUN_START_S * min(max(1.0, slowness), LARGEST_SLOWNESS)
+    each_s = [start_s + FIT_FACTOR * search for search in searches_s if search is not None]
     return remaining_time_s(count * ["fit"], {"fit": each_s} if each_s else {}, worker_count)
 
 
