@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ..recording.poses import Frame
 from ..statistics.axes import OTHER_AXES
+from ..statistics.budget.shape_error import other_section
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
 
 # Messages of the hypotheses by the codes of their concerns.
@@ -44,6 +46,9 @@ MESSAGES = {
     "for a log state sensor_frame in the table of the wrench",
     "description/wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
     "the sensor, and the density or mass of the body",
+    "description/wrench-gain/section": "its {what} fit if multiplied by {factor:.3g}, as if the body had "
+    "{ratio:.3g} times its mass: probably the section of the body is {real}, and that of the mesh is not "
+    "and as wide, with the same density; mesh the section of the body, or check the sensor",
     "description/wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: "
     "set point_m = {point}, with which they fit",
     "description/wrench-frame": 'it is expressed in the frame of the {other}: set frame = "{other}"',
@@ -104,6 +109,9 @@ LARGEST_TARE = 3.0
 SAME_GAIN = 0.05
 # Error of the reference point that gives no concern [m].
 SAME_POINT_M = 0.005
+# Relative difference up to which a gain is the ratio of the areas of a square and a round section:
+# the accuracy of gains, which a fit with a wrong body distorts.
+LIKE_SECTION = 0.1
 # Additional factor for hypotheses with fitted numbers.
 FITTED = 1.5
 # Additional factor for each of many variants of one mistake.
@@ -446,12 +454,20 @@ class _OneSensor:
         ):
             factor = self._gain(columns)
             if factor > 0 and abs(factor - 1) > SAME_GAIN:
-                data = {"what": what, "factor": factor}
+                data: dict[str, Any] = {"what": what, "factor": factor}
+                code = "wrench-gain"
+                body = self.part.transcription.body
+                section = other_section(body.mesh, body.mesh.points_m)
+                is_weighed = body.has_declared_mass
+                if (
+                    section
+                    and not is_weighed
+                    and abs(factor * section.volume_ratio - 1) < LIKE_SECTION
+                ):
+                    code += "/section"
+                    data |= {"ratio": section.volume_ratio, "real": section.name}
                 yield hypothesis(
-                    "wrench-gain",
-                    _multiplied(wrench, columns, factor=factor),
-                    handicap=FITTED,
-                    **data,
+                    code, _multiplied(wrench, columns, factor=factor), handicap=FITTED, **data
                 )
         shift_m = self._point_shift_m()
         if np.linalg.norm(shift_m) > SAME_POINT_M:

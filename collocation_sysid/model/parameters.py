@@ -227,17 +227,30 @@ class Parameter:
 
 
 def is_default_bound(item: Parameter, value: float) -> bool:
+    """Return whether the bound nearest to a value of a free parameter was not stated and is no
+    physical limit, beyond which the constant has no meaning.
+    """
+    constant = constant_named(item.name)
+    side = _nearest_side(item, value)
+    is_limit = constant.widest is not None and constant.bounds[side] == constant.widest[side]
+    return is_known_constant(item.name) and not item.stated_bounds[side] and not is_limit
+
+
+def can_be_widened(item: Parameter, value: float) -> bool:
     """Return whether the bound nearest to a value of a free parameter is the default one of a
     constant with `widest` bounds, and no physical limit.
     """
-    constant = constant_named(item.name)
-    if constant.widest is None:
-        return False
-    is_lower = abs(item.to_coordinate(value) - item.to_coordinate(item.lower)) < abs(
-        item.to_coordinate(value) - item.to_coordinate(item.upper)
-    )
-    side = 0 if is_lower else 1
-    return item.has_default_bound(side) and constant.bounds[side] != constant.widest[side]
+    has_wider = constant_named(item.name).widest is not None
+    is_default = item.has_default_bound(_nearest_side(item, value))
+    return has_wider and is_default and is_default_bound(item, value)
+
+
+def _nearest_side(item: Parameter, value: float) -> int:
+    distances = [
+        abs(item.to_coordinate(value) - item.to_coordinate(bound))
+        for bound in (item.lower, item.upper)
+    ]
+    return 0 if distances[0] < distances[1] else 1
 
 
 def with_widest_bounds(item: Parameter) -> Parameter:
@@ -300,9 +313,10 @@ def complete_parameter(
         _require_admissible(constant, value, f"{name}: fixed")
         return Parameter(name, value, is_fixed=True, scale=constant.scale)
     user_statement = _with_usual_guess(name, user_statement, constant)
-    scale = user_statement.scale or constant.scale
-    low, high = constant.bounds
     guess = user_statement.guess
+    is_negative = constant.may_be_negative and guess is not None and guess < 0
+    scale = user_statement.scale or ("linear" if is_negative else constant.scale)
+    low, high = constant.bounds
     if guess is not None and constant.widest is not None and not low <= guess <= high:
         low, high = constant.widest  # as of metal: the default bounds are those of soft bodies
     if scale == "linear" and constant.scale == "log":

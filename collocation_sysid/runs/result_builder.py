@@ -144,9 +144,9 @@ def _scale(problem: Problem) -> ScaleReference | None:
 
 
 def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
-    """Yield up to three sentences on what the values refer to: the damping law of γ_r if a body that
-    moves has it, how moduli are scaled if no force is measured, and the axis along which E is
-    measured.
+    """Yield up to four sentences on what the values refer to: the damping law of γ_r if a body that
+    moves has it, how moduli are scaled if no force is measured, the area by which forces of specimens
+    are divided, and the axis along which E is measured.
     """
     problem = answer.problem
     parts = [part for each in problem.experiments if not each.is_static for part in each.body.parts]
@@ -158,6 +158,12 @@ def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
         yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
     if (scale := _scale(problem)) is not None:
         yield scale.sentence
+    tests = [each.specimen for each in problem.experiments if each.specimen is not None]
+    if any(test.area_over_length_m or "force" in test.columns for test in tests):
+        yield (
+            "moduli are inversely proportional to the stated area_m2, of which no fit shows an error (a "
+            "round section has 0.785 times the area of a square one of the same width)"
+        )
     if sentence := answer.modulus_axis_sentence():
         yield sentence
 

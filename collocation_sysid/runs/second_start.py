@@ -6,7 +6,9 @@
   another optimum, and no search crosses an exponent of zero, at which a term vanishes. The closed
   forms of specimens tell whether there is a better one, see `methods.power_law_start`.
 - *Default bounds*: they are those of foams and rubbers. A search that ends at one of them is
-  continued within what is physically possible, for metals, liquids and auxetic bodies.
+  continued within what is physically possible, for metals, liquids and auxetic bodies. A factor
+  that may be negative is then estimated on a linear scale, and a first exponent of Ogden's law that
+  ended at its positive bound starts again from its negative, with the same shear modulus.
 """
 
 from __future__ import annotations
@@ -16,10 +18,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..fem.laws.constants import SHARE, is_limitless, usual_value, without_region
+from ..fem.laws.constants import (
+    SHARE,
+    USUAL_EXPONENTS,
+    constant_named,
+    is_limitless,
+    is_modulus,
+    usual_value,
+    without_region,
+)
 from ..methods.power_law_start import power_law_start
 from ..methods.solution import Solution
-from ..model.parameters import Parameter, Parameters, is_default_bound, with_widest_bounds
+from ..model.parameters import Parameter, Parameters, can_be_widened, with_widest_bounds
 from ..statistics.linearised import AT_BOUND, parameter_values
 
 # Poisson's ratio above which a second search starts from the usual one at the same Young's modulus.
@@ -79,15 +89,18 @@ def start_beyond_bounds(solution: Solution) -> SecondStart | None:
             parameters.free, np.minimum(solution.q - lower, upper - solution.q), strict=True
         )
         if distance < AT_BOUND
-        and is_default_bound(item, known[item.name])
+        and can_be_widened(item, known[item.name])
         and not (locks and _is_nearly_half(item.name, known[item.name]))
     }
     if not ended:
         return None
     listed = " and ".join(f"{name} = {bound:.4g}" for name, bound in ended.items())
     values = {item.name: known[item.name] for item in parameters.free}
+    values |= _negative_terms(solution, values, ended)
     return SecondStart(
-        parameters.map_components(lambda item: _widened(item, ended, locks)).with_estimates(values),
+        parameters.map_components(lambda item: _widened(item, values, ended, locks)).with_estimates(
+            values
+        ),
         f"the search ended at the default bound{'s' * (len(ended) > 1)} {listed}; a second one, "
         "with wider bounds,",
     )
@@ -116,9 +129,33 @@ def _is_nearly_half(name: str, value: float) -> bool:
     return without_region(name) == "poisson" and value > NEARLY_INCOMPRESSIBLE
 
 
-def _widened(item: Parameter, ended: Container[str], locks: bool) -> Parameter:
+def _negative_terms(
+    solution: Solution, values: Mapping[str, float], ended: Container[str]
+) -> dict[str, float]:
+    """Return the starts of the first exponents of Ogden's law that ended at a positive bound, and of
+    their factors: the usual exponent with a negative sign, and the same shear modulus.
+    """
+    ogden = any(
+        part.material.name.startswith("ogden-")
+        for each in solution.collocation.transcriptions
+        for part in each.body.parts
+    )
+    starts: dict[str, float] = {}
+    for name, ended_at in values.items():
+        factor = name.removesuffix("alpha_1") + "mu_1_pa"
+        is_first = without_region(name) == "alpha_1" and factor in values
+        if ogden and is_first and name in ended and 0 < ended_at < 1:
+            starts[name] = -USUAL_EXPONENTS[0]
+            starts[factor] = -values[factor] * ended_at / USUAL_EXPONENTS[0]
+    return starts
+
+
+def _widened(
+    item: Parameter, values: Mapping[str, float], ended: Container[str], locks: bool
+) -> Parameter:
     """Return a parameter with the widest bounds in place of its default ones, of shares those that
-    ended at one.
+    ended at one; on a linear scale if it may be negative and ended at its lower bound, or starts
+    from a negative value.
     """
     is_share = without_region(item.name) == SHARE.name
     if is_share and item.name not in ended:
@@ -129,6 +166,11 @@ def _widened(item: Parameter, ended: Container[str], locks: bool) -> Parameter:
     if is_share and widened is not item:
         lower = max(widened.lower, LITTLE_MEMORY)
         return replace(widened, lower=lower, scale="log", unit=1.0)
+    if widened is not item and constant_named(item.name).may_be_negative and item.scale == "log":
+        value = values[item.name]
+        if value < 0 or (item.name in ended and value < 10 * item.lower):
+            size = max(abs(values[each]) for each in values if is_modulus(each))
+            return replace(widened, lower=-widened.upper, scale="linear", unit=0.1 * size)
     return widened
 
 

@@ -125,6 +125,8 @@ TOPICS: dict[str, Topic] = {
             "compare laws with compare-models --damping",
             "law/both": "material and damping obey other laws than stated, such as {material} with "
             "{damping}: compare laws with compare-models --materials and --damping",
+            "mesh-section": "the section of the body is {real}, and that of the mesh {meshed} and as wide: "
+            "mesh the section of the body (object.cylinder_m or box_m)",
             "mesh-width": "the mesh is about {percent:.2g} % too {way} along its {axis} axis: compare "
             "its extents with those of the real body",
             "mesh-coarse": "the mesh is too coarse for such accurate measurements: its estimated error "

@@ -7,9 +7,15 @@ import pytest
 from kit.problems import hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.fem.laws.constants import constant_named
+from collocation_sysid.fem.laws.constants import KNOWN, constant_named
 from collocation_sysid.methods.stiffness_scan import ScanState
-from collocation_sysid.model.parameters import Parameter, Parameters, is_default_bound
+from collocation_sysid.model.parameters import (
+    Parameter,
+    Parameters,
+    can_be_widened,
+    is_default_bound,
+    with_widest_bounds,
+)
 from collocation_sysid.runs.second_start import start_beyond_bounds
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import Concern
@@ -212,3 +218,109 @@ def test_a_liquid_with_two_relaxation_times():
     low, high = run.interval("instantaneous_young_pa")
     assert low < 1e5 < high < 1.3 * low
     assert run.parameters["young_pa"] < 100  # of which the noise leaves some Pa
+
+
+# Bounds of other constants ------------------------------------------------------------------------
+
+STRAIN = np.linspace(-0.25, 0.4, 14)
+
+
+def noise_pa(values_pa, share=1e-3):
+    random = np.random.default_rng(5).standard_normal(len(values_pa))
+    sigma_pa = share * np.abs(values_pa).max()
+    return values_pa + sigma_pa * random, sigma_pa
+
+
+def fitted(law, tests, unknown, **keys) -> cs.Solution:
+    """Solution of tests, each a kind with strains and stresses, without other mistakes."""
+    experiments = []
+    for test, (strain, stress_pa) in tests.items():
+        measured_pa, sigma_pa = noise_pa(stress_pa)
+        specimen = cs.Specimen(
+            test, strain, measured_pa, sigma_pa, strain_zero=0.0, area_error=0.0, **keys
+        )
+        prony = ("b",) if "b.tau_s" in unknown else ()
+        experiments.append(specimen.experiment(law, test, prony=prony))
+    return cs.solve(cs.Problem(experiments, unknown | UNDAMPED))
+
+
+def assert_continued(solution, **truth):
+    assert solution.status.converged
+    assert any("beyond the default bound" in n or "default bound" in n for n in solution.notes)
+    for name, value in truth.items():
+        assert solution.parameters[name] == pytest.approx(value, rel=0.03), name
+
+
+def test_the_bulk_modulus_of_glass_is_found_beyond_the_default_bound():
+    strain = np.linspace(-2e-3, -1e-4, 12)  # of lengths, a third of that of the volume
+    tests = {"volumetric": (strain, 3 * 5e10 * strain)}
+    solution = fitted("neo-hookean", tests, {"kappa_pa": cs.Unknown(), "mu_pa": 3e10})
+    assert_continued(solution, kappa_pa=5e10)
+
+
+def test_a_negative_factor_of_the_second_invariant_is_found():
+    stretch = 1 + STRAIN
+    c10_pa, c01_pa = 2e5, -2e4
+    tests = {
+        "uniaxial": (STRAIN, 2 * (stretch - stretch**-2) * (c10_pa + c01_pa / stretch)),
+        "equibiaxial": (
+            STRAIN[6:],
+            2 * (stretch - stretch**-5)[6:] * (c10_pa + c01_pa * stretch[6:] ** 2),
+        ),
+    }
+    unknown = {"c10_pa": cs.Unknown(), "c01_pa": cs.Unknown(), "kappa_pa": 1e9}
+    assert_continued(fitted("mooney-rivlin", tests, unknown), c10_pa=c10_pa, c01_pa=c01_pa)
+
+
+@pytest.mark.long
+def test_a_negative_first_exponent_is_found_where_the_closed_forms_are_not():
+    """Ogden's law of brain, with a branch of memory that is known."""
+    stretch = 1 + STRAIN
+    alpha, mu_pa = -8.0, -250.0
+    stress_pa = mu_pa * (stretch ** (alpha - 1) - stretch ** (-alpha / 2 - 1))
+    unknown = {"mu_1_pa": cs.Unknown(), "alpha_1": cs.Unknown(), "kappa_pa": 1e7}
+    unknown |= {"b.share": 1e-9, "b.tau_s": 1.0}
+    solution = fitted("ogden-1", {"uniaxial": (STRAIN, stress_pa)}, unknown)
+    assert_continued(solution, alpha_1=alpha, mu_1_pa=mu_pa)
+
+
+@pytest.mark.long
+def test_a_long_relaxation_time_is_found_beyond_the_default_bound():
+    times_s = np.linspace(0.0, 2e4, 60)
+    strain = np.minimum(times_s / 340.0, 1) * 0.02
+    since_s = np.clip(times_s - 340.0, 0.0, None)
+    ramp = 6e3 / 340.0 * (1 - np.exp(-np.minimum(times_s, 340.0) / 6e3))
+    stress_pa = 1e5 * strain + 1e5 * 0.02 * ramp * np.exp(-since_s / 6e3)
+    unknown = {"young_pa": cs.Unknown(), "poisson": 0.4999}
+    unknown |= {"b.share": cs.Unknown(), "b.tau_s": cs.Unknown()}
+    solution = fitted("linear", {"uniaxial": (strain, stress_pa)}, unknown, t_s=times_s)
+    assert_continued(solution, young_pa=1e5, **{"b.tau_s": 6e3, "b.share": 1.0})
+
+
+@pytest.mark.parametrize("name", sorted(KNOWN))
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_bound_that_nobody_stated_is_widened_or_named_first(name, side):
+    constant = KNOWN[name]
+    item = Parameter(
+        name,
+        constant.usual or 1.0,
+        *constant.bounds,
+        scale=constant.scale,
+        unit=constant.typical or 1.0,
+    )
+    value = constant.bounds[side]
+    is_limit = constant.widest is not None and constant.widest[side] == value
+    assert is_default_bound(item, value) is not is_limit
+    if constant.widest is not None and not is_limit:
+        assert can_be_widened(item, value)
+        assert not can_be_widened(with_widest_bounds(item), constant.widest[side])
+        assert is_default_bound(with_widest_bounds(item), constant.widest[side])
+
+
+@pytest.mark.parametrize("name", ["c01_pa", "lambda_pa", "mu_1_pa"])
+def test_a_negative_guess_is_possible_where_the_constant_may_be_negative(name):
+    (item,) = Parameters.from_mapping({name: cs.Unknown(-2e4)}).scalars
+    assert item.scale == "linear"
+    assert item.lower < -2e4
+    with pytest.raises(cs.InputError):
+        Parameters.from_mapping({"c10_pa": cs.Unknown(-2e4)})

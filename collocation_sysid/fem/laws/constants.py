@@ -62,6 +62,9 @@ class Constant:
     widest : (lower, upper) or None
         Bounds of a second search if the first ended at one of `bounds` that the problem does not
         state: what is physically possible. None for constants without one.
+    may_be_negative : bool
+        Whether a logarithmic constant may be negative beyond its default bounds: a second search
+        that starts at its lower one, or a negative guess, then has a linear scale.
 
     Raises
     ------
@@ -81,6 +84,7 @@ class Constant:
     at_least: float = -float("inf")
     prior: tuple[Finite, Positive] | None = None
     widest: tuple[float, float] | None = None
+    may_be_negative: bool = False
 
     def __post_init__(self) -> None:
         lower, upper = self.bounds
@@ -99,11 +103,18 @@ class Constant:
 STIFFNESS = (1.0, 1e9)
 # Stiffness of anything solid [Pa]; diamond has 1.2e12.
 ANY_STIFFNESS = (1e-3, 1e13)
+# Factor of a power or of an invariant [Pa], of any sign.
+ANY_FACTOR = (-1e13, 1e13)
 LAMBDA = Constant(
-    "lambda_pa", "λ", meaning="first Lamé parameter", bounds=STIFFNESS, widest=ANY_STIFFNESS
+    "lambda_pa",
+    "λ",
+    meaning="first Lamé parameter",
+    bounds=STIFFNESS,
+    widest=ANY_STIFFNESS,
+    may_be_negative=True,
 )
 MU = Constant("mu_pa", "μ", meaning="shear modulus", bounds=STIFFNESS, widest=ANY_STIFFNESS)
-KAPPA = Constant("kappa_pa", "κ", meaning="bulk modulus", bounds=(1.0, 1e10))
+KAPPA = Constant("kappa_pa", "κ", meaning="bulk modulus", bounds=(1.0, 1e10), widest=ANY_STIFFNESS)
 YOUNG = Constant("young_pa", "E", meaning="Young's modulus", bounds=STIFFNESS, widest=ANY_STIFFNESS)
 POISSON = Constant(
     "poisson",
@@ -117,10 +128,20 @@ POISSON = Constant(
     widest=(-0.9, 0.4999),
 )
 GAMMA_R = Constant(
-    "gamma_r_s", "γ_r", meaning="stiffness-proportional damping", bounds=(1e-7, 10.0), usual=3e-3
+    "gamma_r_s",
+    "γ_r",
+    meaning="stiffness-proportional damping",
+    bounds=(1e-7, 10.0),
+    usual=3e-3,
+    widest=(1e-7, 1e4),
 )
 GAMMA_M = Constant(
-    "gamma_m_1_s", "γ_m", meaning="mass-proportional damping", bounds=(1e-4, 1e4), usual=0.3
+    "gamma_m_1_s",
+    "γ_m",
+    meaning="mass-proportional damping",
+    bounds=(1e-4, 1e4),
+    usual=0.3,
+    widest=(1e-4, 1e7),
 )
 C10 = Constant(
     "c10_pa",
@@ -129,9 +150,25 @@ C10 = Constant(
     bounds=STIFFNESS,
     widest=ANY_STIFFNESS,
 )
-C01 = Constant("c01_pa", "C₀₁", meaning="factor of the second invariant", bounds=STIFFNESS)
-C20 = Constant("c20_pa", "C₂₀", meaning="factor of (Ī₁ − 3)²", bounds=(-1e9, 1e9), scale="linear")
-C30 = Constant("c30_pa", "C₃₀", meaning="factor of (Ī₁ − 3)³", bounds=(-1e9, 1e9), scale="linear")
+C01 = Constant(
+    "c01_pa",
+    "C₀₁",
+    meaning="factor of the second invariant",
+    bounds=STIFFNESS,
+    widest=ANY_STIFFNESS,
+    may_be_negative=True,
+)
+C20, C30 = (
+    Constant(
+        f"c{power}0_pa",
+        f"C{subscript}₀",
+        meaning=f"factor of (Ī₁ − 3){superscript}",
+        bounds=(-1e9, 1e9),
+        scale="linear",
+        widest=ANY_FACTOR,
+    )
+    for power, subscript, superscript in ((2, "₂", "²"), (3, "₃", "³"))
+)
 GENT_LIMIT = Constant("gent_limit", "J_m", meaning="largest Ī₁ − 3", bounds=(1e-2, 1e4), usual=50.0)
 CHAIN_STRETCH = Constant(
     "chain_stretch",
@@ -149,7 +186,12 @@ _SUBSCRIPTS = "₁₂₃₄"
 # as in Ogden's own constants of rubber.
 MU_TERMS = (
     Constant(
-        "mu_1_pa", "μ₁", meaning="factor of the first power of the stretches", bounds=STIFFNESS
+        "mu_1_pa",
+        "μ₁",
+        meaning="factor of the first power of the stretches",
+        bounds=STIFFNESS,
+        widest=ANY_STIFFNESS,
+        may_be_negative=True,
     ),
     *(
         Constant(
@@ -158,6 +200,7 @@ MU_TERMS = (
             meaning="factor of a power",
             bounds=(-1e9, 1e9),
             scale="linear",
+            widest=ANY_FACTOR,
         )
         for p in range(2, MOST_TERMS + 1)
     ),
@@ -176,6 +219,7 @@ ALPHA_TERMS = tuple(
         usual=usual,
         below=LARGEST_EXPONENT,
         at_least=-LARGEST_EXPONENT,
+        widest=(-0.99 * LARGEST_EXPONENT, 0.99 * LARGEST_EXPONENT),
     )
     for p, usual in enumerate(USUAL_EXPONENTS, start=1)
 )
@@ -190,6 +234,7 @@ BETA_TERMS = tuple(
         typical=0.2,
         usual=0.75,
         at_least=-0.33,
+        widest=(-0.32, 1e4),
     )
     for p in range(1, MOST_TERMS + 1)
 )
@@ -201,7 +246,9 @@ SHARE = Constant(
     "share", "g", meaning="stiffness that relaxes, relative to the long-term one",
     bounds=(0.0, 20.0), scale="linear", typical=0.1, usual=0.1, at_least=0.0, widest=(0.0, 1e6),
 )  # fmt: skip
-TAU = Constant("tau_s", "τ", meaning="relaxation time", bounds=(1e-4, 1e3), usual=0.3)
+TAU = Constant(
+    "tau_s", "τ", meaning="relaxation time", bounds=(1e-4, 1e3), usual=0.3, widest=(1e-7, 1e8)
+)
 DENSITY = Constant("density_kg_m3", "ρ", meaning="density", bounds=(1.0, 1e5))
 # Total mass, which replaces the densities of all parts; their ratios are kept.
 MASS = Constant("mass_kg", "m", meaning="mass of the whole body", bounds=(1e-6, 1e3))
@@ -215,6 +262,7 @@ FRICTION = Constant(
     typical=0.1,
     usual=0.3,
     at_least=0.0,
+    widest=(0.0, 20.0),
 )
 # Coefficient of a shape of a field, see `spatial_field`; names are field_1, field_2, ….
 FIELD_COEFFICIENT = Constant(

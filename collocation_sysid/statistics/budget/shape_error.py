@@ -8,14 +8,17 @@ order, the stress-free shape then differs by the static deflection.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
 from ...common.array_types import Array, Index
 from ...fem.body import Body
-from ...fem.meshes.mesh import ElementNodes
+from ...fem.meshes.mesh import ElementNodes, TetMesh
 from ...fem.node_force import surface_shares
 
 # Modes of the error of the surface: with the correlation length below they have most of its
@@ -54,6 +57,59 @@ def thickness_m(body: Body) -> float:
     a, b, c = np.moveaxis(body.mesh.points_m[body.mesh.surface], 1, 0)
     area_m2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
     return min(6 * body.mesh.volume_m3 / area_m2, float(extents_m(body.mesh.points_m)[-1]))
+
+
+# Share of its bounding box that a square section fills at least, and a round one of polygons at most
+# and at least.
+SQUARE, ROUND = 0.98, (0.6, 0.82)
+# Largest relative difference of both widths, and least length over them.
+ALIKE, LONG = 0.05, 1.2
+
+
+class OtherSection(NamedTuple):
+    """Another section of a straight body: "round" in place of square or "square" in place of round,
+    the volume with it over that of the mesh, the displacements (n, 3) of points [m], the axes (3,) of
+    the coordinates across the body, and the middle (3,) of the body [m].
+    """
+
+    name: str
+    volume_ratio: float
+    moved_m: Array
+    is_across: NDArray[np.bool_]
+    middle_m: Array
+
+
+def other_section(mesh: TetMesh, points_m: Array) -> OtherSection | None:
+    """Return the other section of a straight mesh with a square or a round one of the same width, and
+    how points (n, 3) of the mesh move with it, by the elliptical map of a square to a disc; None for
+    other bodies. The longest extent is along an axis of the coordinates.
+    """
+    low, high = mesh.compute_bounds_m()
+    extents = high - low
+    along = int(extents.argmax())
+    across = [axis for axis in range(3) if axis != along]
+    if np.ptp(extents[across]) > ALIKE * extents[across].mean():
+        return None
+    if extents[along] < LONG * extents[across].mean():
+        return None
+    filled = mesh.volume_m3 / float(np.prod(extents))
+    half_m = extents[across] / 2
+    own = (points_m[:, across] - (low + high)[across] / 2) / half_m
+    if filled > SQUARE:
+        name, volume = "round", np.pi / 4
+        other = own * np.sqrt(np.maximum(0.5, 1 - own[:, ::-1] ** 2 / 2))
+    elif ROUND[0] < filled < ROUND[1]:
+        name, volume = "square", 1.0
+        disc = own / np.maximum(1.0, np.linalg.norm(own, axis=1))[:, None]
+        sums = 2 + disc**2 - disc[:, ::-1] ** 2
+        roots = [np.sqrt(np.maximum(0.0, sums + sign * np.sqrt(8) * disc)) for sign in (1, -1)]
+        other = (roots[0] - roots[1]) / 2
+    else:
+        return None
+    moved_m = np.zeros_like(points_m)
+    moved_m[:, across] = (other - own) * half_m
+    is_across = np.isin(np.arange(3), across)
+    return OtherSection(name, volume / filled, moved_m, is_across, (low + high) / 2)
 
 
 def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) -> Array:

@@ -58,6 +58,7 @@ from .platen_slip import slip_displacements_m, sticking_change_n
 from .shape_error import (
     CORRELATION,
     SURFACE_MODES,
+    other_section,
     sag_m,
     standing_nodes,
     surface_modes,
@@ -852,11 +853,10 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
     )
 
 
-def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
-    """Return the effect of an error of the surface along its normal, by one mode (index from 0) of
-    a smooth random field, in units of the thickness; grasped nodes move with the surface.
+def shape_effect(at: ExperimentAtAnswer, moved_m: Array) -> Effect:
+    """Return the effect of stress-free positions that are off by `moved_m` (n, 3) [m], with which the
+    grasped nodes move.
     """
-    moved_m = at.surface_modes_m[mode]
     prescribed_motion = at.iterate.transcription.prescribed_motion
     rotations: Array = np.nan_to_num(prescribed_motion.pose_rows[0])
     offsets_m = moved_m.ravel()[
@@ -866,6 +866,48 @@ def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
         at.force_change_by_reference(moved_m),
         displacement_m=np.einsum("tgj,gj->tg", rotations, offsets_m),
     )
+
+
+def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
+    """Return the effect of an error of the surface along its normal, by one mode (index from 0) of
+    a smooth random field, in units of the thickness; grasped nodes move with the surface.
+    """
+    return shape_effect(at, at.surface_modes_m[mode])
+
+
+# Sections of a body, in the order of the components, and the relative width of a section of the other
+# kind with the same stiffness: by the area π/4 it is 0.886, by the second moment 3π/16 0.876.
+SECTIONS = {"round": 0.881, "square": 1 / 0.881}
+
+
+def section_effect(at: ExperimentAtAnswer) -> Effect | None:
+    """Return the effect of a round section in place of a square one of the same width, or the
+    reverse; None for other meshes, see `other_section`.
+    """
+    body = at.body
+    points_m = body.nodes.points_m
+    other = other_section(body.mesh, points_m)
+    if other is None:
+        return None
+    off_axis_m = np.where(other.is_across, points_m - other.middle_m, 0.0)
+    of_shape = shape_effect(at, np.log(SECTIONS[other.name]) * off_axis_m)
+    if body.has_declared_mass:
+        return of_shape
+    mass = at.own_mass_kg * (other.volume_ratio - 1)
+    assert of_shape.force_n is not None
+    return replace(of_shape, force_n=of_shape.force_n + at.weight_and_drag(mass), mass_kg=mass)
+
+
+def _section(at: ExperimentAtAnswer, index: int) -> Effect | None:
+    """Return `section_effect` for one of `SECTIONS` (index); None for a mesh from a file or whose
+    origin is stated, with another section, or in contact with obstacles.
+    """
+    body = at.body
+    is_stated = body.mesh_from is not None or body.inverse_equilibrium is not None
+    if is_stated or not body.mesh.is_generated or at.iterate.transcription.experiment.obstacles:
+        return None
+    other = other_section(body.mesh, body.nodes.points_m)
+    return section_effect(at) if other and other.name == [*SECTIONS][index] else None
 
 
 ASSUMPTIONS = (
@@ -900,6 +942,16 @@ ASSUMPTIONS = (
         effect=_surface,
         axes=_MODES,
         by_origin={"scan": 0.01},
+    ),
+    Deviation(
+        "section",
+        "1",
+        description="difference of the section of a straight body from that of the mesh, as a fraction "
+        "of the difference between a square and a round one of the same width",
+        remedy="mesh the section of the body",
+        effect=_section,
+        axes=" ".join(SECTIONS),
+        alternative="if the section of the body is {component}, of the same width",
     ),
     Deviation(
         "mass",

@@ -2,16 +2,17 @@
 made.
 
 Each hypothesis is one more column of the linearised fit: the change of the residuals along the
-motion of the fit if the body had another law, another width along an axis of the mesh, a finer mesh,
-or if its mesh had been made under its weight. The decrease of χ² by one Gauss–Newton step says which
-are worth a refit (`screened_bodies`); of a finer mesh this step is the only test. Mirror images of
-the mesh are too different for a linear step.
+motion of the fit if the body had another law, another width along an axis of the mesh, a round
+section in place of a square one or the reverse, a finer mesh, or if its mesh had been made under its
+weight. The decrease of χ² by one Gauss–Newton step says which are worth a refit (`screened_bodies`);
+of a finer mesh this step is the only test. Mirror images of the mesh are too different for a linear
+step.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,8 +29,8 @@ from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ..budget.consider_analysis import changed_residuals
 from ..budget.mesh_error import LARGEST_NODE_COUNT, finer_mesh_row
-from ..budget.shape_error import GRAVITY_M_S2, sag_m
-from ..budget.systematic_effects import Effect, ExperimentAtAnswer
+from ..budget.shape_error import GRAVITY_M_S2, other_section, sag_m
+from ..budget.systematic_effects import Effect, ExperimentAtAnswer, section_effect, shape_effect
 from ..linearised import LinearisedFit, linearise_fit
 from ..thresholds import LEAST_DECREASE, LEAST_SIGMAS, WIDEST
 from .misspecification_hypothesis import Hypothesis
@@ -141,12 +142,7 @@ def _width_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
     points_m = at.body.nodes_m
     dofs = at.iterate.equations.prescribed.dofs
     moved_m[:, axis] = points_m[:, axis] - points_m[np.unique(dofs // 3), axis].mean()
-    rotations: Array = np.nan_to_num(at.iterate.transcription.prescribed_motion.pose_rows[0])
-    offsets_m = moved_m.ravel()[3 * (dofs // 3)[:, None] + np.arange(3)]
-    return Effect(
-        at.force_change_by_reference(moved_m),
-        displacement_m=np.einsum("tgj,gj->tg", rotations, offsets_m),
-    )
+    return shape_effect(at, moved_m)
 
 
 def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
@@ -174,6 +170,9 @@ def _list_changes(body: Body) -> tuple[list[Deviation], list[_Change]]:
         changes.append(_Change((of_law[pair],), True, _law_code(*pair), *pair))
     if not _is_uniform(body):
         return rows, changes
+    if other_section(body.mesh, body.nodes.points_m) is not None:
+        column = add("section", lambda at, _: section_effect(at))
+        changes.append(_Change((column,), True, "mesh-section"))
     for axis in range(3):
         column = add("width", lambda at, _, axis=axis: _width_effect(at, axis))
         changes.append(_Change((column,), False, "mesh-width", axis=axis))
@@ -322,6 +321,8 @@ def _changed_experiment(
     large to be a mistake of this kind.
     """
     body = experiment.body
+    if change.kind == "mesh-section":
+        return with_other_section(experiment)
     if change.is_whole:
         laws = MATERIALS.get(change.material), DAMPINGS.get(change.damping)
         return with_body(experiment, with_laws(body, *laws))
@@ -352,6 +353,11 @@ def _hypothesis(
             "percent": 100 * abs(width),
             "way": "narrow" if width > 0 else "wide",
         }
+    elif change.kind == "mesh-section":
+        real = (
+            "round" if corrected.body.mesh.volume_m3 < experiment.body.mesh.volume_m3 else "square"
+        )
+        data = {"real": real, "meshed": "square" if real == "round" else "round"}
     elif change.kind == "rest-shape":
         down = amplitudes / np.linalg.norm(amplitudes)
         data = {"down": ", ".join(f"{each:.2f}" for each in down)}
@@ -402,17 +408,51 @@ def with_shape(
 
     The mass stays, and so do stated places of markers.
     """
+    middle_m = _middle_of_grasps_m(experiment)
+    return _made_again(
+        experiment,
+        lambda points_m: middle_m + factors * (points_m - middle_m),
+        mass_kg=experiment.body.mass_kg,
+        rest_shape=rest_shape,
+    )
+
+
+def with_other_section(experiment: Experiment) -> Experiment | None:
+    """Return the experiment with a round mesh in place of a square one of the same width or the
+    reverse, see `other_section`; None if it is not valid. A declared mass stays, else the density;
+    stated places of markers move with the mesh.
+    """
+    body = experiment.body
+    own = other_section(body.mesh, body.mesh.points_m)
+    if own is None:
+        return None
+    mapped = TetMesh(body.mesh.points_m + own.moved_m, body.mesh.tetrahedra)
+    wider = np.sqrt(own.volume_ratio * body.mesh.volume_m3 / mapped.volume_m3)
+    factors = np.where(own.is_across, wider, 1.0)
+
+    def reshaped(points_m: Array) -> Array:
+        other = other_section(body.mesh, points_m)
+        assert other is not None
+        return own.middle_m + factors * (points_m + other.moved_m - own.middle_m)
+
+    ratio = 1.0 if body.has_declared_mass else own.volume_ratio
+    return _made_again(experiment, reshaped, mass_kg=ratio * body.mass_kg)
+
+
+def _made_again(
+    experiment: Experiment,
+    reshaped: Callable[[Array], Array],
+    mass_kg: float,
+    rest_shape: UnderGravity | None = None,
+) -> Experiment | None:
+    """Return the experiment with points (n, 3) of the mesh elsewhere; None if it is not valid."""
     body = experiment.body
     (part,) = body.parts
-    middle_m = _middle_of_grasps_m(experiment)
-    mesh = body.mesh
-    moved_m = middle_m + factors * (mesh.points_m - middle_m)
-    old_m = middle_m + factors * (body.nodes.points_m - middle_m)
     try:
         other = Body(
-            TetMesh(moved_m, mesh.tetrahedra),
+            TetMesh(reshaped(body.mesh.points_m), body.mesh.tetrahedra),
             part.material,
-            mass_kg=body.mass_kg,
+            mass_kg=mass_kg,
             element=body.element.name,
             damping=part.damping,
             prony=part.prony,
@@ -421,7 +461,7 @@ def with_shape(
         )
     except InputError:
         return None
-    index = np.asarray(KDTree(other.nodes_m).query(old_m)[1])
+    index = np.asarray(KDTree(other.nodes_m).query(reshaped(body.nodes.points_m))[1])
     grasps = [replace(grasp, nodes=np.unique(index[grasp.nodes])) for grasp in experiment.grasps]
     return with_body(experiment, other, grasps=grasps)
 
