@@ -194,7 +194,7 @@ class FullProgram:
         matrix, _ = self.program.residuals
         product = sp.coo_array(sp.triu(2 * self.length_m**2 * (matrix.T @ matrix)))
         rows, columns = (each.astype(np.int64) for each in product.coords)
-        return columns * self.position_count + rows, product.data
+        return columns * self.position_count + rows, np.asarray(product.data, dtype=np.float64)
 
     @cached_property
     def _keys(self) -> Index:
@@ -225,10 +225,10 @@ class FullProgram:
         """Return Σ multipliers · ∂²constraint/∂c² (c, c) of the prescribed positions."""
         program = self.program
         matrix, constant = program.coordinates_at_grid
-        weights = np.zeros(program.driven.stated_goals_m.shape)
-        by_time = multipliers[self._grasp_rows].reshape(-1, weights.shape[1])
+        weights = np.zeros((len(constant), len(self.driven.dofs)))
+        by_time = multipliers[self._grasp_rows].reshape(-1, len(self.driven.dofs))
         weights[self._grasp_times] = by_time / -self.length_m
-        planned = weights[:, program.planned_columns].reshape(len(weights), -1, 3)
+        planned = weights[:, program.planned_columns].reshape(len(constant), -1, 3)
         curvature = program.frame.weighted_hessian(matrix @ c + constant, planned)
         return np.einsum("tic,tij,tjd->cd", matrix, curvature, matrix, optimize=True)
 
