@@ -84,7 +84,6 @@ def benchmark(options: BenchmarkCommand) -> None:
 def _list_bodies(options: BenchmarkCommand) -> None:
     """Print the bodies; refuse options that need a folder."""
     from ..extras.benchmark import BODIES
-    from ..extras.benchmark.identified_constants import catalogue_entry
 
     if options.write or options.body is not None:
         where = "--write" if options.write else "--body"
@@ -93,17 +92,17 @@ def _list_bodies(options: BenchmarkCommand) -> None:
         )
     listed: list[dict[str, Any]] = []
     for body in BODIES.values():
-        entry = catalogue_entry(body.entry)
+        entry = body.catalogue_entry()
         listed.append(
             {
                 "body": body.name,
-                "specimen": entry.specimen,
-                "is_measured": entry.is_measured,
+                "specimen": entry["specimen"],
+                "is_measured": entry["is_measured"],
                 "recordings": body.recordings,
                 "is_held_out": body.are_held_out,
                 "is_available": body.find_data_folder() is not None,
                 "script": body.script,
-                "licence": entry.licence,
+                "licence": entry["licence"],
             }
         )
     if options.as_json:

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
-from collocation_sysid.extras.benchmark.identified_constants import IdentifiedConstant
 from collocation_sysid.fem.laws.constants import symbol_of
 
 # Readable units: smallest magnitude, factor from the SI unit, and name; the largest first.
@@ -60,6 +59,38 @@ class QuantileRange:
     high: float
     minimum: float
     maximum: float
+
+
+@dataclass(frozen=True)
+class IdentifiedConstant:
+    """One constant of a body, as an entry of the catalogue.
+
+    Attributes
+    ----------
+    name : str
+        Name in problem files, with its unit.
+    unit : str
+        Unit of the values; "1" for ratios.
+    combined95 : (lower, upper) or None
+        Combined 95 % interval; None if the constant was stated, or has no interval.
+    is_stated : bool
+        Whether the constant was stated in the problem, not estimated.
+    is_derived : bool
+        Whether the constant follows from the parameters, such as Young's modulus at small strain.
+    reason : str or None
+        Why an estimated constant has no interval.
+    true_value : float or None
+        Value with which a recording was simulated; None for measured data.
+    """
+
+    name: str
+    unit: str
+    value: float
+    combined95: tuple[float, float] | None
+    is_stated: bool
+    is_derived: bool
+    reason: str | None
+    true_value: float | None
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,20 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
-from catalogue import Catalogue, CatalogueEntry, Omission, QuantileRange, catalogue_page
+from catalogue import (
+    Catalogue,
+    CatalogueEntry,
+    IdentifiedConstant,
+    Omission,
+    QuantileRange,
+    catalogue_page,
+)
 from catalogue_sources import ROOT, SOURCES, CatalogueSource
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.common.files import RESULT_FILE, write_text_file
 from collocation_sysid.common.serialisation import as_json, read
-from collocation_sysid.extras.benchmark.identified_constants import IdentifiedConstant
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.constants import is_damping, unit_of
 from collocation_sysid.fem.regions import BodyPart

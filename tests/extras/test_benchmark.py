@@ -107,10 +107,9 @@ def test_an_error_of_loads_is_relative_to_the_largest_load(folder: Path):
 
 
 def test_samples_that_were_not_measured_are_not_scored(written: Path):
-    from collocation_sysid.extras.benchmark.benchmark_content import BenchmarkContent
-    from collocation_sysid.extras.benchmark.scores import score
+    from collocation_sysid.extras.benchmark.scores import read_recordings, score
 
-    recording = BenchmarkContent.read(written).recordings[1]
+    (recording,) = read_recordings(written, FOAM)
     signals = recording.signals
     gaps = signals.measured.values.copy()
     gaps[3:7, :3] = np.nan

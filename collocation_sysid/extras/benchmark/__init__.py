@@ -1,10 +1,9 @@
 """Benchmark of simulators: measured bodies, files for any simulator, and scores of predictions.
 
-`benchmark_bodies` lists the bodies, `identified_constants` reads their constants with combined
-intervals from the catalogue, `benchmark_folder` writes files that can be read without this package,
-`benchmark_content` reads these files again, `prediction_files` the predictions of a simulator, and
-`scores` compares them with the measurements. `signals` defines the compared quantities, and
-`body_description` the text for readers.
+`benchmark_bodies` lists the bodies and finds their constants in the catalogue, `benchmark_folder`
+writes files that can be read without this package, `prediction_files` reads the predictions of a
+simulator, and `scores` compares them with the measurements. `signals` defines the compared
+quantities, and `body_description` the text for readers.
 """
 
 from .benchmark_bodies import BODIES, BenchmarkBody

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
+from ...common.pages import documentation_folder
 from ...datasets.dataset_files import dataset_folder
 from ...errors import InputError, require_among
 from ...problem import Problem
 
+CATALOGUE_FILE = "catalogue.json"
 CHECKOUT = Path(__file__).parents[3]
 # Licence of the curves of rubber.
 HYPERELASTICS_LICENCE = "collocation_sysid/datasets/LICENSE_Hyperelastics.md"
@@ -75,6 +80,18 @@ class BenchmarkBody:
         `licence_path` is empty. Whether the file exists is not checked.
         """
         return CHECKOUT / self.licence_path if self.licence_path else None
+
+    def catalogue_entry(self) -> dict[str, Any]:
+        """Return the entry of the body in the catalogue, as in its JSON file; not to be modified.
+
+        Raises
+        ------
+        InputError
+            If the catalogue is not part of the installation, or has no such entry.
+        """
+        entries = _catalogue()
+        require_among(self.entry, entries, source=CATALOGUE_FILE)
+        return entries[self.entry]
 
     def read_problem(self) -> Problem:
         """Return the problem of the body.
@@ -183,3 +200,18 @@ def chosen_bodies(name: str | None) -> tuple[BenchmarkBody, ...]:
         return tuple(body for body in BODIES.values() if body.find_data_folder() is not None)
     require_among(name, BODIES, where="--body")
     return (BODIES[name],)
+
+
+@cache
+def _catalogue() -> dict[str, dict[str, Any]]:
+    """Return the entries of the catalogue by name."""
+    file = documentation_folder() / CATALOGUE_FILE
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"the catalogue is not part of this installation ({error.strerror}); install the "
+            "package again",
+            file,
+        ) from error
+    return {entry["name"]: entry for entry in content["entries"]}

@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,69 +26,14 @@ from ...recording.recording_writers import write_columns_csv, write_poses_csv
 from ...recording.specimen_files import specimen_strains
 from ...result.run_writers import replaced_folder
 from .benchmark_bodies import BenchmarkBody
-from .benchmark_content import BODY_FILE, CONTENT_FILE
-from .body_description import FOLDER_README, body_readme, damping_description, law_description
-from .identified_constants import CatalogueEntry, catalogue_entry
+from .body_description import DAMPING_LAWS, FOLDER_README, LAWS, body_readme
+from .scores import BODY_FILE, CONTENT_FILE
 from .signals import SAMPLE_KEY, RecordingSignals
 
 README_FILE = "README.md"
 LICENCE_FILE = "LICENSE.md"
 # Divisions of the cube that stands for a body without a mesh: any mesh has the same stresses.
 CUBE_DIVISIONS = (1, 1, 1)
-
-
-@dataclass(frozen=True, eq=False)
-class BodyTask:
-    """Content of the folder of one body, before it is written.
-
-    Attributes
-    ----------
-    values : mapping of name to float
-        Values of all parameters of the problem.
-    """
-
-    body: BenchmarkBody
-    entry: CatalogueEntry
-    problem: Problem
-    values: dict[str, float]
-    signals: dict[str, RecordingSignals]
-
-    @classmethod
-    def simulated(cls, body: BenchmarkBody, progress: Callable[[float], None] | None) -> BodyTask:
-        """Return the task of a body, with simulations of its recordings at the constants of the
-        catalogue.
-
-        Parameters
-        ----------
-        body : BenchmarkBody
-            Body whose data are on this computer.
-        progress : callable or None
-            Called with the completed share of each simulation, from 0 to 1.
-
-        Raises
-        ------
-        InputError
-            If the data of the body are missing, or a parameter has no value.
-        SimulationError
-            If a simulation fails.
-        """
-        problem = body.read_problem()
-        entry = catalogue_entry(body.entry)
-        values = _parameter_values(problem, entry)
-        signals = {}
-        for experiment in _recordings(problem, body):
-            trajectory = simulate(
-                experiment,
-                experiment.body.theta_from_values(values),
-                timestep_s=problem.rollout.timestep_s,
-                progress=progress,
-            )
-            signals[experiment.name] = RecordingSignals.from_trajectory(experiment, trajectory)
-        return cls(body, entry, problem=problem, values=values, signals=signals)
-
-    def make_experiments(self) -> list[Experiment]:
-        """Return the recordings to be predicted, in the order of the problem."""
-        return _recordings(self.problem, self.body)
 
 
 def write_benchmark(
@@ -129,24 +73,16 @@ def write_benchmark(
         raise InputError("found no body whose data are on this computer; install the package again")
     with replaced_folder(folder, marker_file=CONTENT_FILE, content_word="benchmark") as draft:
         for body in bodies:
-            task = BodyTask.simulated(body, progress)
-            _write_body(task, draft / body.name)
+            _write_body(body, draft / body.name, progress)
         content = {"schema": SCHEMA, "bodies": [body.name for body in bodies]}
         write_text_file(draft / CONTENT_FILE, as_json(content) + "\n")
         write_text_file(draft / README_FILE, FOLDER_README)
     return Path(folder)
 
 
-def _recordings(problem: Problem, body: BenchmarkBody) -> list[Experiment]:
-    """Return the experiments of a problem that the benchmark asks to predict, in the order of the
-    problem.
-    """
-    return [each for each in problem.experiments if each.name in body.recordings]
-
-
-def _parameter_values(problem: Problem, entry: CatalogueEntry) -> dict[str, float]:
+def _parameter_values(problem: Problem, entry: Mapping[str, Any]) -> dict[str, float]:
     """Return the values of all parameters of a problem by name, in the units of the problem file."""
-    identified = {each.name: each.value for each in entry.constants}
+    identified = {each["name"]: each["value"] for each in entry["constants"]}
     values = {}
     for item in problem.parameters.components:
         value = identified.get(item.name, item.guess if item.is_fixed else None)
@@ -161,13 +97,17 @@ def _parameter_values(problem: Problem, entry: CatalogueEntry) -> dict[str, floa
     return values
 
 
-def _write_body(task: BodyTask, folder: Path) -> None:
-    """Write the data of a body to a new folder: mesh, nodes and tetrahedra, licence if there is
-    one, recordings, description (body.json) and README.
-    """
-    mesh = _mesh(task.make_experiments()[0])
+def _write_body(
+    body: BenchmarkBody, folder: Path, progress: Callable[[float], None] | None
+) -> None:
+    """Simulate the recordings of a body, and write its files to a new folder."""
+    problem = body.read_problem()
+    entry = body.catalogue_entry()
+    values = _parameter_values(problem, entry)
+    experiments = [each for each in problem.experiments if each.name in body.recordings]
+    mesh = _mesh(experiments[0])
     folder.mkdir()
-    if (licence := task.body.find_licence_file()) is not None:
+    if (licence := body.find_licence_file()) is not None:
         shutil.copyfile(licence, folder / LICENCE_FILE)
     mesh.write(folder / "mesh.vtu")
     write_columns_csv(
@@ -175,10 +115,16 @@ def _write_body(task: BodyTask, folder: Path) -> None:
     )
     corners = (f"node_{k}" for k in range(1, 5))
     write_columns_csv(folder / "tetrahedra.csv", dict(zip(corners, mesh.tetrahedra.T, strict=True)))
-    content = _body_content(task)
-    content["recordings"] = [
-        _write_recording(task, experiment, folder=folder) for experiment in task.make_experiments()
-    ]
+    content = _body_content(body, entry, experiments[0], values)
+    content["recordings"] = []
+    for experiment in experiments:
+        theta = experiment.body.theta_from_values(values)
+        trajectory = simulate(
+            experiment, theta, timestep_s=problem.rollout.timestep_s, progress=progress
+        )
+        signals = RecordingSignals.from_trajectory(experiment, trajectory)
+        recording = _write_recording(experiment, signals, body.are_held_out, folder)
+        content["recordings"].append(recording)
     write_text_file(folder / BODY_FILE, as_json(content) + "\n")
     write_text_file(folder / README_FILE, body_readme(content))
 
@@ -190,41 +136,39 @@ def _mesh(experiment: Experiment) -> TetMesh:
     return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0))
 
 
-def _body_content(task: BodyTask) -> dict[str, Any]:
+def _body_content(
+    body: BenchmarkBody, entry: Mapping[str, Any], experiment: Experiment, values: dict[str, float]
+) -> dict[str, Any]:
     """Return the content of body.json without its "recordings": names, source, licence, law,
     damping, element, density and constants of a body.
     """
-    experiment = task.make_experiments()[0]
-    body = experiment.body
-    theta = body.theta_from_values(task.values)
-    (part,) = body.parts
-    (density,) = body.densities(theta)
+    modelled = experiment.body
+    (part,) = modelled.parts
+    (density,) = modelled.densities(modelled.theta_from_values(values))
     is_motion = not experiment.is_static
     return {
         "schema": SCHEMA,
-        "body": task.body.name,
-        "catalogue_entry": task.body.entry,
-        "specimen": task.entry.specimen,
-        "source": task.entry.source,
-        "licence": task.entry.licence,
-        "is_measured": task.entry.is_measured,
-        "note": task.body.note,
-        "identified_from": task.entry.fitted_recordings,
+        "body": body.name,
+        "catalogue_entry": body.entry,
+        **{key: entry[key] for key in ("specimen", "source", "licence", "is_measured")},
+        "note": body.note,
+        "identified_from": entry["recordings"],
         "law": part.material.name,
-        "energy": law_description(part.material.name),
+        "energy": LAWS[part.material.name],
         "damping": part.damping.name if is_motion else None,
-        "damping_force": damping_description(part.damping.name) if is_motion else None,
-        "element": body.element.name if experiment.specimen is None else None,
+        "damping_force": DAMPING_LAWS[part.damping.name] if is_motion else None,
+        "element": modelled.element.name if experiment.specimen is None else None,
         "density_kg_m3": density if experiment.specimen is None else None,
-        "constants": [asdict(each) for each in task.entry.constants],
+        "constants": entry["constants"],
     }
 
 
-def _write_recording(task: BodyTask, experiment: Experiment, folder: Path) -> dict[str, Any]:
+def _write_recording(
+    experiment: Experiment, signals: RecordingSignals, is_held_out: bool, folder: Path
+) -> dict[str, Any]:
     """Write the tables of a recording to the existing folder of its body, and return its entry of
     "recordings" in body.json.
     """
-    signals = task.signals[experiment.name]
     measured = signals.measured
     name = safe_name(experiment.name)
     files = {
@@ -236,7 +180,7 @@ def _write_recording(task: BodyTask, experiment: Experiment, folder: Path) -> di
     content = {
         "name": experiment.name,
         "file_name": name,
-        "is_held_out": task.body.are_held_out,
+        "is_held_out": is_held_out,
         "kind": experiment.kind,
         "start": None if experiment.is_static else experiment.start,
         "gravity_m_s2": experiment.gravity_m_s2,

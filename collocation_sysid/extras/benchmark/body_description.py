@@ -65,20 +65,6 @@ Then `collocation-sysid benchmark FOLDER` prints the scores; `--body NAME` score
 {METRIC}"""
 
 
-def law_description(name: str) -> str:
-    """Return the energy density of the material law called `name`, such as "yeoh", as a formula;
-    `KeyError` for laws that no body of the benchmark has.
-    """
-    return LAWS[name]
-
-
-def damping_description(name: str) -> str:
-    """Return the stress or force of the damping law called `name`, such as "rayleigh", as a
-    formula; `KeyError` for laws that no body of the benchmark has.
-    """
-    return DAMPING_LAWS[name]
-
-
 def body_readme(content: Mapping[str, Any]) -> str:
     """Return the README of a body as one text of Markdown, with a section for each recording.
 

@@ -2,20 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ...common.array_types import Array
+from ...common.checked_arrays import float_array, require_shape
+from ...common.files import damage_refused, read_json, require_size
+from ...common.written_files import is_written_here
 from ...errors import InputError, listed, require_among
-from .benchmark_content import BenchmarkContent, StoredRecording
 from .prediction_files import PREDICTION_SUFFIXES, find_prediction, prediction_name, read_prediction
-from .signals import AXES, Signal
+from .signals import AXES, RecordingSignals, Signal
+
+# File of a benchmark folder with its bodies, and file of a body with all about it but the arrays.
+CONTENT_FILE = "benchmark.json"
+BODY_FILE = "body.json"
+REMEDY = "write the benchmark again, into another folder"
 
 PREDICTION = "prediction"
 SIMULATION = "collocation_sysid"
 UNDEFORMED = "undeformed body"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRecording:
+    """A recording of a benchmark folder.
+
+    Attributes
+    ----------
+    body : str
+        Name of its body, which is that of the folder.
+    name : str
+        Name in the names of files.
+    is_held_out : bool
+        Whether the constants were identified without the recording.
+    """
+
+    body: str
+    name: str
+    is_held_out: bool
+    signals: RecordingSignals
 
 
 @dataclass(frozen=True)
@@ -87,13 +116,13 @@ def score_benchmark(folder: str | Path, body: str | None = None) -> list[Score]:
         If the folder is no benchmark or was changed, has no such body, or if a prediction is
         missing or invalid.
     """
-    content = BenchmarkContent.read(Path(folder))
-    names = content.bodies
+    folder = Path(folder)
+    names = read_bodies(folder)
     if body is not None:
-        require_among(body, names, source=content.folder, where="--body")
+        require_among(body, names, source=folder, where="--body")
         names = (body,)
-    recordings = [each for each in content.recordings if each.body in names]
-    files = _prediction_files(content.folder, recordings)
+    recordings = [each for name in names for each in read_recordings(folder, name)]
+    files = _prediction_files(folder, recordings)
     scores = []
     for recording, file in zip(recordings, files, strict=True):
         prediction = read_prediction(file, recording.signals.measured)
@@ -184,3 +213,68 @@ def _distances(errors: Array, measured: Signal) -> Array:
 def _rms(values: Array) -> float:
     """Return the root of the mean square of at least one value, of any shape; NaN if one is NaN."""
     return float(np.sqrt(np.mean(values**2)))
+
+
+def _unchanged(folder: Path, name: str) -> Path:
+    """Return the file called `name` in a benchmark folder; a file that does not exist is accepted."""
+    file = folder / name
+    if file.exists() and not is_written_here(file, folder):
+        raise InputError(
+            "this file was changed after it was written, so that scores would not be comparable; "
+            f"{REMEDY}",
+            file,
+        )
+    return file
+
+
+def read_bodies(folder: Path) -> tuple[str, ...]:
+    """Return the names of the bodies of a benchmark folder."""
+    content = read_json(_unchanged(folder, CONTENT_FILE), "a benchmark folder")
+    with damage_refused(folder, CONTENT_FILE, REMEDY):
+        return tuple(str(name) for name in content["bodies"])
+
+
+def read_recordings(folder: Path, body: str) -> list[StoredRecording]:
+    """Return the recordings of a body with their measured and simulated values."""
+    file = _unchanged(folder, f"{body}/{BODY_FILE}")
+    content = read_json(file, "the folder of a body of a benchmark")
+    with damage_refused(file.parent, BODY_FILE, REMEDY):
+        return [
+            StoredRecording(
+                body=body,
+                name=recording["file_name"],
+                is_held_out=bool(recording["is_held_out"]),
+                signals=_read_signals(folder, body, recording=recording),
+            )
+            for recording in content["recordings"]
+        ]
+
+
+def _read_signals(folder: Path, body: str, recording: Mapping[str, Any]) -> RecordingSignals:
+    """Return the measured and predicted signals of a recording of a body; blank cells are NaN."""
+    tables = {}
+    for role in ("measured", "simulated", "undeformed"):
+        file = _unchanged(folder, f"{body}/{recording['files'][role]}")
+        require_size(file)
+        try:
+            tables[role] = np.atleast_2d(np.genfromtxt(file, delimiter=",", skip_header=1))
+        except OSError as error:
+            raise InputError(
+                f"this file cannot be read ({error.strerror}); {REMEDY}", file
+            ) from error
+    shape = (len(tables["measured"]), 1 + len(recording["columns"]))
+    for role, table in tables.items():
+        require_shape(table.shape, shape, f"the table {recording['files'][role]}")
+    measured = Signal(
+        recording["quantity"],
+        recording["key"],
+        keys=tables["measured"][:, 0],
+        columns=tuple(recording["columns"]),
+        values=tables["measured"][:, 1:],
+    )
+    return RecordingSignals(
+        measured,
+        float_array(recording["sigma"], "sigma", (len(measured.columns),)),
+        simulated=measured.with_values(tables["simulated"][:, 1:]),
+        undeformed=measured.with_values(tables["undeformed"][:, 1:]),
+    )
