@@ -455,14 +455,6 @@ class InverseEquilibrium:
             raise RestShapeError(self._failure_message(constants, 1.0))
         return self._newton_step(factor, self._weight_n(constants))
 
-    def point_data_at(self, positions_m: Array) -> list[Array]:
-        """Return for each part the data (1, E · q · `layout.count`) of its points if the
-        stress-free positions X (n, 3) [m] are given and do not depend on θ: all derivatives are
-        zero. New arrays, with the columns of `point_data_columns`.
-        """
-        others = self.layout.input_count + len(self.layout.list_input_pairs())
-        return self._fields_at_points([positions_m, *[np.zeros_like(positions_m)] * others])
-
     def _fields_at_points(self, fields: Sequence[Array]) -> list[Array]:
         """Return the data of the points of each part, (1, E · q · `layout.count`) each: G and its
         derivatives, and their volume logarithms if the layout averages the dilatation.

@@ -153,14 +153,6 @@ def style_axes(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") 
         spine.set(linewidth=0.6, color=_GREY)
 
 
-def add_legend(axes: Axes, title: str = "") -> None:
-    """Add a small legend with a white background, readable over lines, and a title, if any, to
-    axes.
-    """
-    box = axes.legend(title=title, fontsize=SMALL_PT, title_fontsize=SMALL_PT, framealpha=0.85)
-    box.get_frame().set(edgecolor="none", facecolor="white")
-
-
 def add_legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
     """Add a legend above the axes, where it hides nothing.
 

@@ -260,16 +260,6 @@ def simulate_with_parameters(
     )
 
 
-def transcription_and_nuisance(
-    experiment: Experiment, solution: Solution
-) -> tuple[Transcription, Array]:
-    """Return an experiment's transcription and the nuisance parameters φ (k,) with which it is
-    simulated, in units of their prior standard deviations.
-    """
-    transcription, own_phi = fitted_nuisance(experiment, solution)
-    return transcription, predicted_nuisance(transcription, own_phi, solution=solution)
-
-
 def predicted_nuisance(transcription: Transcription, own_phi: Array, solution: Solution) -> Array:
     """Return the nuisance parameters φ (k,) with which a recording is simulated: `own_phi`, which
     are fitted to it, of a fitted recording.

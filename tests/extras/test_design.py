@@ -368,13 +368,11 @@ def test_a_small_motion_reports_its_first_order_effect():
     motion = replace(drawn_motions(1)[0], duration_s=0.25, active_s=0.22, rise_s=0.08)
     small = motion.scaled(0.1, 0.1)
     linear = LinearRecording.from_simulations(recording, AT.guess_q).information(small)
-    exact = recording.simulate_motion(
-        recording.experiment(recording.poses(small)), AT.guess_q
-    ).information
-    still = recording.simulate_motion(
-        recording.experiment(recording.poses(motion.scaled(0, 0))), AT.guess_q
+    exact, still = (
+        recording.simulate_motion(recording.experiment(recording.poses(each)), AT.guess_q)[0]
+        for each in (small, motion.scaled(0, 0))
     )
-    gained = np.sqrt(np.diag(exact)) - np.sqrt(np.diag(still.information))
+    gained = np.sqrt(np.diag(exact)) - np.sqrt(np.diag(still))
     assert (gained[2:] > 0.5 * np.sqrt(np.diag(exact))[2:]).all()  # it is not the rest that tells
     assert np.allclose(np.sqrt(np.diag(linear)), np.sqrt(np.diag(exact)), rtol=0.05)
 
@@ -422,9 +420,7 @@ def test_a_wrench_counts_and_the_search_then_begins_at_random():
     q, told = AT.guess_q, []
     for experiment in (sensing, blind):
         recording = FutureRecording(Problem([experiment], AT), experiment, 0.08)
-        told.append(
-            recording.simulate_motion(recording.experiment(still_poses(recording)), q).information
-        )
+        told.append(recording.simulate_motion(recording.experiment(still_poses(recording)), q)[0])
     assert np.linalg.eigvalsh(told[0] - told[1]).min() > -1e-6 * np.trace(told[0])
     assert told[0][0, 0] > 1.01 * told[1][0, 0]
     found = design_motion(Problem([sensing], AT), LIMITS, 0.08, options=DesignOptions(1, pairs=0))

@@ -63,23 +63,6 @@ class TimeDerivatives(NamedTuple):
         )
 
 
-class JacobianFactors(NamedTuple):
-    """Factors of the left Jacobian of the exponential map at rotation angles θ.
-
-    Attributes
-    ----------
-    a, b : array
-        (1 − cos θ)/θ² and (θ − sin θ)/θ³.
-    a_slope, b_slope : array
-        (da/dθ)/θ and (db/dθ)/θ.
-    """
-
-    a: Array
-    b: Array
-    a_slope: Array
-    b_slope: Array
-
-
 @dataclass(frozen=True, eq=False)
 class HandMotion:
     """Translation and rotation vector of a hand over time, from rest to rest.
@@ -230,8 +213,8 @@ def angular_motion(r: Array, rate: Array, curvature: Array) -> tuple[Array, Arra
     return velocity, acceleration + projection * (a_slope * across + b_slope * double_cross)
 
 
-def _jacobian_factors(angle: Array) -> JacobianFactors:
-    """Return the factors of the left Jacobian, each of the shape of the angles θ ≥ 0 [rad]."""
+def _jacobian_factors(angle: Array) -> tuple[Array, ...]:
+    """Return a, b, (da/dθ)/θ and (db/dθ)/θ, each of the shape of the angles θ ≥ 0 [rad]."""
     small = angle < 1e-2
     x = np.where(small, 1.0, angle)
     sine = np.sin(x)
@@ -249,7 +232,7 @@ def _jacobian_factors(angle: Array) -> JacobianFactors:
         -1 / 12 + square / 180,
         -1 / 60 + square / 1260,
     )
-    return JacobianFactors(*(np.where(small, s, e) for s, e in zip(series, exact, strict=True)))
+    return tuple(np.where(small, s, e) for s, e in zip(series, exact, strict=True))
 
 
 def _to_unit_interval(u: Array | float) -> Array:

@@ -29,7 +29,6 @@ from .predicted_information import (
     FutureRecording,
     LinearRecording,
     PredictedErrors,
-    SimulatedMotion,
     prior_draws,
     shared_information,
     symmetric_draws,
@@ -97,15 +96,6 @@ class ErrorBars:
     relative: Mapping[str, float]
     lowest: Mapping[str, float]
     highest: Mapping[str, float]
-
-    @classmethod
-    def from_draws(cls, errors: list[PredictedErrors]) -> ErrorBars:
-        """Return the error bars at the first of at least one draw of θ, the middle, with the lowest
-        and the highest over all draws. `errors` are those at each draw, all with the same names.
-        """
-        each = [error.compute_relative() for error in errors]
-        lowest, highest = ({n: pick(e[n] for e in each) for n in each[0]} for pick in (min, max))
-        return cls(errors[0].values, each[0], lowest=lowest, highest=highest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +228,23 @@ class MotionObjective:
             self.known_information + information, parameters, constants=self.constants, q=q
         )
 
+    def error_bars(self, motion: Experiment | None, recording: FutureRecording) -> ErrorBars:
+        """Return the error bars of existing recordings and priors, and of a recording of `motion`
+        unless it is None: at the middle, with their range over the draws of θ.
+
+        Raises
+        ------
+        SimulationError
+            If the motion cannot be simulated at some draw.
+        """
+        known = [
+            0.0 if motion is None else recording.simulate_motion(motion, q)[0] for q in self.draws
+        ]
+        errors = [self.errors(each, q) for each, q in zip(known, self.draws, strict=True)]
+        each = [error.compute_relative() for error in errors]
+        lowest, highest = ({n: pick(e[n] for e in each) for n in each[0]} for pick in (min, max))
+        return ErrorBars(errors[0].values, each[0], lowest=lowest, highest=highest)
+
     def first_guess(self, options: DesignOptions, say: Say) -> SearchResult:
         """Return the motion with the smallest error bars at the first draw, to first order in the
         motion, as a start of the search.
@@ -295,13 +302,13 @@ class MotionObjective:
         sizes = []
         for q in self.draws:
             try:
-                result = self.recording.simulate_motion(experiment, q)
+                information, markers_m = self.recording.simulate_motion(experiment, q)
             except SimulationError as failure:
                 simulated_share = (failure.time_s - experiment.t_s[0]) / experiment.duration_s
                 return FORBIDDEN * (3 - min(1.0, simulated_share))
-            if (excess := self.limits.out_of_view(result.markers_m)) > 0:
+            if (excess := self.limits.out_of_view(markers_m)) > 0:
                 return FORBIDDEN * (1 + excess / (1 + excess))
-            sizes.append(self.criterion.log_size(self.errors(result.information, q)))
+            sizes.append(self.criterion.log_size(self.errors(information, q)))
             if len(sizes) == 1 and sizes[0] > bound:
                 break
         return self.criterion.combine_draws(sizes)
@@ -412,8 +419,7 @@ def _evaluate_design(objective: MotionObjective, best: SearchResult, add: bool) 
     recording = objective.recording
     motion = objective.motion(best.coefficients)
     experiment = recording.experiment(recording.poses(motion))
-    results = [recording.simulate_motion(experiment, q) for q in objective.draws]
-    after = _error_bars(objective, results)
+    after = objective.error_bars(experiment, recording)
     problem = recording.problem
     values = problem.parameters.values(objective.draws[0])
     predicted = simulate(
@@ -443,25 +449,16 @@ def _before(objective: MotionObjective, add: bool) -> ErrorBars | None:
     at some draw.
     """
     if add:
-        return ErrorBars.from_draws([objective.errors(0.0, q) for q in objective.draws])
+        return objective.error_bars(None, objective.recording)
     recording = objective.recording
     template = recording.template
     if len(template.grasps[0].poses.t_s) < 2:
         return None
     shipped = replace(recording, duration_s=template.duration_s)
     try:
-        simulations = [shipped.simulate_motion(template, q) for q in objective.draws]
+        return objective.error_bars(template, shipped)
     except SimulationError:
         return None
-    return _error_bars(objective, simulations)
-
-
-def _error_bars(objective: MotionObjective, results: list[SimulatedMotion]) -> ErrorBars:
-    """Return the error bars of a motion, together with existing recordings and priors: those at the
-    middle, with the lowest and the highest relative error over all draws.
-    """
-    pairs = zip(results, objective.draws, strict=True)
-    return ErrorBars.from_draws([objective.errors(each.information, q) for each, q in pairs])
 
 
 def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:

@@ -288,22 +288,6 @@ def shared_information(fit: LinearisedFit) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedMotion:
-    """Result of a simulated motion at one q.
-
-    Attributes
-    ----------
-    information : (nq, nq) array
-        Information about the shared parameters.
-    markers_m : (T, M, 3) array
-        Marker positions [m].
-    """
-
-    information: Array
-    markers_m: Array
-
-
-@dataclass(frozen=True, eq=False)
 class FutureRecording:
     """Recording to be designed: everything except the motion.
 
@@ -458,9 +442,10 @@ class FutureRecording:
             markers=template.markers.with_samples(t_s, nowhere),
         )
 
-    def simulate_motion(self, experiment: Experiment, q: Array) -> SimulatedMotion:
-        """Return information and marker positions of an experiment simulated at the parameters q
-        (nq,), in the solver's coordinates.
+    def simulate_motion(self, experiment: Experiment, q: Array) -> tuple[Array, Array]:
+        """Return the information (nq, nq) about the shared parameters and the marker positions
+        (T, M, 3) [m] of an experiment simulated at the parameters q (nq,), in the solver's
+        coordinates.
 
         Raises
         ------
@@ -469,9 +454,7 @@ class FutureRecording:
         """
         fit, x = self.linearise(experiment, q)
         positions = x[:: self.problem.choose_first_substeps()].reshape(len(experiment.t_s), -1, 3)
-        return SimulatedMotion(
-            shared_information(fit), experiment.markers.predict_positions(positions)
-        )
+        return shared_information(fit), experiment.markers.predict_positions(positions)
 
     def program(self, experiment: Experiment) -> Collocation:
         """Return the nonlinear program of one experiment with all parameters of the problem, its

@@ -220,7 +220,7 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
             "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
             "agree for small changes of volume"
         )
-    if region.list_power_terms() and len(region.list_power_terms()) <= MOST_TERMS:
+    if 0 < len(region.power_terms) <= MOST_TERMS:
         is_foam = region.material.startswith("hyperfoam")
         return _power_law_card(region, volume), FOAM_LIMITATION if is_foam else ""
     constants = _format_values(region.mu_pa / 2, volume)
@@ -235,15 +235,15 @@ def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
 
     The energy of a term in the card is 2μ/α² (Σ λ^α − 3): μ is ½ μ_p α_p of Ogden's law.
     """
-    terms = region.list_power_terms()
+    terms = region.power_terms
     if region.material.startswith("ogden"):
         keyword = "HYPERELASTIC,OGDEN"
-        values = [value for t in terms for value in (t.mu_pa * t.alpha / 2, t.alpha)]
+        values = [value for mu, alpha, _ in terms for value in (mu * alpha / 2, alpha)]
         values += [volume] + [ABSENT_TERM] * (len(terms) - 1)
     else:
         keyword = "HYPERFOAM"
-        values = [value for t in terms for value in (t.mu_pa, t.alpha)]
-        values += [t.beta / (1 + 2 * t.beta) for t in terms]
+        values = [value for mu, alpha, _ in terms for value in (mu, alpha)]
+        values += [beta / (1 + 2 * beta) for _, _, beta in terms]
     lines = [
         _format_values(*values[k : k + VALUES_PER_LINE])
         for k in range(0, len(values), VALUES_PER_LINE)

@@ -157,7 +157,7 @@ class TargetCapabilities:
                 *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),
             ]
-            at_once = 1 + sum(branch.share for branch in region.branches)
+            at_once = 1 + sum(branch["share"] for branch in region.branches)
             values = {**vars(region), "at_once": at_once}
             sentences += [
                 f"{region.name}: {each.format(**values)}" for each in filter(None, templates)

@@ -32,44 +32,6 @@ from ...runs.solved_problem import SolvedProblem
 from ...runs.warm_start import WarmStart
 
 
-@dataclass(frozen=True)
-class IdentifiedBranch:
-    """Viscoelastic branch.
-
-    Attributes
-    ----------
-    name : str
-        Name of the branch.
-    share : float
-        Its stiffness over the long-term stiffness.
-    tau_s : float
-        Relaxation time [s].
-    """
-
-    name: str
-    share: float
-    tau_s: float
-
-
-@dataclass(frozen=True)
-class PowerTerm:
-    """Term p of Ogden's law or of a compressible foam.
-
-    Attributes
-    ----------
-    mu_pa : float
-        Constant μ_p.
-    alpha : float
-        Exponent α_p.
-    beta : float
-        Constant β_p of a foam; 0 for Ogden's law.
-    """
-
-    mu_pa: float
-    alpha: float
-    beta: float
-
-
 @dataclass(frozen=True, eq=False)
 class IdentifiedRegion:
     """Part of the body with its constants.
@@ -88,8 +50,9 @@ class IdentifiedRegion:
         Name of the damping law.
     gamma_r_s, gamma_m_1_s : float
         Stiffness-proportional and mass-proportional damping, see the glossary.
-    branches : tuple of IdentifiedBranch
-        Viscoelastic branches; empty without memory.
+    branches : tuple of mapping
+        "name", "share" (stiffness over the long-term stiffness) and "tau_s" (relaxation time) of
+        each viscoelastic branch; empty without memory.
     """
 
     name: str
@@ -104,21 +67,23 @@ class IdentifiedRegion:
     damping: str
     gamma_r_s: float
     gamma_m_1_s: float
-    branches: tuple[IdentifiedBranch, ...]
+    branches: tuple[Mapping[str, Any], ...]
 
     @property
     def kappa_pa(self) -> float:
         """Bulk modulus κ = λ + ⅔ μ [Pa]."""
         return self.lambda_pa + 2 / 3 * self.mu_pa
 
-    def list_power_terms(self) -> tuple[PowerTerm, ...]:
-        """Return the terms of Ogden's law or of a compressible foam; empty for other materials."""
+    @property
+    def power_terms(self) -> tuple[tuple[float, float, float], ...]:
+        """Constants μ_p [Pa], α_p and β_p of the terms of Ogden's law (β_p = 0) or of a compressible
+        foam; empty for other materials.
+        """
         if not is_power_law(self.material):
             return ()
         c = self.constants
         return tuple(
-            PowerTerm(c[f"mu_{p}_pa"], c[f"alpha_{p}"], beta=c.get(f"beta_{p}", 0.0))
-            for p in term_numbers(c)
+            (c[f"mu_{p}_pa"], c[f"alpha_{p}"], c.get(f"beta_{p}", 0.0)) for p in term_numbers(c)
         )
 
 
@@ -374,15 +339,6 @@ class IdentifiedBody:
         """Whether each node (n,) is prescribed along all axes at the first sample."""
         return np.asarray(self.is_prescribed.all(axis=1))
 
-    @cached_property
-    def prescribed_displacements_m(self) -> Array:
-        """Prescribed coordinates minus `nodes_m` (n, 3) [m], and 0 where a coordinate is free.
-
-        It is not zero where a second grasp holds nodes elsewhere than the rigidly placed body has
-        them.
-        """
-        return np.nan_to_num(self.prescribed_m - self.nodes_m)
-
     @property
     def is_quadratic(self) -> bool:
         """Whether the elements have nodes on their edges."""
@@ -436,9 +392,8 @@ class IdentifiedBody:
                     values.get("gamma_r_s", 0.0),
                     values.get("gamma_m_1_s", 0.0),
                     tuple(
-                        IdentifiedBranch(
-                            b.name, values[f"{b.name}.share"], tau_s=values[f"{b.name}.tau_s"]
-                        )
+                        {"name": b.name}
+                        | {key: values[f"{b.name}.{key}"] for key in ("share", "tau_s")}
                         for b in part.prony
                     ),
                 )

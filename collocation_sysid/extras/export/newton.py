@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -112,57 +111,30 @@ def model(device=None):
 '''
 
 
-@dataclass(frozen=True)
-class SharedContact:
-    """Contact constants of Newton, which has one set for all obstacles of a soft body.
-
-    Attributes
-    ----------
-    friction : float
-        Friction coefficient.
-    node_stiffness_n_m : float
-        Contact stiffness of a node.
-    particle_radius_m : float
-        Radius of particles: half of the width δ of the pressure law.
-    limitations : tuple of str
-        Sentence on obstacles that differ in these constants; empty if they agree.
+def _shared_contact(
+    obstacles: Sequence[FacetedObstacle],
+) -> tuple[float, float, float, tuple[str, ...]]:
+    """Return the contact constants that Newton has once for all obstacles of a soft body: friction
+    coefficient, stiffness of a node [N/m], and radius of particles, half the width δ of the
+    pressure law [m]; and a sentence if obstacles differ in these constants. Zeros without any.
     """
-
-    friction: float
-    node_stiffness_n_m: float
-    particle_radius_m: float
-    limitations: tuple[str, ...]
-
-    @classmethod
-    def from_obstacles(cls, obstacles: Sequence[FacetedObstacle]) -> SharedContact:
-        """Return the contact constants that represent all obstacles: the friction of the first one,
-        the largest stiffness of a node, and half of the largest width as the particle radius; zeros
-        without obstacles. If obstacles differ in a constant, `limitations` has one sentence on
-        that, otherwise none.
-        """
-        constants = {
-            "friction": [float(wall.obstacle.friction) for wall in obstacles],
-            "stiffness": [wall.node_stiffness_n_m for wall in obstacles],
-            "width": [wall.width_m for wall in obstacles],
-        }
-        friction, stiffness, width = (values or [0.0] for values in constants.values())
-        unlike = [
-            name
-            for name, values in constants.items()
-            if not np.allclose(values, values[:1], atol=0)
-        ]
-        sentence = (
-            f"obstacles differ in {listed(unlike)}, but a soft body in Newton has only one value: "
-            f"exported are the friction {friction[0]:.4g} of the first one, with which Newton "
-            f"averages that of each obstacle, and the largest stiffness {max(stiffness):.4g} N/m "
-            f"of a node and width {max(width):.4g} m"
-        )
-        return cls(
-            friction[0],
-            max(stiffness),
-            particle_radius_m=max(width) / 2,
-            limitations=(sentence,) * bool(unlike),
-        )
+    constants = {
+        "friction": [float(wall.obstacle.friction) for wall in obstacles],
+        "stiffness": [wall.node_stiffness_n_m for wall in obstacles],
+        "width": [wall.width_m for wall in obstacles],
+    }
+    friction, stiffness, width = (values or [0.0] for values in constants.values())
+    unlike = [
+        name for name, values in constants.items() if not np.allclose(values, values[:1], atol=0)
+    ]
+    sentence = (
+        f"obstacles differ in {listed(unlike)}, but a soft body in Newton has only one value: "
+        f"exported are the friction {friction[0]:.4g} of the first one, with which Newton "
+        f"averages that of each obstacle, and the largest stiffness {max(stiffness):.4g} N/m "
+        f"of a node and width {max(width):.4g} m"
+    )
+    differing = (sentence,) * bool(unlike)
+    return friction[0], max(stiffness), max(width) / 2, differing
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
@@ -182,10 +154,10 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         # Damping stress of Newton: 4 k Ė; of this package: γ_r (2 μ Ė + λ tr(Ė) I).
         damping = region.gamma_r_s * region.mu_pa / 2
         constants.append(np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1)))
-    contact = SharedContact.from_obstacles(faceted_obstacles(body))
+    friction, stiffness_n_m, radius_m, differing = _shared_contact(faceted_obstacles(body))
     limits = [
         *CAPABILITIES.limitations(body),
-        *contact.limitations,
+        *differing,
         "SolverSemiImplicit needs other constants for the same material, k_mu = 4/3 μ and "
         "k_lambda = λ + 5/6 μ, and another damping",
         "positions are single precision",
@@ -200,9 +172,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         "node_mass_kg": body.total_node_mass_kg,
         "held": body.is_node_prescribed,
         "gravity_m_s2": body.experiment.gravity_m_s2,
-        "contact_m": contact.particle_radius_m,
-        "contact_n_m": contact.node_stiffness_n_m,
-        "contact_mu": contact.friction,
+        "contact_m": radius_m,
+        "contact_n_m": stiffness_n_m,
+        "contact_mu": friction,
         "obstacles": [_obstacle_data(each, body.start_s) for each in body.obstacles],
     }
     files = {
@@ -258,9 +230,9 @@ def compare_at_rest(
         raise InputError("install Newton to verify the export: pip install newton") from error
 
     builder = newton.ModelBuilder()
-    contact = SharedContact.from_obstacles(faceted_obstacles(body))
+    friction, stiffness_n_m, radius_m, differing = _shared_contact(faceted_obstacles(body))
     if body.obstacles:
-        builder.default_particle_radius = contact.particle_radius_m
+        builder.default_particle_radius = radius_m
     add_to(builder)
     # Particles without mass stay where they are.
     grasped = np.flatnonzero(body.is_node_prescribed)
@@ -269,9 +241,9 @@ def compare_at_rest(
     builder.color()
     model = builder.finalize(device="cpu")
     if body.obstacles:
-        model.soft_contact_ke = contact.node_stiffness_n_m
-        model.soft_contact_mu = contact.friction
-        model.shape_material_ke.fill_(contact.node_stiffness_n_m)
+        model.soft_contact_ke = stiffness_n_m
+        model.soft_contact_mu = friction
+        model.shape_material_ke.fill_(stiffness_n_m)
     pipeline = newton.CollisionPipeline(model)
     # Obstacles do not move, so that rigid bodies need not be solved for.
     solver = newton.solvers.SolverVBD(
@@ -288,7 +260,7 @@ def compare_at_rest(
         before.particle_qd.assign(VELOCITY_FACTOR * before.particle_qd.numpy())
     theirs = before.particle_q.numpy().astype(float) - body.nodes_m
     sag_m = longest_displacement_m(equilibria(body)[0][0])
-    remark = "".join(contact.limitations)
+    remark = "".join(differing)
     return [
         PredictionComparison(
             "largest displacement at rest",

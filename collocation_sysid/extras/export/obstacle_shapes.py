@@ -242,8 +242,6 @@ class FacetedObstacle:
         Obstacle whose friction coefficient is a number.
     facets : Facets
         Facets in the obstacle's frame.
-    retraction_m : (3,)
-        Displacement from the place at the first sample to one without contact.
     start_points_m : (p, 3)
         Points of the facets at the place without contact, in the world.
     first_node, first_cell : int
@@ -259,7 +257,6 @@ class FacetedObstacle:
 
     obstacle: Obstacle
     facets: Facets
-    retraction_m: Array
     start_points_m: Array
     first_node: int
     first_cell: int
@@ -275,20 +272,14 @@ class FacetedObstacle:
         (rotation,), (place,) = self.obstacle.poses.at([t_s])
         return self.facets.points_m @ rotation.T + place
 
-    def build_triangles(self) -> Index:
-        """Return the node indices of the facets (f, 3) in the file of a simulator, which count on
-        after those of the body and of earlier obstacles.
-        """
-        return self.facets.triangles + self.first_node
-
     def build_tetrahedra(self) -> Index:
-        """Return the node indices (f, 4), counted like those of `triangles`, of a tetrahedron under
-        each facet, whose last node is the point behind all facets.
+        """Return the node indices (f, 4), which count on after those of the body and of earlier
+        obstacles, of a tetrahedron under each facet, whose last node is the point behind all
+        facets.
         """
-        inner = np.full(
-            (len(self.build_triangles()), 1), self.first_node + len(self.start_points_m) - 1
-        )
-        return np.hstack([self.build_triangles()[:, [0, 2, 1]], inner])
+        triangles = self.facets.triangles + self.first_node
+        inner = np.full((len(triangles), 1), self.first_node + len(self.start_points_m) - 1)
+        return np.hstack([triangles[:, [0, 2, 1]], inner])
 
 
 def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
@@ -340,7 +331,6 @@ def faceted_obstacles(body: IdentifiedBody) -> tuple[FacetedObstacle, ...]:
             FacetedObstacle(
                 obstacle,
                 shown,
-                retraction_m=back_m,
                 start_points_m=start_m,
                 first_node=nodes,
                 first_cell=cells,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -81,10 +81,6 @@ class SheetView:
         corner = np.asarray(corner_mm, dtype=float)
         scale = float(np.min(room / np.maximum(high - low, 1e-12)))
         return cls(camera, scale, origin_mm=corner + room / 2 - scale * (low + high) / 2)
-
-    def moved_by(self, by_mm: ArrayLike) -> SheetView:
-        """Return the view moved on the sheet by `by_mm` (2,)."""
-        return replace(self, origin_mm=self.origin_mm + np.asarray(by_mm))
 
     def to_sheet_mm(self, points_m: ArrayLike) -> Array:
         """Return the positions (…, 2) [mm] on the sheet of points (…, 3) [m]."""
