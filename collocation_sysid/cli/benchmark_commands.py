@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ..common.display import Table
-from ..common.serialisation import as_json
+from ..common.serialisation import as_json as json_text
 from ..errors import InputError
-from .command_options import AsJson, Quiet, command
+from .command_options import AsJson, Quiet, command, option
 from .common import error_console, print_result
 
 if TYPE_CHECKING:
@@ -24,28 +24,6 @@ commands = typer.Typer()
 READABLE_UNITS = {"m": (1e3, "mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa")}
 
 
-@dataclass(frozen=True, kw_only=True)
-class BenchmarkCommand:
-    """Options of `benchmark`.
-
-    Attributes
-    ----------
-    folder : FOLDER
-        Benchmark folder; without it, the bodies are listed.
-    write : --write
-        Write the bodies into the folder, instead of scoring the predictions in it.
-    body : NAME
-        Only this body; by default all bodies in the folder are scored, or all bodies whose data are
-        on this computer are written.
-    """
-
-    folder: Annotated[Path | None, typer.Argument()] = None
-    write: bool = False
-    body: str | None = None
-    as_json: AsJson = False
-    quiet: Quiet = False
-
-
 @command(
     commands,
     "benchmark",
@@ -53,7 +31,28 @@ class BenchmarkCommand:
     "benchmark bodies --write --body isoprene_rubber",
     "benchmark bodies",
 )
-def benchmark(options: BenchmarkCommand) -> None:
+def benchmark(
+    *,
+    folder: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="FOLDER", help="Benchmark folder; without it, the bodies are listed."
+        ),
+    ] = None,
+    write: Annotated[
+        bool, option("Write the bodies into the folder, instead of scoring the predictions in it.")
+    ] = False,
+    body: Annotated[
+        str | None,
+        option(
+            "Only this body; by default all bodies in the folder are scored, or all bodies whose "
+            "data are on this computer are written.",
+            "NAME",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
     """List, write or score the bodies of a benchmark of simulators.
 
     Without FOLDER, the bodies are listed. With --write, the folder gets the mesh, the prescribed
@@ -68,25 +67,24 @@ def benchmark(options: BenchmarkCommand) -> None:
     from ..extras.benchmark import score_benchmark
     from ..result.solve_progress import SolveProgress
 
-    if options.folder is None:
-        _list_bodies(options)
-    elif options.write:
-        _write_bodies(options, options.folder)
+    if folder is None:
+        _list_bodies(as_json, "--write" if write else "--body" if body else None)
+    elif write:
+        _write_bodies(folder, body, as_json=as_json, quiet=quiet)
     else:
-        with SolveProgress(error_console, quiet=options.quiet, activity="computing the scores"):
-            scores = score_benchmark(options.folder, options.body)
-        if options.as_json:
-            typer.echo(as_json([asdict(each) for each in scores]))
+        with SolveProgress(error_console, quiet=quiet, activity="computing the scores"):
+            scores = score_benchmark(folder, body)
+        if as_json:
+            typer.echo(json_text([asdict(each) for each in scores]))
         else:
             print_result([*score_tables(scores), *score_warnings(scores)])
 
 
-def _list_bodies(options: BenchmarkCommand) -> None:
-    """Print the bodies; refuse options that need a folder."""
+def _list_bodies(as_json: bool, where: str | None) -> None:
+    """Print the bodies; refuse the option `where`, which needs a folder."""
     from ..extras.benchmark import BODIES
 
-    if options.write or options.body is not None:
-        where = "--write" if options.write else "--body"
+    if where is not None:
         raise InputError(
             f"this option needs a folder; expected benchmark FOLDER {where}", None, where=where
         )
@@ -105,8 +103,8 @@ def _list_bodies(options: BenchmarkCommand) -> None:
                 "licence": entry["licence"],
             }
         )
-    if options.as_json:
-        typer.echo(as_json(listed))
+    if as_json:
+        typer.echo(json_text(listed))
         return
     rows = tuple(
         (
@@ -123,7 +121,7 @@ def _list_bodies(options: BenchmarkCommand) -> None:
     print_result(Table("", heads, rows=rows, names=5, texts=1))
 
 
-def _write_bodies(options: BenchmarkCommand, folder: Path) -> None:
+def _write_bodies(folder: Path, body: str | None, as_json: bool, quiet: bool) -> None:
     """Write the benchmark folder, and print its path.
 
     Bodies that were left out because their data are not on this computer are named on stderr. With
@@ -134,23 +132,21 @@ def _write_bodies(options: BenchmarkCommand, folder: Path) -> None:
     from ..extras.benchmark.benchmark_bodies import chosen_bodies
     from ..result.solve_progress import SolveProgress
 
-    chosen = chosen_bodies(options.body)
-    with SolveProgress(
-        error_console, quiet=options.quiet, activity="simulating the bodies"
-    ) as progress:
+    chosen = chosen_bodies(body)
+    with SolveProgress(error_console, quiet=quiet, activity="simulating the bodies") as progress:
         write_benchmark(chosen, folder, progress=progress.share)
-    left_out = [body for body in BODIES.values() if options.body is None and body not in chosen]
-    if options.as_json:
+    left_out = [each for each in BODIES.values() if body is None and each not in chosen]
+    if as_json:
         report = {
             "folder": str(folder),
-            "bodies": [body.name for body in chosen],
-            "left_out": [body.name for body in left_out],
+            "bodies": [each.name for each in chosen],
+            "left_out": [each.name for each in left_out],
         }
-        typer.echo(as_json(report))
+        typer.echo(json_text(report))
         return
-    for body in left_out:
+    for each in left_out:
         error_console.print(
-            f"{body.name} is left out: its data are not on this computer; python scripts {body.script} "
+            f"{each.name} is left out: its data are not on this computer; python scripts {each.script} "
             "fetches them",
             soft_wrap=True,
         )

@@ -1,10 +1,10 @@
-"""Commands made from dataclasses of options; an option is declared once, as a field.
+"""Commands made from functions; an option is declared once, as a parameter.
 
-The help text of an option is in the section "Attributes" of its class, as for the options of a
-method. There, in place of the type, names of the option other than the field's can be given, such
-as -v, and the placeholder that help shows for the value, such as FILE. Options that several
-commands share are annotated with both instead. Help lists the options of a class before those of
-its bases.
+A parameter that is annotated with `option` has its help and its placeholder there. A parameter whose
+type is a dataclass stands for one option per field, whose help text is in the section "Attributes" of
+the class, as for the options of a method. There, in place of the type, names of the option other
+than the field's can be given, such as -v, and the placeholder that help shows for the value, such as
+FILE.
 """
 
 from __future__ import annotations
@@ -70,14 +70,18 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON."
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Do not show progress.")]
 
 
-def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], None]], Any]:
-    """Return a decorator that registers a function of a dataclass of options as a command, and
-    returns the function unchanged.
+def option(help_text: str, placeholder: str | None = None) -> Any:
+    """Return the annotation of an option with its help and the placeholder of its value."""
+    return typer.Option(help=help_text, metavar=placeholder)
 
-    The function must have one argument, annotated with its dataclass. The command has the name and
-    the docstring of the function, and calls it with the options of the command line. An option
-    without help in its annotation or in the docstring of the dataclass is a KeyError of the
-    decorator.
+
+def command(group: typer.Typer, *examples: str) -> Callable[[Callable[..., None]], Any]:
+    """Return a decorator that registers a function as a command, and returns the function unchanged.
+
+    The command has the name and the docstring of the function, whose parameters are keyword-only. It
+    calls the function with the options of the command line, validated against the annotations of the
+    parameters. An option without help in its annotation or in the docstring of its dataclass is a
+    KeyError of the decorator.
 
     Parameters
     ----------
@@ -87,16 +91,14 @@ def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], Non
         Examples of arguments, shown below the help.
     """
 
-    def registered(function: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Register the function, whose only argument is annotated with its dataclass of options, in
-        `group`, and return it unchanged.
-        """
-        (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
+    def registered(function: Callable[..., None]) -> Callable[..., None]:
+        """Register the function in `group`, and return it unchanged."""
+        kind = _options_of(function)
         parameters = [*_typer_parameters(kind)]
 
         def called(**values: Any) -> None:
             """Run the command with the options of the command line, by name."""
-            function(_options_from_values(kind, values))
+            function(**vars(_options_from_values(kind, values)))
 
         called.__name__ = function.__name__
         called.__doc__ = function.__doc__
@@ -107,6 +109,15 @@ def command(group: typer.Typer, *examples: str) -> Callable[[Callable[[Any], Non
         return function
 
     return registered
+
+
+def _options_of(function: Callable[..., None]) -> type:
+    """Return a validated dataclass whose fields are the parameters of a function."""
+    hints = get_type_hints(function, include_extras=True)
+    stated = inspect.signature(function).parameters
+    defaults = {n: each.default for n, each in stated.items() if each.default is not each.empty}
+    content = {"__annotations__": {name: hints[name] for name in stated}, **defaults}
+    return validated(kw_only=True)(type(function.__name__, (), content))
 
 
 def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
@@ -125,6 +136,8 @@ def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
             )
             if isinstance(info, OptionInfo):
                 info.param_decls = _option_names(name, default, type_text=written)
+        elif isinstance(info, OptionInfo) and info.default is ... and not info.param_decls:
+            info.param_decls = _option_names(name, default)
         yield inspect.Parameter(
             name,
             inspect.Parameter.KEYWORD_ONLY,
@@ -133,7 +146,7 @@ def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
         )
 
 
-def _option_names(field: str, default: Any, type_text: str) -> list[str]:
+def _option_names(field: str, default: Any, type_text: str = "") -> list[str]:
     """Return the names of an option on the command line: those in `type_text`, and unless a long
     one is among them the name of the field before them, with hyphens.
     """
@@ -192,10 +205,10 @@ class ProblemOptions:
     set_: Overrides = None
     allow_code: AllowCode = False
 
-    def read_problem(self, simulation: bool = False) -> Problem:
+    def read_problem(self, quiet: bool = False, simulation: bool = False) -> Problem:
         """Read the problem file with the changes of the command line, and return the problem.
 
-        Progress and notes are shown on stderr unless the command has an option `quiet` that is set.
+        Progress and notes are shown on stderr unless `quiet`.
 
         Parameters
         ----------
@@ -211,7 +224,7 @@ class ProblemOptions:
         from ..result.solve_progress import SolveProgress
 
         with SolveProgress(
-            error_console, quiet=getattr(self, "quiet", False), activity=f"reading {self.problem}"
+            error_console, quiet=quiet, activity=f"reading {self.problem}"
         ) as progress:
             return Problem.read(
                 self.problem,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import typer
 
 from ..common.display import Line, Shown, Table, labelled, number
-from ..common.validated_classes import validated
 from ..installation_check import Dependency, InstallationReport, check_installation
 from .command_options import OutputOptions, command
 from .common import EXIT_BAD_INPUT, error_console
@@ -13,13 +12,8 @@ from .common import EXIT_BAD_INPUT, error_console
 commands = typer.Typer()
 
 
-@validated(kw_only=True)
-class DoctorCommand(OutputOptions):
-    """Options of `doctor`, all of which are shared."""
-
-
 @command(commands, "doctor", "doctor --json")
-def doctor(options: DoctorCommand) -> None:
+def doctor(*, output: OutputOptions) -> None:
     """Check the installation and run a self test.
 
     The command lists the versions of the required packages, the solvers, the cache of compiled
@@ -31,7 +25,7 @@ def doctor(options: DoctorCommand) -> None:
     """
     with error_console.status("checking the installation"):
         report = check_installation()
-    options.print_result(report, installation_sections(report))
+    output.print_result(report, installation_sections(report))
     raise typer.Exit(0 if report.is_working else EXIT_BAD_INPUT)
 
 

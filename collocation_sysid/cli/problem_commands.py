@@ -7,7 +7,7 @@ import shlex
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
@@ -15,17 +15,15 @@ from rich.text import Text
 from ..common.files import replaced_file, require_possible, run_name
 from ..common.serialisation import as_json
 from ..common.signal_handling import INTERRUPTS
-from ..common.validated_classes import validated
 from ..errors import InputError, SimulationError
 from ..methods import require_method
 from ..methods.solution import Status
-from ..pipeline import Run, run
+from ..pipeline import run
 from ..result.run_record import draw_run
 from ..result.run_writers import require_replaceable
 from ..result.synthesis import Recipe, write_data
 from ..runs.check import check_problem, quick_check
-from ..runs.result_content import Result
-from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
+from .command_options import OutputFolder, OutputOptions, ProblemOptions, command, option
 from .common import (
     EXIT_DOUBTFUL,
     EXIT_INTERRUPTED,
@@ -41,44 +39,6 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@validated(kw_only=True)
-class SolveCommand(ProblemOptions, OutputOptions):
-    """Options of `solve`.
-
-    Attributes
-    ----------
-    method : str
-        The method to use instead of that in the problem file.
-    start : RUN
-        Start from the result in this run folder.
-    scheduler : ADDRESS
-        Address of a dask.distributed scheduler whose workers compute the experiments.
-    verbose : -v
-        Print a line per iteration.
-    strict : bool
-        Exit code 1 if the verdict is doubtful.
-    details : bool
-        Show everything: statistical parts, corrections, notes, probes, residuals, times.
-    budget : bool
-        Show the contributions to the variance of each estimate.
-    probe : bool
-        Deeper check: refit subsets of the data, and relax each assumption.
-    pictures : bool
-        Draw pictures into the run folder; the command plot can draw them later.
-    """
-
-    method: str | None = None
-    out: OutputFolder = None
-    start: Path | None = None
-    scheduler: str | None = None
-    verbose: bool = False
-    strict: bool = False
-    details: bool = False
-    budget: bool = False
-    probe: bool = False
-    pictures: bool = True
-
-
 @command(
     commands,
     "solve problem.toml",
@@ -86,7 +46,42 @@ class SolveCommand(ProblemOptions, OutputOptions):
     "solve problem.toml --set parameters.mu_pa.guess=200",
     "solve finer.toml --start runs/coarse",
 )
-def solve(options: SolveCommand) -> None:
+def solve(
+    *,
+    method: Annotated[
+        str | None, option("The method to use instead of that in the problem file.")
+    ] = None,
+    out: OutputFolder = None,
+    start: Annotated[
+        Path | None, option("Start from the result in this run folder.", "RUN")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        option(
+            "Address of a dask.distributed scheduler whose workers compute the experiments.",
+            "ADDRESS",
+        ),
+    ] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Print a line per iteration.")
+    ] = False,
+    strict: Annotated[bool, option("Exit code 1 if the verdict is doubtful.")] = False,
+    details: Annotated[
+        bool,
+        option("Show everything: statistical parts, corrections, notes, probes, residuals, times."),
+    ] = False,
+    budget: Annotated[
+        bool, option("Show the contributions to the variance of each estimate.")
+    ] = False,
+    probe: Annotated[
+        bool, option("Deeper check: refit subsets of the data, and relax each assumption.")
+    ] = False,
+    pictures: Annotated[
+        bool, option("Draw pictures into the run folder; the command plot can draw them later.")
+    ] = True,
+    source: ProblemOptions,
+    output: OutputOptions,
+) -> None:
     """Identify the parameters and write a run folder, runs/NAME by default.
 
     Parameters need no guess: a scan over the stiffness finds initial values. --start begins with
@@ -103,107 +98,78 @@ def solve(options: SolveCommand) -> None:
     from ..result.run_summary import next_step, run_summary
     from ..result.solve_progress import SolveProgress
 
-    if options.method is not None:
-        require_method(options.method, "--method")
-    folder = options.out or Path("runs") / run_name(options.problem)
-    problem = options.read_problem()
+    if method is not None:
+        require_method(method, "--method")
+    folder = out or Path("runs") / run_name(source.problem)
+    problem = source.read_problem(output.quiet)
     require_possible(folder)
     require_replaceable(folder)
     no_output = None
     with ExitStack() as until_saved:
-        with SolveProgress(
-            error_console, problem, verbose=options.verbose, quiet=options.quiet
-        ) as progress:
+        with SolveProgress(error_console, problem, verbose=verbose, quiet=output.quiet) as progress:
             try:
                 finished = run(
                     problem,
-                    options.method,
+                    method,
                     watch=progress.iteration,
                     log=progress.say,
-                    start=options.start,
-                    scheduler=options.scheduler,
-                    probe=options.probe,
+                    start=start,
+                    scheduler=scheduler,
+                    probe=probe,
                 )
             except KeyboardInterrupt:
                 raise interruption_exit(
                     f"no result could be kept; nothing was written to {folder}", continues=False
                 ) from None
             until_saved.enter_context(INTERRUPTS.deferred())
-        if not options.as_json:
+        if not output.as_json:
             try:
-                print_result(
-                    run_summary(finished.result, details=options.details, budget=options.budget)
-                )
+                print_result(run_summary(finished.result, details=details, budget=budget))
             except OSError as error:  # a standard output that is closed or full loses no run
                 no_output = error
         # Notes of the problem were shown before.
         with SolveProgress(
             error_console,
             None,
-            verbose=options.verbose,
-            quiet=options.quiet,
+            verbose=verbose,
+            quiet=output.quiet,
             activity="writing the run folder",
         ):
             try:
                 finished.save(folder, pictures=False)
             except InputError:
-                if options.as_json:
+                if output.as_json:
                     typer.echo(as_json(finished.result))
                 raise
         if no_output is not None:
             raise no_output
-        if not options.as_json:
+        if not output.as_json:
             print_result(f"written to {folder}")
-        drawn = _draw_pictures(finished, folder, options=options, until_saved=until_saved)
+        drawn = finished.result
+        try:
+            until_saved.close()
+            if pictures:
+                with SolveProgress(error_console, verbose=verbose, quiet=output.quiet) as progress:
+                    drawn = draw_run(finished, folder, report=progress.say)
+        except KeyboardInterrupt:
+            drawn = None
+            again = shlex.join(["collocation-sysid", "plot", str(folder)])
+            message = f"interrupted: the result is kept in {folder}, but some pictures are missing"
+            error_console.print(Text(f"{message}; draw them with: {again}"), soft_wrap=True)
     result = drawn or finished.result
-    if options.as_json:
+    if output.as_json:
         typer.echo(as_json(result))
     else:
-        if options.details and result.elapsed_s.pictures is not None:
+        if details and result.elapsed_s.pictures is not None:
             print_result(f"pictures drawn in {result.elapsed_s.pictures:.1f} s")
         again = shlex.join(["collocation-sysid", *sys.argv[1:]])
         print_result(f"next: {next_step(result, folder, again)}")
     status = finished.solution.status
     if drawn is None or status is Status.INTERRUPTED or finished.omitted_checks:
         raise typer.Exit(EXIT_INTERRUPTED)
-    if options.strict and finished.trust.verdict == "doubtful":
+    if strict and finished.trust.verdict == "doubtful":
         raise typer.Exit(EXIT_DOUBTFUL)
     raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
-
-
-def _draw_pictures(
-    finished: Run, folder: Path, options: SolveCommand, until_saved: ExitStack
-) -> Result | None:
-    """Draw the pictures of a finished run into its folder if `options` ask for them, and return its
-    result with the time that they took.
-    """
-    from ..result.solve_progress import SolveProgress
-
-    try:
-        until_saved.close()
-        if not options.pictures:
-            return finished.result
-        with SolveProgress(error_console, verbose=options.verbose, quiet=options.quiet) as progress:
-            return draw_run(finished, folder, report=progress.say)
-    except KeyboardInterrupt:
-        again = shlex.join(["collocation-sysid", "plot", str(folder)])
-        message = f"interrupted: the result is kept in {folder}, but some pictures are missing"
-        error_console.print(Text(f"{message}; draw them with: {again}"), soft_wrap=True)
-        return None
-
-
-@validated(kw_only=True)
-class SimulateCommand(ProblemOptions, OutputOptions):
-    """Options of `simulate`.
-
-    Attributes
-    ----------
-    out : DIR
-        Output folder.
-    """
-
-    out: Path
-    recipe: Recipe
 
 
 @command(
@@ -211,7 +177,13 @@ class SimulateCommand(ProblemOptions, OutputOptions):
     "simulate problem.toml --out data --noise-m 0.001 --seed 1",
     "simulate problem.toml --out data --set parameters.mu_pa.guess=300",
 )
-def simulate(options: SimulateCommand) -> None:
+def simulate(
+    *,
+    out: Annotated[Path, option("Output folder.", "DIR")],
+    recipe: Recipe,
+    source: ProblemOptions,
+    output: OutputOptions,
+) -> None:
     """Simulate at the guesses and write the measurements and poses as CSV.
 
     The positions of the markers are their reference_m, or follow from their file. The parameters
@@ -224,27 +196,23 @@ def simulate(options: SimulateCommand) -> None:
     """
     from ..result.solve_progress import SolveProgress
 
-    problem = options.read_problem(simulation=True)
-    require_possible(options.out)
+    problem = source.read_problem(output.quiet, simulation=True)
+    require_possible(out)
     notes: list[str] = []
     with SolveProgress(
-        error_console, problem, quiet=options.quiet, activity="simulating"
+        error_console, problem, quiet=output.quiet, activity="simulating"
     ) as progress:
         try:
             written = write_data(
-                problem,
-                options.out,
-                recipe=options.recipe,
-                progress=progress.share,
-                report=notes.append,
+                problem, out, recipe=recipe, progress=progress.share, report=notes.append
             )
         except SimulationError as error:
             if error.stability_loss is not None:
-                _draw_instability(error, options.out)
+                _draw_instability(error, out)
             raise
     for note in notes:
         error_console.print(Text(f"note: {note}"), soft_wrap=True)
-    if options.as_json:
+    if output.as_json:
         typer.echo(json.dumps([str(file) for file in written]))
     else:
         for file in written:
@@ -265,25 +233,6 @@ def _draw_instability(error: SimulationError, folder: Path) -> None:
     error_console.print(f"the mode is drawn in {file}")
 
 
-@validated(kw_only=True)
-class CheckCommand(ProblemOptions, OutputOptions):
-    """Options of `check`.
-
-    Attributes
-    ----------
-    full : bool
-        Simulate the complete recordings and make all comparisons, however long this takes.
-    details : bool
-        Show everything: quality of the elements, modes, all grasps and methods, notes.
-    out : DIR
-        Folder for pictures of the cameras' images; runs/<problem>_check by default.
-    """
-
-    full: bool = False
-    details: bool = False
-    out: Path | None = None
-
-
 @command(
     commands,
     "check problem.toml",
@@ -291,7 +240,27 @@ class CheckCommand(ProblemOptions, OutputOptions):
     "check problem.toml --out pictures",
     "check problem.toml --set transcription.scheme=backward-euler",
 )
-def check(options: CheckCommand) -> None:
+def check(
+    *,
+    full: Annotated[
+        bool,
+        option(
+            "Simulate the complete recordings and make all comparisons, however long this takes."
+        ),
+    ] = False,
+    details: Annotated[
+        bool,
+        option("Show everything: quality of the elements, modes, all grasps and methods, notes."),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        option(
+            "Folder for pictures of the cameras' images; runs/<problem>_check by default.", "DIR"
+        ),
+    ] = None,
+    source: ProblemOptions,
+    output: OutputOptions,
+) -> None:
     """Check a problem before solving it, and report probable mistakes.
 
     The bodies, recordings and grasps are shown immediately. The check of the derivatives, the cost
@@ -307,23 +276,21 @@ def check(options: CheckCommand) -> None:
     from ..result.check_sections import full_check_tables, quick_check_tables
     from ..result.solve_progress import SolveProgress
 
-    problem = options.read_problem()
-    if not options.as_json:
+    problem = source.read_problem(output.quiet)
+    if not output.as_json:
         with SolveProgress(
-            error_console, quiet=options.quiet, activity="checking bodies, recordings and grasps"
+            error_console, quiet=output.quiet, activity="checking bodies, recordings and grasps"
         ):
             findings_at_once = quick_check(problem)
-        print_result(quick_check_tables(findings_at_once, options.details))
+        print_result(quick_check_tables(findings_at_once, details))
         _write_camera_overlays(
-            problem,
-            options.out or Path("runs") / f"{run_name(options.problem)}_check",
-            quiet=options.quiet,
+            problem, out or Path("runs") / f"{run_name(source.problem)}_check", quiet=output.quiet
         )
     with SolveProgress(
-        error_console, quiet=options.quiet, activity="preparing the complete program"
+        error_console, quiet=output.quiet, activity="preparing the complete program"
     ) as progress:
-        findings = check_problem(problem, progress.say, full=options.full)
-    options.print_result(findings.as_dict(), full_check_tables(findings, options.details))
+        findings = check_problem(problem, progress.say, full=full)
+    output.print_result(findings.as_dict(), full_check_tables(findings, details))
     good = findings.derivatives_agree and not findings.causes
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 

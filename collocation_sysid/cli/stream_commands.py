@@ -17,7 +17,7 @@ from ..common.validated_types import NotNegative, Positive
 from ..errors import InputError
 from ..extras.live import LiveEstimator, LiveOptions, LiveUpdate
 from ..extras.live.sources import read_problem
-from .command_options import AllowCode, OutputOptions, Overrides, ProblemPath, command
+from .command_options import AllowCode, OutputOptions, Overrides, ProblemPath, command, option
 from .common import EXIT_BAD_INPUT, error_console, print_result
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class LiveEstimationOptions:
     set_: Overrides = None
     allow_code: AllowCode = False
 
-    def make_estimator(self, recording: Path) -> LiveEstimator:
+    def make_estimator(self, recording: Path, quiet: bool = False) -> LiveEstimator:
         """Return the estimator for a problem file or a run folder, with these options.
 
         Raises
@@ -64,9 +64,7 @@ class LiveEstimationOptions:
         from ..result.solve_progress import SolveProgress
 
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
-        with SolveProgress(
-            error_console, quiet=getattr(self, "quiet", False), activity=f"reading {recording}"
-        ) as progress:
+        with SolveProgress(error_console, quiet=quiet, activity=f"reading {recording}") as progress:
             problem = read_problem(recording, self.set_ or (), allow_code=self.allow_code)
             progress.say("preparing the estimator")
             return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
@@ -104,27 +102,27 @@ def settled_update(estimator: LiveEstimator, recording: LiveRecording | None) ->
     return settled
 
 
-@validated(kw_only=True)
-class LiveCommand(LiveEstimationOptions):
-    """Options of `live`.
-
-    Attributes
-    ----------
-    udp : PORT
-        Read frames from this UDP port instead of standard input.
-    """
-
-    problem: ProblemPath
-    udp: Annotated[int | None, typer.Option(min=0, max=65535)] = None
-
-
 @command(
     commands,
     "live problem.toml < frames.jsonl",
     "live problem.toml --udp 9870 > estimates.jsonl",
     "live problem.toml --rerun swing.rrd < frames.jsonl",
 )
-def live(options: LiveCommand) -> None:
+def live(
+    *,
+    problem: ProblemPath,
+    udp: Annotated[
+        int | None,
+        typer.Option(
+            "--udp",
+            min=0,
+            max=65535,
+            metavar="PORT",
+            help="Read frames from this UDP port instead of standard input.",
+        ),
+    ] = None,
+    estimation: LiveEstimationOptions,
+) -> None:
     """Estimate the parameters while a recording is made.
 
     The command reads frames. It prints a line of JSON for each frame, and one with the final
@@ -141,26 +139,26 @@ def live(options: LiveCommand) -> None:
         without_garbage_of_startup,
     )
 
-    if options.udp is None and sys.stdin is None:  # closed by whoever started the process
+    if udp is None and sys.stdin is None:  # closed by whoever started the process
         raise InputError(
             "is closed; expected frames, as in live problem.toml < frames.jsonl, or --udp PORT",
             "standard input",
         )
-    estimator = options.make_estimator(options.problem)
+    estimator = estimation.make_estimator(problem)
 
     def opened(port: int) -> None:
         """Print on stderr that the port is open."""
         error_console.print(f"listening on UDP port {port} of this machine")
 
-    if options.udp is None:
+    if udp is None:
         lines = decode_lines(sys.stdin.buffer)
         source = "standard input"
     else:
-        lines = receive_datagrams(options.udp, opened)
-        source = f"UDP port {options.udp}"
+        lines = receive_datagrams(udp, opened)
+        source = f"UDP port {udp}"
     reader = FrameReader.from_model(estimator.model, estimator.problem, source=source)
     bad = 0
-    with options.open_recording(estimator) as recording:
+    with estimation.open_recording(estimator) as recording:
         with without_garbage_of_startup():
             for line in lines:
                 try:
@@ -179,32 +177,27 @@ def live(options: LiveCommand) -> None:
         raise typer.Exit(EXIT_BAD_INPUT)
 
 
-@validated(kw_only=True)
-class ReplayCommand(LiveEstimationOptions, OutputOptions):
-    """Options of `replay`.
-
-    Attributes
-    ----------
-    recording : RUN_OR_PROBLEM
-        A problem file, or a run folder.
-    rate : HZ
-        Frames per second; by default as recorded, 0 for as fast as possible.
-    film : FILE
-        File .gif to which a film of the estimates is written.
-    """
-
-    recording: Annotated[Path, typer.Argument()]
-    rate: NotNegative | None = None
-    film: Path | None = None
-
-
 @command(
     commands,
     "replay problem.toml --rate 100",
     "replay runs/swing --film swing.gif",
     "replay problem.toml --json --rate 0",
 )
-def replay(options: ReplayCommand) -> None:
+def replay(
+    *,
+    recording: Annotated[
+        Path, typer.Argument(metavar="RUN_OR_PROBLEM", help="A problem file, or a run folder.")
+    ],
+    rate: Annotated[
+        NotNegative | None,
+        option("Frames per second; by default as recorded, 0 for as fast as possible.", "HZ"),
+    ] = None,
+    film: Annotated[
+        Path | None, option("File .gif to which a film of the estimates is written.", "FILE")
+    ] = None,
+    estimation: LiveEstimationOptions,
+    output: OutputOptions,
+) -> None:
     """Stream a recording as if it were being made, and estimate the parameters live."""
     from rich.live import Live
 
@@ -214,32 +207,30 @@ def replay(options: ReplayCommand) -> None:
     from ..extras.live.sources import update_as_json as json_line
     from ..result.solve_progress import SolveProgress
 
-    rate = options.rate
-    film = options.film
     if film is not None:
         require_possible(film.parent)
         live_display.require_gif(film)
-    estimator = options.make_estimator(options.recording)
+    estimator = estimation.make_estimator(recording, output.quiet)
     experiment = estimator.model.experiment
     frames = frames_of_recording(experiment, estimator.model)
     pace = 1.0 / experiment.timestep_s if rate is None else rate
     updates = []
-    watched = error_console.is_terminal and not options.quiet and not options.as_json
+    watched = error_console.is_terminal and not output.quiet and not output.as_json
     shown = Live(console=error_console, refresh_per_second=10)
-    with options.open_recording(estimator) as recording:
+    with estimation.open_recording(estimator) as written:
         with without_garbage_of_startup(), shown if watched else nullcontext():
             for frame in paced_frames(frames, pace) if pace else frames:
-                updates.append(processed(estimator, frame, recording=recording))
-                if options.as_json:
+                updates.append(processed(estimator, frame, recording=written))
+                if output.as_json:
                     typer.echo(json_line(updates[-1]))
                 elif watched:
                     shown.update(on_terminal(live_display.display_of(updates)))
-        settled = settled_update(estimator, recording) or updates[-1]
-    if options.as_json:
+        settled = settled_update(estimator, written) or updates[-1]
+    if output.as_json:
         typer.echo(json_line(settled))
     else:
         print_result(live_display.final_display(updates, settled))
     if film is not None:
-        with SolveProgress(error_console, quiet=options.quiet, activity="making the film"):
+        with SolveProgress(error_console, quiet=output.quiet, activity="making the film"):
             live_display.write_film(updates, film)
         typer.echo(film)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
+from typing import Annotated
 
 import typer
 
@@ -33,14 +34,14 @@ from ..extras.studies.study_kinds import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES
 from ..extras.studies.study_rows import SuccessCriterion
 from ..fem.kernels import available_threads
 from ..problem import Problem
-from .command_options import OutputFolder, OutputOptions, ProblemOptions, command
+from .command_options import OutputFolder, OutputOptions, ProblemOptions, command, option
 from .common import error_console, interruption_exit, print_result
 
 commands = typer.Typer()
 
 
 @validated(kw_only=True)
-class StudyOptions(ProblemOptions, OutputOptions):
+class StudyOptions:
     """Options of commands with many runs.
 
     Attributes
@@ -54,32 +55,28 @@ class StudyOptions(ProblemOptions, OutputOptions):
     dry_run: bool = False
 
 
-@validated(kw_only=True)
-class CompareMethodsCommand(StudyOptions):
-    """Options of `compare-methods`.
-
-    Attributes
-    ----------
-    methods : A,B,…
-        Methods to compare, each with its options in the problem file.
-    truth : FILE|NAME=VALUE
-        True parameters: a TOML file, or values.
-    within : float
-        Largest relative error of the parameters with which a run counts as successful.
-    """
-
-    methods: str
-    starts: Starts
-    truth: list[str] | None = None
-    within: Positive = 0.01
-
-
 @command(
     commands,
     "compare-methods problem.toml --methods reduced-space,shooting --starts 40",
     "compare-methods problem.toml --methods penalty,interior-point --truth truth.toml",
 )
-def compare_methods(options: CompareMethodsCommand) -> None:
+def compare_methods(
+    *,
+    methods: Annotated[
+        str, option("Methods to compare, each with its options in the problem file.", "A,B,…")
+    ],
+    starts: Starts,
+    truth: Annotated[
+        list[str] | None, option("True parameters: a TOML file, or values.", "FILE|NAME=VALUE")
+    ] = None,
+    within: Annotated[
+        Positive,
+        option("Largest relative error of the parameters with which a run counts as successful."),
+    ] = 0.01,
+    study: StudyOptions,
+    source: ProblemOptions,
+    output: OutputOptions,
+) -> None:
     """Compare methods from several initial guesses by success, accuracy and time.
 
     All methods solve the same problem from the same guesses. To compare the materials, damping laws
@@ -87,50 +84,21 @@ def compare_methods(options: CompareMethodsCommand) -> None:
 
     Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
-    methods = parse_methods(options.methods)
-    problem = options.read_problem()
+    named = parse_methods(methods)
+    problem = source.read_problem(output.quiet)
     free = [item.name for item in problem.parameters.free]
-    truth = read_truth(options.truth or (), problem.parameters.names, needed=free)
+    known = read_truth(truth or (), problem.parameters.names, needed=free)
     planned = plan_comparison(
         problem,
-        methods,
-        overrides=options.set_ or (),
-        starts=options.starts,
-        truth=truth,
-        allow_code=options.allow_code,
+        named,
+        overrides=source.set_ or (),
+        starts=starts,
+        truth=known,
+        allow_code=source.allow_code,
     )
     _run_study(
-        METHOD_STUDY, options, planned=planned, yardstick=SuccessCriterion(truth, options.within)
+        METHOD_STUDY, planned, study, source, output, yardstick=SuccessCriterion(known, within)
     )
-
-
-@validated(kw_only=True)
-class CompareModelsCommand(StudyOptions):
-    """Options of `compare-models`.
-
-    Attributes
-    ----------
-    materials : A,B,…
-        Materials to compare, instead of that of the object.
-    damping : A,B,…
-        Damping laws to compare, instead of that of the object.
-    prony : 0,1,…
-        Numbers of viscoelastic branches to compare.
-    region : NAME
-        Region whose materials, damping laws and branches are compared; by default the complete
-        body.
-    with_ : FILE
-        Another problem file with the same recordings, which is compared as a model.
-    method : str
-        The method that fits every model, instead of that in the problem file.
-    """
-
-    materials: str | None = None
-    damping: str | None = None
-    prony: str | None = None
-    region: str | None = None
-    with_: list[Path] | None = None
-    method: str | None = None
 
 
 @command(
@@ -139,7 +107,38 @@ class CompareModelsCommand(StudyOptions):
     "compare-models problem.toml --damping kelvin-voigt,material,rayleigh",
     "compare-models problem.toml --prony 0,1 --region tip",
 )
-def compare_models(options: CompareModelsCommand) -> None:
+def compare_models(
+    *,
+    materials: Annotated[
+        str | None, option("Materials to compare, instead of that of the object.", "A,B,…")
+    ] = None,
+    damping: Annotated[
+        str | None, option("Damping laws to compare, instead of that of the object.", "A,B,…")
+    ] = None,
+    prony: Annotated[
+        str | None, option("Numbers of viscoelastic branches to compare.", "0,1,…")
+    ] = None,
+    region: Annotated[
+        str | None,
+        option(
+            "Region whose materials, damping laws and branches are compared; by default the "
+            "complete body.",
+            "NAME",
+        ),
+    ] = None,
+    with_: Annotated[
+        list[Path] | None,
+        option(
+            "Another problem file with the same recordings, which is compared as a model.", "FILE"
+        ),
+    ] = None,
+    method: Annotated[
+        str | None, option("The method that fits every model, instead of that in the problem file.")
+    ] = None,
+    study: StudyOptions,
+    source: ProblemOptions,
+    output: OutputOptions,
+) -> None:
     """Fit models of material and damping, and recommend the one that best predicts held-out data.
 
     Each model is fitted to all recordings. It is then fitted to all recordings except one, in turn,
@@ -150,40 +149,40 @@ def compare_models(options: CompareModelsCommand) -> None:
 
     Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
-    if not options.with_ and {options.materials, options.damping, options.prony} == {None}:
+    if not with_ and {materials, damping, prony} == {None}:
         raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
     from ..extras.studies.study_progress import STUDY_FACTOR, expected_study_s
     from ..result.solve_progress import SolveProgress
     from ..runs.check import expected_search_s
 
-    is_announced = not (options.quiet or options.dry_run)
-    method = _single_method(options.method)
-    problem = options.read_problem()
-    others = [replace(options, problem=file).read_problem() for file in options.with_ or ()]
+    is_announced = not (output.quiet or study.dry_run)
+    chosen = _single_method(method)
+    problem = source.read_problem(output.quiet)
+    others = [replace(source, problem=file).read_problem(output.quiet) for file in with_ or ()]
     variants = models(
         [problem, *others],
-        options.set_ or (),
-        materials=parse_materials(options.materials) if options.materials is not None else (),
-        branches=parse_branches(options.prony) if options.prony is not None else (),
-        region=options.region,
-        dampings=parse_dampings(options.damping) if options.damping is not None else (),
+        source.set_ or (),
+        materials=parse_materials(materials) if materials is not None else (),
+        branches=parse_branches(prony) if prony is not None else (),
+        region=region,
+        dampings=parse_dampings(damping) if damping is not None else (),
     )
     with (
-        SolveProgress(error_console, quiet=options.quiet, activity="reading the models"),
+        SolveProgress(error_console, quiet=output.quiet, activity="reading the models"),
         counted_phase(StepUnit.PROBLEM, len(variants)),
     ):
         began_s, used_s = perf_counter(), sum(os.times()[:4])
         searches_s = []
         for variant in variants:  # an impossible model would fail every run
-            read = Problem.read(variant.path, variant.overrides, allow_code=options.allow_code)
+            read = Problem.read(variant.path, variant.overrides, allow_code=source.allow_code)
             if is_announced:
                 searches_s.append(expected_search_s(read))
             complete_steps(StepUnit.PROBLEM)
         used_s = max(sum(os.times()[:4]) - used_s, 0.5)
         slowness = (perf_counter() - began_s) / used_s
-    planned = plan_models(problem, variants, method=method, allow_code=options.allow_code)
+    planned = plan_models(problem, variants, method=chosen, allow_code=source.allow_code)
     if is_announced:
-        workers = 1 if options.limits.scheduler else options.limits.workers or available_threads()
+        workers = 1 if study.limits.scheduler else study.limits.workers or available_threads()
         total_s = expected_study_s(
             searches_s, len(planned), worker_count=workers, slowness=slowness
         )
@@ -198,23 +197,7 @@ def compare_models(options: CompareModelsCommand) -> None:
             f"data; {about}",
             soft_wrap=True,
         )
-    _run_study(MODEL_STUDY, options, planned=planned)
-
-
-@validated(kw_only=True)
-class SweepCommand(StudyOptions):
-    """Options of `sweep`.
-
-    Attributes
-    ----------
-    over : KEY=VALUES
-        Key and its values: key=a,b,c, key=first:last:count or key=first:last:log:count.
-    method : str
-        The method to use instead of that in the problem file.
-    """
-
-    over: list[str]
-    method: str | None = None
+    _run_study(MODEL_STUDY, planned, study, source, output)
 
 
 @command(
@@ -222,23 +205,40 @@ class SweepCommand(StudyOptions):
     "sweep problem.toml --over transcription.substeps=1,2,4",
     "sweep problem.toml --over parameters.mu_pa.guess=50:5000:log:9",
 )
-def sweep(options: SweepCommand) -> None:
+def sweep(
+    *,
+    over: Annotated[
+        list[str],
+        option(
+            "Key and its values: key=a,b,c, key=first:last:count or key=first:last:log:count.",
+            "KEY=VALUES",
+        ),
+    ],
+    method: Annotated[
+        str | None, option("The method to use instead of that in the problem file.")
+    ] = None,
+    study: StudyOptions,
+    source: ProblemOptions,
+    output: OutputOptions,
+) -> None:
     """Solve the problem for every combination of the values of some keys.
 
     Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
     from ..result.solve_progress import SolveProgress
 
-    method = _single_method(options.method)
-    over = parse_varied_keys(options.over)
-    overrides = options.set_ or ()
+    chosen = _single_method(method)
     planned = plan_sweep(
-        options.problem, over, overrides=overrides, method=method, allow_code=options.allow_code
+        source.problem,
+        parse_varied_keys(over),
+        overrides=source.set_ or (),
+        method=chosen,
+        allow_code=source.allow_code,
     )
     # A missing file would fail every run.
-    with SolveProgress(error_console, quiet=options.quiet, activity=f"reading {options.problem}"):
-        Problem.read(options.problem, planned[0].overrides, allow_code=options.allow_code)
-    _run_study(SWEEP_STUDY, options, planned=planned)
+    with SolveProgress(error_console, quiet=output.quiet, activity=f"reading {source.problem}"):
+        Problem.read(source.problem, planned[0].overrides, allow_code=source.allow_code)
+    _run_study(SWEEP_STUDY, planned, study, source, output)
 
 
 def _single_method(text: str | None) -> str | None:
@@ -253,13 +253,15 @@ def _single_method(text: str | None) -> str | None:
 
 def _run_study(
     kind: str,
-    options: StudyOptions,
     planned: Sequence[PlannedRun],
+    study: StudyOptions,
+    source: ProblemOptions,
+    output: OutputOptions,
     yardstick: SuccessCriterion | None = None,
 ) -> None:
     """Execute the runs that are not finished, write tables and plots, and print the tables.
 
-    The folder is `options.out`, by default runs/NAME-KIND. With `options.dry_run` the planned runs
+    The folder is `study.out`, by default runs/NAME-KIND. With `study.dry_run` the planned runs
     are only listed, with those that are finished marked, and nothing is written. Runs that fail do
     not end the study: they are in the tables. Without any record no tables are written.
     """
@@ -272,13 +274,13 @@ def _run_study(
     )
     from ..extras.studies.study_progress import StudyProgress
 
-    name = run_name(options.problem)
-    folder = options.out or Path("runs") / f"{name}-{kind}"
+    name = run_name(source.problem)
+    folder = study.out or Path("runs") / f"{name}-{kind}"
     store = RunStore(folder / "runs")
-    limits = options.limits
+    limits = study.limits
     finished = [run.key for run in planned if store.load_finished(run.key, limits.time_limit_s)]
-    if options.dry_run:
-        if options.as_json:
+    if study.dry_run:
+        if output.as_json:
             listed = [{**run.as_dict(), "finished": run.key in finished} for run in planned]
             typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
         else:
@@ -289,7 +291,7 @@ def _run_study(
     is_complete = True
     try:
         with StudyProgress(
-            error_console, remaining, total=len(planned), quiet=options.quiet
+            error_console, remaining, total=len(planned), quiet=output.quiet
         ) as progress:
             run_all(remaining, store, options=limits, on_record=progress.count_run)
     except KeyboardInterrupt:
@@ -303,4 +305,4 @@ def _run_study(
         raise interruption_exit(
             f"{len(report.records)} of {len(planned)} runs are kept in {folder}"
         )
-    options.print_result(report_json(report), study_tables(report, folder))
+    output.print_result(report_json(report), study_tables(report, folder))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,9 +14,9 @@ import typer
 from ..common.console import PlainConsole
 from ..common.display import Shown, Table
 from ..common.pages import glossary_terms, page_files, page_text, page_title
-from ..common.serialisation import as_json
+from ..common.serialisation import as_json as json_text
 from ..errors import InputError, hint_at, located
-from .command_options import AsJson, command
+from .command_options import AsJson, command, option
 from .common import error_console, print_result
 
 commands = typer.Typer()
@@ -34,29 +33,18 @@ class NewProblemKind(StrEnum):
     SWING = "swing"
 
 
-@dataclass(frozen=True, kw_only=True)
-class MethodsCommand:
-    """Options of `methods`.
-
-    Attributes
-    ----------
-    name : str
-        The method whose options are listed.
-    """
-
-    name: Annotated[str | None, typer.Argument()] = None
-    as_json: AsJson = False
-
-
 @command(commands, "methods", "methods interior-point")
-def methods(options: MethodsCommand) -> None:
+def methods(
+    *,
+    name: Annotated[str | None, typer.Argument(help="The method whose options are listed.")] = None,
+    as_json: AsJson = False,
+) -> None:
     """List the methods, or the options of one method: defaults, allowed values and meaning."""
     from ..methods import METHODS, method_options_schema, method_summary, require_method
 
-    name = options.name
     if name is not None:
         require_method(name, "NAME")
-    if options.as_json:
+    if as_json:
         listed = (
             method_options_schema(name)
             if name
@@ -76,19 +64,6 @@ def schema() -> None:
     typer.echo(schema_text(), nl=False)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExplainCommand:
-    """Options of the command explain.
-
-    Attributes
-    ----------
-    topics : TOPIC
-        Topics of the pages to show, or keys of the problem file.
-    """
-
-    topics: Annotated[list[str] | None, typer.Argument()] = None
-
-
 @command(
     commands,
     "explain",
@@ -97,14 +72,22 @@ class ExplainCommand:
     "explain resample_hz",
     "explain theory | less",
 )
-def explain(options: ExplainCommand) -> None:
+def explain(
+    *,
+    topics: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="TOPIC", help="Topics of the pages to show, or keys of the problem file."
+        ),
+    ] = None,
+) -> None:
     """Show pages of the documentation, or list their topics; describe keys of the problem file, and
     words of the output, such as constants and rows of the uncertainty budget.
 
     Pages are part of the installation; no network is needed. If the output is not a terminal, they
     are printed as Markdown.
     """
-    if not options.topics:
+    if not topics:
         print_result(
             Table(
                 "",
@@ -114,9 +97,8 @@ def explain(options: ExplainCommand) -> None:
             )
         )
         return
-    topics = [_known_topic(topic) for topic in options.topics]
     console = PlainConsole()
-    for topic in topics:
+    for topic in [_known_topic(each) for each in topics]:
         if topic not in page_files():
             for table in (_key_table(topic), _word_table(topic)):
                 if table.rows:
@@ -193,30 +175,25 @@ def _word_table(word: str) -> Table:
     return Table("", ("name", "", "meaning"), rows=tuple(rows), names=2, texts=1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class LogCommand:
-    """Options of `log`.
-
-    Attributes
-    ----------
-    log : LOG
-        A ROS bag, an MCAP file, or the folder of a LeRobot dataset.
-    """
-
-    log: Annotated[Path, typer.Argument()]
-    as_json: AsJson = False
-
-
 @command(commands, "log trial.mcap", "log bags/2026-05-04 --json")
-def log(options: LogCommand) -> None:
+def log(
+    *,
+    log: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LOG", help="A ROS bag, an MCAP file, or the folder of a LeRobot dataset."
+        ),
+    ],
+    as_json: AsJson = False,
+) -> None:
     """List the topics in a robot's log, their uses, and how a problem file names them."""
     from ..recording.formats.topics import list_topics
     from ..result.solve_progress import SolveProgress
 
-    with SolveProgress(error_console, activity=f"reading {options.log}"), located(options.log):
-        listed = list_topics(options.log)
-    if options.as_json:
-        typer.echo(as_json(listed))
+    with SolveProgress(error_console, activity=f"reading {log}"), located(log):
+        listed = list_topics(log)
+    if as_json:
+        typer.echo(json_text(listed))
         return
     rows = tuple(
         (
@@ -239,26 +216,6 @@ def log(options: LogCommand) -> None:
     print_result([Table("", heads, rows=rows, names=2, texts=2), *what])
 
 
-@dataclass(frozen=True, kw_only=True)
-class NewCommand:
-    """Options of `new`.
-
-    Attributes
-    ----------
-    name : str
-        Name of the new folder.
-    kind : str
-        Add a simulated recording of this kind, so that the problem runs as it is.
-    dataset : str
-        Copy the problem and the data of this dataset instead of the template, for example
-        kawabata_1981.
-    """
-
-    name: Annotated[str, typer.Argument()]
-    kind: NewProblemKind | None = None
-    dataset: str | None = None
-
-
 @command(
     commands,
     "new my_object",
@@ -266,7 +223,21 @@ class NewCommand:
     "new rubber --dataset kawabata_1981",
     "check silicone/problem.toml",
 )
-def new(options: NewCommand) -> None:
+def new(
+    *,
+    name: Annotated[str, typer.Argument(help="Name of the new folder.")],
+    kind: Annotated[
+        NewProblemKind | None,
+        option("Add a simulated recording of this kind, so that the problem runs as it is."),
+    ] = None,
+    dataset: Annotated[
+        str | None,
+        option(
+            "Copy the problem and the data of this dataset instead of the template, for example "
+            "kawabata_1981."
+        ),
+    ] = None,
+) -> None:
     """Write a commented problem file as a starting point.
 
     The folder, new or existing, gets problem.toml and, with either --kind or --dataset, its data.
@@ -276,14 +247,13 @@ def new(options: NewCommand) -> None:
     from ..datasets.dataset_files import copy_dataset
     from ..problem.new_problem import create_problem
 
-    folder = Path(options.name)
-    kind = options.kind
-    if kind is not None and options.dataset is not None:
+    folder = Path(name)
+    if kind is not None and dataset is not None:
         raise InputError(
             "found --kind and --dataset; expected one of them", None, where="--dataset"
         )
-    if options.dataset is not None:
-        file, *data = copy_dataset(options.dataset, folder)
+    if dataset is not None:
+        file, *data = copy_dataset(dataset, folder)
     else:
         file, *data = create_problem(folder, kind and kind.value)
     typer.echo(file)
@@ -297,8 +267,8 @@ def new(options: NewCommand) -> None:
         "the problem runs as it is, with simulated data whose true constants its first lines state; "
         "then replace the data by your own"
     )
-    is_empty = kind is None and options.dataset is None
-    if options.dataset is not None:
+    is_empty = kind is None and dataset is None
+    if dataset is not None:
         example = "the problem runs as it is; its comments state the source of the data"
     error_console.print(f"Next: {yours if is_empty else example}.", soft_wrap=True)
     for next_ in ("check", "solve"):
@@ -322,12 +292,12 @@ def _options_table(method: str) -> list[Shown]:
     from ..problem.solver_schema import table_heading
 
     rows = []
-    for name, option in method_options_schema(method)["properties"].items():
+    for name, stated in method_options_schema(method)["properties"].items():
         rows.append(
             (
                 name,
-                _default_text(option),
-                f"{_allowed_values_text(option)}\n{option['description']}",
+                _default_text(stated),
+                f"{_allowed_values_text(stated)}\n{stated['description']}",
             )
         )
     table = Table("", ("option", "default", ""), rows=tuple(rows), names=2, texts=1)
