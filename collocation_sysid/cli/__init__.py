@@ -4,7 +4,7 @@ Each command is a function in one of the modules `FAMILIES`: `problem_commands` 
 check), `run_commands` (refine, export, plot, report, animate), `study_commands`
 (compare-methods, compare-models, sweep), `design_commands` (design, plan), `stream_commands` (live,
 replay), `benchmark_commands` (benchmark), `installation_commands` (doctor) and `texts`
-(methods, schema, explain, log, new). `command_options` makes command-line options from dataclasses,
+(methods, schema, explain, log, new). `command_options` makes command-line options from parameters,
 `common` has exit codes and output, and `markdown` shows documentation on a terminal.
 
 Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
