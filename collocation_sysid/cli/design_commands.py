@@ -178,5 +178,5 @@ def plan(
     output.print_result(plan_json(answer), plan_summary(answer, folder))
     if answer.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
-    if answer.answer.status not in ("converged", "flat"):
+    if answer.answer.status not in ("converged", "flat") or answer.exceeds_error:
         raise typer.Exit(EXIT_NOT_CONVERGED)

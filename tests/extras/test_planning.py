@@ -20,7 +20,7 @@ from collocation_sysid.extras.design.hand_limits import Limits
 from collocation_sysid.extras.planning import reduced_solver
 from collocation_sysid.extras.planning.full_program import FullProgram, solve_full
 from collocation_sysid.extras.planning.motion_plan import MotionPlan, plan_motion
-from collocation_sysid.extras.planning.plan_folder import command_times_s, plan_json
+from collocation_sysid.extras.planning.plan_folder import command_times_s, plan_json, plan_summary
 from collocation_sysid.extras.planning.planned_body import PlannedBody
 from collocation_sysid.extras.planning.planned_program import PlannedProgram
 from collocation_sysid.extras.planning.reduced_solver import ReducedTolerances, solve_reduced
@@ -307,8 +307,69 @@ def test_components_of_the_end_may_be_free():
 
 def test_limits_without_any_motion_are_named():
     wanted = task(duration_s=0.22, reference=[], hand={"end_m": (0.25, 0.0, 0.0), "intervals": 10})
-    with pytest.raises(InputError, match=r"no motion of 0\.22 s .* end_m .* longer duration_s"):
+    with pytest.raises(InputError, match=r"no motion of 0\.22 s .* end_m .* \(0\.\d+ s suffice"):
         plan_motion(hung_bar(), wanted, LIMITS)
+
+
+# The hand ends 100 mm away; the tip shall be there in time.
+REACH = {
+    "reference": [
+        {"point": "tip", "t_s": [0.4], "position_m": [(0.1, 0.0, np.nan)], "relative": True}
+    ],
+    "duration_s": 0.4,
+    "hand": {"intervals": 10},
+}
+SLOW = LIMITS.model_copy(update={"acceleration_m_s2": 3.0})
+
+
+@cache
+def late_plan() -> MotionPlan:
+    return plan_motion(hung_bar(), task(**REACH, largest_error_m=1e-3), SLOW)
+
+
+def test_limits_that_bind_are_named_with_times_and_gain():
+    plan = late_plan()
+    assert plan.exceeds_error
+    (limit,) = plan.binding_limits
+    assert limit.name == "acceleration_m_s2"
+    assert limit.spans_s[0][0] < 0.1
+    assert limit.spans_s[-1][1] > 0.3
+    wider = SLOW.model_copy(update={"acceleration_m_s2": 1.01 * 3.0})
+    value = plan.answer.history[-1]
+    # The unit of the jerk changes with the limit: compare what follows from it alone.
+    better = solve_reduced(
+        PlannedProgram.from_task(PlannedBody.read(hung_bar()), task(**REACH), wider)
+    ).history[-1]
+    assert 1 - better / value == pytest.approx(limit.gain_per_percent, rel=0.1)
+
+
+def test_the_duration_that_suffices_is_the_shortest_one():
+    plan = late_plan()
+    sufficient_s = plan.sufficient_duration_s
+    assert 0.4 < sufficient_s < 1.0
+    errors = [
+        plan_motion(
+            hung_bar(), task(**REACH).stretched(factor * sufficient_s), SLOW
+        ).largest_error_m
+        for factor in (1.0, 0.95)
+    ]
+    assert errors[0] <= 1e-3 < errors[1]
+    found = plan_motion(hung_bar(), task(**REACH, largest_error_m=1e-3, shortest=True), SLOW)
+    assert found.program.task.duration_s == pytest.approx(sufficient_s)
+    assert not found.exceeds_error
+    (line,) = [
+        str(each) for each in plan_summary(plan, Path("out")) if "the largest error" in str(each)
+    ]
+    assert f"duration_s = {sufficient_s:.3g}" in line
+
+
+def test_a_stretched_task_has_the_same_path():
+    rows = {"t_s": [0.2, 0.4], "position_m": [(0.0, 0, 0), (0.1, 0, 0)], "until_s": 0.5}
+    rows["velocity_m_s"] = [(1.0, 0.0, 0.0), (np.nan, 0.0, 0.0)]
+    (found,) = task(reference=[{"point": "tip", **rows}]).stretched(1.6).reference
+    assert found.t_s == pytest.approx([0.4, 0.8])
+    assert (found.until_s, found.position_m) == (1.0, rows["position_m"])
+    assert found.velocity_m_s[0][0] == 0.5
 
 
 def test_ctrl_c_keeps_the_best_plan():
@@ -400,6 +461,8 @@ def test_both_solvers_find_the_same_motion(free):
     assert np.abs(full.c - reduced.c).max() < 1e-6
     assert np.abs(full.x - reduced.x).max() < 1e-6 * np.ptp(reduced.x)
     assert planned.objective(full.c, full.x) == pytest.approx(reduced.history[-1], rel=1e-6)
+    error = np.abs(full.multipliers - reduced.multipliers).max()
+    assert error < 1e-3 * reduced.multipliers.max()
 
 
 # Uncertainty --------------------------------------------------------------------------------------
@@ -503,6 +566,7 @@ MISTAKES = {
         ('duration_s = "1"', "expected a number"),
         ("duration_s = 0.8\nduratoin_s = 1.0", "unknown key.*duration_s"),
         ("duration_s = 0.8 0.9", "task.toml"),
+        ("duration_s = 0.8\nshortest = true", "shortest: .* expected largest_error_m"),
     ],
     'point = "low"': [
         ("", "neither point nor point_m|expected .*point"),

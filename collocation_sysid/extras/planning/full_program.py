@@ -63,7 +63,9 @@ class FullProgram:
         self.position_count = transcription.variable_count
         self.variable_count = self.position_count + program.space.size
         self.motion_count = self.collocation.constraint_count
-        self.limit_count = len(program.hand_limits.names)
+        limits = program.hand_limits
+        self.limit_count = len(limits.names)
+        self.vector_count = len(limits.t_s) * len(limits.at_time.vector_names)
         self.constraint_count = self.motion_count + self.limit_count
         per_time = transcription.constraints_per_time
         place = np.searchsorted(transcription.constrained_dofs, self.driven.dofs)
@@ -235,9 +237,8 @@ class FullProgram:
     def _limit_hessian(self, c: Array, multipliers: Array) -> Array:
         """Return Σ multipliers · ∂²constraint/∂c² (c, c) of the limits of the hand."""
         limits = self.program.hand_limits
-        vectors = len(limits.t_s) * len(limits.at_time.vector_names)
-        of_vectors = multipliers[:vectors].reshape(len(limits.t_s), -1)
-        of_rows = multipliers[vectors:].reshape(len(limits.t_s), -1)
+        of_vectors = multipliers[: self.vector_count].reshape(len(limits.t_s), -1)
+        of_rows = multipliers[self.vector_count :].reshape(len(limits.t_s), -1)
         states = limits.matrix @ c + limits.constant
         stacked = np.concatenate([states, of_vectors, of_rows], axis=1).T
         values = self._limit_curvature(stacked).full().reshape(18, len(limits.t_s), 18)
@@ -334,12 +335,15 @@ def solve_full(
         ended = "iteration limit" if status == "Maximum_Iterations_Exceeded" else "stalled"
         return replace(start, status=ended)
     c, x = full.unpack(found["x"].full().ravel())
+    # Of half the objective and of the norms of vectors, as in the reduced space.
+    multipliers = found["lam_g"].full().ravel()[full.motion_count :]
+    multipliers[full.vector_count :] /= 2
     history = [float(value) for value in solver.stats()["iterations"]["obj"]]
     return PlanAnswer(
         c,
         x,
         program.driven.respond(program.drive(c), x),
-        found["lam_g"].full().ravel()[full.motion_count :],
+        multipliers,
         "converged",
         [*start.history, *history],
     )

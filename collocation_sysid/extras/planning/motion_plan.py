@@ -7,21 +7,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ...common.array_types import Array
-from ...errors import InputError
+from ...errors import InputError, SimulationError
 from ...problem import Problem
 from ...program.simulation import Trajectory, simulate
 from ...recording import PoseSequence
 from ...runs.solved_problem import SolvedProblem
 from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.hand_limits import REACHED, Limits
+from .durations import Trial, shortest, shortest_of_hand
 from .full_program import solve_full
 from .planned_body import PlannedBody
 from .planned_program import POSES_PER_SAMPLE, PlannedProgram
@@ -36,6 +38,8 @@ from .spline_motion import PoseLimit, SplineMotion
 from .task import Reference, Task
 
 Solver = Literal["reduced-space", "interior-point"]
+# Share of a limit, tightened by its margin, from which it binds.
+BINDING = 1 - 1e-4
 # Time steps of the simulation that checks a plan, for each of the plan's.
 FINER = 4
 
@@ -61,6 +65,25 @@ class TrackingError:
     expected_rms_m: float | None
 
 
+class BindingLimit(NamedTuple):
+    """Limit of the hand that a plan reaches.
+
+    Attributes
+    ----------
+    name : str
+        Name of the limit.
+    spans_s : tuple of (from, until)
+        Times at which it binds [s].
+    gain_per_percent : float
+        Share of the objective by which the plan would improve, to first order, if the limit were
+        wider by one percent.
+    """
+
+    name: str
+    spans_s: tuple[tuple[float, float], ...]
+    gain_per_percent: float
+
+
 @dataclass(frozen=True, eq=False)
 class MotionPlan:
     """Planned motion.
@@ -75,12 +98,16 @@ class MotionPlan:
         Simulation of the plan with `FINER` time steps for each of the plan's.
     seconds : float
         Time of the search [s].
+    sufficient_duration_s : float or None
+        Duration with which the error would be as small as the task accepts [s]; None if it is as
+        small, or no such duration was found.
     """
 
     program: PlannedProgram
     answer: PlanAnswer
     fine: Trajectory
     seconds: float
+    sufficient_duration_s: float | None = None
 
     @property
     def interrupted(self) -> bool:
@@ -212,11 +239,44 @@ class MotionPlan:
         """Largest distance of a node from its mean position after the motion [m]; None if the body
         need not be at rest.
         """
-        if not self.program.task.end.at_rest:
-            return None
-        after = self.t_s >= self.program.task.duration_s - 1e-9
-        positions = self.fine.positions_m[after]
-        return float(np.linalg.norm(positions - positions.mean(axis=0), axis=2).max())
+        positions = self.fine.positions_m
+        return self.program.residual_vibration_m(positions.reshape(len(positions), -1))
+
+    @property
+    def exceeds_error(self) -> bool:
+        """Whether the error is larger than the task accepts."""
+        accepted_m = self.program.task.largest_error_m
+        return accepted_m is not None and self.largest_error_m > accepted_m
+
+    @cached_property
+    def largest_error_m(self) -> float:
+        """Largest distance of a point from its reference, or of a node from rest, on the time grid
+        of the plan [m].
+        """
+        return self.program.largest_error_m(self.answer.x)
+
+    @cached_property
+    def binding_limits(self) -> tuple[BindingLimit, ...]:
+        """Limits of the hand that the motion reaches, those first whose widening would improve the
+        plan most.
+        """
+        limits = self.program.hand_limits
+        value = self.answer.history[-1]
+        found = []
+        for name in dict.fromkeys(limits.names):
+            chosen = np.array([each == name for each in limits.names])
+            # Of the objective, twice that of the steps, by one percent of the limit.
+            gain = 0.02 * float(self.answer.multipliers[chosen].sum()) / max(value, 1e-300)
+            binds = np.zeros(len(limits.t_s), dtype=bool)
+            at = np.searchsorted(limits.t_s, limits.times_s[chosen] - 1e-12)
+            np.logical_or.at(binds, at, limits.shares(self.answer.c)[chosen] > BINDING)
+            if binds.any():
+                ends = np.flatnonzero(np.diff(np.concatenate([[0], binds.astype(int), [0]])))
+                spans = [
+                    (float(limits.t_s[i]), float(limits.t_s[j - 1])) for i, j in ends.reshape(-1, 2)
+                ]
+                found.append(BindingLimit(name, tuple(spans), gain))
+        return tuple(sorted(found, key=lambda each: -each.gain_per_percent))
 
 
 def plan_motion(
@@ -278,21 +338,49 @@ def plan_motion(
     if not isinstance(limits, Limits):
         limits = Limits.read(limits)
     began_s = time.perf_counter()
-    say("computing the equilibrium before the motion")
-    program = PlannedProgram.from_task(body, task, limits, pose_limits)
-    say("searching for the motion")
-    try:
+
+    def solve(duration_s: float) -> Trial:
+        """Return the plan of the task with a duration."""
+        say(f"searching for a motion of {duration_s:.3g} s")
+        of_duration = task if duration_s == task.duration_s else task.stretched(duration_s)
+        program = PlannedProgram.from_task(body, of_duration, limits, pose_limits)
         answer = solve_reduced(program, tolerances=tolerances, watch=watch)
         if solver == "interior-point" and answer.status != "interrupted":
             say("improving the motion by IPOPT")
             answer = solve_full(program, answer, watch=watch)
+        return Trial(program, answer)
+
+    def attempt(duration_s: float) -> Trial | None:
+        """Return the plan with a duration; None if its error is too large."""
+        try:
+            found = solve(duration_s)
+        except (HandLimitsExcludeTask, SimulationError):
+            return None
+        if found.answer.status == "interrupted":
+            raise KeyboardInterrupt
+        return found if found.largest_error_m <= accepted_m else None
+
+    accepted_m = np.inf if task.largest_error_m is None else task.largest_error_m
+    sufficient_s = None
+    try:
+        trial = solve(task.duration_s)
     except HandLimitsExcludeTask as error:
+        program = PlannedProgram.from_task(body, task, limits, pose_limits)
         raise InputError(_contradiction(program), None, where="hand") from error
     except np.linalg.LinAlgError as error:
         raise InputError(f"{error}; state wider limits", None, where="hand") from error
+    suffices = trial.largest_error_m <= accepted_m
+    if trial.answer.status != "interrupted" and (task.shortest or not suffices):
+        with suppress(KeyboardInterrupt):  # the plan of the stated duration remains
+            found = shortest(attempt, task.duration_s, trial if suffices else None)
+            if found is not None and task.shortest:
+                trial = found[1]
+            elif found is not None:
+                sufficient_s = found[0]
     seconds = time.perf_counter() - began_s
     say("simulating the plan with fine time steps")
-    return MotionPlan(program, answer, _finely_simulated(program, answer.c), seconds)
+    fine = _finely_simulated(trial.program, trial.answer.c)
+    return MotionPlan(trial.program, trial.answer, fine, seconds, sufficient_s)
 
 
 def _finely_simulated(program: PlannedProgram, c: Array) -> Trajectory:
@@ -317,8 +405,10 @@ def _contradiction(program: PlannedProgram) -> str:
         for key, value in (("end_m", hand.end_m), ("end_rotation_deg", hand.end_rotation_deg))
         if value is not None
     ]
+    enough_s = shortest_of_hand(program)
+    longer = "" if enough_s is None else f" ({enough_s:.3g} s suffice)"
     return (
         f"no motion of {program.task.duration_s:g} s from rest to rest respects the limits with "
-        f"{' and '.join(ends) or 'the joint limits'}; expected a longer duration_s, a nearer end, or "
-        "wider limits of speed and acceleration"
+        f"{' and '.join(ends) or 'the joint limits'}; expected a longer duration_s{longer}, a nearer "
+        "end, or wider limits of speed and acceleration"
     )

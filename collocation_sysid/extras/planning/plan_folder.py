@@ -154,12 +154,47 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
             for name, share in plan.shares.items()
         },
         "limits_reached": plan.list_active_limits(),
+        "binding_limits": [each._asdict() for each in plan.binding_limits],
+        "largest_error_m": plan.largest_error_m,
+        "accepted_error_m": program.task.largest_error_m,
+        "sufficient_duration_s": plan.sufficient_duration_s,
         "hand": {
             "intervals": program.space.intervals,
             "coefficients": plan.motion.coefficients,
             "initial_position_m": program.frame.position_m,
         },
     }
+
+
+def _limit_lines(plan: MotionPlan) -> list[Shown]:
+    """Return the lines about limits, and about an error that is larger than accepted."""
+    lines: list[Shown] = []
+    task = plan.program.task
+    if task.shortest:
+        lines.append(f"shortest duration: {task.duration_s:.3g} s")
+    if plan.exceeds_error:
+        enough_s = plan.sufficient_duration_s
+        longer = (
+            ""
+            if enough_s is None
+            else f"duration_s = {enough_s:.3g} with the times of references in proportion, or "
+        )
+        lines.append(
+            Line(
+                f"the largest error is {1e3 * plan.largest_error_m:.3g} mm, more than "
+                f"largest_error_m; expected {longer}wider limits",
+                "check",
+            )
+        )
+    if not plan.binding_limits:
+        lines.append(f"limits reached: {', '.join(plan.list_active_limits()) or 'none'}")
+    for each in plan.binding_limits:
+        spans = ", ".join(f"{first:.3g}–{last:.3g}" for first, last in each.spans_s)
+        lines.append(
+            f"{each.name} binds at {spans} s; 1 % more would improve the objective by "
+            f"{100 * each.gain_per_percent:.2g} %"
+        )
+    return lines
 
 
 def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
@@ -194,6 +229,6 @@ def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
             f"({100 * limiting[1]:.0f} % of the variance)"
         )
     shown.append(f"time steps change the points by {1e3 * plan.time_step_error_m:.2g} mm")
-    shown.append(f"limits reached: {', '.join(plan.list_active_limits()) or 'none'}")
+    shown += _limit_lines(plan)
     shown.append(f"written to {folder}")
     return shown

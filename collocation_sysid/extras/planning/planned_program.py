@@ -14,7 +14,7 @@ the duration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, cast
 
@@ -256,6 +256,13 @@ class PlannedProgram:
             body, task, limits, experiment, driven, space, start, references, lowest_hz, pose_limits
         )
 
+    def with_duration(self, duration_s: float) -> PlannedProgram:
+        """Return the program with another duration [s] of the hand's motion, for the limits of the
+        hand alone: samples and references are those of this program.
+        """
+        task = self.task.stretched(duration_s)
+        return replace(self, task=task, space=_space(task, self.bounds))
+
     # The hand -------------------------------------------------------------------------------------
 
     @cached_property
@@ -431,6 +438,30 @@ class PlannedProgram:
         matrix, constant = self.effort
         parts["jerk"] = float(np.sum((matrix @ c + constant) ** 2))
         return parts
+
+    def largest_error_m(self, x: Array) -> float:
+        """Return the largest distance of a point from its reference and, if the body rests at the
+        end, of a node from its mean position after the motion, in a motion x (N, 3n) [m].
+        """
+        sampled = x[self.sample_rows]
+        largest = 0.0
+        for each in self.references:
+            points = sampled @ self.point_weights(each.name).toarray().T
+            deviation = np.nan_to_num(points - each.position_m)
+            largest = max(largest, float(np.linalg.norm(deviation, axis=1).max()))
+        return max(largest, self.residual_vibration_m(sampled) or 0.0)
+
+    def residual_vibration_m(self, sampled: Array) -> float | None:
+        """Return the largest distance of a node from its mean position after the motion [m], for
+        positions (T, 3n) at the samples; None if the body need not be at rest.
+        """
+        if not self.task.end.at_rest:
+            return None
+        since_s = self.experiment.t_s - self.experiment.t_s[0]
+        nodes = sampled[since_s >= self.task.duration_s - 1e-9].reshape(
+            -1, sampled.shape[1] // 3, 3
+        )
+        return float(np.linalg.norm(nodes - nodes.mean(axis=0), axis=2).max())
 
     def objective(self, c: Array, x: Array) -> float:
         """Return the objective at unknowns c and motion x (N, 3n)."""

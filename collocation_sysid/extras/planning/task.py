@@ -191,6 +191,12 @@ class Task(Section):
     ----------
     duration_s
         Duration of the motion of the hand [s].
+    largest_error_m
+        Largest distance of a point from its reference, and of a node from rest at the end, that is
+        acceptable. If the plan exceeds it, the duration that would suffice is computed.
+    shortest
+        Whether the duration is the shortest with which `largest_error_m` is not exceeded; all times
+        of the references are stretched with it.
     sample_s
         Time between the samples of the plan; that of the recording by default.
     reference
@@ -202,6 +208,8 @@ class Task(Section):
     """
 
     duration_s: Positive
+    largest_error_m: Positive | None = None
+    shortest: Flag = False
     sample_s: Positive | None = None
     reference: list[ReferenceSection] = Field(default_factory=list)
     end: EndSection = Field(default_factory=EndSection)
@@ -210,6 +218,13 @@ class Task(Section):
     @model_validator(mode="after")
     def _require_purpose(self) -> Task:
         hand = self.hand
+        if self.shortest and self.largest_error_m is None:
+            raise InputError(
+                "the shortest duration needs the error that is acceptable; expected "
+                "largest_error_m",
+                None,
+                where="shortest",
+            )
         if not self.reference and hand.end_m is None and hand.end_rotation_deg is None:
             raise InputError(
                 "nothing to do; expected a [[reference]] table, or end_m in [hand]",
@@ -225,6 +240,26 @@ class Task(Section):
                     where=f"reference {number}: from_s",
                 )
         return self
+
+    def stretched(self, duration_s: float) -> Task:
+        """Return the task with another duration [s]: all times of its references are multiplied by
+        the ratio of the durations, and velocities divided by it.
+        """
+        ratio = duration_s / self.duration_s
+
+        def of_reference(each: ReferenceSection) -> ReferenceSection:
+            update: dict[str, Any] = {"from_s": ratio * each.from_s}
+            if each.until_s is not None:
+                update["until_s"] = ratio * each.until_s
+            if each.t_s is not None:
+                update["t_s"] = [ratio * t for t in each.t_s]
+            if each.velocity_m_s is not None:
+                rows = np.array(each.velocity_m_s) / ratio
+                update["velocity_m_s"] = [tuple(row) for row in rows.tolist()]
+            return each.model_copy(update=update)
+
+        references = [of_reference(each) for each in self.reference]
+        return self.model_copy(update={"duration_s": duration_s, "reference": references})
 
     @classmethod
     def read(cls, path: str | Path) -> Task:
