@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .features.image_tracks.tracks import ImageTracks, PoseSigma
     from .fem.body import Body
     from .fem.laws.constants import Constant
+    from .fem.laws.fibres import Fibres
     from .fem.laws.materials import DampingLaw, Material, Prony
     from .fem.meshes.mesh import TetMesh
     from .fem.meshes.selection import Ball, Box, Face, Indices, Named
@@ -106,6 +107,7 @@ __all__ = [
     "Deviation",
     "Experiment",
     "Face",
+    "Fibres",
     "Field",
     "FieldCoefficients",
     "FollowingSensor",

@@ -34,6 +34,7 @@ from ..errors import InputError
 from .air import placed_unit_drag
 from .discretisation import Discretisation
 from .laws.constants import DENSITY, Constant
+from .laws.fibres import Fibres
 from .laws.materials import DampingLaw, Energy, Material, Prony
 from .laws.memory import MemoryInput
 from .laws.stress import StressEvaluator
@@ -156,6 +157,8 @@ class Body(Discretisation):
         Custom forces on its nodes or faces.
     field : Field, optional
         Constant that varies in space, outside all regions.
+    fibres : Fibres, optional
+        Fibres beside the material, outside all regions.
     rest_shape : UnderGravity or "stress_free", optional
         UnderGravity: how the body was held while its mesh was made; the stress-free shape is then
         computed, see `rest_shape`. "stress_free": the mesh is the stress-free shape. None: not
@@ -219,6 +222,7 @@ class Body(Discretisation):
         prony: Sequence[str | Prony] = (),
         forces: Sequence[NodeForce] = (),
         field: Field | None = None,
+        fibres: Fibres | None = None,
         rest_shape: UnderGravity | Literal["stress_free"] | None = None,
         made: Made | None = None,
         mesh_from: MeshOrigin | None = None,
@@ -235,6 +239,7 @@ class Body(Discretisation):
             regions=regions,
             prony=prony,
             field=field,
+            fibres=fibres,
         )
         _require_origin(made, mesh_from, rest_shape=rest_shape)
         self.made: Made | None = made

@@ -101,8 +101,8 @@ class CoarseBody:
 def coarsen_body(body: Body, node_count: int, node_sets: Sequence[Index]) -> CoarseBody:
     """Return the body on a mesh with about a given number of nodes.
 
-    Materials, stated and free densities, fields (not computed again), custom forces, the rest shape
-    and `has_declared_mass` are those of `body`. Densities stay, so the mass changes with the volume
+    Materials, stated and free densities, fields (not computed again), fibres, custom forces, the rest
+    shape and `has_declared_mass` are those of `body`. Densities stay, so the mass changes with the volume
     that a coarse surface encloses. Frames of obstacles are not copied.
 
     Parameters
@@ -184,7 +184,12 @@ def _with_properties(body: Body, meshes: CoarseMesh, groups: Index) -> CoarseBod
     parts = zip(coarse.parts, body.parts, strict=True)
     coarse = coarse.with_parts(
         tuple(
-            replace(part, field=_coarse_field(source, part, body, coarse)) for part, source in parts
+            replace(
+                part,
+                field=_coarse_field(source, part, body, coarse),
+                axes=_coarse_axes(source, part, body, coarse),
+            )
+            for part, source in parts
         )
     )
     return CoarseBody(body, coarse, meshes)
@@ -236,6 +241,18 @@ def _coarse_field(source: BodyPart, part: BodyPart, body: Body, coarse: Body) ->
             "its own mesh, so that it cannot be transferred to a coarse mesh; expected a body "
             "without field, or a field with prior = 'smooth'"
         )
+    nearest = _nearest_cells(source, part, body, coarse)
+    return modes.on_cells(nearest, coarse.mesh.volumes_m3[part.cells])
+
+
+def _coarse_axes(source: BodyPart, part: BodyPart, body: Body, coarse: Body) -> Array | None:
+    """Return the axes of fibres in the elements of the coarse part, each those of the nearest
+    element; None without fibres.
+    """
+    return None if source.axes is None else source.axes[_nearest_cells(source, part, body, coarse)]
+
+
+def _nearest_cells(source: BodyPart, part: BodyPart, body: Body, coarse: Body) -> Index:
+    """Return for each element of the coarse part the nearest of the part of the given body."""
     centres_m = body.mesh.centres_m[source.cells]
-    _, nearest = KDTree(centres_m).query(coarse.mesh.centres_m[part.cells])
-    return modes.on_cells(np.asarray(nearest), coarse.mesh.volumes_m3[part.cells])
+    return np.asarray(KDTree(centres_m).query(coarse.mesh.centres_m[part.cells])[1])

@@ -226,15 +226,25 @@ class Discretisation(ConstantsModel):
     def part_elements(self, part: BodyPart) -> tuple[Index, Array]:
         """Return the nodes (E, nodes) and geometry (E, q, 3·nodes + 1) of the elements of a part,
         in the order of its kernels: ascending nodes in each element if its damping law has a
-        stress.
+        stress. Shape gradients are by the axes of the fibres of each element, if it has any.
         """
         cells = self.cells[part.cells]
-        geometry = self.geometry[part.cells]
+        geometry = self.material_geometry(part)
         if part.damping.stress is None:
             return cells, geometry
         # Ascending nodes make an element's lower triangle part of the global one: in a skew
         # matrix, the other triangle has the opposite sign.
         return with_ascending_nodes(cells, geometry)
+
+    def material_geometry(self, part: BodyPart) -> Array:
+        """Return the geometry (E, q, 3·nodes + 1) of the elements of a part with shape gradients by
+        the axes of their fibres, R: the deformation gradient is then F R.
+        """
+        geometry = self.geometry[part.cells]
+        if part.axes is None:
+            return geometry
+        gradients = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3) @ part.axes[:, None]
+        return np.append(gradients.reshape(*geometry.shape[:2], -1), geometry[..., -1:], axis=2)
 
     def field_output_slices(self, name: str) -> dict[tuple[int, str], slice]:
         """Return the slices of a result row that hold derivatives by the logarithm z of each cell.

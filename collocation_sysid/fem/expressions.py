@@ -34,7 +34,7 @@ import casadi as ca
 
 from .elements import Element
 from .kernel import Derivative, ElementKernel, Outputs, Pieces, QuadraturePoint
-from .laws.materials import DampingLaw, Material
+from .laws.materials import DampingLaw, Material, damped_psi
 from .laws.mean_dilatation import averaging_kernel
 from .rest_point_layout import RestPointLayout
 
@@ -98,7 +98,7 @@ class PointLaw:
             return None
         F_symbol = ca.SX.sym("F", 9)
         rate_symbol = ca.SX.sym("rate", 9)
-        psi = self.psi(ca.reshape(F_symbol, 3, 3), theta)
+        psi = damped_psi(self.damping, self.material, ca.reshape(F_symbol, 3, 3), theta)
         expressions = self.damping.stress(
             psi, F_symbol, rate_symbol, **self._damping_constants(theta)
         )

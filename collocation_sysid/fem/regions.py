@@ -21,6 +21,7 @@ from ..common.validated_types import Positive, Text
 from ..errors import InputError, hint_at
 from .laws.constants import CONTRAST, DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, Constant
 from .laws.damping_admissibility import require_admissible_damping
+from .laws.fibres import Fibres, reinforced
 from .laws.materials import (
     DampingLaw,
     Energy,
@@ -55,6 +56,8 @@ class Region:
     field : Field, optional
         Constant that varies in space within the region; None for none, also if the body has a
         field.
+    fibres : Fibres, optional
+        Fibres of the region beside its material; None for none, also if the body has fibres.
 
     Raises
     ------
@@ -69,6 +72,7 @@ class Region:
     damping: str | DampingLaw | None = None
     prony: Sequence[str | Prony] | None = None
     field: Field | None = None
+    fibres: Fibres | None = None
 
     def __post_init__(self) -> None:
         if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
@@ -100,6 +104,8 @@ class BodyPart:
         Whether the density is an entry of θ.
     field : FieldModes or None
         Constant that varies in space within the part.
+    axes : (k, 3, 3) array or None
+        Axes of the fibres of each cell, as columns; None without fibres.
     """
 
     name: str
@@ -112,6 +118,7 @@ class BodyPart:
     has_own_density: bool = False
     has_free_density: bool = False
     field: FieldModes | None = None
+    axes: Array | None = None
 
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
@@ -172,6 +179,7 @@ def parts_from_regions(
     regions: Sequence[Region],
     prony: Sequence[str | Prony] = (),
     field: Field | None = None,
+    fibres: Fibres | None = None,
 ) -> tuple[BodyPart, ...]:
     """Return the parts of a body: the cells outside all regions, if any, then the regions in their
     order.
@@ -185,6 +193,8 @@ def parts_from_regions(
         of them.
     field : Field, optional
         Field of the cells outside all regions; regions do not inherit it.
+    fibres : Fibres, optional
+        Fibres of the cells outside all regions; regions do not inherit them.
 
     Raises
     ------
@@ -209,12 +219,15 @@ def parts_from_regions(
         prony=branches,
     )
     require_admissible_damping(remainder.damping, remainder.material)
-    if field is not None and not rest.size:
-        raise InputError(
-            "found a field for the part of the body outside all regions, but the regions contain "
-            "every cell; expected the field as an entry of one of the regions"
-        )
-    parts = [_with_field(remainder, field, mesh=mesh)] if rest.size else []
+    for given, name in ((field, "a field"), (fibres, "fibres")):
+        if given is not None and not rest.size:
+            raise InputError(
+                f"found {name} for the part of the body outside all regions, but the regions contain "
+                f"every cell; expected {name.replace('a ', 'the ')} as an entry of one of the regions"
+            )
+    parts = []
+    if rest.size:
+        parts = [_with_field(_with_fibres(remainder, fibres, mesh=mesh), field, mesh=mesh)]
     for region, cells, density in zip(regions, claimed, densities[1:], strict=True):
         try:
             law = remainder.material if region.material is None else as_material(region.material)
@@ -233,11 +246,23 @@ def parts_from_regions(
                 prony=memory,
                 has_own_density=has_own,
             )
+            part = _with_fibres(part, region.fibres, mesh=mesh)
             parts.append(_with_field(part, region.field, mesh=mesh))
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
     mass = sum(part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum()) for part in parts)
     return tuple(replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts)
+
+
+def _with_fibres(part: BodyPart, fibres: Fibres | None, mesh: TetMesh) -> BodyPart:
+    """Return the part with fibres beside its material; the part itself for None."""
+    if fibres is None:
+        return part
+    try:
+        material = reinforced(part.material, fibres.energy)
+        return replace(part, material=material, axes=fibres.axes(mesh, part.cells))
+    except InputError as error:
+        raise error.located(None, "fibres") from error
 
 
 def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:

@@ -697,9 +697,15 @@ class InverseEquilibrium:
 def require_supported(parts: Sequence[BodyPart]) -> None:
     """Raise an `InputError` if the stress-free shape of these parts cannot be computed.
 
-    This is the case for fields and for branches of memory.
+    This is the case for fields, for branches of memory and for fibres.
     """
     for part in parts:
+        if part.axes is not None:
+            raise InputError(
+                "found rest_shape = 'under_gravity' and fibres; expected a material without them, or "
+                "rest_shape = 'stress_free'",
+                where="rest_shape",
+            )
         if part.field is not None:
             raise InputError(
                 f"found rest_shape = 'under_gravity' and a field of {part.field_name}; expected "

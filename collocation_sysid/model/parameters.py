@@ -812,7 +812,7 @@ class Parameters:
         """
         return self.map_components(
             lambda item: (
-                Parameter(item.name, values[item.name], is_fixed=True)
+                Parameter(item.name, values[item.name], is_fixed=True, scale=item.scale)
                 if item.name in values
                 else item
             )

@@ -14,6 +14,7 @@ from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.laws.constants import FRICTION, Constant, constant_named, with_undamped
+from ..fem.laws.fibres import Fibres
 from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import (
     box_of_edge,
@@ -39,7 +40,14 @@ from .problem_reading import read_problem_file
 from .problem_size import Say, Size, announce_reading, require_feasible
 from .recording_reader import RecordingReader
 from .recording_schema import LOADS
-from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
+from .schema import (
+    CodeSection,
+    ObjectSection,
+    ParameterSection,
+    PriorSection,
+    ProblemFile,
+    RegionSection,
+)
 from .specimen_reader import SpecimenReader
 from .specimen_schema import SpecimenSection
 
@@ -86,7 +94,8 @@ def problem_arguments(
             body, size = _load_object(file, folder, code=code, simulation=simulation, say=say)
             mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
         else:
-            body = cells.body_for(file.list_specimens()[0].test)
+            first = file.list_specimens()[0]
+            body = cells.body_for(first.test, first.cut_angle_deg)
             unknowns = with_undamped(unknowns, body.constants)
     with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
@@ -103,7 +112,7 @@ def problem_arguments(
             where = f"experiment '{section.name}'"
             if isinstance(section, SpecimenSection):
                 specimen_reader = SpecimenReader(
-                    section, folder, body=cells.body_for(section.test), simulation=simulation
+                    section, folder, cells.body_for(section.test, section.cut_angle_deg), simulation
                 )
                 with _locate_in_table(path, where):
                     specimens[section.name], experiment = specimen_reader.read()
@@ -166,7 +175,8 @@ def _load_object(
 class SpecimenCells:
     """Homogeneous cells of specimens of the object's material, each made once.
 
-    Tests that need an inner node have another cell than those that do not; there are at most two.
+    Tests that need an inner node have another cell than those that do not, and so have specimens of
+    a material with fibres that were cut at different angles.
 
     Parameters
     ----------
@@ -179,30 +189,33 @@ class SpecimenCells:
     def __init__(self, section: ObjectSection, code: CodeLoader) -> None:
         self._section = section
         self._code = code
-        self._bodies: dict[bool, Body] = {}
+        self._bodies: dict[tuple[bool, float], Body] = {}
 
-    def body_for(self, test: str) -> Body:
-        """Return the cell of a kind of test, one of `homogeneous_deformation.TESTS`; the same
-        object for all tests with the same kind of cell.
+    def body_for(self, test: str, cut_angle_deg: float) -> Body:
+        """Return the cell of a kind of test, one of `homogeneous_deformation.TESTS`, of a specimen
+        that was cut at an angle; the same object for all tests with the same kind of cell.
 
         Raises
         ------
         InputError
             If the material is a Python file that may not be run or is invalid.
         """
-        has_inner_node = not DEFORMATIONS[test].free
-        if has_inner_node not in self._bodies:
+        fibres = fibres_of(self._section, "fibres")
+        cell = (not DEFORMATIONS[test].free, 0.0 if fibres is None else cut_angle_deg)
+        if cell not in self._bodies:
             law = self._section.material
             is_code = isinstance(law, CodeSection)
             material = self._code.material(law, "material") if is_code else law
-            self._bodies[has_inner_node] = cell_body(
+            self._bodies[cell] = cell_body(
                 test,
                 material,
+                fibres=fibres,
+                cut_angle_deg=cut_angle_deg,
                 prony=tuple(b.name for b in self._section.prony if b.region is None),
                 damping=self._section.damping,
                 made=self._section.made,
             )
-        return self._bodies[has_inner_node]
+        return self._bodies[cell]
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
@@ -328,6 +341,14 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
         raise InputError(message, None, where=key) from error
 
 
+def fibres_of(section: ObjectSection | RegionSection, where: str) -> Fibres | None:
+    """Return the fibres that a table states at the key `where`; None without any."""
+    if section.fibres is None:
+        return None
+    with located(where=where):
+        return Fibres(**declared_in(section.fibres, where=where))
+
+
 def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
     """Return the body with its materials, regions, forces and fields."""
 
@@ -358,6 +379,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
             damping=region.damping,
             prony=branches(region.name) or None,
             field=field(region.field, f"region.{k}.field"),
+            fibres=fibres_of(region, f"region.{k}.fibres"),
         )
         for k, region in enumerate(section.region)
     ]
@@ -372,6 +394,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         prony=branches(None),
         forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
         field=field(section.field, "field"),
+        fibres=fibres_of(section, "fibres"),
         rest_shape=_rest_shape(section),
         made=section.made,
         mesh_from=section.mesh_from,

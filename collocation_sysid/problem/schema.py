@@ -21,6 +21,7 @@ from ..common.validated_types import Count, Finite, Flag, NotNegative, Positive,
 from ..errors import InputError
 from ..fem.body import Made, MeshOrigin
 from ..fem.elements import ELEMENTS
+from ..fem.laws.fibres import Fibres
 from ..fem.laws.materials import DAMPINGS, MATERIALS
 from ..fem.spatial_field import Field as SpatialField
 from ..model.parameters import Unknown
@@ -79,6 +80,9 @@ class NodeForceSection(CodeSection):
 class FieldSection(Section, of=SpatialField): ...
 
 
+class FibresSection(Section, of=Fibres): ...
+
+
 Material = Annotated[MaterialName | CodeSection, ByForm(str)]
 
 
@@ -100,6 +104,8 @@ class RegionSection(Section):
         Density of the region [kg/m³]; by default that of the object.
     field : FieldSection, optional
         A constant that varies in space within the region.
+    fibres : FibresSection, optional
+        Fibres of the region beside its material.
     """
 
     name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")]
@@ -108,6 +114,7 @@ class RegionSection(Section):
     damping: DampingName | None = None
     density_kg_m3: Positive | None = None
     field: FieldSection | None = None
+    fibres: FibresSection | None = None
 
 
 class PronySection(Section):
@@ -202,6 +209,10 @@ class ObjectSection(Section):
         [[object.force]] tables: custom forces on the nodes.
     field : FieldSection, optional
         A constant that varies in space: parameter, length_m, modes, amplitude.
+    fibres : FibresSection, optional
+        Fibres beside the material, outside all regions: direction or axis, families, law. Of a
+        specimen without a mesh the direction is in the plane of its axes z (of the first strain)
+        and x, see cut_angle_deg.
     rest_shape : {"stress_free", "under_gravity"}, optional
         "stress_free": the mesh has the shape without stress. "under_gravity": the mesh has the
         shape in which the object hung or stood under its own weight while it was scanned. By
@@ -237,6 +248,7 @@ class ObjectSection(Section):
     prony: list[PronySection] = Field(default_factory=list)
     force: list[NodeForceSection] = Field(default_factory=list)
     field: FieldSection | None = None
+    fibres: FibresSection | None = None
     rest_shape: Literal["stress_free", "under_gravity"] | None = None
     made: Made | None = None
     mesh_from: MeshOrigin | None = None

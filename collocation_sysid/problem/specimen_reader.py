@@ -132,6 +132,7 @@ class SpecimenReader:
             **arguments,
             axial_stretch=section.axial_stretch,
             transverse_stretch=section.transverse_stretch,
+            cut_angle_deg=section.cut_angle_deg,
             sigma_pa=self._sigma_pa(),
             lateral_sigma=section.lateral_sigma,
             strain_zero=deviation(section.strain_zero),

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from ..common.schema_tables import Among, ByForm, require_one
-from ..common.validated_types import AtLeastOne, Boundless, Count, Flag, Positive, Text
+from ..common.validated_types import AtLeastOne, Boundless, Count, Finite, Flag, Positive, Text
 from ..recording.homogeneous_deformation import TESTS
 from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
 from .measurement_section import NamedSection
@@ -49,6 +49,9 @@ class SpecimenSection(NamedSection):
     transverse_stretch : float, optional
         Constant stretch across axial_stretch; by default that of an incompressible specimen,
         1/√axial_stretch.
+    cut_angle_deg : float
+        Angle at which the specimen was cut from a sheet with fibres (object.fibres): from the axis
+        z of the sheet to the axis of the first strain, positive toward the axis x.
     area_m2 : float, optional
         Undeformed area by which a force is divided.
     sigma_pa : float, optional
@@ -89,6 +92,7 @@ class SpecimenSection(NamedSection):
     length_m: Positive | None = None
     axial_stretch: Positive = 1.0
     transverse_stretch: Positive | None = None
+    cut_angle_deg: Finite = 0.0
     area_m2: Positive | None = None
     sigma_pa: Positive | None = None
     sigma_n: Positive | None = None

@@ -46,6 +46,8 @@ class HomogeneousDeformation:
         Components of the constant H with their values, such as those of a pre-stretch.
     free : str
         Axes along which the normal stress vanishes and the stretch is free.
+    free_shear : tuple of str
+        Other components of F that are free, because their stress vanishes.
     first_stress : str
         Component of the nominal stress that belongs to e₁: its direction, then the normal.
     second_stress : str
@@ -70,6 +72,7 @@ class HomogeneousDeformation:
     scale: float = 1.0
     held: tuple[tuple[str, float], ...] = ()
     free: str = ""
+    free_shear: tuple[str, ...] = ()
     first_stress: str = "zz"
     second_stress: str = ""
     lateral: str = ""
@@ -124,11 +127,11 @@ class HomogeneousDeformation:
 
     def prescribed_axes(self, node: int) -> Axes:
         """Return the axes along which a node of the cell is prescribed, by its index from 0: all
-        but the own axis of a node on an axis of `free`.
+        but the own axis of a node on an axis of `free`, and those of `free_shear`.
         """
         own = AXES[node - 1] if node else ""
-        prescribed = "".join(axis for axis in AXES if not (axis == own and axis in self.free))
-        return cast(Axes, prescribed)
+        free = {axis + axis for axis in self.free} | {*self.free_shear}
+        return cast(Axes, "".join(axis for axis in AXES if axis + own not in free))
 
 
 def _indices(component: str) -> tuple[int, int]:

@@ -11,13 +11,15 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
 from ..common.checked_arrays import float_converter
 from ..common.declarations import declaration, key
-from ..common.validated_types import NotNegative, Positive
+from ..common.validated_types import Finite, NotNegative, Positive
 from ..errors import InputError
 from ..fem.body import Body, Made
+from ..fem.laws.fibres import Fibres
 from ..fem.laws.materials import DampingLaw, Energy, Material, Prony
 from .custom_sensor import Gauge, GraspQuantities, PointQuantities
 from .experiment import Experiment
@@ -97,6 +99,10 @@ class Specimen:
     transverse_stretch : float, optional
         Constant stretch across `axial_stretch`; by default 1/√axial_stretch, that of an
         incompressible specimen.
+    cut_angle_deg : float
+        Angle [°] at which the specimen was cut from a sheet with fibres: from the axis z of the
+        sheet, in which the direction of the fibres is stated, to the axis of the first strain,
+        positive toward the axis x of the sheet.
     length_m, area_m2 : float, optional
         Undeformed length and area of the specimen, if `strain` is the displacement of a test bench
         over the length: the budget then contains the compliance of the bench. None (both) if the
@@ -129,6 +135,7 @@ class Specimen:
     stress_zero_pa: float = key(NotNegative, default=0.0)
     axial_stretch: float = key(Positive, default=1.0)
     transverse_stretch: float | None = key(Positive, default=None)
+    cut_angle_deg: float = key(Finite, default=0.0)
     length_m: float | None = key(Positive, default=None)
     area_m2: float | None = key(Positive, default=None)
 
@@ -228,6 +235,7 @@ class Specimen:
         name: str = "specimen",
         *,
         prony: tuple[str | Prony, ...] = (),
+        fibres: Fibres | None = None,
         validation: bool = False,
         body: Body | None = None,
     ) -> Experiment:
@@ -241,6 +249,9 @@ class Specimen:
             Name of the experiment.
         prony : sequence of str or Prony
             Branches of the material's memory, as of `Body`; not used if `body` is given.
+        fibres : Fibres, optional
+            Fibres of the sheet from which the specimen was cut, in the plane of the sheet's axes z
+            and x or across it; not used if `body` is given.
         validation : bool
             Whether the test is only predicted, not fitted.
         body : Body, optional
@@ -252,7 +263,10 @@ class Specimen:
         InputError
             If the law cannot be evaluated at the largest strains, see `require_evaluable_law`.
         """
-        cell = cell_body(self.test, material, prony=prony) if body is None else body
+        cell = body
+        if cell is None:
+            angle = self.cut_angle_deg
+            cell = cell_body(self.test, material, prony, fibres=fibres, cut_angle_deg=angle)
         assert self.t_s is not None
         require_evaluable_law(
             cell, self.find_deformation(), strain=self.strain, second_strain=self.second_strain
@@ -261,7 +275,7 @@ class Specimen:
         return Experiment(
             cell,
             self.t_s,
-            grasps=self._grasps(),
+            grasps=self._grasps(has_fibres=any(part.axes is not None for part in cell.parts)),
             gravity_m_s2=(0.0, 0.0, 0.0),
             name=name,
             kind="static",
@@ -272,12 +286,14 @@ class Specimen:
             specimen=self.find_deformation(),
         )
 
-    def _grasps(self) -> list[Grasp]:
+    def _grasps(self, has_fibres: bool) -> list[Grasp]:
         """Return a grasp for each of the four nodes of the cell, in their order: at rest, or with
-        the displacements of the test at `t_s`.
+        the displacements of the test at `t_s`. With fibres, a specimen in uniaxial tension shears.
         """
         assert self.t_s is not None
         deformation = self.find_deformation()
+        if has_fibres and self.test == "uniaxial":
+            deformation = replace(deformation, free_shear=("zx",))
         shifts = deformation.gradients(self.strain, self.second_strain) - np.eye(3)
         grasps = []
         for node in range(1 + len(AXES)):
@@ -417,8 +433,11 @@ def cell_body(
     prony: tuple[str | Prony, ...] = (),
     damping: str | DampingLaw = "kelvin-voigt",
     made: Made | None = None,
+    fibres: Fibres | None = None,
+    cut_angle_deg: float = 0.0,
 ) -> Body:
-    """Return the homogeneous cell of a kind of test, one of `TESTS`; other arguments as of `Body`.
+    """Return the homogeneous cell of a kind of test, one of `TESTS`; other arguments as of `Body`
+    and `Specimen`.
 
     The cell has an additional node inside if the test prescribes all others. The damping law has no
     effect on equilibria.
@@ -432,4 +451,44 @@ def cell_body(
         prony=prony,
         rest_shape="stress_free",
         made=made,
+        fibres=None if fibres is None else _cut(fibres, cut_angle_deg),
     )
+
+
+def cell_of_other_test(body: Body, test: str) -> Body:
+    """Return the cell of another kind of test for the specimen that has the cell `body`."""
+    (part,) = body.parts
+    cell = cell_body(test, part.material, part.prony, damping=part.damping, made=body.made)
+    if part.axes is None:
+        return cell
+    (new,) = cell.parts
+    axes = np.broadcast_to(part.axes[0], (len(new.cells), 3, 3))
+    return cell.with_parts((replace(new, axes=axes),))
+
+
+def _cut(fibres: Fibres, angle_deg: float) -> Fibres:
+    """Return the fibres of a sheet by the axes of a specimen that was cut from it at an angle."""
+    turn = Rotation.from_euler("y", -angle_deg, degrees=True)
+    vectors = {}
+    for name in ("direction", "normal"):
+        vector = getattr(fibres, name)
+        is_vector = vector is not None and np.shape(vector) == (3,)
+        if not (is_vector or (name == "normal" and vector is None)):
+            raise InputError(
+                "the fibres of a specimen without a mesh have no vector as their "
+                f"{name}; expected one direction for the whole sheet",
+                None,
+                where=f"fibres.{name}",
+            )
+        if vector is None:
+            continue
+        size = np.abs(vector) > 1e-9 * np.linalg.norm(vector)
+        if (size[1] and size[[0, 2]].any()) or (name == "normal" and not size[1]):
+            raise InputError(
+                f"found {name} = {np.asarray(vector).tolist()} in a specimen without a mesh; expected "
+                "a direction in the plane of its axes z and x, or along y, and the normal along y",
+                None,
+                where=f"fibres.{name}",
+            )
+        vectors[name] = turn.apply(vector)
+    return replace(fibres, **vectors)

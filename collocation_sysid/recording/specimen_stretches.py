@@ -34,7 +34,8 @@ def require_evaluable_law(
     second_strain : (T,) array or None
         Strain along the second axis of a biaxial test; None for other tests.
     """
-    laws = [part.material.name for part in body.parts if is_power_law(part.material.name)]
+    names = [part.material.matrix.name for part in body.parts]
+    laws = [name for name in names if is_power_law(name)]
     if not laws or not len(strain):
         return
     stretches = isochoric_stretches(deformation, strain, second_strain=second_strain)

@@ -58,7 +58,7 @@ class ElementFields:
             places = len(FIELD_NAMES) * part.cells[:, None] + np.arange(len(FIELD_NAMES))
             width = len(FIELD_NAMES) * len(body.cells)
             cells = body.cells[part.cells]
-            geometry = body.geometry[part.cells]
+            geometry = body.material_geometry(part)
             histories = None
             if part.stress_field:
                 logs = np.arange(len(cells))[:, None, None]

@@ -20,7 +20,7 @@ from ..program.measured_motion import fitted_values
 from ..program.simulation import simulate
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
-from ..recording.specimen import Specimen, cell_body
+from ..recording.specimen import Specimen, cell_of_other_test
 from ..recording.specimen_files import specimen_strains
 from ..statistics.budget.consider_analysis import UNWEIGHTED, changes_of_assumptions
 from ..statistics.budget.uncertainty_budget import VarianceSources
@@ -203,14 +203,11 @@ def _other_test(experiment: Experiment, test: str, values: Mapping[str, float]) 
     """Return another test of a specimen, up to the same strain, with the same noise over the
     largest stress.
     """
-    (part,) = experiment.body.parts
     stress = experiment.readings[0]
     assert stress.values is not None
     relative = stress.sigma / np.nanmax(np.abs(stress.values))
     strain, _ = specimen_strains(experiment)
-    body = cell_body(
-        test, part.material, prony=part.prony, damping=part.damping, made=experiment.body.made
-    )
+    body = cell_of_other_test(experiment.body, test)
     blank = Specimen(test, strain, np.zeros_like(strain), 1.0, t_s=experiment.t_s)
     added = blank.experiment(body=body, name=f"added {test}")
     (stresses_pa,) = simulate(added, values).custom_sensor_values

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array, Index
 from ..fem.body import Body
-from ..fem.laws.materials import DampingLaw, Material
+from ..fem.laws.materials import DampingLaw, Material, damped_psi
 from ..program.linear_algebra.block_band import full_matrix
 from .property_check import EXACT, PropertyCheck
 from .small_problems import DENSITY_KG_M3, uneven_box, usual_constants
@@ -56,7 +56,7 @@ def damping_stress(
         If the law has neither stress nor potential.
     """
     F, rate, material_values, law_values = symbols
-    psi = material.psi(ca.reshape(F, 3, 3), material_values)
+    psi = damped_psi(law, material, ca.reshape(F, 3, 3), material_values)
     named = {c.name: law_values[k] for k, c in enumerate(law.constants)}
     if law.stress is not None:
         stress, slope = law.stress(psi, F, rate, **named)
@@ -173,7 +173,7 @@ class PlainInternalForce:
         force = np.zeros(size)
         jacobian = np.zeros((size, count))
         hessian = np.zeros((count, count))
-        for cell, geometry in zip(self.body.cells, self.body.geometry, strict=True):
+        for cell, geometry in zip(*self.body.part_elements(self.body.parts[0]), strict=True):
             dofs: Index = (3 * cell[:, None] + np.arange(3)).ravel()
             state = [x[dofs], v[dofs], w[dofs], geometry.T, theta[:laws]]
             columns = np.concatenate([dofs, size + dofs, 2 * size + np.arange(laws)])

@@ -121,3 +121,16 @@ def test_a_best_value_out_of_bounds_is_refused():
 def test_bounds_that_are_not_positive_or_without_the_best_value_are_refused(bounds):
     with pytest.raises(InputError, match="is not within its bounds"):
         compute_profile(Solver(parabola(0.1)), "mu_pa", (BEST, 50.0), bounds)
+
+
+def test_a_linear_parameter_may_be_negative():
+    asked = []
+
+    def loss(name, value):
+        asked.append(value)
+        return 50.0 + ((value + 2.0) / 0.5) ** 2
+
+    found = compute_profile(loss, "growth", (-2.0, 50.0), (-10.0, 10.0), 0.4, scale="linear")
+    reach = 0.5 * np.sqrt(THRESHOLD)
+    np.testing.assert_allclose(found.interval, [-2.0 - reach, -2.0 + reach], rtol=0.02)
+    assert len(asked) < 20

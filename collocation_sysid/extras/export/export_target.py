@@ -32,6 +32,7 @@ VISCOELASTICITY = (
     "viscoelastic memory is not supported; the exported stiffness is the long-term one, and the "
     "instantaneous one is {at_once:.4g} times that"
 )
+FIBRES = "fibres are not exported: the exported part is softer along them than the identified one"
 MOTION = (
     "grasped nodes are fixed at their positions of the first sample; the motion is in the CSV "
     "files of poses beside this file, and your simulation has to apply it"
@@ -153,6 +154,7 @@ class TargetCapabilities:
             damped = bool(region.gamma_r_s)
             templates = [
                 *[VISCOELASTICITY] * bool(region.branches),
+                *[FIBRES] * ("fibre_pa" in region.constants),
                 *[self.other_materials] * (region.material not in self.materials),
                 *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),

@@ -382,7 +382,7 @@ class IdentifiedBody:
                 IdentifiedRegion(
                     part.name or "body",
                     part.cells,
-                    part.material.name,
+                    part.material.matrix.name,
                     {c.name: values[c.name] for c in part.material.constants},
                     *lame[part.name],
                     young,

@@ -12,6 +12,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
+import numpy as np
+
 from ...common.checked_calls import checked
 from ...common.validated_types import Finite, Positive, Text
 from ...errors import InputError
@@ -283,6 +285,32 @@ CONTRAST = Constant(
     bounds=(0.02, 50.0),
     usual=1.0,
 )
+# Constants of fibres, see `fibres`.
+FIBRE_STIFFNESS = Constant(
+    "fibre_pa", "E_f", meaning="stiffness that fibres add along themselves", bounds=STIFFNESS
+)
+FIBRE_EXPONENT = Constant(
+    "fibre_exponent", "k_f", meaning="stiffening of stretched fibres", bounds=(1e-3, 1e3), usual=1.0
+)
+FIBRE_DISPERSION = Constant(
+    "fibre_dispersion",
+    "κ_f",
+    meaning="scatter of directions of fibres, 1/3 if isotropic",
+    bounds=(0.0, 0.333),
+    scale="linear",
+    typical=0.1,
+    usual=0.1,
+    at_least=0.0,
+    below=0.334,
+)
+FIBRE_ANGLE = Constant(
+    "fibre_angle_rad",
+    "β_f",
+    meaning="angle of fibres from their stated direction",
+    bounds=(-np.pi / 2, np.pi / 2),
+    scale="linear",
+    typical=0.1,
+)
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa", "E₀", meaning="instantaneous Young's modulus, before relaxation"
 )
@@ -313,6 +341,10 @@ KNOWN: Mapping[str, Constant] = {
         MASS,
         FRICTION,
         CONTRAST,
+        FIBRE_STIFFNESS,
+        FIBRE_EXPONENT,
+        FIBRE_DISPERSION,
+        FIBRE_ANGLE,
         INSTANTANEOUS,
     )
 }

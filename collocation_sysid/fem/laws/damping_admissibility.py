@@ -10,7 +10,7 @@ import numpy as np
 from ...common.files import reason
 from ...errors import InputError
 from .constants import DENSITY, GAMMA_M, MASS, Constant
-from .materials import DAMPINGS, DampingLaw, Material
+from .materials import DAMPINGS, DampingLaw, Material, damped_psi
 from .moduli import elastic_names
 
 # Largest relative difference of two stresses that counts as rounding of some thousand operations.
@@ -101,7 +101,7 @@ def viscous_stress(
         If a function of the law raises an error or its result has the wrong shape.
     """
     count = len(material.constants)
-    psi = material.psi(ca.reshape(F, 3, 3), theta[:count])
+    psi = damped_psi(damping, material, ca.reshape(F, 3, 3), theta)
     values = {constant.name: theta[count + k] for k, constant in enumerate(damping.constants)}
     stress = ca.SX(9, 1)
     if damping.potential is not None:

@@ -26,9 +26,10 @@ EXAMINED = tuple(material for name, material in MATERIALS.items() if name != "li
 
 def is_examined(material: Material) -> bool:
     """Return whether the criterion applies to a material: the built-in ones except linear
-    elasticity. Energies of users could be anisotropic.
+    elasticity. Energies of users could be anisotropic. Of a material with fibres the matrix alone
+    is examined.
     """
-    return material in EXAMINED
+    return material.matrix in EXAMINED
 
 
 def stability_margins(material: Material, constants: Array, stretches: Array) -> Array:
@@ -37,9 +38,9 @@ def stability_margins(material: Material, constants: Array, stretches: Array) ->
     Parameters
     ----------
     material : Material
-        Isotropic material, see `is_examined`.
+        Isotropic material, see `is_examined`, or one with fibres.
     constants : (c,)
-        Constants of the material.
+        Constants of the material; those of fibres are not used.
     stretches : (n, 3)
         Principal stretches.
 
@@ -50,8 +51,10 @@ def stability_margins(material: Material, constants: Array, stretches: Array) ->
     """
     if not len(stretches):
         return np.zeros(0)
-    hessian = _log_strain_hessian(material).map(len(stretches))
-    values = np.repeat(np.asarray(constants)[:, None], len(stretches), axis=1)
+    matrix = material.matrix
+    hessian = _log_strain_hessian(matrix).map(len(stretches))
+    own = np.asarray(constants)[: len(matrix.constants)]
+    values = np.repeat(own[:, None], len(stretches), axis=1)
     entries = hessian(np.log(stretches).T, values).full()
     matrices = entries.T.reshape(-1, 3, 3)
     margins = np.full(len(stretches), np.nan)

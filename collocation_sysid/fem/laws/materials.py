@@ -16,7 +16,8 @@ the latter is viscous in the rate of the Green strain. Rayleigh's law agrees wit
 strain, but it also damps the rotation of a stretched body, and adds energy where the stiffness is
 not positive definite.
 
-Mass-proportional damping γ_m is part of `body`, the evolution of Prony branches part of `memory`.
+Mass-proportional damping γ_m is part of `body`, the evolution of Prony branches part of `memory`,
+and fibres beside an isotropic material part of `fibres`.
 """
 
 from __future__ import annotations
@@ -105,6 +106,11 @@ class Material:
         )
         material._check_at_rest()
         return material
+
+    @property
+    def matrix(self) -> Material:
+        """Isotropic material that fibres reinforce; the material itself without any."""
+        return self
 
     def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
         """Return the energy density (1, 1) [J/m³] as an expression, from F (3, 3) and the constants
@@ -406,6 +412,14 @@ class DampingLaw:
                 f"the damping law {self.name!r} has neither a stress nor a potential; expected "
                 "stress=function or potential=function"
             )
+
+
+def damped_psi(damping: DampingLaw, material: Material, F: ca.SX, values: ca.SX) -> ca.SX:
+    """Return the energy density that a damping law gets, at F (3, 3), from the constants (c,) of the
+    material: without fibres for a stress, whose viscosities are those of the matrix.
+    """
+    viscous = material if damping.stress is None else material.matrix
+    return viscous.psi(F, values[: len(viscous.constants)])
 
 
 def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -319,7 +319,7 @@ class StressEvaluator:
         kernel = stress_kernel(name, body.element, law=body.law(number))
         points = body.geometry.shape[1]
         cells = np.repeat(body.cells[part.cells], points, axis=0)
-        geometry = body.geometry[part.cells].reshape(len(cells), 1, -1)
+        geometry = body.material_geometry(part).reshape(len(cells), 1, -1)
         point_columns = places.reshape(len(cells), 1, 6)
         if name.endswith("_slope"):
             # 3n for each of what the points carry, part after part.

@@ -72,8 +72,8 @@ def split_faces_in_four(faces: Index, mesh: TetMesh) -> Index:
 def refine_body(body: Body) -> Body:
     """Return the body on a mesh with half the element size, see `split_in_eight`.
 
-    Materials, stated and free densities, fields (not computed again), custom forces, the rest shape
-    and `has_declared_mass` are those of `body`; the total mass is the same. Frames of obstacles are
+    Materials, stated and free densities, fields (not computed again), fibres, custom forces, the rest
+    shape and `has_declared_mass` are those of `body`; the total mass is the same. Frames of obstacles are
     not copied.
     """
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
@@ -109,11 +109,18 @@ def refine_body(body: Body) -> Body:
     )
     finer.has_declared_mass = body.has_declared_mass
     finer = finer.with_free_densities([part.name for part in body.parts if part.has_free_density])
-    if not body.collect_field_lengths_m():
+    if not any(part.field or part.axes is not None for part in body.parts):
         return finer
-    fields = [part.field and part.field.split_in_eight() for part in body.parts]
-    parts = zip(finer.parts, fields, strict=True)
-    return finer.with_parts(tuple(replace(part, field=field) for part, field in parts))
+    return finer.with_parts(
+        tuple(
+            replace(
+                part,
+                field=source.field and source.field.split_in_eight(),
+                axes=None if source.axes is None else np.repeat(source.axes, 8, axis=0),
+            )
+            for part, source in zip(finer.parts, body.parts, strict=True)
+        )
+    )
 
 
 def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:

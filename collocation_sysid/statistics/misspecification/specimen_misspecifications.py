@@ -41,7 +41,7 @@ from ...recording.specimen import (
     STRESS_NAME,
     STRESS_UNIT,
     Specimen,
-    cell_body,
+    cell_of_other_test,
 )
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
@@ -384,10 +384,7 @@ def _of_another_kind(experiment: Experiment, test: str) -> Experiment | None:
     values = {gauge.name: gauge.measured_values[:, 0] for gauge in experiment.readings}
     body = experiment.body
     if bool(DEFORMATIONS[test].free) != bool(experiment.specimen.free):
-        (part,) = body.parts
-        body = cell_body(
-            test, part.material, prony=part.prony, damping=part.damping, made=body.made
-        )
+        body = cell_of_other_test(body, test)
     second_pa: Any = values.get(SECOND_STRESS_NAME)
     lateral: Any = values.get(LATERAL_NAME)
     try:

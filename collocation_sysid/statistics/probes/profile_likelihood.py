@@ -8,7 +8,7 @@ loss; where the loss never rises so far, the interval is open.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy.optimize import root_scalar
 from ...common.array_types import Array
 from ...common.step_counting import search_activity
 from ...errors import InputError, SimulationError
+from ...fem.laws.constants import Scale
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...model.parameters import Parameter
@@ -29,7 +30,7 @@ SolveFixed = Callable[[str, float], float]
 
 # Increase of the loss at the ends of a 95 % interval.
 THRESHOLD = float(chi2_isf(0.05, 1))
-# Relative precision of the ends, in the logarithm.
+# Precision of the ends, over their distance from the estimate.
 PRECISION = 0.02
 # Largest number of doublings of the first step.
 MOST_DOUBLINGS = 20
@@ -71,6 +72,7 @@ def compute_profile(
     bounds: tuple[float, float],
     deviation: float = 0.1,
     noise_scale: float = 1.0,
+    scale: Scale = "log",
 ) -> Profile:
     """Search the two values at which the loss has risen by the threshold.
 
@@ -84,12 +86,15 @@ def compute_profile(
     best : (value, loss)
         The optimum.
     bounds : (lower, upper)
-        Positive bounds of the parameter, which the search does not leave.
+        Bounds of the parameter, which the search does not leave; positive for the scale "log".
     deviation : float
-        Expected standard deviation of the logarithm: the first step is two of them.
+        Expected standard deviation of the logarithm, or of a linear parameter: the first step is
+        two of them.
     noise_scale : float
         Variance of the residuals in units of σ², by which the threshold grows: the reduced χ² if
         the noise is estimated, more if errors are correlated.
+    scale : {"log", "linear"}
+        Whether the search follows the logarithm of the parameter or its value.
 
     Returns
     -------
@@ -104,11 +109,13 @@ def compute_profile(
 
     Notes
     -----
-    Ends are found to `PRECISION` in the logarithm. A deviation that is not positive and finite
-    counts as 0.05. The optimum is not solved again.
+    Ends are found to `PRECISION` of their distance from the best value. A deviation that is not
+    positive and finite counts as 0.05 (of a linear parameter: of its value). The optimum is not
+    solved again.
     """
     value, loss = best
-    if not 0 < bounds[0] <= value <= bounds[1]:
+    is_log = scale == "log"
+    if not bounds[0] <= value <= bounds[1] or (is_log and bounds[0] <= 0):
         raise InputError(
             f"best value {value:g} of {parameter} is not within its bounds "
             f"[{bounds[0]:g}, {bounds[1]:g}]"
@@ -116,12 +123,15 @@ def compute_profile(
     losses_by_value = {value: loss}
     threshold = THRESHOLD * noise_scale
 
+    def moved(way: float) -> float:
+        return float(np.clip(value * np.exp(way) if is_log else value + way, *bounds))
+
     def rise(way: float) -> float:
         """Return √(rise of the loss over the threshold), at most √`HIGHEST`, less one; nearly
-        linear in `way`, the change of the logarithm of the parameter. Values within half of
+        linear in `way`, the change of the parameter on its scale. Values within half of
         `PRECISION` are zero.
         """
-        trial = float(np.clip(value * np.exp(way), *bounds))
+        trial = moved(way)
         if trial not in losses_by_value:
             try:
                 losses_by_value[trial] = solve_fixed(parameter, trial)
@@ -132,13 +142,11 @@ def compute_profile(
         )
         return above if abs(above) > PRECISION / 2 else 0.0
 
-    step = 2 * deviation if np.isfinite(deviation) and deviation > 0 else 0.1
-    lower, upper = (
-        None
-        if (way := _find_end(rise, side * step, bound=float(np.log(bound / value)))) is None
-        else float(value * np.exp(way))
-        for side, bound in zip((-1, 1), bounds, strict=True)
-    )
+    usual = 0.05 if is_log else 0.05 * abs(value) or 0.05
+    step = 2 * (deviation if np.isfinite(deviation) and deviation > 0 else usual)
+    reaches = [float(np.log(end / value) if is_log else end - value) for end in bounds]
+    ways = [_find_end(rise, step * side, end) for side, end in zip((-1, 1), reaches, strict=True)]
+    lower, upper = (None if way is None else moved(way) for way in ways)
     values = np.array(sorted(losses_by_value))
     losses = np.array([losses_by_value[at] for at in values.tolist()])
     message = _message(parameter, (lower, upper), bounds=bounds)
@@ -159,8 +167,8 @@ def compute_profile(
 
 
 def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
-    """Return the change of the logarithm of the parameter at which the loss has risen enough, on
-    the side to which `step` points; None if it has not at the bound, or after `MOST_DOUBLINGS`
+    """Return the change of the parameter on its scale at which the loss has risen enough, on the
+    side to which `step` points; None if it has not at the bound, or after `MOST_DOUBLINGS`
     doublings of the step.
     """
     inside = 0.0
@@ -233,22 +241,41 @@ def profile_of_solution(
     k = free.index(name)
     variance = float(uncertainty.covariance[k, k])
     item = parameters.free[k]
+    value = solution.parameters[name]
+    is_log = item.scale == "log"
 
+    changes = _conditional_changes(fit, free, k)
     numbers = itertools.count(1)
+    fits = [solution]
 
-    def solve_fixed(_: str, value: float) -> float:
-        """Return the loss with the parameter fixed at a value; the name is not used."""
+    def solve_fixed(_: str, trial: float) -> float:
+        """Return the loss with the parameter fixed at a value; the name is not used. The refit
+        starts where the linearised fit expects the others, from the nearest refit so far.
+        """
         activity = f"profile likelihood of {name}, value {next(numbers)}"
+        at = item.to_coordinate(trial)
+        nearest = min(fits, key=lambda each: abs(item.to_coordinate(each.parameters[name]) - at))
+        start = dict(nearest.parameters)
+        distance = at - item.to_coordinate(start[name])
+        for other, change in zip(parameters.free, changes, strict=True):
+            if other.name in start and np.isfinite(change):
+                moved = other.to_coordinate(start[other.name]) + change * distance
+                start[other.name] = other.from_coordinate(moved)
         with search_activity(activity):
-            return _loss_with_fixed(solution, item, value=value)
+            refit = _refit_with_fixed(solution, item, value=trial, start=start)
+        if not refit.status.converged:
+            return float("inf")
+        fits.append(refit)
+        return _loss_of(refit) + _prior_loss(item, trial)
 
     return compute_profile(
         solve_fixed,
         name,
-        best=(solution.parameters[name], _loss_of(solution)),
+        best=(value, _loss_of(solution)),
         bounds=(item.lower, item.upper),
-        deviation=float(np.sqrt(variance)),
+        deviation=float(np.sqrt(variance)) * (1.0 if is_log else abs(value)),
         noise_scale=_noise_scale(solution, fit, uncertainty=uncertainty, k=k),
+        scale=item.scale,
     )
 
 
@@ -259,22 +286,32 @@ def _loss_of(solution: Solution) -> float:
     return solution.collocation.objective(solution.z) / solution.collocation.loss_scale
 
 
-def _loss_with_fixed(solution: Solution, item: Parameter, value: float) -> float:
-    """Return the smallest loss, with all priors, with one parameter fixed at a value, searched from
-    the answer by reduced space; infinite if the solve does not converge.
+def _conditional_changes(fit: LinearisedFit, free: Sequence[str], k: int) -> Array:
+    """Return the change (nq,) of the coordinate of each free parameter with that of the parameter
+    with index k, all others fitted; NaN where the fit does not determine it.
+    """
+    covariance = least_squares_of_fit(fit).covariance()[: len(free), k]
+    return covariance / covariance[k]
+
+
+def _refit_with_fixed(
+    solution: Solution, item: Parameter, value: float, start: Mapping[str, float]
+) -> Solution:
+    """Return the fit by reduced space with one parameter fixed at a value, from given values of the
+    others. Short parts of the recording are not fitted before: they would leave the minimum.
     """
     before = solution.collocation
-    started = before.parameters.with_estimates(solution.parameters)
-    fixed = started.with_fixed({item.name: value})
-    refit = ReducedSpace()(replace(before, parameters=fixed)).unless_interrupted()
-    if not refit.status.converged:
-        return float("inf")
-    prior = 0.0
-    if item.prior is not None:
-        mean, deviation = item.prior
-        deviation_from_prior = np.log(value / mean) if item.scale == "log" else value - mean
-        prior = (deviation_from_prior / deviation) ** 2
-    return _loss_of(refit) + float(prior)
+    fixed = before.parameters.with_estimates(start).with_fixed({item.name: value})
+    return ReducedSpace(ladder=(1.0,))(replace(before, parameters=fixed)).unless_interrupted()
+
+
+def _prior_loss(item: Parameter, value: float) -> float:
+    """Return the loss of the prior of a parameter at a value; 0 without a prior."""
+    if item.prior is None:
+        return 0.0
+    mean, deviation = item.prior
+    departure = np.log(value / mean) if item.scale == "log" else value - mean
+    return float((departure / deviation) ** 2)
 
 
 def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
