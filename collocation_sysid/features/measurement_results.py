@@ -63,7 +63,8 @@ class PredictionErrors:
         for reading, rms in (self.reading_rms or {}).items():
             texts.append(f"{reading} {quantity(rms, (units or {}).get(reading, ''))} RMS")
         for camera, distances in (self.depth or {}).items():
-            texts.append(f"depth of {camera} {distances.text}")
+            whose = "" if camera == "depth" else f" of {camera}"  # which has no name of its own
+            texts.append(f"depth{whose} {distances.text}")
         return "; ".join(texts)
 
 

@@ -234,6 +234,8 @@ def _fit(result: Result) -> Iterator[Shown]:
         errors = _fit_errors(replace(fitted[name], samples=0))
         own = [errors] if errors else []
         prediction = _simulation_text(simulated[name])
+        if errors == prediction:  # as of equilibria
+            prediction = "the same"
         yield f"fit: {', '.join([*quality, *own])}; forward simulation: {prediction}"
         return
     if quality:
