@@ -468,28 +468,89 @@ def test_both_solvers_find_the_same_motion(free):
 # Uncertainty --------------------------------------------------------------------------------------
 
 
-def test_the_band_is_the_spread_of_points_over_draws_of_the_constants():
-    body = PlannedBody.read(hung_bar())
-    covariance = np.diag([0.02, 0.01, 0.1, 0.1]) ** 2
+def known_plan(deviations, **changes) -> MotionPlan:
+    """The plan of the bar, with stated standard deviations of the four logarithms."""
+    covariance = np.diag(deviations) ** 2
+    body = replace(PlannedBody.read(hung_bar()), covariance=covariance, **changes)
     plan = bar_plan()
-    known = replace(plan, program=replace(plan.program, body=replace(body, covariance=covariance)))
-    planned = known.program
+    return replace(plan, program=replace(plan.program, body=body))
+
+
+def drawn_tips(plan: MotionPlan, count: int) -> np.ndarray:
+    """Positions (count, T, 3) of the tip with random truths around the constants of a plan."""
+    planned = plan.program
     at_tip = planned.point_weights("tip").toarray()
-    drive = planned.drive(plan.answer.c)
     rng = np.random.default_rng(0)
-    draws = [
-        (replace(planned.driven, q=planned.driven.q + np.sqrt(np.diag(covariance)) * rng.normal(size=4))
-         .simulate(drive)[planned.sample_rows] @ at_tip.T)
-        for _ in range(60)
-    ]  # fmt: skip
-    spread = np.std(draws, axis=0)
-    predicted = known.constants_std_m["tip"]
+    draws = rng.multivariate_normal(planned.driven.q, plan.covariance, size=count)
+    drive = planned.drive(plan.answer.c)
+    return np.array(
+        [
+            replace(planned.driven, q=q).simulate(drive)[planned.sample_rows] @ at_tip.T
+            for q in draws
+        ]
+    )
+
+
+@pytest.mark.long
+def test_the_band_contains_the_tip_of_random_truths():
+    plan = known_plan([0.02, 0.01, 0.1, 0.1])
+    tips = drawn_tips(plan, 100)
+    predicted = plan.constants_std_m["tip"]
     peak = predicted[:, 0].argmax()
-    assert spread[peak, 0] == pytest.approx(predicted[peak, 0], rel=0.25)
-    name, share = known.limiting_constant
+    assert np.std(tips, axis=0)[peak, 0] == pytest.approx(predicted[peak, 0], rel=0.25)
+    nominal = plan.answer.x[plan.program.sample_rows] @ plan.program.point_weights("tip").T
+    inside = np.abs(tips - nominal) <= plan.half_widths_m["tip"]
+    moving = predicted > 1e-7
+    assert 0.9 < inside[:, moving].mean() < 0.99
+    name, share = plan.limiting_constant
     assert name == "young_pa"
     assert 0.5 < share <= 1.0
-    assert known.tracking_error(planned.references[0]).band_m > 0
+    assert plan.tracking_error(plan.program.references[0]).band_m > 0
+
+
+def test_errors_of_the_description_widen_the_band():
+    deviations = [0.02, 0.01, 0.1, 0.1]
+    half = known_plan(deviations).half_widths_m["tip"]
+    wider = known_plan(deviations, description_std_m=5e-4).half_widths_m["tip"]
+    assert wider == pytest.approx(np.hypot(half, 1.96 * 5e-4), rel=1e-4)
+
+
+def test_a_recording_of_the_plan_narrows_the_statistical_part_of_the_band():
+    deviations = np.array([0.05, 0.02, 0.3, 0.3])
+    places = {"marker_places_m": {"tip": np.array([0.01, 0.01, 0.0])}}
+    known = known_plan(deviations, statistical_covariance=np.diag(deviations**2), **places)
+    systematic = known_plan(deviations, statistical_covariance=np.zeros((4, 4)), **places)
+    before = known.half_widths_m["tip"].max()
+    assert systematic.half_width_after_recording_m == pytest.approx(before)
+    assert known.half_width_after_recording_m < 0.7 * before
+    # The information is that of the tip's coordinates with the noise of the recording.
+    by_q = known.contributions_m["tip"].reshape(-1, 4)
+    covariance = np.linalg.inv(np.diag(deviations**-2) + by_q.T @ by_q / 1e-3**2)
+    variance = np.einsum("tq,qr,tr->t", by_q, covariance, by_q).max()
+    assert known.half_width_after_recording_m == pytest.approx(1.96 * np.sqrt(variance), rel=1e-3)
+
+
+def test_a_robust_plan_is_better_on_average_over_the_constants():
+    plan = known_plan([0.15, 1e-5, 0.3, 1e-5])
+    planned = plan.program
+    scenarios = planned.scenarios()
+    assert len(scenarios) == 4
+    mean = np.mean([each.driven.q for each in scenarios], axis=0)
+    spread = np.mean([np.outer(*[each.driven.q - mean] * 2) for each in scenarios], axis=0)
+    assert spread[::2, ::2] == pytest.approx(plan.covariance[::2, ::2], abs=1e-9)
+    answer = solve_reduced(planned, scenarios=scenarios)
+
+    def average(c, programs):
+        return np.mean([each.objective(c, each.simulate(c)) for each in programs])
+
+    assert answer.history[-1] == pytest.approx(average(answer.c, scenarios))
+    rng = np.random.default_rng(1)
+    draws = rng.multivariate_normal(planned.driven.q, plan.covariance, size=10)
+    drawn = [replace(planned, driven=replace(planned.driven, q=q)) for q in draws]
+    for programs in (scenarios, drawn):
+        assert average(answer.c, programs) < 0.99 * average(plan.answer.c, programs)
+    with pytest.raises(InputError, match="a robust plan needs a run"):
+        plan_motion(hung_bar(), task(), LIMITS, robust=True)
 
 
 def test_without_a_run_the_uncertainty_is_unknown():

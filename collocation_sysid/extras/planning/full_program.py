@@ -339,11 +339,4 @@ def solve_full(
     multipliers = found["lam_g"].full().ravel()[full.motion_count :]
     multipliers[full.vector_count :] /= 2
     history = [float(value) for value in solver.stats()["iterations"]["obj"]]
-    return PlanAnswer(
-        c,
-        x,
-        program.driven.respond(program.drive(c), x),
-        multipliers,
-        "converged",
-        [*start.history, *history],
-    )
+    return PlanAnswer(c, x, multipliers, "converged", [*start.history, *history])

@@ -53,8 +53,8 @@ class TrackingError:
     rms_m, largest_m : float
         Root mean square and largest distance from the reference [m]; NaN if only velocities count.
     band_m : float or None
-        Largest half width of the 95 % band of a coordinate due to the uncertainty of the constants
-        [m]; None if that is not known.
+        Largest half width of the 95 % band of a coordinate [m], see `MotionPlan.half_widths_m`; None
+        if that is not known.
     expected_rms_m : float or None
         Root mean square distance that is expected with this uncertainty [m].
     """
@@ -173,6 +173,17 @@ class MotionPlan:
             for name, by_q in contributions.items()
         }  # fmt: skip
 
+    @cached_property
+    def half_widths_m(self) -> dict[str, Array] | None:
+        """Half width (T, 3) of the 95 % band of each point [m], by name: of the constants and of
+        errors of the description; None if these are not known.
+        """
+        std = self.constants_std_m
+        other = self.program.body.description_std_m
+        return None if std is None else {
+            name: NORMAL_95 * np.sqrt(each**2 + other**2) for name, each in std.items()
+        }  # fmt: skip
+
     @property
     def covariance(self) -> Array:
         """Combined covariance (nq, nq) of the parameters in the solver's coordinates."""
@@ -188,12 +199,46 @@ class MotionPlan:
         program = self.program
         if program.body.covariance is None:
             return None
-        by_q = program.driven.respond_to_parameters(program.drive(self.answer.c), self.answer.x)
-        sampled = by_q[program.sample_rows]
         return {
-            name: np.einsum("ij,tjq->tiq", program.point_weights(name).toarray(), sampled)
+            name: np.einsum("ij,tjq->tiq", program.point_weights(name).toarray(), self._by_q)
             for name in program.experiment.markers.names
         }
+
+    @cached_property
+    def _by_q(self) -> Array:
+        """Derivatives (T, 3n, nq) of the motion at the samples by the parameters [m]."""
+        program = self.program
+        by_q = program.driven.respond_to_parameters(program.drive(self.answer.c), self.answer.x)
+        return by_q[program.sample_rows]
+
+    @cached_property
+    def half_width_after_recording_m(self) -> float | None:
+        """Largest half width of the 95 % band of a coordinate that would remain if this motion were
+        executed, recorded with the same markers, and included in the identification [m]; None if
+        that is not known. Systematic effects remain.
+        """
+        body, contributions = self.program.body, self.contributions_m
+        places = {
+            name: place for name, place in body.marker_places_m.items() if np.isfinite(place).all()
+        }
+        statistical = body.statistical_covariance
+        if contributions is None or statistical is None or not places:
+            return None
+        markers = body.experiment(None, self.program.experiment.t_s, places).markers
+        weights = np.zeros((len(places), len(self.program.experiment.body.nodes_m)))
+        placement = markers.placement
+        for row, nodes, shares in zip(weights, placement.nodes, placement.weights, strict=True):
+            row[nodes] = shares
+        by_node = self._by_q.reshape(len(self.t_s), -1, 3, len(statistical))
+        rows = np.einsum("mn,tnaq->tmaq", weights, by_node).reshape(-1, len(statistical))
+        information = rows.T @ rows / float(np.median(body.template.markers.sigma_m)) ** 2
+        reduced = statistical @ np.linalg.inv(np.eye(len(statistical)) + information @ statistical)
+        remaining = self.covariance - statistical + reduced
+        variance = body.description_std_m**2
+        return NORMAL_95 * max(
+            float(np.sqrt(variance + np.einsum("tiq,qr,tir->ti", each, remaining, each).max()))
+            for each in contributions.values()
+        )
 
     @cached_property
     def limiting_constant(self) -> tuple[str, float] | None:
@@ -223,15 +268,16 @@ class MotionPlan:
         at = counted.any(axis=1)
         distance = np.linalg.norm(deviation[at], axis=1)
         rms = float(np.sqrt(np.mean(distance**2)))
-        std = self.constants_std_m
-        if std is None:
+        half_widths = self.half_widths_m
+        if half_widths is None:
             return TrackingError(rms, float(distance.max()), None, None)
-        spread = np.where(counted, std[reference.name], 0.0)[at]
+        half = np.where(counted, half_widths[reference.name], 0.0)[at]
+        variance = np.sum((half / NORMAL_95) ** 2, axis=1)
         return TrackingError(
             rms,
             float(distance.max()),
-            NORMAL_95 * float(spread.max()),
-            float(np.sqrt(np.mean(distance**2 + np.sum(spread**2, axis=1)))),
+            float(half.max()),
+            float(np.sqrt(np.mean(distance**2 + variance))),
         )
 
     @cached_property
@@ -288,6 +334,7 @@ def plan_motion(
     allow_code: bool = False,
     pose_limits: PoseLimit | None = None,
     solver: Solver = "reduced-space",
+    robust: bool = False,
     tolerances: ReducedTolerances | None = None,
     watch: Watch | None = None,
     say: Callable[[str], None] = lambda _: None,
@@ -316,6 +363,8 @@ def plan_motion(
     solver : {"reduced-space", "interior-point"}
         Gauss–Newton steps in the space of the hand's unknowns, or IPOPT after these, with the
         positions of all nodes as variables.
+    robust : bool
+        Whether the objective is its mean over the uncertainty of the constants; a run is needed.
     tolerances : ReducedTolerances, optional
         Tolerances of the search in the reduced space.
     watch : callable, optional
@@ -337,6 +386,12 @@ def plan_motion(
         task = Task.read(task)
     if not isinstance(limits, Limits):
         limits = Limits.read(limits)
+    if robust and (body.covariance is None or solver != "reduced-space"):
+        raise InputError(
+            "a robust plan needs a run with uncertainties, and the solver reduced-space",
+            None,
+            where="--robust",
+        )
     began_s = time.perf_counter()
 
     def solve(duration_s: float) -> Trial:
@@ -344,7 +399,10 @@ def plan_motion(
         say(f"searching for a motion of {duration_s:.3g} s")
         of_duration = task if duration_s == task.duration_s else task.stretched(duration_s)
         program = PlannedProgram.from_task(body, of_duration, limits, pose_limits)
-        answer = solve_reduced(program, tolerances=tolerances, watch=watch)
+        scenarios = program.scenarios() if robust else ()
+        answer = solve_reduced(program, scenarios=scenarios, tolerances=tolerances, watch=watch)
+        if robust:
+            answer.x = program.simulate(answer.c)
         if solver == "interior-point" and answer.status != "interrupted":
             say("improving the motion by IPOPT")
             answer = solve_full(program, answer, watch=watch)

@@ -146,6 +146,8 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
         "lowest_frequency_hz": program.lowest_hz if np.isfinite(program.lowest_hz) else None,
         "residual_vibration_m": plan.residual_vibration_m,
         "time_step_error_m": plan.time_step_error_m,
+        "description_std_m": program.body.description_std_m,
+        "half_width_after_recording_m": plan.half_width_after_recording_m,
         "limiting_constant": None
         if limiting is None
         else {"name": limiting[0], "share": limiting[1]},
@@ -225,8 +227,13 @@ def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
         shown.append(f"residual vibration: {1e3 * plan.residual_vibration_m:.3g} mm")
     if (limiting := plan.limiting_constant) is not None:
         shown.append(
-            f"the uncertainty of {symbol_of(limiting[0])} limits the plan "
-            f"({100 * limiting[1]:.0f} % of the variance)"
+            f"the uncertainty of {symbol_of(limiting[0])} contributes most to the band "
+            f"({100 * limiting[1]:.0f} % of the constants' variance)"
+        )
+    if plan.half_width_after_recording_m is not None:
+        shown.append(
+            "if this motion is recorded with the same markers, and identified from too, the band "
+            f"becomes ± {1e3 * plan.half_width_after_recording_m:.3g} mm"
         )
     shown.append(f"time steps change the points by {1e3 * plan.time_step_error_m:.2g} mm")
     shown += _limit_lines(plan)

@@ -14,7 +14,6 @@ from ...result.figure_style import (
     own_settings,
     style_axes,
 )
-from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.design_page import motion_picture_of
 from .motion_plan import MotionPlan
 
@@ -37,7 +36,7 @@ def tracking_picture(plan: MotionPlan) -> Figure:
     references = [each for each in plan.program.references if np.isfinite(each.position_m).any()]
     figure = new_figure(PAGE_MM, 15 + 45 * len(references))
     panels = figure.subplots(len(references), 1, sharex=True, squeeze=False)[:, 0]
-    std = plan.constants_std_m
+    half_widths = plan.half_widths_m
     for panel, reference in zip(panels, references, strict=True):
         points = plan.points_m[reference.name]
         for axis, colour in zip(range(3), COLOUR_CYCLE, strict=False):
@@ -45,8 +44,8 @@ def tracking_picture(plan: MotionPlan) -> Figure:
             panel.plot(plan.t_s, middle, color=colour, lw=LINE_PT, label="xyz"[axis])
             wanted = 1e3 * (reference.position_m[:, axis] - points[0, axis])
             panel.plot(plan.t_s, wanted, color=colour, lw=LINE_PT, ls="--")
-            if std is not None:
-                half = 1e3 * NORMAL_95 * std[reference.name][:, axis]
+            if half_widths is not None:
+                half = 1e3 * half_widths[reference.name][:, axis]
                 panel.fill_between(
                     plan.t_s, middle - half, middle + half, color=colour, alpha=0.2, lw=0
                 )

@@ -36,8 +36,13 @@ class PlannedBody:
         Parameters in the solver's coordinates.
     covariance : (nq, nq) array or None
         Combined covariance of q; None if it is not known.
+    statistical_covariance : (nq, nq) array or None
+        Its part due to noise, which further recordings reduce.
     marker_places_m : dict of name to (3,) array
         Places of the markers on the undeformed body [m]; NaN where a place is not known.
+    description_std_m : float
+        Standard deviation of a coordinate of a point by errors of the description [m]: by how much
+        the residuals of the markers in the fit exceed their noise.
     warnings : tuple of str
         Reasons not to rely on the constants without care.
     run : Path or None
@@ -48,7 +53,9 @@ class PlannedBody:
     template: Experiment
     q: Array
     covariance: Array | None
+    statistical_covariance: Array | None
     marker_places_m: dict[str, Array]
+    description_std_m: float = 0.0
     warnings: tuple[str, ...] = ()
     run: Path | None = None
 
@@ -100,7 +107,7 @@ class PlannedBody:
         )
         template = _select(problem, problem.experiments, experiment)
         places = _stated_places(template)
-        return cls(problem, template, problem.parameters.guess_q, None, places)
+        return cls(problem, template, problem.parameters.guess_q, None, None, places)
 
     @classmethod
     def _from_solved(cls, run: SolvedProblem, experiment: str | None) -> PlannedBody:
@@ -117,8 +124,9 @@ class PlannedBody:
             problem,
             part.transcription.corrected_experiment(part.phi),
             problem.parameters.guess_q,
-            _combined_covariance(result, problem),
+            *_covariances(result, problem),
             places,
+            _description_std_m(result),
             warnings=_warnings(result),
         )
 
@@ -143,14 +151,15 @@ class PlannedBody:
         phi = answer.apply_to_nuisance(collocation)[0][transcription.nuisance_indices.indices]
         places = dict(zip(chosen.markers.names, transcription.marker_places_m(phi), strict=True))
         with damaged_run_refused(folder):
-            covariance = _combined_covariance(result, problem)
+            covariances = _covariances(result, problem)
             warnings = _warnings(result)
         return cls(
             problem,
             transcription.corrected_experiment(phi),
             problem.parameters.guess_q,
-            covariance,
+            *covariances,
             places,
+            _description_std_m(result),
             warnings=warnings,
             run=folder,
         )
@@ -289,18 +298,26 @@ def _stated_places(experiment: Experiment) -> dict[str, Array]:
     return dict(zip(markers.names, placed, strict=True))
 
 
-def _combined_covariance(result: Result, problem: Problem) -> Array | None:
-    """Return the combined covariance (nq, nq) of q, zero for coefficients of fields."""
+def _covariances(result: Result, problem: Problem) -> tuple[Array, Array] | tuple[None, None]:
+    """Return the combined and the statistical covariance (nq, nq) of q, zero for coefficients of
+    fields; the statistical one twice if systematic effects were not evaluated, None without any.
+    """
     uncertainty = result.uncertainty
     if uncertainty is None:
-        return None
-    known = uncertainty.combined_covariance
-    matrix = np.asarray(uncertainty.covariance if known is None else known, dtype=np.float64)
+        return None, None
     names = [item.name for item in problem.parameters.free]
-    places = [names.index(name) for name in uncertainty.names]
-    covariance = np.zeros((len(names),) * 2)
-    covariance[np.ix_(places, places)] = matrix
-    return covariance
+    places = np.ix_(*[[names.index(name) for name in uncertainty.names]] * 2)
+    known = uncertainty.combined_covariance
+    combined, statistical = np.zeros((2, len(names), len(names)))
+    statistical[places] = uncertainty.covariance
+    combined[places] = uncertainty.covariance if known is None else known
+    return combined, statistical
+
+
+def _description_std_m(result: Result) -> float:
+    """Return the standard deviation of a coordinate by which residuals exceed their noise [m]."""
+    excess = result.fit.rms_m**2 - result.fit.noise_rms_m**2
+    return float(np.sqrt(max(0.0, excess) / 3))
 
 
 def _warnings(result: Result) -> tuple[str, ...]:

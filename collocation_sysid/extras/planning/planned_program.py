@@ -28,6 +28,7 @@ from ...common.time_dependence import at_times
 from ...errors import InputError
 from ...model.parameters import ThetaMap
 from ...program.driven_motion import Drive, DrivenMotion
+from ...program.forward.initial_equilibrium import equilibrium
 from ...program.modes.natural_modes import natural_modes
 from ...recording import Experiment, PoseSequence
 from ..design.hand_limits import HandBounds, Limits
@@ -42,6 +43,8 @@ FEWEST_AT_REST = 4
 # Jerk in units of the limit of the acceleration over the duration: that of a motion which changes
 # between the limits in a tenth of its duration.
 JERK_UNIT = 10.0
+# Least variance in a direction of the parameters that scenarios vary, over the largest.
+SMALLEST_VARIANCE = 1e-8
 # Poses per sample that the simulation of a plan interpolates.
 POSES_PER_SAMPLE = 4
 
@@ -262,6 +265,29 @@ class PlannedProgram:
         """
         task = self.task.stretched(duration_s)
         return replace(self, task=task, space=_space(task, self.bounds))
+
+    def scenarios(self) -> tuple[PlannedProgram, ...]:
+        """Return programs whose parameters are at 2k points around those of this program, so that
+        means over these points equal means over the distribution of the parameters to second order
+        (k is the rank of the combined covariance).
+
+        Raises
+        ------
+        SimulationError
+            If the body has no equilibrium with some of these parameters.
+        """
+        covariance = self.body.covariance
+        assert covariance is not None
+        variances, directions = np.linalg.eigh(covariance)
+        chosen = np.flatnonzero(variances > SMALLEST_VARIANCE * variances.max(initial=0.0))
+        steps = directions[:, chosen] * np.sqrt(len(chosen) * variances[chosen])
+        constants = ThetaMap(self.driven.transcription.parameters, self.experiment.body)
+        found = []
+        for step in np.concatenate([steps.T, -steps.T]):
+            driven = replace(self.driven, q=self.driven.q + step)
+            start = equilibrium(self.experiment, constants.theta(driven.q), start=self.start)
+            found.append(replace(self, driven=driven, start=start))
+        return tuple(found)
 
     # The hand -------------------------------------------------------------------------------------
 

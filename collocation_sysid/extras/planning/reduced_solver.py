@@ -9,7 +9,7 @@ Every iterate respects all limits. A step counts only if the simulated motion is
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -73,8 +73,6 @@ class PlanAnswer:
         Unknowns.
     x : (N, 3n) array
         Motion [m].
-    derivatives : (N, 3n, c) array
-        Derivatives of the motion by the unknowns.
     multipliers : (k,) array
         Multipliers of the limits.
     status : {"converged", "flat", "iteration limit", "interrupted", "stalled"}
@@ -86,7 +84,6 @@ class PlanAnswer:
 
     c: Array
     x: Array
-    derivatives: Array
     multipliers: Array
     status: str
     history: list[float] = field(default_factory=list)
@@ -182,6 +179,7 @@ def smoothest_motion(program: PlannedProgram) -> Array:
 def solve_reduced(
     program: PlannedProgram,
     start: Array | None = None,
+    scenarios: Sequence[PlannedProgram] = (),
     tolerances: ReducedTolerances | None = None,
     watch: Watch | None = None,
 ) -> PlanAnswer:
@@ -193,6 +191,8 @@ def solve_reduced(
         The problem.
     start : (c,) array, optional
         Initial unknowns within the limits; those of the smoothest motion by default.
+    scenarios : sequence of PlannedProgram
+        Programs with other parameters: the objective is the mean of theirs.
     tolerances : ReducedTolerances, optional
         Tolerances of the search.
     watch : callable, optional
@@ -207,22 +207,25 @@ def solve_reduced(
     """
     limits = tolerances or ReducedTolerances()
     c = smoothest_motion(program) if start is None else start
-    x = program.simulate(c)
+    programs = scenarios or (program,)
+    motions = [each.simulate(c) for each in programs]
     matrix, target = program.residuals
     by_jerk, jerk = program.effort
-    value = program.objective(c, x)
-    derivatives = np.zeros((*x.shape, len(c)))
+    value = _mean_objective(programs, c, motions)
     multipliers = np.zeros(len(program.hand_limits.names))
-    answer = PlanAnswer(c, x, derivatives, multipliers, "iteration limit", [value])
+    answer = PlanAnswer(c, motions[0], multipliers, "iteration limit", [value])
     damping, failures = 0.0, 0
     try:
         while len(answer.history) <= limits.iterations:
             if watch is not None:
                 watch(len(answer.history) - 1, value)
-            derivatives = program.driven.respond(program.drive(c), x)
-            answer.derivatives = derivatives
-            rows = np.vstack([matrix @ derivatives.reshape(x.size, len(c)), by_jerk])
-            residual = np.concatenate([matrix @ x.ravel() - target, by_jerk @ c + jerk])
+            drive = program.drive(c)
+            slopes = [p.driven.respond(drive, x) for p, x in zip(programs, motions, strict=True)]
+            share = 1 / np.sqrt(len(programs))
+            rows = np.vstack([*(share * (matrix @ s.reshape(-1, len(c))) for s in slopes), by_jerk])
+            residual = np.concatenate(
+                [*(share * (matrix @ x.ravel() - target) for x in motions), by_jerk @ c + jerk]
+            )
             undamped, present = triangular(rows, residual)
             near = program.hand_limits.linearise(c)
             while True:
@@ -243,11 +246,14 @@ def solve_reduced(
                     answer.status = "converged" if damping < 1e-3 else "stalled"
                     if damping < 1e-3:
                         return answer
-                moved, decrease = x, -np.inf
+                moved, decrease = motions, -np.inf
                 if program.hand_limits.shares(trial).max() <= LARGEST_SHARE:
                     with suppress(SimulationError):
-                        moved = program.simulate(trial, near=x + derivatives @ step)
-                        decrease = value - program.objective(trial, moved)
+                        moved = [
+                            p.simulate(trial, near=x + by_c @ step)
+                            for p, x, by_c in zip(programs, motions, slopes, strict=True)
+                        ]
+                        decrease = value - _mean_objective(programs, trial, moved)
                 if decrease > 1e-4 * predicted:
                     break
                 failures += 1
@@ -259,17 +265,20 @@ def solve_reduced(
             damping = damping / 5 if ratio > 0.5 else damping
             damping = 0.0 if damping < 1e-6 else damping
             failures = 0
-            c, x, value = trial, moved, value - decrease
-            answer.c, answer.x, answer.multipliers = c, x, trial_multipliers
+            c, motions, value = trial, moved, value - decrease
+            answer.c, answer.x, answer.multipliers = c, motions[0], trial_multipliers
             answer.history.append(value)
             past = answer.history[-4:]
             if len(past) == 4 and past[0] - value < limits.progress * past[0]:
                 answer.status = "flat"
                 break
-        answer.derivatives = program.driven.respond(program.drive(c), x)
     except np.linalg.LinAlgError:  # the best plan remains
         answer.status = "stalled"
     except KeyboardInterrupt:
         answer.status = "interrupted"
-        answer.derivatives = program.driven.respond(program.drive(answer.c), answer.x)
     return answer
+
+
+def _mean_objective(programs: Sequence[PlannedProgram], c: Array, motions: list[Array]) -> float:
+    values = [each.objective(c, x) for each, x in zip(programs, motions, strict=True)]
+    return sum(values) / len(values)
