@@ -268,7 +268,7 @@ def bench_tables(
             )
     measured = iter(loads)
     for declared, grasp in moved:
-        if (sensed := declared.sensor) is not None and grasp.has_sensor():
-            at_s = grasp.list_load_times_s()
+        if (sensed := declared.sensor) is not None and grasp.wrench is not None:
+            at_s = grasp.wrench.t_s
             add_loads(table_of(sensed, at_s), sensed, at_s=at_s, loads=next(measured))
     return tables

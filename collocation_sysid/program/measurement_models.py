@@ -7,7 +7,7 @@ from ..recording.depth_camera import Depth
 from ..recording.experiment import Experiment
 from ..recording.markers import Markers
 from ..recording.measured_wrench import Wrench
-from ..recording.measurement import Measurement, sensor_fields
+from ..recording.measurement import Measurement
 from .association import Association
 from .custom_sensor_residual import CustomSensorModel
 from .depth.depth_model import DepthModel
@@ -36,8 +36,7 @@ def measurement_models(grid: MotionGrid) -> tuple[MeasurementModel, ...]:
     experiment, in the order of `Experiment.measurements`.
     """
     experiment = grid.experiment
-    groups = [(experiment.markers,), experiment.wrenches]
-    groups += [getattr(experiment, name) for name in sensor_fields(Experiment)]
+    groups = [(experiment.markers,), experiment.wrenches, experiment.readings, experiment.depths]
     return tuple(
         model_of(each)(each, number, grid) for group in groups for number, each in enumerate(group)
     )

@@ -403,22 +403,34 @@ def _with_steps(
     )
 
 
+def _with_values(
+    experiment: Experiment, kind: type[Measurement], values: Sequence[Any]
+) -> Experiment:
+    """Return the experiment with other numbers of its measurements of one kind, in their order."""
+    is_kind = [isinstance(each, kind) for each in experiment.measurements]
+    if len(values) != sum(is_kind):
+        names = ", ".join(each.title for each in experiment.measurements if isinstance(each, kind))
+        raise InputError(
+            f"the values of the {kind.measurement_text} are {len(values)} arrays; expected a list "
+            f"with one array for each sensor: {names or 'none'}"
+        )
+    others = iter(values)
+    return experiment.with_measurements(
+        each.with_samples(each.sample_times_s, next(others)) if has_other else each
+        for each, has_other in zip(experiment.measurements, is_kind, strict=True)
+    )
+
+
 def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
     """Return the experiment with other samples (S, 6) [N, N m] of its force–torque sensors, one
     array for each grasp that has one, in the order of the grasps.
 
     Raises
     ------
-    ValueError
+    InputError
         If the number of arrays is not that of the sensors.
     """
-    instrumented = [k for k, g in enumerate(experiment.grasps) if g.wrench is not None]
-    grasps = [*experiment.grasps]
-    for k, values in zip(instrumented, wrenches, strict=True):
-        sensor = grasps[k].wrench
-        assert sensor is not None
-        grasps[k] = replace(grasps[k], wrench=replace(sensor, values=values))
-    return replace(experiment, grasps=grasps)
+    return _with_values(experiment, Wrench, wrenches)
 
 
 def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experiment:
@@ -430,15 +442,7 @@ def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experi
     InputError
         If the number of arrays is not that of the sensors, or an array has the wrong shape.
     """
-    if len(values) != len(experiment.readings):
-        names = ", ".join(gauge.name for gauge in experiment.readings)
-        raise InputError(
-            f"the values of the readings are {len(values)} arrays; expected a list with one array "
-            f"for each sensor: {names or 'none'}"
-        )
-    pairs = zip(experiment.readings, values, strict=True)
-    readings = [gauge.with_samples(gauge.sample_times_s, each) for gauge, each in pairs]
-    return replace(experiment, readings=readings)
+    return _with_values(experiment, CustomSensor, values)
 
 
 @checked
@@ -446,7 +450,6 @@ def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
     """Return the experiment with other marker tracks (T, M, 3) [m] at its samples; raise InputError
     for another shape.
     """
-    shape = experiment.markers.positions_m.shape
-    tracks = float_array(positions_m, "positions_m", shape, finite=False)
     markers = experiment.markers
-    return replace(experiment, markers=markers.with_samples(markers.t_s, tracks))
+    tracks = float_array(positions_m, "positions_m", markers.positions_m.shape, finite=False)
+    return _with_values(experiment, Markers, [tracks] * bool(markers.names))

@@ -468,20 +468,12 @@ def _still_experiment(experiment: Experiment, collocation: Collocation) -> Exper
     markers = experiment.markers
     first, _ = markers.first_samples
     tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
-    gauges = [
-        g.with_samples(t_s, np.zeros((count, g.measured_values.shape[1])))
-        for g in experiment.readings
+    still = [
+        markers.with_samples(t_s, tracks) if each is markers else each.with_zeros_at(t_s)
+        for each in experiment.measurements
     ]
-    return replace(
-        experiment,
-        t_s=t_s,
-        grasps=[
-            grasp.with_zero_loads_at(t_s)
-            for grasp in _grasps_at(experiment, _first_poses(experiment))
-        ],
-        markers=markers.with_samples(t_s, tracks),
-        readings=gauges,
-    )
+    grasps = _grasps_at(experiment, _first_poses(experiment))
+    return experiment.with_measurements(still, t_s=t_s, grasps=grasps)
 
 
 def _first_poses(experiment: Experiment) -> Poses:

@@ -238,6 +238,7 @@ def without_grasp_sensors(experiment: Experiment) -> Experiment:
     """Return the experiment without force–torque sensors and without custom sensors of grasps;
     custom sensors of points are kept.
     """
-    grasps = [grasp.without_sensor() for grasp in experiment.grasps]
-    readings = [gauge for gauge in experiment.readings if gauge.grasp is None]
-    return replace(experiment, grasps=grasps, readings=readings)
+    is_at_grasp = {*experiment.wrenches, *(g for g in experiment.readings if g.grasp is not None)}
+    return experiment.with_measurements(
+        None if each in is_at_grasp else each for each in experiment.measurements
+    )

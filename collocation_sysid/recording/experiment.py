@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import KW_ONLY, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,7 @@ from .homogeneous_deformation import HomogeneousDeformation
 from .loads import Force, LoadTime, PointMass, smooth_ramp
 from .markers import Markers
 from .measured_wrench import Wrench
-from .measurement import SENSORS, Measurement, sensor_fields
+from .measurement import Measurement
 from .nuisance import Nuisance
 from .obstacle import Obstacle, with_obstacle_frames
 from .placement import require_body
@@ -174,10 +174,8 @@ class Experiment:
     forces: tuple[Force, ...] = key(converter=tuple[Force, ...], default=())
     tendons: tuple[Tendon, ...] = key(converter=tuple[Tendon, ...], default=())
     pressures: tuple[Pressure, ...] = key(converter=tuple[Pressure, ...], default=())
-    readings: tuple[CustomSensor, ...] = key(
-        converter=tuple[CustomSensor, ...], default=(), metadata=SENSORS
-    )
-    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=(), metadata=SENSORS)
+    readings: tuple[CustomSensor, ...] = key(converter=tuple[CustomSensor, ...], default=())
+    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
     nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
     temperature_difference_k: Array | None = key(
@@ -250,10 +248,40 @@ class Experiment:
         """All measurements: markers if there are any, wrenches, custom sensors and depth cameras."""
         return (*(self.markers,) * bool(self.markers.names), *self.wrenches, *self.separate_sensors)
 
+    def with_measurements(
+        self, measurements: Iterable[Measurement | None], **changes: Any
+    ) -> Experiment:
+        """Return a copy of the experiment with other measurements.
+
+        Parameters
+        ----------
+        measurements : iterable of Measurement or None
+            Each in the place of one of `Experiment.measurements`, in their order; None leaves it
+            out.
+        **changes
+            Other fields that are replaced; `grasps` then have the same sensors.
+
+        Raises
+        ------
+        ValueError
+            If their number is another one.
+        """
+        others = iter([each for _, each in zip(self.measurements, measurements, strict=True)])
+        markers = next(others) if self.markers.names else None
+        grasps = [
+            grasp if grasp.wrench is None else replace(grasp, wrench=next(others))
+            for grasp in changes.pop("grasps", self.grasps)
+        ]
+        sensors = {
+            name: [other for _ in getattr(self, name) if (other := next(others)) is not None]
+            for name in ("readings", "depths")
+        }
+        return replace(self, markers=markers, grasps=grasps, **sensors, **changes)
+
     @property
     def separate_sensors(self) -> list[CustomSensor | Depth]:
         """Sensors with times of their own, besides markers and those of grasps."""
-        return [each for name in sensor_fields(Experiment) for each in getattr(self, name)]
+        return [*self.readings, *self.depths]
 
     @property
     def camera_names(self) -> list[str]:

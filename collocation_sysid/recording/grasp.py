@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..common.array_types import Array, Index
 from ..common.checked_arrays import float_array
 from ..common.declarations import declaration, key
-from ..common.time_dependence import at_times
 from ..common.validated_types import Finite, NotNegative
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
@@ -170,65 +169,6 @@ class Grasp:
             If the poses do not cover a time, see `PoseSequence.at`.
         """
         return self.poses.moved_positions(nodes_m[self.nodes], t_s)
-
-    def without_sensor(self) -> Self:
-        """Return a copy of the grasp without its force–torque sensor, if it has one."""
-        return replace(self, wrench=None)
-
-    def with_loads(self, t_s: Array, values: Array) -> Self:
-        """Return a copy of the grasp with other samples of its force–torque sensor.
-
-        Parameters
-        ----------
-        t_s : (S,) array
-            Sample times [s].
-        values : (S, 3) or (S, 6) array
-            Forces [N] and torques [N m]; NaN where missing.
-
-        Raises
-        ------
-        ValueError
-            If the grasp has no sensor.
-        """
-        if self.wrench is None:
-            raise ValueError("the grasp has no force–torque sensor")
-        return replace(self, wrench=replace(self.wrench, t_s=t_s, values=values))
-
-    def has_sensor(self) -> bool:
-        """Return whether a force–torque sensor measures the grasp."""
-        return self.wrench is not None
-
-    def list_load_times_s(self) -> Array:
-        """Return the sample times (S,) of the force–torque sensor [s]; empty without a sensor."""
-        return np.zeros(0) if self.wrench is None else self.wrench.t_s
-
-    def with_loads_within(self, t_s: Array, fewest: int) -> Self:
-        """Return the grasp with the samples of its sensor from the first to the last of the times
-        `t_s` (T,) [s]; without the sensor if it has fewer than `fewest` samples or no measured
-        component there.
-        """
-        if self.wrench is None:
-            return replace(self)
-        here = (self.wrench.t_s >= t_s[0]) & (self.wrench.t_s <= t_s[-1])
-        if here.sum() < fewest or not self.wrench.is_measured[here].any():
-            return self.without_sensor()
-        return replace(self, wrench=at_times(self.wrench, here))
-
-    def without_loads_after(self, end_s: float) -> Self:
-        """Return a copy of the grasp with measurements of its sensor after `end_s` [s] replaced by
-        NaN; the grasp itself without a sensor.
-        """
-        if self.wrench is None:
-            return self
-        is_later = (self.wrench.t_s > end_s)[:, None]
-        values = np.where(is_later, np.nan, self.wrench.values)
-        return self.with_loads(self.wrench.t_s, values)
-
-    def with_zero_loads_at(self, t_s: Array) -> Self:
-        """Return the grasp with zeros at the times `t_s` (S,) [s] as placeholders of its measured
-        loads, NaN for components that are not measured; a copy if it has no sensor.
-        """
-        return replace(self, wrench=self.wrench and self.wrench.with_zeros_at(t_s))
 
 
 def prescribed_nodes(grasps: Sequence[Grasp]) -> Index:

@@ -229,11 +229,17 @@ class Markers(Measurement):
         )
         return replace(self, places_m=None, placement=placement)
 
-    def with_samples(self, t_s: ArrayLike, positions_m: ArrayLike) -> Markers:
-        """Return the markers with other tracks (T, M, 3) [m], measured at exactly the times `t_s`
-        (T,) [s].
+    def with_samples(self, t_s: ArrayLike, values: ArrayLike) -> Markers:
+        """Return the markers with other tracks [m], (T, M, 3) or (T, 3M), measured at exactly the
+        times `t_s` (T,) [s].
         """
+        positions_m = np.reshape(values, (len(np.atleast_1d(t_s)), len(self.names), 3))
         return replace(self, t_s=t_s, positions_m=positions_m, offsets_s=None)
+
+    def without_later_values(self, end_s: float) -> Markers:
+        """Return the markers with NaN after `end_s` [s]."""
+        is_later = (self.t_s > end_s)[:, None, None]
+        return replace(self, positions_m=np.where(is_later, np.nan, self.positions_m))
 
     @classmethod
     def none(cls, t_s: ArrayLike) -> Markers:

@@ -16,7 +16,7 @@ from ..common.array_types import Array
 from ..common.checked_arrays import float_array, float_converter, read_only_floats
 from ..common.declarations import declaration, key
 from ..common.schema_tables import Vector
-from ..common.time_dependence import over_time
+from ..common.time_dependence import at_times, over_time
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .formats.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
@@ -117,12 +117,23 @@ class Wrench(Measurement):
         names = ", ".join(self.list_component_names())
         return f"Wrench({len(self.t_s)} samples of {names} in the frame of the {self.frame})"
 
-    def with_zeros_at(self, t_s: Array) -> Wrench:
+    def with_samples(self, t_s: ArrayLike, values: ArrayLike) -> Wrench:
+        """Return a copy with other forces [N] and torques [N m], (S, 3) or (S, 6), NaN where missing."""
+        return replace(self, t_s=t_s, values=values)
+
+    def with_zeros_at(self, t_s: ArrayLike) -> Wrench:
         """Return a copy with zeros at the times `t_s` (S,) [s], as placeholders; NaN for components
         that are not measured.
         """
-        values = np.where(self.measured_components, np.zeros((len(t_s), 1)), np.nan)
-        return replace(self, t_s=t_s, values=values)
+        values = np.where(self.measured_components, np.zeros((np.size(t_s), 1)), np.nan)
+        return self.with_samples(t_s, values)
+
+    def within(self, t_s: Array, fewest: int) -> Wrench | None:
+        """Return the sensor with its samples within the times, see `Measurement.within`."""
+        here = (self.t_s >= t_s[0]) & (self.t_s <= t_s[-1])
+        if here.sum() < fewest or not self.is_measured[here].any():
+            return None
+        return at_times(self, here)
 
     @property
     def sample_times_s(self) -> Array:

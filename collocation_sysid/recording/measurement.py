@@ -1,34 +1,22 @@
 """What a recording measures: the base class of markers, wrenches, custom sensors and depth cameras.
 
 Comparisons with a motion, copies of other recordings, series over time and texts follow from the
-attributes of `Measurement`, so that they are the same for every kind. Fields of `Experiment` that
-contain measurements with times of their own have the metadata `SENSORS`.
+attributes of `Measurement`, so that they are the same for every kind.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import Field, fields
-from functools import cache
+from collections.abc import Sequence
+from dataclasses import Field
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, root_mean
 from ..common.display import quantity
-
-# Key of the mark in the metadata of a field.
-MARK = "measurements"
-# Metadata of a field that is a tuple of measurements with times of their own.
-SENSORS: Mapping[str, bool] = {MARK: True}
-
-
-@cache
-def sensor_fields(kind: type) -> tuple[str, ...]:
-    """Return the names of the fields of a dataclass that are marked by `SENSORS`, in their order."""
-    return tuple(each.name for each in fields(kind) if MARK in each.metadata)
+from .sample_times import TIME_TOLERANCE_S
 
 
 class Measurement:
@@ -125,7 +113,17 @@ class Measurement:
         """Return whether a number or a point is measured."""
         return bool(np.isfinite(self.measured_values).any() or any(self.point_counts))
 
-    # A part of the measurements ---------------------------------------------------------------
+    # Other samples, and a part of them ---------------------------------------------------------
+
+    def with_samples(self, t_s: ArrayLike, values: ArrayLike) -> Self:
+        """Return a copy with other numbers (S, m) at times (S,) [s]; here self, for unlabelled
+        points.
+        """
+        return self
+
+    def with_zeros_at(self, t_s: ArrayLike) -> Self:
+        """Return a copy with zeros at the times `t_s` (S,) [s], as placeholders."""
+        return self.with_samples(t_s, np.zeros((np.size(t_s), self.measured_values.shape[1])))
 
     @property
     def point_counts(self) -> Sequence[int]:
@@ -148,8 +146,20 @@ class Measurement:
         """
         return self
 
+    def within(self, t_s: Array, fewest: int) -> Self | None:
+        """Return the sensor with only its samples from the first to the last of the times `t_s` (T,)
+        [s]; None if these are fewer than `fewest`, or nothing is measured at them. Here the same as
+        `until_time`.
+        """
+        return self.until_time(t_s[-1] + TIME_TOLERANCE_S)
+
     def without_later_values(self, end_s: float) -> Self | None:
         """Return the sensor without measurements after `end_s` [s] in a recording that continues;
-        None to leave the sensor out. Here the same as `until_time`.
+        None to leave the sensor out. Here NaN in their place, or for unlabelled points the same as
+        `until_time`.
         """
-        return self.until_time(end_s)
+        if not self.value_sigmas.size:
+            return self.until_time(end_s)
+        is_later = (self.sample_times_s > end_s)[:, None]
+        values = np.where(is_later, np.nan, self.measured_values)
+        return self.with_samples(self.sample_times_s, values)

@@ -6,10 +6,8 @@ not depend on the kinds of sensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -17,15 +15,11 @@ from ..common.array_types import Array
 from ..common.time_dependence import at_times
 from .experiment import Experiment
 from .grasp import Grasp
-from .measurement import Measurement, sensor_fields
+from .measurement import Measurement
 from .poses import PoseSequence
 from .sample_times import TIME_TOLERANCE_S
 from .time_tables import FEWEST_SHARED_SAMPLES
 
-# Fields of an experiment whose measurements are all of sensors besides markers and grasps.
-NO_SENSORS: MappingProxyType[str, Any] = MappingProxyType(
-    dict.fromkeys(sensor_fields(Experiment), ())
-)
 # Fewest samples of a placeholder, which resampling and a low-pass need.
 FEWEST_PLACEHOLDERS = 3
 
@@ -55,35 +49,17 @@ def shortened_experiment(
         needed_s = sensor.needed_until_s(fewest) - TIME_TOLERANCE_S
         count = max(count, int(np.searchsorted(experiment.t_s, needed_s)) + 1)
     t_s = experiment.t_s[:count]
-    end_s = t_s[-1] + TIME_TOLERANCE_S
-    markers = experiment.markers
-    grasps = experiment.grasps
-    if shortens_sensors:
-        if not np.isfinite(markers.positions_m[:count]).any():
-            # At least one sample has to be present.
-            markers = replace(markers, positions_m=np.nan_to_num(markers.positions_m))
-        grasps = tuple(grasp.with_loads_within(t_s, fewest=fewest) for grasp in grasps)
-    return replace(
-        experiment,
-        t_s=t_s,
-        markers=at_times(markers, slice(count)),
-        grasps=grasps,
-        **_replaced_sensors(experiment, lambda each: each.until_time(end_s)),
-    )
 
+    def shortened(sensor: Measurement) -> Measurement | None:
+        if sensor is not experiment.markers:
+            until = sensor.until_time(t_s[-1] + TIME_TOLERANCE_S)
+            return sensor.within(t_s, fewest) if shortens_sensors else until
+        first = at_times(experiment.markers, slice(count))
+        # At least one sample has to be present.
+        is_empty = shortens_sensors and not first.has_samples()
+        return first.with_zeros_at(first.t_s) if is_empty else first
 
-def _replaced_sensors(
-    experiment: Experiment, change: Callable[[Measurement], Measurement | None]
-) -> dict[str, Any]:
-    """Return the separate sensors of an experiment by the name of the field, each replaced by what
-    `change` returns for it; None leaves the sensor out.
-    """
-    return {
-        name: [
-            changed for each in getattr(experiment, name) if (changed := change(each)) is not None
-        ]
-        for name in sensor_fields(Experiment)
-    }
+    return experiment.with_measurements(map(shortened, experiment.measurements), t_s=t_s)
 
 
 def without_later_measurements(experiment: Experiment, end_s: float) -> Experiment:
@@ -92,14 +68,8 @@ def without_later_measurements(experiment: Experiment, end_s: float) -> Experime
     Markers and measured forces become NaN, and other sensors do as they declare, see
     `Measurement.without_later_values`. The experiment itself is not modified.
     """
-    markers = experiment.markers
-    is_later = (experiment.t_s > end_s)[:, None, None]
-    positions_m = np.where(is_later, np.nan, markers.positions_m)
-    return replace(
-        experiment,
-        markers=replace(markers, positions_m=positions_m),
-        grasps=tuple(grasp.without_loads_after(end_s) for grasp in experiment.grasps),
-        **_replaced_sensors(experiment, lambda each: each.without_later_values(end_s)),
+    return experiment.with_measurements(
+        each.without_later_values(end_s) for each in experiment.measurements
     )
 
 
@@ -107,19 +77,13 @@ def thinned_experiment(experiment: Experiment, *, many: int, most: int) -> Exper
     """Return the experiment with at most `most` unlabelled points in each sample of those sensors
     that have more than `many` in one; itself if there is no such sensor.
     """
-
-    def change(sensor: Measurement) -> Measurement:
-        has_many = max(sensor.point_counts, default=0) > many
-        return sensor.thinned(most) if has_many else sensor
-
-    sensors = _replaced_sensors(experiment, change)
-    if all(
-        new is old
-        for name in sensors
-        for new, old in zip(sensors[name], getattr(experiment, name), strict=True)
-    ):
+    has_many = [max(each.point_counts, default=0) > many for each in experiment.measurements]
+    if not any(has_many):
         return experiment
-    return replace(experiment, **sensors)
+    return experiment.with_measurements(
+        sensor.thinned(most) if many_points else sensor
+        for sensor, many_points in zip(experiment.measurements, has_many, strict=True)
+    )
 
 
 def moved_grasp(grasp: Grasp, poses: PoseSequence, t_s: Array) -> Grasp:
@@ -129,12 +93,13 @@ def moved_grasp(grasp: Grasp, poses: PoseSequence, t_s: Array) -> Grasp:
     components that it does not measure.
     """
     moved = replace(grasp, poses=poses)
-    if not grasp.has_sensor():
+    if grasp.wrench is None:
         return moved
-    sample_times_s = grasp.list_load_times_s()
+    sample_times_s = grasp.wrench.t_s
     rate_hz = (len(sample_times_s) - 1) / max(np.ptp(sample_times_s), 1e-300)
     count = max(FEWEST_PLACEHOLDERS, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
-    return moved.with_zero_loads_at(t_s[0] + np.arange(count) / rate_hz)
+    placeholder = grasp.wrench.with_zeros_at(t_s[0] + np.arange(count) / rate_hz)
+    return replace(moved, wrench=placeholder)
 
 
 def measured_count(experiment: Experiment) -> int:

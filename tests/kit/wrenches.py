@@ -10,6 +10,7 @@ import numpy as np
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
+from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, Nuisance, Wrench
 from kit.problems import TRUTH, as_theta, hung_cube, measured_with
@@ -41,20 +42,6 @@ def fitted(
 ) -> Collocation:
     """The problem of one experiment."""
     return Collocation([experiment], parameters, scheme, **options)
-
-
-def with_wrenches(experiment: Experiment, values: list[np.ndarray]) -> Experiment:
-    """The experiment with other wrenches at the grasps that have a sensor."""
-    found = iter(values)
-    return replace(
-        experiment,
-        grasps=[
-            grasp
-            if grasp.wrench is None
-            else replace(grasp, wrench=replace(grasp.wrench, values=next(found)))
-            for grasp in experiment.grasps
-        ],
-    )
 
 
 def felt(experiment: Experiment) -> Experiment:

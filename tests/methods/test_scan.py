@@ -17,7 +17,7 @@ from kit.problems import (
     relative_errors,
 )
 from kit.static import block
-from kit.wrenches import sensed, sensing, with_wrenches, wristed_cube
+from kit.wrenches import sensed, sensing, wristed_cube
 
 from collocation_sysid import (
     Body,
@@ -48,6 +48,7 @@ from collocation_sysid.methods.stiffness_scan import (
 )
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.simulation import with_wrenches
 
 NOTHING = {name: Unknown() for name in TRUTH}
 # Of λ = 200 Pa and μ = 300 Pa.

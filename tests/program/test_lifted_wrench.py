@@ -13,7 +13,7 @@ from kit.lifted_wrenches import ALL_UNKNOWN, free_density, weighed
 from kit.memories import ONE, guesses
 from kit.problems import GUESS, TRUTH, hung_cube
 from kit.static import ELASTIC_ONLY, HANGING, block
-from kit.wrenches import sensed, sensing, with_wrenches, wristed_cube
+from kit.wrenches import sensed, sensing, wristed_cube
 
 from collocation_sysid.methods.comparison.casadi_nlp import SqpMethod
 from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Penalty
@@ -23,7 +23,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.program.lifted.lifted_collocation import lifted_count
-from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, Nuisance
 

@@ -248,5 +248,5 @@ def test_another_number_of_wrenches_than_sensors_is_refused(count):
     measured = with_wrenches(cube, [samples]).grasps[0].wrench
     assert measured is not None
     assert (measured.values == 1).all()
-    with pytest.raises(ValueError, match="argument"):
+    with pytest.raises(ValueError, match="measured forces"):
         with_wrenches(cube, [samples] * count)

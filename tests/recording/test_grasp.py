@@ -342,47 +342,6 @@ def test_a_node_in_two_grasps_is_refused_by_name():
         prescribed_nodes(grasps)
 
 
-def measured_grasp() -> Grasp:
-    """A grasp whose sensor measures forces at five times, and no torque."""
-    t_s = 0.1 * np.arange(5)
-    forces_n = np.arange(15.0).reshape(5, 3)
-    return Grasp(np.array([0]), turning_poses(), wrench=Wrench(t_s, forces_n, 0.1))
-
-
-def test_loads_of_a_grasp_are_cut_to_times():
-    grasp = measured_grasp()
-    cut = grasp.with_loads_within(np.array([0.1, 0.35]), fewest=3)
-    np.testing.assert_allclose(cut.list_load_times_s(), [0.1, 0.2, 0.3])
-    np.testing.assert_array_equal(cut.wrench.values, grasp.wrench.values[1:4])
-    assert grasp.with_loads_within(np.array([0.1, 0.35]), fewest=4).wrench is None
-    assert grasp.has_sensor()
-
-
-def test_loads_after_a_time_are_missing_and_times_stay():
-    grasp = measured_grasp()
-    early = grasp.without_loads_after(0.2)
-    np.testing.assert_array_equal(early.list_load_times_s(), grasp.list_load_times_s())
-    np.testing.assert_array_equal(
-        early.wrench.is_measured.any(axis=1), [True, True, True, False, False]
-    )
-
-
-def test_placeholders_of_loads_are_zero_where_a_component_is_measured():
-    zero = measured_grasp().with_zero_loads_at(np.array([0.0, 0.05]))
-    np.testing.assert_array_equal(zero.wrench.values[:, :3], 0.0)
-    assert np.isnan(zero.wrench.values[:, 3:]).all()
-
-
-def test_a_grasp_without_sensor_has_no_loads():
-    bare = measured_grasp().without_sensor()
-    assert not bare.has_sensor()
-    assert not len(bare.list_load_times_s())
-    assert bare.without_loads_after(0.2) is bare
-    assert bare.with_zero_loads_at(np.array([0.0])).wrench is None
-    with pytest.raises(ValueError, match="no force–torque sensor"):
-        bare.with_loads(np.array([0.0]), np.zeros((1, 3)))
-
-
 def test_forces_of_an_obstacle_are_rotated_from_its_axes_to_the_world():
     poses = turning_poses()
     wall = Obstacle(poses=poses, shape=Plane((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)))

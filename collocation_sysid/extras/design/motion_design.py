@@ -253,7 +253,7 @@ class MotionObjective:
         if a force is measured too, the memory would be too large, or the simulation fails. Ctrl-C
         ends the search with the best so far.
         """
-        sensed = self.recording.template.grasps[0].has_sensor()
+        sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
             return SearchResult()
         middle = self.draws[0]

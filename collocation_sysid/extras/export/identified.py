@@ -22,7 +22,6 @@ from ...fem.laws.moduli import engineering_constants
 from ...fem.laws.ogden import is_power_law, term_numbers
 from ...problem import Problem
 from ...recording import Experiment, Markers, Obstacle
-from ...recording.measurement_selection import NO_SENSORS
 from ...recording.obstacle_solids import solid_key
 from ...result.replay import MotionRecord, damaged_run_refused, read_arrays
 from ...runs.forward_simulation import ForwardSimulation
@@ -106,7 +105,7 @@ def without_obstacles(experiment: Experiment) -> Experiment:
     some = Markers(
         t_s, np.zeros((len(t_s), 1, 3)), sigma_m=1e-3, names=["corner"], places_m=body.nodes_m[:1]
     )
-    unmeasured: dict[str, Any] = {"markers": some, **NO_SENSORS}
+    unmeasured: dict[str, Any] = {"markers": some, "readings": (), "depths": ()}
     try:
         return replace(experiment, grasps=experiment.body_grasps, **started, **unmeasured)
     except InputError as error:

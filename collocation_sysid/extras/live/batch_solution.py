@@ -11,8 +11,8 @@ from ...methods.reduced_space import ReducedSpace
 from ...pipeline import Run, run
 from ...problem import Problem
 from ...program.streaming import LoggedRow, StreamingModel
-from ...recording.custom_sensor import CustomSensor
 from ...recording.experiment import Experiment
+from ...recording.measurement import Measurement
 from ...recording.poses import PoseSequence
 from ...recording.sample_times import STEP_TOLERANCE
 from .frame_buffer import FrameBuffer
@@ -62,26 +62,20 @@ def recording_from_log(
         smooth = grasps[number].poses.interpolation
         poses = PoseSequence.from_matrices(t_s, matrices, interpolation=smooth)
         grasps[number] = replace(grasps[number], poses=poses)
-    markers = experiment.markers.with_samples(t_s, tracks_m)
-    readings = []
-    sampled_grasps = set()
-    sensors = *experiment.readings, *experiment.sensors_by_grasp
-    for number, gauge in enumerate(sensors, 1):
+    instruments = [*experiment.readings, *experiment.wrenches]
+    measurements: list[Measurement | None] = []
+    for sensor in experiment.measurements:
+        if sensor is experiment.markers:
+            measurements.append(sensor.with_samples(t_s, tracks_m))
+            continue
+        number = 1 + instruments.index(sensor)
         samples = {when: values for of, when, values in intake.all_samples(log) if of == number}
         inside = [when for when in sorted(samples) if when <= len(t_s) - 1]
         values = np.array([samples[when] for when in inside])
-        if len(inside) < FEWEST or not np.isfinite(values).any():
-            continue
+        is_measured = len(inside) >= FEWEST and bool(np.isfinite(values).any())
         at_s = t_s[0] + model.experiment.timestep_s * np.array(inside)
-        if isinstance(gauge, CustomSensor):
-            readings.append(gauge.with_samples(at_s, values))
-        else:
-            sampled_grasps.add(gauge - 1)
-            grasps[gauge - 1] = grasps[gauge - 1].with_loads(at_s, values)
-    grasps = [
-        grasp if k in sampled_grasps else grasp.without_sensor() for k, grasp in enumerate(grasps)
-    ]
-    return replace(experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings)
+        measurements.append(sensor.with_samples(at_s, values) if is_measured else None)
+    return experiment.with_measurements(measurements, t_s=t_s, grasps=grasps)
 
 
 def solve_recording(problem: Problem, recording: Experiment) -> Run:

@@ -14,7 +14,6 @@ from ...common.files import RESULT_FILE, require_run_folder
 from ...errors import InputError, located
 from ...problem import Problem
 from ...recording import Experiment, Markers, Nuisance, Obstacle, PoseSequence
-from ...recording.measurement_selection import NO_SENSORS
 from ...result.replay import damaged_run_refused
 from ...runs.result_builder import build_result
 from ...runs.result_content import Result
@@ -230,7 +229,8 @@ class PlannedBody:
             loaded_since_s=np.inf,
             validation=False,
             nuisance=Nuisance.none(),
-            **NO_SENSORS,
+            readings=(),
+            depths=(),
             **changes,
         )
 

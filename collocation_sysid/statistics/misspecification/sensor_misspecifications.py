@@ -90,7 +90,10 @@ def sensor_hypotheses(
         for hypothesis in (*whole, *linear):
             values, t_s = hypothesis.corrected
             try:
-                corrected = _with_samples(experiment, sensor, values, t_s)
+                corrected = experiment.with_measurements(
+                    each.with_samples(t_s, values) if each is sensor else each
+                    for each in experiment.measurements
+                )
             except InputError:
                 continue
             title = sensor.samples_text or sensor.title
@@ -185,21 +188,3 @@ def _amplitudes(fit: LinearisedFit, columns: Sequence[Array], own: int) -> Array
     gram = projected_gram(fit, blocks)
     best: Array = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=1e-8)[0].astype(float)
     return -best
-
-
-def _with_samples(
-    experiment: Experiment, sensor: Measurement, values: Array, t_s: Array
-) -> Experiment:
-    """Return the experiment with other samples of a custom sensor or of a wrench."""
-    if isinstance(sensor, CustomSensor):
-        readings = [
-            each.with_samples(t_s, values) if each is sensor else each
-            for each in experiment.readings
-        ]
-        return replace(experiment, readings=readings)
-    assert isinstance(sensor, Wrench)
-    other = replace(sensor, values=values, t_s=t_s)
-    grasps = [
-        replace(each, wrench=other) if each.wrench is sensor else each for each in experiment.grasps
-    ]
-    return replace(experiment, grasps=grasps)
