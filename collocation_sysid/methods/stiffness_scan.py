@@ -470,10 +470,11 @@ def _compared_samples(transcription: Transcription, share: float) -> int:
     """
     t_s = transcription.experiment.t_s
     first_samples = [transcription.experiment.markers.find_first_visible_sample()]
-    for reading in transcription.residuals[1:]:
-        first_samples.append(
-            int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
-        )
+    first_samples += [
+        int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
+        for reading in transcription.residuals
+        if reading is not transcription.markers
+    ]
     return min(len(t_s), max(samples_in_share(len(t_s), share), max(first_samples) + 1))
 
 

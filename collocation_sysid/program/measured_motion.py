@@ -44,7 +44,7 @@ def residual_changes(
     the fit.
     """
     transcription = part.transcription
-    rows = transcription.markers.observable.rows
+    rows = transcription.sample_rows
     fitted = SampledMotion(
         transcription.experiment.t_s,
         ReactionGrid.from_dynamics(transcription.dynamics),

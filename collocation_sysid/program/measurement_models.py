@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from ..recording.custom_sensor import CustomSensor, FollowingSensor
 from ..recording.depth_camera import Depth
 from ..recording.experiment import Experiment
@@ -24,6 +26,8 @@ MODELS: dict[type[Measurement], type[MeasurementModel]] = {
     FollowingSensor: FollowingSensorModel,
     Depth: DepthModel,
 }
+# Kinds whose measurements are numbered together.
+NUMBERED = (Markers, Wrench, CustomSensor, Depth)
 
 
 def model_of(measurement: Measurement) -> type[MeasurementModel]:
@@ -32,14 +36,14 @@ def model_of(measurement: Measurement) -> type[MeasurementModel]:
 
 
 def measurement_models(grid: MotionGrid) -> tuple[MeasurementModel, ...]:
-    """Return the models of the markers, also without any, and of all other measurements of an
-    experiment, in the order of `Experiment.measurements`.
-    """
-    experiment = grid.experiment
-    groups = [(experiment.markers,), experiment.wrenches, experiment.readings, experiment.depths]
-    return tuple(
-        model_of(each)(each, number, grid) for group in groups for number, each in enumerate(group)
-    )
+    """Return the models of `Experiment.measurements`, in their order."""
+    numbers: Counter[type[Measurement]] = Counter()
+    models = []
+    for each in grid.experiment.measurements:
+        kind = next(kind for kind in NUMBERED if isinstance(each, kind))
+        models.append(model_of(each)(each, numbers[kind], grid))
+        numbers[kind] += 1
+    return tuple(models)
 
 
 def with_correspondences(experiment: Experiment) -> list[Measurement]:

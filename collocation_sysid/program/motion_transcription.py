@@ -155,20 +155,28 @@ class MotionTranscription:
         return NuisanceMap.from_experiment(self.experiment, self.nuisance_indices.pivot_m)
 
     @cached_property
+    def measurement_grid(self) -> MotionGrid:
+        """Times at which the measurements know the motion."""
+        reaction_grid = ReactionGrid.from_dynamics(self.dynamics)
+        return MotionGrid(
+            self.experiment,
+            self.nuisance,
+            t_s=reaction_grid.t_s,
+            reaction_grid=reaction_grid,
+            sample_rows=np.arange(len(self.experiment.t_s)) * self.substeps,
+            huber=self.huber,
+            is_initially_at_rest=not self.dynamics.start_velocity_m_s.any(),
+        )
+
+    @property
+    def sample_rows(self) -> Index:
+        """Rows (T,) of x at the samples."""
+        return self.measurement_grid.sample_rows
+
+    @cached_property
     def measurement_models(self) -> tuple[MeasurementModel, ...]:
         """Models of the measurements, for any association, see `measurement_models`."""
-        reaction_grid = ReactionGrid.from_dynamics(self.dynamics)
-        return measurement_models(
-            MotionGrid(
-                self.experiment,
-                self.nuisance,
-                t_s=reaction_grid.t_s,
-                reaction_grid=reaction_grid,
-                sample_rows=np.arange(len(self.experiment.t_s)) * self.substeps,
-                huber=self.huber,
-                is_initially_at_rest=not self.dynamics.start_velocity_m_s.any(),
-            )
-        )
+        return measurement_models(self.measurement_grid)
 
     @cached_property
     def sensed_dofs(self) -> Index:

@@ -254,7 +254,7 @@ def _ideal_predictions(motion: Trajectory) -> tuple[Array, ...]:
     grid = MotionGrid.at_samples(experiment, motion.reactions[0])
     association = Association(MarkerAssociation.from_experiment(experiment))
     predicted = []
-    for model in measurement_models(grid)[0 if experiment.markers.names else 1 :]:
+    for model in measurement_models(grid):
         if model.measurement.point_counts:
             predicted.append(model.measurement.measured_values)
             continue

@@ -22,7 +22,7 @@ from ..recording.nuisance import TIME
 from .association import Association
 from .correspondences import CorrespondenceResidual
 from .local_loss import LocalLoss
-from .markers.marker_residual import MarkerResidual
+from .markers.marker_residual import MarkerModel, MarkerResidual
 from .measurement_model import CorrespondenceModel
 from .measurement_residual import MeasurementResidual
 from .motion_transcription import MotionTranscription, RowWeights, WeightedHistory
@@ -56,8 +56,7 @@ class Transcription(MotionTranscription):
     @cached_property
     def residuals(self) -> tuple[MeasurementResidual, ...]:
         """Measurement residuals: the first one of each measurement in the order of
-        `Experiment.measurements`, those of the markers also if there are none; then other ones,
-        such as outlines.
+        `Experiment.measurements`, then other ones, such as outlines.
         """
         by_measurement = self._residuals_by_measurement
         return (
@@ -68,8 +67,7 @@ class Transcription(MotionTranscription):
     @property
     def main_residuals(self) -> tuple[MeasurementResidual, ...]:
         """The first residual of each of `Experiment.measurements`, which predicts it."""
-        first = 0 if self.experiment.markers.names else 1
-        return self.residuals[first : len(self.measurement_models)]
+        return self.residuals[: len(self.measurement_models)]
 
     def residuals_of(self, kind: type[R]) -> tuple[R, ...]:
         """Return the residuals of one class, in the order of `residuals`."""
@@ -77,15 +75,17 @@ class Transcription(MotionTranscription):
 
     @cached_property
     def markers(self) -> MarkerResidual:
-        """Residual of the markers."""
-        return self.residuals_of(MarkerResidual)[0]
+        """Residual of the markers; an empty one, which is not among `residuals`, without any."""
+        own = self.residuals_of(MarkerResidual)
+        of_none = MarkerModel(self.experiment.markers, 0, self.measurement_grid)
+        return own[0] if own else of_none.residuals(self.association, None)[0]
 
     @property
     def reassociable(self) -> tuple[CorrespondenceResidual, ...]:
         """The first residual of each measurement with correspondences, in the order of the
         association's.
         """
-        firsts = self.residuals[: len(self.measurement_models)]
+        firsts = self.main_residuals
         return tuple(each for each in firsts if isinstance(each, CorrespondenceResidual))
 
     @cached_property
@@ -210,7 +210,7 @@ class Transcription(MotionTranscription):
         sample within the rows.
         """
         markers = self.experiment.markers
-        rows = self.markers.observable.rows
+        rows = self.sample_rows
         if markers.located.all():
             return self.association, phi
         points_m, _ = markers.first_samples
@@ -233,7 +233,7 @@ class Transcription(MotionTranscription):
         """
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.is_complete[:, unknown].argmax(axis=0)
-        rows = [int(self.markers.observable.rows[first].max())] if len(first) else []
+        rows = [int(self.sample_rows[first].max())] if len(first) else []
         return 1 + max(rows + [each.first_row for each in self.reassociable], default=-1)
 
     def count_rows_to_follow(self) -> int:

@@ -239,7 +239,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
     fitted = {}
     collected = []
     for part, readings in zip(finished.solution.parts, finished.solution.readings_m, strict=True):
-        x = part.x[part.transcription.markers.observable.rows]
+        x = part.x[part.transcription.sample_rows]
         fitted[part.transcription.experiment.name] = (x.reshape(len(x), -1, 3), readings)
     for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
         rollout = finished.rollouts[experiment.name]

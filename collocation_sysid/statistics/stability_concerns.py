@@ -61,7 +61,7 @@ def strain_stability_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator
         experiment = iterate.transcription.experiment
         samples = np.linspace(0, len(experiment.t_s) - 1, STATES).round().astype(int)
         samples = np.unique(samples)
-        states = iterate.x[iterate.transcription.markers.observable.rows[samples]]
+        states = iterate.x[iterate.transcription.sample_rows[samples]]
         body = experiment.body
         theta = np.asarray(iterate.equations.dynamics.theta)
         if any(is_examined(part.material) for part in body.parts):

@@ -79,7 +79,7 @@ def _instability(iterate: ExperimentIterate) -> Instability | None:
     last = len(experiment.t_s) - 1
     samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
     t_s = experiment.t_s[samples]
-    rows = iterate.transcription.markers.observable.rows[samples]
+    rows = iterate.transcription.sample_rows[samples]
     is_prescribed = experiment.is_prescribed(t_s).reshape(len(t_s), -1)
     dynamics = iterate.equations.dynamics
     theta = dynamics.theta

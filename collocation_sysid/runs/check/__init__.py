@@ -408,7 +408,7 @@ def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> d
     """
     positions_m = {}
     for part in collocation.iterates(z):
-        at_samples = part.x[part.transcription.markers.observable.rows]
+        at_samples = part.x[part.transcription.sample_rows]
         positions_m[part.transcription.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     shared_fields = _quick_fields(problem, positions_m)
     recordings = shared_fields["recordings"]
