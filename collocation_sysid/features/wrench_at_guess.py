@@ -19,7 +19,7 @@ from ..program.collocation import ExperimentIterate
 from ..program.wrench_residual import WrenchResidual
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import COMPONENTS, UNITS
-from ..statistics.axes import OTHER_AXES
+from ..statistics.axes import with_other_axes
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
 
 # Message of the offset by the code of its concern; those of other hypotheses are in
@@ -124,11 +124,7 @@ class WrenchDeviation:
         """
         stated = self._explained_share(self.measured)
         trials = [(Hypothesis("wrench-sign", self.subject), -self.measured, 0.0)]
-        for axes, (order, signs) in OTHER_AXES.items():
-            if order == (0, 1, 2) and len({*signs}) == 1:
-                continue  # the sign of all components
-            columns = [*order, *(3 + k for k in order)]
-            turned = np.tile(signs, 2) * self.measured[:, columns]
+        for axes, turned in with_other_axes(self.measured, has_sign=False):
             hypothesis = Hypothesis("wrench-axes", self.subject, data={"axes": axes})
             trials.append((hypothesis, turned, ONE_OF_MANY_SHARE))
         shares = [self._explained_share(values) - handicap for _, values, handicap in trials]

@@ -30,7 +30,7 @@ from ..program.wrench_residual import WrenchResidual, without_grasp_sensors
 from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ..recording.poses import Frame
-from ..statistics.axes import OTHER_AXES
+from ..statistics.axes import with_other_axes
 from ..statistics.budget.shape_error import other_section
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
 
@@ -154,24 +154,9 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class WrenchComparison:
-    """Comparison of wrenches with their prediction from the markers.
-
-    Attributes
-    ----------
-    hypotheses : list of Hypothesis
-        Likely mistakes.
-    predicted : list of str
-        Names of the experiments whose markers the fit explains; only these were compared.
-    """
-
-    hypotheses: list[Hypothesis]
-    predicted: list[str]
-
-
-def wrench_mistakes(collocation: Collocation) -> WrenchComparison:
-    """Return hypotheses about wrongly described wrenches before any solve.
+def wrench_mistakes(collocation: Collocation) -> tuple[list[Hypothesis], list[str]]:
+    """Return hypotheses about wrongly described wrenches before any solve, and the names of the
+    experiments whose markers a fit explains; only these are compared.
 
     The first samples of the experiments with markers and wrenches are fitted to their markers
     alone. Experiments whose markers that fit does not explain, and those in which a tool is
@@ -186,14 +171,12 @@ def wrench_mistakes(collocation: Collocation) -> WrenchComparison:
     ]
     shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
     if not shorter:
-        return WrenchComparison([], [])
+        return [], []
     beginning = replace(collocation, experiments=shorter)
     method = ReducedSpace(max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE)
     parts = _from_markers(beginning, beginning.transcriptions, method=method)
     explained = [part for part in parts if _markers_misfit(part) < MARKERS_MISFIT]
-    return WrenchComparison(
-        _of_parts(explained), [part.transcription.experiment.name for part in explained]
-    )
+    return _of_parts(explained), [part.transcription.experiment.name for part in explained]
 
 
 def _misses(part: ExperimentIterate) -> bool:
@@ -437,10 +420,7 @@ class _OneSensor:
                 )
         other: Frame = "grasp" if wrench.frame == "world" else "world"
         yield hypothesis("wrench-frame", replace(wrench, frame=other), other=other)
-        for axes, (order, signs) in OTHER_AXES.items():
-            if len({*signs}) == 1 and order == (0, 1, 2):
-                continue  # a matter of the sign
-            turned = np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
+        for axes, turned in with_other_axes(values, has_sign=False):
             without = replace(wrench, values=turned)
             yield hypothesis("wrench-axes", without, handicap=ONE_OF_MANY, axes=axes)
         for what, units, columns in UNITS:

@@ -39,9 +39,8 @@ def simulated_hypotheses(check: SimulatedCheck) -> tuple[Sequence[Hypothesis], S
         )
     elif has_both:
         check.report_progress("comparing the wrenches with the prediction from the markers")
-        comparison = wrench_mistakes(check.collocation)
-        hypotheses = list(comparison.hypotheses)
-        unpredicted -= set(comparison.predicted)
+        hypotheses, predicted = wrench_mistakes(check.collocation)
+        unpredicted -= set(predicted)
         notes += [
             f"no fit explains the markers of '{name}', so that its wrench was compared with the "
             "simulation at the guess alone"

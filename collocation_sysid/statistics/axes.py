@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import permutations, product
 
-AxesOrder = tuple[tuple[int, ...], tuple[int, ...]]
+import numpy as np
+
+from ..common.array_types import Array
 
 
-def _other_axes() -> Iterator[tuple[str, AxesOrder]]:
-    """Yield every order and signs of three axes except the identity, mirror images included, with
-    their description; the order has indices of axes, the signs are 1 or −1.
+def with_other_axes(values: Array, *, has_sign: bool = True) -> Iterator[tuple[str, Array]]:
+    """Yield vectors, (…, 3k), with their axes in every other order and of every other sign, mirror
+    images included, after a description such as "x, −z, y"; the opposite sign of all three axes
+    only with `has_sign`.
     """
+    vectors = values.reshape(*values.shape[:-1], -1, 3)
     for order in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
-            if order != (0, 1, 2) or min(signs) < 0:
-                shown = ("−" * (sign < 0) + "xyz"[k] for k, sign in zip(order, signs, strict=True))
-                yield ", ".join(shown), (order, signs)
-
-
-# By a description such as "x, −z, y": the column of each axis, and its sign.
-OTHER_AXES = dict(_other_axes())
+            is_sign = order == (0, 1, 2) and len({*signs}) == 1
+            if is_sign and (signs[0] > 0 or not has_sign):
+                continue
+            shown = ("−" * (sign < 0) + "xyz"[k] for k, sign in zip(order, signs, strict=True))
+            turned = np.array(signs) * vectors[..., [*order]]
+            yield ", ".join(shown), turned.reshape(values.shape)

@@ -266,7 +266,7 @@ def checked_causes(problem: Problem) -> tuple[Hypothesis, ...]:
         variables, _ = initial_variables(collocation)
         mistakes = depth_image_hypotheses(problem, collocation.iterates(variables))
         causes = rank((*causes, *mistakes))
-    return causes or rank(wrench_mistakes(collocation).hypotheses)
+    return causes or rank(wrench_mistakes(collocation)[0])
 
 
 def solve_report(problem: Problem, family: ProblemFamily) -> SolveReport:

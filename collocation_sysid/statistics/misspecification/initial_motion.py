@@ -8,7 +8,6 @@ moves much farther.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,29 +34,11 @@ CLOCK_DEVIATIONS = 3.0
 THIRD_DIFFERENCES = 20.0
 
 
-@dataclass(frozen=True)
-class InitialMotion:
-    """Motion in the initial interval of a recording.
-
-    Attributes
-    ----------
-    duration_s : float
-        Length of the interval [s].
-    markers_m : float
-        RMS displacement of the markers from their mean positions, without that of noise [m].
-    grasp_m : float
-        Largest distance of a point of the body, moved rigidly with its grasp, between two times
-        of the interval [m].
-    """
-
-    duration_s: float
-    markers_m: float
-    grasp_m: float
-
-
-def initial_motion(experiment: Experiment) -> InitialMotion | None:
+def initial_motion(experiment: Experiment) -> tuple[float, float, float] | None:
     """Return the motion in the shortest initial interval in which the markers move by more than
-    noise.
+    noise: the length of the interval [s], the RMS displacement of the markers from their mean
+    positions without that of noise [m], and the largest distance of a point of the body, moved
+    rigidly with its grasp, between two times of the interval [m].
 
     None if there is no such interval within the first quarter of the recording, or without a
     marker that is present at each of its samples.
@@ -91,11 +72,9 @@ def initial_motion(experiment: Experiment) -> InitialMotion | None:
         freedom = (count - 1) * tracks_m.shape[1] * 3
         if chi2_sf(float(np.sum(scaled**2)), freedom) < FALSE_ALARM:
             variance = tracks_m.var(axis=0).sum(axis=1) - 3 * deviation_m**2
-            return InitialMotion(
-                float(t_s[count - 1] - t_s[0]),
-                float(np.sqrt(max(0.0, variance.mean()))),
-                _grasp_motion_m(experiment, count),
-            )
+            duration_s = float(t_s[count - 1] - t_s[0])
+            markers_m = float(np.sqrt(max(0.0, variance.mean())))
+            return duration_s, markers_m, _grasp_motion_m(experiment, count)
     return None
 
 
@@ -122,18 +101,12 @@ def initial_motion_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     motion = initial_motion(experiment)
     if motion is None:
         return
-    limit_m = LARGEST_RESPONSE * motion.grasp_m
-    if motion.markers_m > limit_m:
-        yield Hypothesis(
-            "not-at-rest",
-            f"'{experiment.name}'",
-            data={
-                "by_mm": 1e3 * motion.markers_m,
-                "within_ms": 1e3 * motion.duration_s,
-                "grasp_mm": 1e3 * motion.grasp_m,
-            },
-            strength=float(motion.markers_m / max(limit_m, motion.markers_m / 10)),
-        )
+    duration_s, markers_m, grasp_m = motion
+    limit_m = LARGEST_RESPONSE * grasp_m
+    if markers_m > limit_m:
+        data = {"by_mm": 1e3 * markers_m, "within_ms": 1e3 * duration_s, "grasp_mm": 1e3 * grasp_m}
+        strength = float(markers_m / max(limit_m, markers_m / 10))
+        yield Hypothesis("not-at-rest", f"'{experiment.name}'", data=data, strength=strength)
 
 
 def _loads_change(experiment: Experiment) -> bool:

@@ -21,7 +21,7 @@ from ...errors import SimulationError
 from ...program.modes.modal_prediction import DeclaredMotion, ModalResponse, delayed_tracks
 from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, place_markers
-from ..axes import OTHER_AXES
+from ..axes import with_other_axes
 from ..thresholds import FITTED, LARGEST_MISFIT, LEAST_IMPROVEMENT, ONE_OF_MANY
 from .initial_motion import initial_motion_hypotheses
 from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
@@ -145,8 +145,7 @@ def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
     """Yield the tracks (T, M, 3) with their axes in every other order and of either sign, as
     untested hypotheses about the experiment of a name; the changed tracks are their `corrected`.
     """
-    for axes, (order, signs) in OTHER_AXES.items():
-        turned = np.array(signs) * tracks_m[..., list(order)]
+    for axes, turned in with_other_axes(tracks_m):
         yield Hypothesis(
             "markers-axes", name, data={"axes": axes}, corrected=turned, handicap=ONE_OF_MANY
         )

@@ -12,7 +12,7 @@ step.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -229,7 +229,9 @@ def screened_bodies(
     gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
     found: list[tuple[float, Hypothesis]] = []
     for change in changes:
-        decrease, amplitudes = _gain(gram, change)
+        own = [1 + column for column in change.columns]
+        whole = np.ones(len(own)) if change.is_whole else None
+        decrease, amplitudes = linear_step(gram, own, whole)
         if is_far and change.kind == "law":
             decrease = np.inf
         corrected = _changed_experiment(experiment, change, amplitudes)
@@ -259,11 +261,11 @@ def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
     except (InputError, SimulationError, np.linalg.LinAlgError):
         return
     gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
-    amplitude = -gram[1, 0] / max(gram[1, 1], 1e-300)
-    if amplitude < MESH_AMPLITUDES[0]:
+    least, most = MESH_AMPLITUDES
+    amplitude = min(most, float(linear_step(gram, [1])[1][0]))
+    if amplitude < least:
         return
-    amplitude = min(amplitude, MESH_AMPLITUDES[1])
-    decrease = -2 * amplitude * gram[1, 0] - amplitude**2 * gram[1, 1]
+    decrease, _ = linear_step(gram, [1], np.array([amplitude]))
     sigmas = float(amplitude * np.sqrt(gram[1, 1] / collocation.count_measurements()))
     if decrease > LEAST_DECREASE and sigmas > LEAST_SIGMAS:
         linear = any(body.element.name == "tet4" for body in bodies)
@@ -299,19 +301,19 @@ def projected_gram(fit: LinearisedFit, blocks: Sequence[Array]) -> Array:
     return (remaining := values - jacobian @ explained).T @ remaining
 
 
-def _gain(gram: Array, change: _Change) -> tuple[float, Array]:
-    """Return the decrease of χ² by a change, and its amplitudes (1 where it happens as a whole)."""
-    own = [1 + column for column in change.columns]
-    if change.is_whole:
-        amplitudes = np.ones(len(own))
-    else:
-        amplitudes = -np.linalg.lstsq(gram[np.ix_(own, own)], gram[own, 0], rcond=1e-8)[0]
-    after = (
-        gram[0, 0]
-        + 2 * amplitudes @ gram[own, 0]
-        + amplitudes @ gram[np.ix_(own, own)] @ amplitudes
-    )
-    return float(gram[0, 0] - after), np.asarray(amplitudes, dtype=float)
+def linear_step(
+    gram: Array, columns: Iterable[int], amplitudes: Array | None = None
+) -> tuple[float, Array]:
+    """Return the decrease of χ² by changes of the residuals, and their amplitudes, by default those
+    that decrease it most.
+
+    `gram` is the result of `projected_gram`, in which changes are `columns` from 1 on.
+    """
+    own = [*columns]
+    among = gram[np.ix_(own, own)]
+    if amplitudes is None:
+        amplitudes = -np.linalg.lstsq(among, gram[own, 0], rcond=1e-8)[0].astype(np.float64)
+    return float(-2 * amplitudes @ gram[own, 0] - amplitudes @ among @ amplitudes), amplitudes
 
 
 def _changed_experiment(

@@ -19,11 +19,11 @@ from ...recording.custom_sensor import CustomSensor
 from ...recording.experiment import Experiment
 from ...recording.measured_wrench import Wrench
 from ...recording.measurement import Measurement
-from ..axes import OTHER_AXES
+from ..axes import with_other_axes
 from ..linearised import LinearisedFit, linearise_fit
 from ..thresholds import BETTER
 from .misspecification_hypothesis import Hypothesis
-from .model_misspecifications import projected_gram
+from .model_misspecifications import linear_step, projected_gram
 
 # Factors of wrong units: prefixes, percent, degrees, kilograms-force, pounds-force, psi, inches.
 FACTORS = (1e6, 1e3, 1e2, 1e1, 180 / np.pi, 9.80665, 4.4482216, 6894.757, 25.4)
@@ -135,12 +135,7 @@ def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
         ratio = (values - predicted) / sensor.value_sigmas
         return root_mean(ratio[np.isfinite(ratio)] ** 2) if np.isfinite(ratio).any() else np.inf
 
-    vectors = measured.reshape(len(measured), -1, 3)
-    turned = {
-        axes: (np.array(signs) * vectors[..., [*order]]).reshape(measured.shape)
-        for axes, (order, signs) in OTHER_AXES.items()
-        if len({*signs}) > 1 or order != (0, 1, 2)  # else a matter of the sign
-    }
+    turned = dict(with_other_axes(measured, has_sign=False))
     axes = min(turned, key=lambda each: misfit(turned[each]))
     if BETTER * misfit(turned[axes]) < misfit(measured):
         corrected = turned[axes], sensor.sample_times_s
@@ -185,6 +180,4 @@ def _amplitudes(fit: LinearisedFit, columns: Sequence[Array], own: int) -> Array
     for k, column in enumerate(columns):
         changes[:, : column.shape[1], k] = column
     blocks[own] = changes.reshape(blocks[own].shape)
-    gram = projected_gram(fit, blocks)
-    best: Array = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=1e-8)[0].astype(float)
-    return -best
+    return linear_step(projected_gram(fit, blocks), range(1, 1 + len(columns)))[1]
