@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
     from .methods.comparison.penalty import AugmentedLagrangian, Penalty
     from .methods.comparison.shooting import Shooting
-    from .methods.continuation import Continuation
     from .methods.interior_point import InteriorPoint
     from .methods.reduced_space import ReducedSpace
     from .methods.solution import Iteration, Solution, Status
+    from .methods.starts.continuation import Continuation
     from .model.parameters import FieldCoefficients, Parameter, Parameters, Tied, Unknown
     from .model.schemes import Scheme, Stencil
     from .pipeline import Run, run, solve

@@ -21,9 +21,9 @@ from .common.time_limit import TimeLimitReached, time_limit
 from .errors import InputError, SimulationError
 from .fem.two_phase import TwoPhaseModes
 from .methods.experiment_executors import connect_executor
-from .methods.initial_trajectories import simulate_trajectories
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Method, Solution, Status, Watch
+from .methods.starts.initial_trajectories import simulate_trajectories
 from .model.schemes import as_scheme
 from .problem import Problem
 from .program.collocation import Collocation

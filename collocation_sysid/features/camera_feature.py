@@ -8,7 +8,7 @@ import numpy as np
 
 from ..common.array_types import Array, root_mean
 from ..methods.solution import Solution
-from ..methods.stiffness_scan import typical_constants
+from ..methods.starts.stiffness_scan import typical_constants
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
 from ..program.depth.depth_comparison import depth_residuals, outline_distances_px

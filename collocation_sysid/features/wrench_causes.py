@@ -19,9 +19,9 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..errors import InputError, SimulationError
-from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
+from ..methods.starts.continuation import first_samples
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.markers.marker_residual import MarkerResidual
 from ..program.observables import ObservedMotion, ReactionForces

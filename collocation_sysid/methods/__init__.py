@@ -7,13 +7,12 @@ Solvers
     parameters; `reduced_search` is its trust region, `loss_curvature` its second derivatives,
     `horizon` and `trajectory_sweeps` its linearised problem, and `experiment_executors` runs it in
     threads or on a Dask cluster. `interior_point` solves for motion and parameters simultaneously
-    with IPOPT; `condensed_program` removes variables that follow from others, `initial_point`
-    computes its start, and `complementarity` adds hard obstacles. `continuation` runs any method on
-    growing parts of the recordings. `comparison` contains methods of the literature, to compare
-    with.
+    with IPOPT; `condensed_program` removes variables that follow from others, and
+    `complementarity` adds hard obstacles. `comparison` contains methods of the literature, to
+    compare with.
 Start
-    `stiffness_scan` finds a stiffness to start from, `initial_trajectories` simulates trajectories
-    at given parameters.
+    `starts` contains what happens before a search: scans, closed forms, simulations at given
+    parameters, and searches of the first samples.
 Common
     `solution` defines the protocol of methods and the result, `solve_recorder` the history,
     `method_options` the construction of methods from options by name, `nlpsol` and `callbacks` the
@@ -29,7 +28,7 @@ from pydantic import TypeAdapter
 
 from ..errors import InputError, require_among
 from .comparison.casadi_nlp import refusal_reason
-from .continuation import STAGES, Continuation
+from .starts.continuation import STAGES, Continuation
 
 METHODS: dict[str, type] = STAGES | {Continuation.name: Continuation}
 

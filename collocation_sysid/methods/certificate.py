@@ -18,7 +18,7 @@ import scipy.sparse.linalg as spla
 from ..common.array_types import Array
 from ..program.collocation import BOUND_TOLERANCE, Collocation, convert_variables
 from ..program.lifted.lifted_collocation import with_lifted_variables
-from .initial_point import adjoint_multipliers
+from .starts.initial_point import adjoint_multipliers
 
 # Eigenvalues of the reduced Hessian below this share of the largest are rounding.
 SMALLEST_CURVATURE = 1e-12

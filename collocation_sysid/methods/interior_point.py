@@ -26,10 +26,10 @@ from .callbacks import NlpFunctions
 from .certificate import certify
 from .complementarity import require_frictionless, solve_complementarity
 from .condensed_program import complete_program, condense
-from .initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
 from .method_options import MethodOptions
 from .solution import Solution, Status, Watch
 from .solve_recorder import Recorder
+from .starts.initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
 
 
 def _require_ipopt_value(value: Any) -> Any:

@@ -21,9 +21,9 @@ from ..errors import InputError
 from ..program.collocation import Collocation, convert_variables
 from .callbacks import HessianValues, IterationMonitor, NlpFunctions
 from .condensed_program import complete_multipliers
-from .initial_point import InitialMultipliers
 from .solution import Solution, Status
 from .solve_recorder import Recorder
+from .starts.initial_point import InitialMultipliers
 
 # Of solvers that are written otherwise.
 NAMES = {"ipopt": "IPOPT"}

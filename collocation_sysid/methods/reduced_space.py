@@ -39,11 +39,11 @@ from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.sweep import Sweep
 from ..recording.measurement_selection import main_measurement
 from .experiment_executors import ExperimentExecutor, LocalExecutor
-from .initial_trajectories import complete_variables, simulate_trajectories
 from .loss_curvature import require_second_derivatives
 from .reduced_search import ReducedSearch, SearchOptions
 from .solution import Solution, Status, Watch
 from .solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
+from .starts.initial_trajectories import complete_variables, simulate_trajectories
 from .trajectory_sweeps import trajectory_positions
 
 # Misfits above this many standard deviations of the markers are worth a note.

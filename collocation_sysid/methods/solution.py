@@ -26,7 +26,7 @@ from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import GAUGE
-from .stiffness_scan import Scan
+from .starts.stiffness_scan import Scan
 
 
 class Status(Enum):

@@ -11,8 +11,8 @@ from ..common.time_limit import TimeLimitReached
 from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch
-from .initial_trajectories import initial_variables
 from .solution import Iteration, Solution, Status, Timing, Watch
+from .starts.initial_trajectories import initial_variables
 
 
 class SearchEnded(Exception):

@@ -18,7 +18,7 @@ from ..common.declarations import keys_of
 from ..common.schema_tables import declared_in
 from ..errors import InputError, hint_at, listed, located
 from ..fem.body import Body
-from ..methods.stiffness_scan import typical_constants
+from ..methods.starts.stiffness_scan import typical_constants
 from ..model.parameters import Parameters
 from ..recording import (
     Experiment,

@@ -19,11 +19,11 @@ from ..methods import METHODS, method_options_schema, method_summary
 from ..methods.comparison.casadi_nlp import Sleqp, SqpMethod, refusal_reason
 from ..methods.comparison.penalty import AugmentedLagrangian, Penalty
 from ..methods.comparison.shooting import Shooting
-from ..methods.continuation import Continuation
 from ..methods.interior_point import InteriorPoint
 from ..methods.method_options import MethodOptions, method_from_options
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method
+from ..methods.starts.continuation import Continuation
 
 OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
 DEFAULT = "reduced-space"

@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 
 from ..common.array_types import Array, Index
 from ..errors import SimulationError
-from ..methods.initial_trajectories import simulate_trajectories
+from ..methods.starts.initial_trajectories import simulate_trajectories
 from ..program.collocation import Collocation
 from ..program.measurement_residual import huber_as_weights
 from ..statistics.linearised import LinearisedFit, linearise_fit

@@ -17,7 +17,7 @@ from ..fem.laws.constants import field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution
 from ..fem.two_phase import PhaseSummary
 from ..methods.solution import Iteration, Timing
-from ..methods.stiffness_scan import ScanSummary
+from ..methods.starts.stiffness_scan import ScanSummary
 from ..statistics.assessment import Assessment
 from ..statistics.budget.alternatives import Alternative, OriginAnswer
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds

@@ -27,8 +27,8 @@ from ..fem.laws.constants import (
     usual_value,
     without_region,
 )
-from ..methods.power_law_start import power_law_start
 from ..methods.solution import Solution
+from ..methods.starts.power_law import power_law_start
 from ..model.parameters import Parameter, Parameters, can_be_widened, with_widest_bounds
 from ..statistics.linearised import AT_BOUND, parameter_values
 

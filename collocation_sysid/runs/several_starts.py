@@ -16,7 +16,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Iteration, Method, Solution, Status, Watch
-from ..methods.stiffness_scan import Scan
+from ..methods.starts.stiffness_scan import Scan
 from ..program.collocation import Collocation
 
 # Difference of losses below which two solutions are the same minimum with other correspondences:

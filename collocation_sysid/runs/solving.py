@@ -16,10 +16,10 @@ from ..features.measurements import lost_samples
 from ..features.registry import FEATURES
 from ..fem.laws.constants import without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
-from ..methods.initial_trajectories import associated_at_guess
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method, Solution, Status, Watch
-from ..methods.stiffness_scan import Scan, rescue, start_problem
+from ..methods.starts.initial_trajectories import associated_at_guess
+from ..methods.starts.stiffness_scan import Scan, rescue, start_problem
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at

@@ -11,8 +11,8 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.files import RESULT_FILE, damage_refused
 from ..errors import InputError
-from ..methods.initial_trajectories import simulate_trajectories
 from ..methods.solution import Solution
+from ..methods.starts.initial_trajectories import simulate_trajectories
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..program.transcription import Transcription

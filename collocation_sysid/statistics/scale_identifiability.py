@@ -24,7 +24,7 @@ from ..fem.laws.constants import (
     symbol_of,
     without_region,
 )
-from ..methods.stiffness_scan import SOFT_PA, typical_parameters
+from ..methods.starts.stiffness_scan import SOFT_PA, typical_parameters
 from ..model.parameters import Parameters, ThetaMap
 from ..recording.experiment import Experiment
 from .concerns import Concern, Grade

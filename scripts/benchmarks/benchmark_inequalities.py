@@ -24,8 +24,8 @@ from script_arguments import make_parser
 
 import collocation_sysid as cs
 from collocation_sysid.methods.horizon import Horizon, Iterate
-from collocation_sysid.methods.initial_trajectories import simulate_trajectories
 from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.starts.initial_trajectories import simulate_trajectories
 from collocation_sysid.program.sweep import Sweep
 
 TRUTH = {"young_pa": 2e4, "poisson": 0.4, "gamma_r_s": 0.01, "gamma_m_1_s": 0.1}

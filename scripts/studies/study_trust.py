@@ -28,7 +28,7 @@ from collocation_sysid import Run, run
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
-from collocation_sysid.methods.stiffness_scan import typical_constants
+from collocation_sysid.methods.starts.stiffness_scan import typical_constants
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.problem.recording_reader import require_plausible_markers

@@ -31,9 +31,9 @@ from collocation_sysid.common import cluster
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import experiment_executors
 from collocation_sysid.methods.experiment_executors import DaskExecutor, connect_executor
-from collocation_sysid.methods.initial_trajectories import simulate_trajectories
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
+from collocation_sysid.methods.starts.initial_trajectories import simulate_trajectories
 from collocation_sysid.program.collocation import Collocation
 
 distributed = pytest.importorskip("distributed")

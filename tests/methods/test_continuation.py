@@ -22,10 +22,10 @@ from kit.problems import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.continuation import Continuation, first_samples, first_share
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
+from collocation_sysid.methods.starts.continuation import Continuation, first_samples, first_share
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem

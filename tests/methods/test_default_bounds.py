@@ -8,7 +8,7 @@ from kit.problems import hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.fem.laws.constants import KNOWN, constant_named
-from collocation_sysid.methods.stiffness_scan import ScanState
+from collocation_sysid.methods.starts.stiffness_scan import ScanState
 from collocation_sysid.model.parameters import (
     Parameter,
     Parameters,

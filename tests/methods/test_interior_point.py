@@ -34,15 +34,15 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods import initial_point
 from collocation_sysid.methods.condensed_program import condense
-from collocation_sysid.methods.initial_point import LARGEST_CORRECTION, adjoint_multipliers
-from collocation_sysid.methods.initial_trajectories import (
+from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Iteration, Solution, Status
+from collocation_sysid.methods.starts.initial_point import LARGEST_CORRECTION, adjoint_multipliers
+from collocation_sysid.methods.starts.initial_trajectories import (
     associated_at_guess,
     initial_variables,
     rigid_trajectory,
 )
-from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
-from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem

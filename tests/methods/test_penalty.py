@@ -23,8 +23,8 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods.comparison.inner import FIRST_ORDER, minimise_merit
 from collocation_sysid.methods.comparison.merit import MeritFunction, PenaltyProblem
 from collocation_sysid.methods.comparison.penalty import Penalty
-from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.methods.solution import Iteration, Status
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.program.collocation import Collocation
 
 NEWTON = Penalty(inner="levenberg-marquardt")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.methods.power_law_start import power_law_start
+from collocation_sysid.methods.starts.power_law import power_law_start
 
 RUBBER = {"mu_1_pa": 3.2e5, "alpha_1": 2.0, "mu_2_pa": -4e4, "alpha_2": -2.0, "kappa_pa": 1e9}
 FOAM = {

@@ -28,15 +28,15 @@ import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods.horizon import Horizon, Iterate
-from collocation_sysid.methods.initial_trajectories import (
-    initial_variables,
-    rigid_trajectory,
-    simulate_trajectories,
-)
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import secant_update, with_curvature
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
+from collocation_sysid.methods.starts.initial_trajectories import (
+    initial_variables,
+    rigid_trajectory,
+    simulate_trajectories,
+)
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.least_squares import SquareRootInformation

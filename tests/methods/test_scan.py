@@ -37,7 +37,7 @@ from collocation_sysid import (
 )
 from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.methods.stiffness_scan import (
+from collocation_sysid.methods.starts.stiffness_scan import (
     CLEARLY_BETTER,
     ScanState,
     TrialSimulation,
@@ -316,7 +316,7 @@ def test_a_guess_that_cannot_be_simulated_is_rescued_with_a_note():
 
 def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit", 1e-3
+        "collocation_sysid.methods.starts.stiffness_scan.TrialSimulation.rigid_misfit", 1e-3
     )
     collocation, found, _ = start_problem(cube(guessed(mu_pa=1e4)).collocation())
     assert found is not None
@@ -332,7 +332,7 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
 
 def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit", 0.0
+        "collocation_sysid.methods.starts.stiffness_scan.TrialSimulation.rigid_misfit", 0.0
     )
     collocation = cube(guessed(**{**TRUTH, "mu_pa": 301.0})).collocation()
     assert start_problem(collocation)[0] is collocation
@@ -342,7 +342,7 @@ def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
 def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
     """As where a tare, which is not estimated in a scan, makes most of the misfit."""
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan.TrialSimulation.rigid_misfit", 0.0
+        "collocation_sysid.methods.starts.stiffness_scan.TrialSimulation.rigid_misfit", 0.0
     )
     problem = cube(guessed(mu_pa=600.0))
     (experiment,) = problem.experiments
@@ -387,7 +387,7 @@ def test_with_a_guess_it_is_left_to_the_method():
 def test_a_method_that_simulates_everything_gets_a_start_that_can_be(monkeypatch):
     best = scanned().young_pa[scanned().best]
     monkeypatch.setattr(
-        "collocation_sysid.methods.stiffness_scan.TrialSimulation.is_simulable",
+        "collocation_sysid.methods.starts.stiffness_scan.TrialSimulation.is_simulable",
         lambda _, young: young > 1.5 * best,
     )
     found = scan_stiffness(cube().collocation(), is_complete=True)

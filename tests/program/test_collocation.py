@@ -23,7 +23,7 @@ from kit.problems import (
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.kernels.combine import combine_with_numpy
 from collocation_sysid.fem.laws.moduli import engineering_constants as engineering_moduli
-from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme

@@ -11,7 +11,7 @@ from kit.problems import smooth_poses, times
 
 import collocation_sysid as cs
 from collocation_sysid.extras.studies.model_choice import reserve_test_data
-from collocation_sysid.methods.continuation import first_samples
+from collocation_sysid.methods.starts.continuation import first_samples
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
 from collocation_sysid.runs.check import check_problem

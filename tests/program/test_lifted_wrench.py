@@ -17,10 +17,10 @@ from kit.wrenches import sensed, sensing, wristed_cube
 
 from collocation_sysid.methods.comparison.casadi_nlp import SqpMethod
 from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Penalty
-from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
+from collocation_sysid.methods.starts.continuation import Continuation
 from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.program.lifted.lifted_collocation import lifted_count
 from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches

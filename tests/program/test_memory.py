@@ -9,8 +9,8 @@ from kit.memories import ONE, TWO, guesses, recorded, remembering, truth
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.comparison.shooting import Shooting
-from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.starts.continuation import Continuation
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate

@@ -29,9 +29,9 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.comparison.shooting import Shooting
-from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.collocation import Collocation

@@ -117,7 +117,7 @@ LIFTING = (
     "program.lifted",
     "methods.certificate",
     "methods.interior_point",
-    "methods.initial_point",
+    "methods.starts.initial_point",
     "methods.complementarity",
     "methods.comparison",
     "runs.check",

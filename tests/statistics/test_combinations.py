@@ -9,7 +9,7 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
-from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.result.pictures.confidence import combinations_picture
 from collocation_sysid.runs.expected_precision import (
     added_measurements,

@@ -26,7 +26,7 @@ from collocation_sysid import (
     run,
 )
 from collocation_sysid.common.display import plain_text
-from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording.nuisance import TEMPERATURE

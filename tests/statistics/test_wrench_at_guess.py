@@ -15,7 +15,7 @@ from collocation_sysid.features.wrench_at_guess import (
     has_inertial_wrenches,
     wrench_deviations,
 )
-from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Experiment, Wrench

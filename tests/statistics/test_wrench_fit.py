@@ -16,9 +16,9 @@ from kit.wrenches import SIGMA_N, SIGMA_NM, sensing
 import collocation_sysid as cs
 from collocation_sysid.methods.comparison.shooting import Shooting
 from collocation_sysid.methods.horizon import Horizon
-from collocation_sysid.methods.initial_trajectories import initial_variables
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables

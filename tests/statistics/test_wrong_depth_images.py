@@ -19,7 +19,7 @@ from collocation_sysid.features.camera_image_misspecifications import (
     camera_image_hypotheses,
     equilibrium_shapes_m,
 )
-from collocation_sysid.methods.initial_trajectories import initial_variables
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import check_problem, misspecification_hypotheses
 from collocation_sysid.runs.misspecifications import find_misspecifications

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import InputError
-from ...methods.stiffness_scan import typical_parameters
+from ...methods.starts.stiffness_scan import typical_parameters
 from ...model.point_forces import law_function
 from ...problem import Problem
 from ...program.streaming import StreamingModel

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...common.array_types import Array
-from ...methods.stiffness_scan import STIFFEST_PA, typical_parameters, without_guesses
+from ...methods.starts.stiffness_scan import STIFFEST_PA, typical_parameters, without_guesses
 from ...program.streaming import StreamingModel
 from .window_pass import WindowPass
 

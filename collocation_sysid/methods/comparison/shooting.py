@@ -30,10 +30,10 @@ from ...errors import SimulationError
 from ...program.collocation import Collocation
 from ...program.stopwatch import Stopwatch
 from ..horizon import Horizon
-from ..initial_trajectories import complete_variables, simulate_trajectories
 from ..method_options import MethodOptions
 from ..solution import Solution, Status, Watch, constraint_multipliers
 from ..solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
+from ..starts.initial_trajectories import complete_variables, simulate_trajectories
 
 # Relative decrease of the loss, or of one of a standard deviation, that is rounding.
 ROUNDING = 1e-14

@@ -20,9 +20,14 @@ from ...errors import SimulationError
 from ...features.feature import SimulatedCheck
 from ...features.measurements import lost_samples
 from ...features.registry import FEATURES
-from ...methods.initial_trajectories import initial_variables
 from ...methods.reduced_space import ReducedSpace
-from ...methods.stiffness_scan import SOFT_PA, start_problem, typical_constants, typical_parameters
+from ...methods.starts.initial_trajectories import initial_variables
+from ...methods.starts.stiffness_scan import (
+    SOFT_PA,
+    start_problem,
+    typical_constants,
+    typical_parameters,
+)
 from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation

@@ -20,10 +20,10 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.time_dependence import at_times
 from ...errors import InputError, SimulationError
-from ...methods.continuation import first_samples
-from ...methods.initial_trajectories import associated_at_guess
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution, Status
+from ...methods.starts.continuation import first_samples
+from ...methods.starts.initial_trajectories import associated_at_guess
 from ...program.collocation import ExperimentIterate
 from ...program.modes.modal_prediction import DeclaredMotion
 from ...recording.experiment import Experiment

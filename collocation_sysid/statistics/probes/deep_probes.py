@@ -17,7 +17,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
-from ...methods.initial_trajectories import simulate_trajectories
+from ...methods.starts.initial_trajectories import simulate_trajectories
 from ..budget.systematic_effects import CORRELATION_KEY
 from ..distributions import normal_isf
 from ..linearised import (

@@ -23,17 +23,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..common.array_types import Array, root_mean
-from ..common.step_counting import StepUnit, complete_steps, counted_phase
-from ..errors import InputError, SimulationError
-from ..fem.laws.constants import YOUNG, is_modulus, usual_value
-from ..model.parameters import Parameter, Parameters, with_widest_bounds
-from ..program.collocation import Collocation, ExperimentIterate
-from ..program.forward.newton_solver import NewtonOptions
-from ..program.transcription import Transcription
+from ...common.array_types import Array, root_mean
+from ...common.step_counting import StepUnit, complete_steps, counted_phase
+from ...errors import InputError, SimulationError
+from ...fem.laws.constants import YOUNG, is_modulus, usual_value
+from ...model.parameters import Parameter, Parameters, with_widest_bounds
+from ...program.collocation import Collocation, ExperimentIterate
+from ...program.forward.newton_solver import NewtonOptions
+from ...program.transcription import Transcription
+from ..method_options import SHARES, samples_in_share
 from .initial_trajectories import simulate_trajectories
-from .method_options import SHARES, samples_in_share
-from .power_law_start import power_law_start
+from .power_law import power_law_start
 
 # Largest Young's modulus of the scan [Pa].
 STIFFEST_PA = 1e7

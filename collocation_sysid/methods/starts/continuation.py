@@ -13,22 +13,22 @@ from dataclasses import field, replace
 from functools import cached_property
 from typing import ClassVar
 
-from ..common.array_types import Array
-from ..common.validated_classes import validated
-from ..errors import InputError, hint_at
-from ..program.collocation import Collocation
-from ..recording.experiment import Experiment
-from ..recording.measurement_selection import shortened_experiment
-from ..recording.time_tables import FEWEST_SHARED_SAMPLES
-from .comparison.casadi_nlp import Sleqp, SqpMethod
-from .comparison.penalty import AugmentedLagrangian, Penalty
-from .comparison.shooting import Shooting
+from ...common.array_types import Array
+from ...common.validated_classes import validated
+from ...errors import InputError, hint_at
+from ...program.collocation import Collocation
+from ...recording.experiment import Experiment
+from ...recording.measurement_selection import shortened_experiment
+from ...recording.time_tables import FEWEST_SHARED_SAMPLES
+from ..comparison.casadi_nlp import Sleqp, SqpMethod
+from ..comparison.penalty import AugmentedLagrangian, Penalty
+from ..comparison.shooting import Shooting
+from ..interior_point import InteriorPoint
+from ..method_options import SHARES, MethodOptions, Shares, method_from_options, samples_in_share
+from ..reduced_space import ReducedSpace
+from ..solution import Iteration, Method, Solution, Status, Watch
+from ..solve_recorder import Recorder
 from .initial_trajectories import complete_variables, simulate_trajectories
-from .interior_point import InteriorPoint
-from .method_options import SHARES, MethodOptions, Shares, method_from_options, samples_in_share
-from .reduced_space import ReducedSpace
-from .solution import Iteration, Method, Solution, Status, Watch
-from .solve_recorder import Recorder
 
 _ONE_HORIZON = (
     InteriorPoint,

@@ -21,15 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, least_squares
 
-from ..common.array_types import Array
-from ..fem.laws.constants import constant_named, symbol_of
-from ..fem.laws.ogden import is_power_law, term_numbers
-from ..model.parameters import Parameter, Parameters, Tied
-from ..program.collocation import Collocation
-from ..recording.experiment import Experiment
-from ..recording.homogeneous_deformation import AXES
-from ..recording.specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
-from ..recording.specimen_files import deformed_gradients
+from ...common.array_types import Array
+from ...fem.laws.constants import constant_named, symbol_of
+from ...fem.laws.ogden import is_power_law, term_numbers
+from ...model.parameters import Parameter, Parameters, Tied
+from ...program.collocation import Collocation
+from ...recording.experiment import Experiment
+from ...recording.homogeneous_deformation import AXES
+from ...recording.specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
+from ...recording.specimen_files import deformed_gradients
 
 # Sizes of the exponents of the grid, each with both signs.
 GRID = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 18.0, 22.0)

@@ -11,17 +11,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..common.array_types import Array
-from ..errors import SimulationError
-from ..fem.kernels import map_experiments
-from ..model.forces import Forces
-from ..program.collocation import Collocation
-from ..program.forward.initial_equilibrium import initial_state
-from ..program.forward.loss_of_stability import explain_failure
-from ..program.forward.newton_solver import NewtonOptions, NewtonSolver
-from ..program.forward.scheme_simulation import continue_simulation, simulate_scheme
-from ..program.stopwatch import Stopwatch
-from ..program.transcription import Transcription
+from ...common.array_types import Array
+from ...errors import SimulationError
+from ...fem.kernels import map_experiments
+from ...model.forces import Forces
+from ...program.collocation import Collocation
+from ...program.forward.initial_equilibrium import initial_state
+from ...program.forward.loss_of_stability import explain_failure
+from ...program.forward.newton_solver import NewtonOptions, NewtonSolver
+from ...program.forward.scheme_simulation import continue_simulation, simulate_scheme
+from ...program.stopwatch import Stopwatch
+from ...program.transcription import Transcription
 
 
 def associated_at_guess(collocation: Collocation) -> Collocation:

@@ -16,14 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse.linalg as spla
 
-from ..common.array_types import Array
-from ..errors import SimulationError
-from ..program.collocation import Collocation, convert_variables
-from ..program.lifted.lifted_collocation import lifted_count
-from .condensed_program import CondensedCollocation, complete_program
-from .reduced_space import ReducedSpace
-from .solution import Iteration, Solution, Status, constraint_multipliers
-from .solve_recorder import Recorder, SearchEnded
+from ...common.array_types import Array
+from ...errors import SimulationError
+from ...program.collocation import Collocation, convert_variables
+from ...program.lifted.lifted_collocation import lifted_count
+from ..condensed_program import CondensedCollocation, complete_program
+from ..reduced_space import ReducedSpace
+from ..solution import Iteration, Solution, Status, constraint_multipliers
+from ..solve_recorder import Recorder, SearchEnded
 
 # Longest last step of a parameter's logarithm: Newton's method converges quadratically from there.
 LARGEST_CORRECTION = 1e-3

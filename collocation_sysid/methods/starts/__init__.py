@@ -1,0 +1,8 @@
+"""Starts of a search: parameters and trajectories from which a method begins.
+
+- `stiffness_scan`: parameters without a guess, by simulations; `power_law`: constants of power laws,
+  from closed forms of specimens.
+- `initial_trajectories`: motions at the guess; `initial_point`: a coarse solution by reduced space, for
+  interior point.
+- `continuation`: searches of the first samples, from which the search of all samples begins.
+"""
