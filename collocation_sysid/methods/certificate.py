@@ -105,7 +105,7 @@ def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certifica
     basis = np.zeros((len(variables), int(is_free.sum())))
     basis[np.flatnonzero(is_free), np.arange(basis.shape[1])] = 1.0
     basis[is_position] = -factor.solve(jacobian[:, np.flatnonzero(is_free)].toarray())
-    hessian = program.hessian(variables, 1.0, multipliers=adjoint.constraints)
+    hessian = program.hessian(variables, 1.0, multipliers=adjoint[0])
     reduced = basis.T @ (hessian @ basis)
     curvatures = np.asarray(np.linalg.eigvalsh((reduced + reduced.T) / 2), dtype=float)
 

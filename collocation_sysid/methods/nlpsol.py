@@ -23,7 +23,6 @@ from .callbacks import HessianValues, IterationMonitor, NlpFunctions
 from .condensed_program import complete_multipliers
 from .solution import Solution, Status
 from .solve_recorder import Recorder
-from .starts.initial_point import InitialMultipliers
 
 # Of solvers that are written otherwise.
 NAMES = {"ipopt": "IPOPT"}
@@ -51,7 +50,7 @@ def solve(
     settings: Settings,
     statuses: Mapping[str, Status],
     judge: Callable[[Status, Array, Array], Status] = lambda status, *_: status,
-    initial_multipliers: InitialMultipliers | None = None,
+    initial_multipliers: tuple[Array, Array] | None = None,
 ) -> Solution:
     """Solve the recorder's collocation, and return the solution; if the solver did not converge,
     its best iterate.
@@ -80,7 +79,7 @@ def solve(
         Status by the solver's return status; others mean a numerical failure.
     judge : callable
         Function of status, variables and multipliers of the problem that returns the final status.
-    initial_multipliers : InitialMultipliers, optional
+    initial_multipliers : ((constraints,) array, (variables,) array), optional
         Initial multipliers of the program; zeros by default.
 
     Raises
@@ -215,7 +214,7 @@ def _run(
     bounds: tuple[Array, Array],
     start: Array,
     monitor: IterationMonitor,
-    multipliers: InitialMultipliers | None,
+    multipliers: tuple[Array, Array] | None,
 ) -> _NlpsolResult:
     """Run a solver, on a thread of its own if this is the main thread.
 
@@ -224,7 +223,7 @@ def _run(
     lower, upper = bounds
     arguments = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}
     if multipliers is not None:
-        arguments |= {"lam_g0": multipliers.constraints, "lam_x0": multipliers.bounds}
+        arguments |= dict(zip(("lam_g0", "lam_x0"), multipliers, strict=True))
     results: list[_NlpsolResult] = []
 
     def search() -> None:

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,14 +20,6 @@ from ..common.array_types import Array
 from ..fem.kernels import COMPILING, Instances, make_instance_evaluator
 
 Expression = Callable[[ca.SX, ca.SX], ca.SX]
-
-
-class _Symbols(NamedTuple):
-    """Dense expression y (m,) in the symbols u (k,) and data (d,)."""
-
-    u: ca.SX
-    data: ca.SX
-    y: ca.SX
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +79,7 @@ class GeneratedFunction:
             Weights of the values; 1 by default.
         """
         weights = (
-            np.ones((self._symbols.y.numel(), *data.shape[1:])) if weights is None else weights
+            np.ones((self._symbols[2].numel(), *data.shape[1:])) if weights is None else weights
         )
         return self._evaluate_at_instances("curvature", self._curvature, u, data, weights)[0]
 
@@ -134,12 +125,12 @@ class GeneratedFunction:
         return np.array(ca.DM(second.sparsity(), 1.0).full(), dtype=bool)
 
     @cached_property
-    def _symbols(self) -> _Symbols:
-        """Symbols of u and data, and the expression of them."""
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Symbols u (k,) and data (d,), and the dense expression y (m,) of them."""
         u = ca.SX.sym("u", self.input_size)
         data = ca.SX.sym("data", self.data_size)
         y = ca.densify(ca.SX(self.expression(u, data)))
-        return _Symbols(u, data, y=y)
+        return u, data, y
 
     @cached_property
     def _value(self) -> ca.Function:

@@ -13,7 +13,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,24 +93,6 @@ class CandidatePoints:
         on_nodes = self.weights[:, :, None] * push.T[:, None]
         summed = np.bincount(self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size)
         return np.asarray(summed, dtype=float)
-
-
-class LinearisedLocalForce(NamedTuple):
-    """Local forces in a time step and their derivative by the unknown positions.
-
-    Attributes
-    ----------
-    force : (3n,) array
-        Forces [N].
-    symmetric : (m,) array
-        Lower triangle of the symmetric part of the derivative [N/m].
-    skew : (m,) or (0,) array
-        Lower triangle of its skew part [N/m]; empty if no force depends on velocities.
-    """
-
-    force: Array
-    symmetric: Array
-    skew: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,8 +220,12 @@ class LocalForces:
             total += part.force(xi, nu)
         return total
 
-    def linearise(self, xi: Array, nu: Array, rates: tuple[float, float]) -> LinearisedLocalForce:
-        """Return the sum of the forces at ξ and ν, and its derivative by the unknown positions.
+    def linearise(
+        self, xi: Array, nu: Array, rates: tuple[float, float]
+    ) -> tuple[Array, Array, Array]:
+        """Return the sum of the forces (3n,) [N] at ξ and ν, and the lower triangles (m,) of the
+        symmetric and of the skew part of its derivative by the unknown positions [N/m]; the last is
+        empty if no force depends on velocities.
 
         Parameters
         ----------
@@ -273,7 +258,7 @@ class LocalForces:
                     weights=(candidates.skew_factors[indices] * blocks).ravel(),
                     minlength=len(skew),
                 )
-        return LinearisedLocalForce(force, symmetric, skew=skew)
+        return force, symmetric, skew
 
     def active_points(self, xi: Array, nu: Array, rates: tuple[float, float]) -> list[ActivePoints]:
         """Return the points on which each force with candidates acts at ξ and ν, (1, 3n) each;

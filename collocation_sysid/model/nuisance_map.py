@@ -86,24 +86,6 @@ class TimedLoad(NamedTuple):
         return getattr(self.load, self.change)
 
 
-class CalibrationIndices(NamedTuple):
-    """Indices in φ of the calibration of an actuator; −1 for a parameter that is not estimated.
-
-    Attributes
-    ----------
-    factor : int
-        Index of the factor f.
-    offset : int
-        Index of the loss b.
-    lag : int
-        Index of the logarithm of the lag over the stated lag.
-    """
-
-    factor: int
-    offset: int
-    lag: int
-
-
 @dataclass(frozen=True)
 class NuisanceEntry:
     """One nuisance parameter.
@@ -301,8 +283,9 @@ class NuisanceMap(RecordingQuantities):
         """Indices in φ of the calibration of tensions and pressures."""
         return self._indices_where(lambda e: "drives" in e.row.changes)
 
-    def actuator_calibration_indices(self, number: int) -> CalibrationIndices:
-        """Return the indices in φ of the calibration of one actuator.
+    def actuator_calibration_indices(self, number: int) -> list[int]:
+        """Return the indices in φ of factor, loss and logarithm of the lag of one actuator; −1 for a
+        parameter that is not estimated.
 
         Parameters
         ----------
@@ -314,7 +297,7 @@ class NuisanceMap(RecordingQuantities):
         for k in self.actuator_indices:
             if self.entries[k].number == number:
                 indices[columns.get(self.entries[k].row.name, 0)] = int(k)
-        return CalibrationIndices(*indices)
+        return indices
 
     def actuator_calibration(self, phi: Array) -> Array:
         """Return factor f, loss b and logarithm of the lag over the stated lag of each tendon and

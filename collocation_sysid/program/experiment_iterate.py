@@ -162,7 +162,7 @@ class ExperimentIterate:
         """Vector–Jacobian product of the reaction forces R, including the dependence through
         history variables. The transcription's `linearisation_buffer` is overwritten.
         """
-        direct = reaction_vjp(
+        by_x, by_p, force_weights = reaction_vjp(
             self.equations,
             self.x,
             weights=weights,
@@ -170,9 +170,9 @@ class ExperimentIterate:
             buffer=self.transcription.linearisation_buffer,
         )
         through_x, through_p = self.transcription.history_vjp(
-            self.x, self.equations, weights=direct.force_weights
+            self.x, self.equations, weights=force_weights
         )
-        return direct.by_x + through_x, direct.by_parameters + through_p
+        return by_x + through_x, by_p + through_p
 
     def linearise_fixed_motion(self) -> list[tuple[Array, Array]]:
         """Linearise the residuals of all measurements by φ, at a motion that does not change.

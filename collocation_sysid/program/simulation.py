@@ -368,7 +368,7 @@ def _with_steps(
     sensed = sensed_dofs(experiment)
     equilibria = None
     if integrator == NEWMARK and not experiment.is_static:
-        motion = simulate_newmark(
+        x, v, forced = simulate_newmark(
             experiment,
             theta,
             steps_per_sample=steps,
@@ -376,9 +376,6 @@ def _with_steps(
             progress=progress,
             sensed=sensed,
         )
-        x = motion.positions_m
-        v = motion.velocities_m_s
-        forced = motion.reactions
         rows = (len(x) - 1) * steps + 1
         at = ReactionGrid.from_times(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
     else:

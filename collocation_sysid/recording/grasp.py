@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, Literal, Self, cast, get_args
@@ -221,7 +221,7 @@ def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> lis
     """
     if not is_prescribed.any():
         return ["translate and rotate as a rigid body"]
-    free = free_rigid_modes(points_m, is_prescribed).coordinates
+    free, _ = free_rigid_modes(points_m, is_prescribed)
     if not len(free):
         return []
     # Free motions without rotation, and the axes of the free rotations.
@@ -233,24 +233,7 @@ def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> lis
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class FreeRigidModes:
-    """Infinitesimal rigid motions that do not move prescribed coordinates.
-
-    Attributes
-    ----------
-    coordinates : (k, 6) array
-        Orthonormal basis of the free motions: translations along the axes, then rotations about
-        them, those over the distance of the farthest held node from the centre of the held nodes.
-    displacements : (n, 3, k) array
-        Displacements of all nodes in these motions.
-    """
-
-    coordinates: Array
-    displacements: Array
-
-
-def free_rigid_modes(points_m: Array, is_prescribed: NDArray[np.bool_]) -> FreeRigidModes:
+def free_rigid_modes(points_m: Array, is_prescribed: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Return the rigid motions that prescribed coordinates leave free, to first order.
 
     Parameters
@@ -259,6 +242,14 @@ def free_rigid_modes(points_m: Array, is_prescribed: NDArray[np.bool_]) -> FreeR
         Node positions [m].
     is_prescribed : (n, 3) array of bool
         Whether each coordinate is prescribed; at least one is.
+
+    Returns
+    -------
+    coordinates : (k, 6) array
+        Orthonormal basis of the free motions: translations along the axes, then rotations about
+        them, those over the distance of the farthest held node from the centre of the held nodes.
+    displacements : (n, 3, k) array
+        Displacements of all nodes in these motions.
     """
     held = is_prescribed.any(axis=1)
     arms_m = points_m - points_m[held].mean(axis=0)
@@ -271,7 +262,7 @@ def free_rigid_modes(points_m: Array, is_prescribed: NDArray[np.bool_]) -> FreeR
     _, values, directions = np.linalg.svd(factor)
     rank = int((values > SMALLEST_SINGULAR_VALUE * values[0]).sum())
     free = directions[rank:]
-    return FreeRigidModes(free, displacements=modes @ free.T)
+    return free, modes @ free.T
 
 
 def _null_space(matrix: Array) -> Array:

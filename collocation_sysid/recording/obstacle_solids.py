@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from itertools import product
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -162,24 +162,6 @@ def _checked_ends(value: ArrayLike) -> Array:
     return ends
 
 
-class CylindricalCoordinates(NamedTuple):
-    """Place of a point relative to the axis of a solid of revolution.
-
-    Attributes
-    ----------
-    axial_m : SX
-        Distance along the axis from its middle [m], positive towards the second end.
-    radial_m : SX
-        Distance from the axis [m], at least 0.
-    half_length_m : float
-        Half of the length of the axis [m].
-    """
-
-    axial_m: ca.SX
-    radial_m: ca.SX
-    half_length_m: float
-
-
 @declaration
 class _AxialSolid(Solid):
     """A solid of revolution about an axis between two ends."""
@@ -196,15 +178,16 @@ class _AxialSolid(Solid):
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
-    def _cylindrical_coordinates(self, point: ca.SX) -> CylindricalCoordinates:
-        """Return the cylindrical coordinates of a point (3,) [m] about the axis of the solid."""
+    def _beyond_ends_and_radius(self, point: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return by how much a point (3,) [m] is beyond the nearer end along the axis of the solid,
+        negative between the ends, and its distance from the axis [m].
+        """
         first, last = self.ends_m
         half = float(np.linalg.norm(last - first)) / 2
         axis = ca.DM((last - first) / (2 * half))
         offset = point - ca.DM((first + last) / 2)
         axial = ca.dot(axis, offset)
-        radial = _length(offset - axial * axis)
-        return CylindricalCoordinates(axial, radial, half_length_m=half)
+        return ca.fabs(axial) - half, _length(offset - axial * axis)
 
 
 @declaration
@@ -226,10 +209,8 @@ class Cylinder(_AxialSolid):
         """Return the signed distance of a point (3,) from the cylinder [m]; negative inside, where
         it is that to the nearest of the side and the ends.
         """
-        place = self._cylindrical_coordinates(point)
-        beyond = ca.vertcat(
-            place.radial_m - self.radius_m, ca.fabs(place.axial_m) - place.half_length_m
-        )
+        along_m, radial_m = self._beyond_ends_and_radius(point)
+        beyond = ca.vertcat(radial_m - self.radius_m, along_m)
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
 
@@ -246,9 +227,8 @@ class Capsule(_AxialSolid):
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
         """Return the signed distance of a point (3,) from the capsule [m]; negative inside."""
-        place = self._cylindrical_coordinates(point)
-        beyond = ca.fmax(ca.fabs(place.axial_m) - place.half_length_m, 0)
-        return _length(ca.vertcat(beyond, place.radial_m)) - self.radius_m
+        along_m, radial_m = self._beyond_ends_and_radius(point)
+        return _length(ca.vertcat(ca.fmax(along_m, 0), radial_m)) - self.radius_m
 
 
 @declaration

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,27 +207,12 @@ def without_rounding(t_s: Array) -> Array:
 # Custom sensors -----------------------------------------------------------------------------------
 
 
-class CustomSensorTable(NamedTuple):
-    """Values of a custom sensor over time.
-
-    Attributes
-    ----------
-    t_s : (S,) array
-        Sample times [s].
-    values : (S, m) array
-        Values in their own units; NaN where a cell is blank.
-    columns : list of str
-        Names of the m columns of the values.
-    """
-
-    t_s: Array
-    values: Array
-    columns: list[str]
-
-
 @names_file_in_errors
-def read_custom_sensor(path: str | Path, columns: Sequence[str] = ()) -> CustomSensorTable:
-    """Read the values of a custom sensor over time.
+def read_custom_sensor(
+    path: str | Path, columns: Sequence[str] = ()
+) -> tuple[Array, Array, list[str]]:
+    """Return sample times (S,) [s] of a custom sensor, its values (S, m), NaN where a cell is blank,
+    and the names of their m columns.
 
     Parameters
     ----------
@@ -252,7 +236,7 @@ def read_custom_sensor(path: str | Path, columns: Sequence[str] = ()) -> CustomS
             raise grid.error_at(f"{there} {name!r}; expected one among {among}{hint}")
     t_s = times_in_column(grid, grid.columns.index("t_s"))
     values = numeric_cells(grid, [grid.columns.index(name) for name in names], blank_allowed=True)
-    return CustomSensorTable(without_rounding(t_s), np.asarray(values), columns=names)
+    return without_rounding(t_s), np.asarray(values), names
 
 
 def is_within_experiment(

@@ -32,11 +32,11 @@ from kit.wrenches import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.laws.moduli import engineering_constants
-from collocation_sysid.methods import initial_point
 from collocation_sysid.methods.condensed_program import condense
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
+from collocation_sysid.methods.starts import initial_point
 from collocation_sysid.methods.starts.initial_point import LARGEST_CORRECTION, adjoint_multipliers
 from collocation_sysid.methods.starts.initial_trajectories import (
     associated_at_guess,
@@ -274,8 +274,9 @@ def test_initial_multipliers_balance_the_lagrangian(name: str):
     program = condense(with_lifted_variables(collocation))
     found = adjoint_multipliers(program, collocation, z)
     assert found is not None
+    constraints, bounds = found
     at = convert_variables(z, collocation, program)
-    slope = program.gradient(at) + program.jacobian(at).T @ found.constraints
+    slope = program.gradient(at) + program.jacobian(at).T @ constraints
     lower, upper = program.bounds()
     of_p = np.zeros(program.variable_count, dtype=bool)
     of_p[: program.nq] = of_p[program.phi_columns] = True
@@ -283,7 +284,7 @@ def test_initial_multipliers_balance_the_lagrangian(name: str):
     assert np.abs(slope[~of_p & (lower < upper)]).max() < 1e-8 * scale
     distance = np.where(slope > 0, at - lower, upper - at)
     active = (lower < upper) & (np.abs(slope) > distance)
-    np.testing.assert_array_equal(found.bounds, np.where(active, -slope, 0.0))
+    np.testing.assert_array_equal(bounds, np.where(active, -slope, 0.0))
 
 
 def test_a_parameter_at_its_bound_needs_no_iteration_from_the_answer():

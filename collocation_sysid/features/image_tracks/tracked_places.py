@@ -50,26 +50,9 @@ SAME_FACE = 1e-3
 ShapeAt = Callable[[float], Array]
 
 
-@dataclass(frozen=True, eq=False)
-class FoundPlaces:
-    """Poses of all cameras and places of all points of an experiment.
-
-    Attributes
-    ----------
-    poses : mapping of str to (4, 4) array
-        Pose of each camera by its name, in the frame that carries it.
-    mirrored : mapping of str to float
-        Of cameras whose pose was found: the RMS of the second best pose over that of the best one.
-    places_m : mapping of str to (3,) array
-        Place of each point on the undeformed body; NaN if no ray meets the body.
-    """
-
-    poses: Mapping[str, Array]
-    mirrored: Mapping[str, float]
-    places_m: Mapping[str, Array]
-
-
-def find_places(experiment: Experiment, shape_at: ShapeAt) -> FoundPlaces:
+def find_places(
+    experiment: Experiment, shape_at: ShapeAt
+) -> tuple[dict[str, Array], dict[str, float], dict[str, Array]]:
     """Return the poses of the cameras and the places of the points of an experiment.
 
     Parameters
@@ -77,6 +60,15 @@ def find_places(experiment: Experiment, shape_at: ShapeAt) -> FoundPlaces:
     experiment : Experiment
     shape_at : callable
         ``shape_at(t_s)``, nodes (n, 3) of the body at a time [m].
+
+    Returns
+    -------
+    poses : mapping of str to (4, 4) array
+        Pose of each camera by its name, in the frame that carries it.
+    mirrored : mapping of str to float
+        Of cameras whose pose was found: the RMS of the second best pose over that of the best one.
+    places_m : mapping of str to (3,) array
+        Place of each point on the undeformed body; NaN if no ray meets the body.
 
     Raises
     ------
@@ -96,7 +88,7 @@ def find_places(experiment: Experiment, shape_at: ShapeAt) -> FoundPlaces:
     places = dict(stated)
     for tracks in cameras:
         _add_places(places, tracks, poses[tracks.name], experiment.body, shape_at)
-    return FoundPlaces(poses, mirrored, places)
+    return poses, mirrored, places
 
 
 def _poses_of(
@@ -222,13 +214,13 @@ class TrackedPlaces(Correspondences):
         pose_parameters: Index,
     ) -> TrackedPlaces:
         """Find places and pose with the shapes of the body, see `find_places`."""
-        found = find_places(experiment, shape_at)
+        poses, mirrored, places_m = find_places(experiment, shape_at)
         body = experiment.body
-        places = np.array([found.places_m[name] for name in tracks.names])
+        places = np.array([places_m[name] for name in tracks.names])
         is_placed = np.asarray(np.isfinite(places).all(axis=1))
         places[~is_placed] = body.nodes_m[body.mesh.surface[0, 0]]
         sigmas = np.where(is_placed, tracks.place_sigmas_m(experiment), 0.0)
-        camera = replace(tracks.camera, pose=found.poses[tracks.name])
+        camera = replace(tracks.camera, pose=poses[tracks.name])
         rotations, translations = camera.pose_at(tracks.sample_times_s)
         shapes = np.array([shape_at(float(t)) for t in tracks.sample_times_s])
         correspondences = cls(
@@ -241,7 +233,7 @@ class TrackedPlaces(Correspondences):
             coordinate_parameters=coordinate_parameters,
             pose_parameters=pose_parameters,
             start_pose=np.zeros(len(pose_parameters)),
-            mirror_ratio=found.mirrored.get(tracks.name, np.inf),
+            mirror_ratio=mirrored.get(tracks.name, np.inf),
         )
         return correspondences.with_visibility(shapes)._aligned(shapes)
 

@@ -173,25 +173,9 @@ def _refined_solution(coarse: Solution, refined: Solution) -> Solution:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class InitialMultipliers:
-    """Initial multipliers of the program that is passed to IPOPT.
-
-    Attributes
-    ----------
-    constraints : (constraints,) array
-        Multipliers of the constraints.
-    bounds : (variables,) array
-        Multipliers of the bounds, positive at upper bounds; zero for variables without bounds.
-    """
-
-    constraints: Array
-    bounds: Array
-
-
 def adjoint_multipliers(
     program: Collocation, collocation: Collocation, z: Array
-) -> InitialMultipliers | None:
+) -> tuple[Array, Array] | None:
     """Return the multipliers that make the Lagrangian stationary in all positions.
 
     Parameters
@@ -205,8 +189,10 @@ def adjoint_multipliers(
 
     Returns
     -------
-    InitialMultipliers or None
-        None if the equations of a time step are singular or a multiplier is not finite.
+    ((constraints,) array, (variables,) array) or None
+        Multipliers of the constraints and of the bounds, which are positive at upper bounds and
+        zero for variables without bounds; None if the equations of a time step are singular or a
+        multiplier is not finite.
     """
     try:
         of_motion = constraint_multipliers(collocation, z)
@@ -229,8 +215,8 @@ def adjoint_multipliers(
         # Constraints of eliminated positions do not depend on the remaining variables.
         slope = program.condense_gradient(variables, slope)
     bounds = _bound_multipliers(program, variables, slope)
-    multipliers = InitialMultipliers(constraints, bounds)
-    return multipliers if np.isfinite(constraints).all() and np.isfinite(bounds).all() else None
+    is_finite = np.isfinite(constraints).all() and np.isfinite(bounds).all()
+    return (constraints, bounds) if is_finite else None
 
 
 def _bound_multipliers(program: Collocation, variables: Array, slope: Array) -> Array:

@@ -96,24 +96,6 @@ class NormalContact(NamedTuple):
     force_n: ca.SX
 
 
-class FrictionAtPoint(NamedTuple):
-    """Expressions of the friction of a point.
-
-    Attributes
-    ----------
-    limit_n : SX
-        Limit μ N of the friction force [N].
-    force : (3,) SX
-        Friction force [N], in the axes of the world.
-    velocity : (3,) SX
-        Tangential velocity relative to the obstacle [m/s], in the axes of the world.
-    """
-
-    limit_n: ca.SX
-    force: ca.SX
-    velocity: ca.SX
-
-
 @dataclass(frozen=True, eq=False)
 class ContactLaw:
     """Contact force of one obstacle at a surface point, as an expression with derivatives.
@@ -404,7 +386,7 @@ class ContactLaw:
         force = ca.vertcat(contact.axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m)
         if not self.obstacle.has_friction:
             return force
-        friction = self._friction(u, contact).force
+        _, friction, _ = self._friction(u, contact)
         return force + ca.vertcat(
             friction, -ca.vec(friction @ (contact.point / self._frame_size_m).T)
         )
@@ -440,8 +422,10 @@ class ContactLaw:
         """Return the constants (c,), which are the last entries of u."""
         return u[u.numel() - len(self.constant_columns) :]
 
-    def _friction(self, u: ca.SX, contact: NormalContact) -> FrictionAtPoint:
-        """Return the friction of a point with a normal force."""
+    def _friction(self, u: ca.SX, contact: NormalContact) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Return the limit μ N of the friction of a point [N], its friction force (3,) [N], and its
+        tangential velocity (3,) relative to the obstacle [m/s], in the axes of the world.
+        """
         slope = contact.axes @ contact.gap_gradient
         relative, *ends = ca.vertsplit(u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3)
         relative -= ca.horzcat(*ends) @ (contact.point / self._frame_size_m)
@@ -450,7 +434,7 @@ class ContactLaw:
         coefficient = self.friction_coefficient(self._constants(u))
         limit_n = coefficient * contact.force_n
         speed = ca.sqrt(ca.sumsqr(tangential) + self.slip**2)
-        return FrictionAtPoint(limit_n, -limit_n / speed * tangential, velocity=tangential)
+        return limit_n, -limit_n / speed * tangential, tangential
 
     @cached_property
     def friction_function(self) -> GeneratedFunction:
@@ -463,15 +447,10 @@ class ContactLaw:
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
             """Return the 6 values of friction, with u = (y, ẏ, c)."""
             contact = self._normal_contact(u, data, pressing=None)
-            friction = self._friction(u, contact)
+            limit_n, force, velocity = self._friction(u, contact)
             slip_speed = SLIP_THRESHOLD * self.slip
-            slips = ca.sumsqr(friction.velocity) > slip_speed**2
-            return ca.vertcat(
-                friction.limit_n,
-                friction.limit_n * slips,
-                friction.force,
-                -ca.dot(friction.force, friction.velocity),
-            )
+            slips = ca.sumsqr(velocity) > slip_speed**2
+            return ca.vertcat(limit_n, limit_n * slips, force, -ca.dot(force, velocity))
 
         return GeneratedFunction(
             friction_values, self.force_function.input_size, data_size=DATA_COUNT

@@ -276,9 +276,7 @@ def _outline_points(
     at_second = corners[edge] == ends[edge, 1:]
     shares = at_first * (1 - share)[:, None] + at_second * share[:, None]
     faces, places = surface.to_faces(front_triangle[edge], shares)
-    surface_points = surface.evaluate(shape_m, faces, barycentric=places)
-    weights = surface_points.weights
-    points_m = surface_points.points_m
+    weights, points_m, _ = surface.evaluate(shape_m, faces, barycentric=places)
     pixels = camera.distorted_pixels(own_m)
     tangents_px = pixels[ends[edge, 1]] - pixels[ends[edge, 0]]
     length_px = np.linalg.norm(tangents_px, axis=1)

@@ -407,10 +407,7 @@ def _match_image(
     nearest = _nearest_facing(world, surface, x=x, eye_m=eye_m, gate_m=gate_m)
     indices = nearest.indices
     faces = nearest.faces
-    surface_points = surface.evaluate(x, faces, barycentric=nearest.barycentric)
-    weights = surface_points.weights
-    feet = surface_points.points_m
-    normals = surface_points.normals
+    weights, feet, normals = surface.evaluate(x, faces, barycentric=nearest.barycentric)
     ways = normals if eye_m is None else eye_m - feet
     is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
     offsets = world[indices] - feet

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,43 +40,6 @@ TRIANGLES_OF_FACE = {
     3: np.array([[0, 1, 2]]),
     6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
 }
-
-
-class SurfacePoints(NamedTuple):
-    """Points on faces of a deformed surface.
-
-    Attributes
-    ----------
-    weights : (P, v) array
-        Shape functions of the v nodes of each point's face.
-    points_m : (P, 3) array
-        Positions [m].
-    normals : (P, 3) array
-        Outward unit normals; zero on a degenerate face.
-    """
-
-    weights: Array
-    points_m: Array
-    normals: Array
-
-
-class _SurfaceTangents(NamedTuple):
-    """Points on faces of a deformed surface, and tangents there.
-
-    Attributes
-    ----------
-    weights : (P, v) array
-        Shape functions of the v nodes of each point's face.
-    points_m : (P, 3) array
-        Positions [m].
-    tangents : (P, 2, 3) array
-        Derivatives of the position by the first and the second barycentric coordinate [m], the
-        third changing by the opposite amount.
-    """
-
-    weights: Array
-    points_m: Array
-    tangents: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +116,10 @@ class VisibleSurface:
         corners = CORNERS[parts[triangles % len(parts)]]
         return triangles // len(parts), np.einsum("pc,pci->pi", barycentric, corners)
 
-    def evaluate(self, x: Array, faces: Index, barycentric: Array) -> SurfacePoints:
-        """Evaluate points on faces of a deformed surface.
+    def evaluate(self, x: Array, faces: Index, barycentric: Array) -> tuple[Array, Array, Array]:
+        """Return the shape functions (P, v) of the v nodes of each point's face, the positions
+        (P, 3) [m] of points on a deformed surface, and its outward unit normals (P, 3) there, zero
+        on a degenerate face.
 
         Parameters
         ----------
@@ -166,19 +130,22 @@ class VisibleSurface:
         barycentric : (P, 3) array
             Barycentric coordinates on them.
         """
-        at = self._evaluate_tangents(x, faces, barycentric=barycentric)
-        normals = np.cross(at.tangents[:, 0], at.tangents[:, 1])
+        weights, points_m, tangents = self._evaluate_tangents(x, faces, barycentric)
+        normals = np.cross(tangents[:, 0], tangents[:, 1])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-        return SurfacePoints(at.weights, at.points_m, normals=normals)
+        return weights, points_m, normals
 
-    def _evaluate_tangents(self, x: Array, faces: Index, barycentric: Array) -> _SurfaceTangents:
-        """Return points on faces and tangents along the faces; arguments as in `evaluate`."""
+    def _evaluate_tangents(
+        self, x: Array, faces: Index, barycentric: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return shape functions and points as `evaluate` does, and tangents (P, 2, 3): derivatives
+        by the first and the second barycentric coordinate [m], the third changing by the opposite
+        amount.
+        """
         weights, slopes = face_shape_functions(barycentric, self.faces.shape[1])
         corners = x[self.faces[faces]]
         tangents = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
-        return _SurfaceTangents(
-            weights, np.einsum("pa,pai->pi", weights, corners), tangents=tangents
-        )
+        return weights, np.einsum("pa,pai->pi", weights, corners), tangents
 
     def subdivided_triangles(self, x: Array, divisions: int = 4) -> Array:
         """Return the corners (F · divisions², 3, 3) [m] of triangles on a surface deformed to x (n,
@@ -193,7 +160,7 @@ class VisibleSurface:
         places = np.stack([1 - of_b - of_c, of_b, of_c], axis=-1).reshape(-1, 3)
         faces = np.repeat(np.arange(len(self.faces)), len(places))
         barycentric = np.tile(places, (len(self.faces), 1))
-        return self.evaluate(x, faces, barycentric=barycentric).points_m.reshape(-1, 3, 3)
+        return self.evaluate(x, faces, barycentric=barycentric)[1].reshape(-1, 3, 3)
 
     def is_facing(
         self, x: Array, eye_m: Array | None, minimum_cosine: float = 0.0
@@ -355,9 +322,8 @@ class VisibleSurface:
         moving = np.arange(len(points) if self.faces.shape[1] > 3 else 0)
         for _ in range(SETTLING):
             # Faces are curved: the nearest point of a face is beside that of the flat triangle.
-            at = self._evaluate_tangents(x, faces[moving], barycentric=places[moving])
-            feet = at.points_m
-            by_a, by_b = at.tangents.transpose(1, 0, 2)
+            _, feet, tangents = self._evaluate_tangents(x, faces[moving], places[moving])
+            by_a, by_b = tangents.transpose(1, 0, 2)
             aa, ab, bb = (
                 np.sum(u * v, axis=1) for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))
             )

@@ -121,13 +121,13 @@ class StepEquations(ABC):
         at = self.linearise_without_local(x)
         if not self.local.has_forces:
             return at
-        local = self.local.linearise(*self.states(x), self.rates)
+        force_n, symmetric, local_skew = self.local.linearise(*self.states(x), self.rates)
         skew = at.skew
-        if local.skew.size:
-            skew = skew - self.local_weight * local.skew
+        if local_skew.size:
+            skew = skew - self.local_weight * local_skew
         return NewtonLinearisation(
-            at.residual + self.local_weight * local.force,
-            at.symmetric - self.local_weight * local.symmetric,
+            at.residual + self.local_weight * force_n,
+            at.symmetric - self.local_weight * symmetric,
             skew=skew,
         )
 

@@ -71,25 +71,6 @@ class _State:
 
 
 @dataclass(frozen=True, eq=False)
-class NewmarkMotion:
-    """Motion simulated by Newmark's method.
-
-    Attributes
-    ----------
-    positions_m : (T, 3n) array
-        Positions at the samples [m].
-    velocities_m_s : (T, 3n) array
-        Velocities at the samples [m/s].
-    reactions : ReactionForces
-        Reaction forces on the sensed dofs at all steps, without derivatives.
-    """
-
-    positions_m: Array
-    velocities_m_s: Array
-    reactions: ReactionForces
-
-
-@dataclass(frozen=True, eq=False)
 class _PrescribedMotion:
     """Motion of the p prescribed dofs at one time.
 
@@ -112,7 +93,7 @@ def simulate_newmark(
     options: NewtonOptions | None,
     progress: Progress | None,
     sensed: Index,
-) -> NewmarkMotion:
+) -> tuple[Array, Array, ReactionForces]:
     """Simulate an experiment by Newmark's method.
 
     Parameters
@@ -129,6 +110,13 @@ def simulate_newmark(
         Called with the share of the samples done.
     sensed : (g,) array
         Dofs whose reaction forces are wanted.
+
+    Returns
+    -------
+    x, v : (T, 3n) arrays
+        Positions [m] and velocities [m/s] at the samples.
+    reactions : ReactionForces
+        Reaction forces on the sensed dofs at all steps, without derivatives.
 
     Raises
     ------
@@ -162,7 +150,7 @@ def simulate_newmark(
     reactions_and_positions[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
     reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
     reactions, positions = reactions_and_positions
-    return NewmarkMotion(x, v, reactions=ReactionForces(reactions, position_m=positions))
+    return x, v, ReactionForces(reactions, position_m=positions)
 
 
 class _NewmarkEquations(StepEquations):

@@ -40,22 +40,6 @@ class PatternIndices(NamedTuple):
     unit: Array = ONE
 
 
-class _HessianPairs(NamedTuple):
-    """Pairs of inputs of an expression with second derivatives.
-
-    Attributes
-    ----------
-    first, second : (h,) arrays
-        Indices among the k inputs; each pair occurs in both orders.
-    is_upper : (h, I) array of bool
-        Instances at which the pair is in the upper triangle of the Hessian by z.
-    """
-
-    first: Index
-    second: Index
-    is_upper: NDArray[np.bool_]
-
-
 @dataclass(frozen=True, eq=False)
 class ExpressionPattern:
     """An expression at I instances.
@@ -203,19 +187,21 @@ class ExpressionPattern:
         return self._assemble(value, count), slopes.ravel()
 
     @cached_property
-    def _hessian_pairs(self) -> _HessianPairs:
-        """Pairs of inputs with second derivatives."""
+    def _hessian_pairs(self) -> tuple[Index, Index, NDArray[np.bool_]]:
+        """Pairs (h,) of inputs with second derivatives, in both orders, and the instances (h, I) at
+        which a pair is in the upper triangle of the Hessian by z.
+        """
         i, j = np.nonzero(self.expression.hessian_pattern)
         indices = self.inputs.indices
-        return _HessianPairs(i, j, is_upper=indices[i] <= indices[j])
+        return i, j, indices[i] <= indices[j]
 
     def hessian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns in z of the second derivatives, upper triangle; an entry may be
         repeated.
         """
-        pairs = self._hessian_pairs
+        i, j, is_upper = self._hessian_pairs
         indices = self.inputs.indices
-        return (indices[pairs.first][pairs.is_upper], indices[pairs.second][pairs.is_upper])
+        return indices[i][is_upper], indices[j][is_upper]
 
     def hessian_values(self, z: Array, multipliers: Array) -> Array:
         """Return the second derivatives of multipliers (count,) · constraints by the scaled

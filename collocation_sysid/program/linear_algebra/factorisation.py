@@ -241,24 +241,6 @@ class _CompleteRows(NamedTuple):
     skew_signs: Array
 
 
-class _UpperTriangle(NamedTuple):
-    """Upper triangle of a symmetric matrix in compressed rows.
-
-    Attributes
-    ----------
-    row_starts : (k + 1,) array
-        Index of the first entry of each row, and the number of entries.
-    columns : (e,) array
-        Column of each entry, ascending in each row.
-    lower_positions : (e,) array
-        Position of the value of each entry among those of the lower triangle.
-    """
-
-    row_starts: Index
-    columns: Index
-    lower_positions: Index
-
-
 class _OrderedColumns(NamedTuple):
     """Structure of both triangles of a matrix in compressed columns, in the order in which SuperLU
     fills in little.
@@ -552,7 +534,7 @@ class Factoriser:
             except IndexError:  # not asked for beforehand: other threads take from it too
                 pardiso = self._pardiso(is_single)
             factor = SupernodalFactor(pardiso, pool)
-            upper_values = values[self._upper.lower_positions]
+            upper_values = values[self._upper[2]]
             return factor if pardiso.factorise(upper_values) else None
         if not self.is_banded:
             lu = self._superlu(values, pivot_below=0.0)
@@ -569,7 +551,8 @@ class Factoriser:
 
     def _pardiso(self, is_single: bool) -> Pardiso:
         """Return a new PARDISO solver for the pattern, of single or double precision."""
-        return Pardiso(self._upper.row_starts, self._upper.columns, is_single=is_single)
+        row_starts, columns, _ = self._upper
+        return Pardiso(row_starts, columns, is_single=is_single)
 
     @cached_property
     def _supernodal_size(self) -> int:
@@ -607,16 +590,17 @@ class Factoriser:
         return sp.csr_array((entries, rows.columns, rows.row_starts), shape=(self.size, self.size))
 
     @cached_property
-    def _upper(self) -> _UpperTriangle:
-        """Upper triangle of the matrix on the free dofs, row by row."""
+    def _upper(self) -> tuple[Index, Index, Index]:
+        """Upper triangle of the matrix on the free dofs, row by row: index of the first entry of
+        each row, then the number of entries; column of each entry; and position of its value among
+        those of the lower triangle.
+        """
         here = self._full_rows <= self._full_columns
         rows = self._full_rows[here]
         columns = self._full_columns[here]
         order = np.lexsort((columns, rows))
         starts = np.searchsorted(rows[order], np.arange(self.size + 1))
-        return _UpperTriangle(
-            starts, columns[order], lower_positions=self._full_source[here][order]
-        )
+        return starts, columns[order], self._full_source[here][order]
 
     def allocate(self, sides: int) -> FactorMemory | None:
         """Return memory for a factor within the skyline, or None if other methods are used.

@@ -84,25 +84,6 @@ class GraspForces:
         self.changes[:done] = known.changes
 
 
-@dataclass(frozen=True, eq=False)
-class ReactionGradient:
-    """Derivatives of a weighted sum of reaction forces, with history variables kept constant.
-
-    Attributes
-    ----------
-    by_x : (N, 3n) array
-        Derivatives by the positions [1/m].
-    by_parameters : (m,) array
-        Derivatives by the parameters that change the motion.
-    force_weights : (N, 3n) array
-        Weights of the forces at the evaluations [1/N], by which history variables contribute.
-    """
-
-    by_x: Array
-    by_parameters: Array
-    force_weights: Array
-
-
 def forces_on_dofs(
     dynamics: Dynamics, x: Array, dofs: Index, histories: Sequence[AnyHistory] = ()
 ) -> Array:
@@ -212,7 +193,7 @@ def linearised_reactions(
 
 def reaction_vjp(
     equations: EquationsAtParameters, x: Array, weights: Array, dofs: Index, buffer: Array
-) -> ReactionGradient:
+) -> tuple[Array, Array, Array]:
     """Vector–Jacobian product of the reaction forces R on selected dofs, with history variables
     kept constant.
 
@@ -228,6 +209,15 @@ def reaction_vjp(
         Selected dofs.
     buffer : array
         Work space of `Dynamics.linearise`, overwritten.
+
+    Returns
+    -------
+    by_x : (N, 3n) array
+        Derivatives by the positions [1/m].
+    by_parameters : (m,) array
+        Derivatives by the parameters that change the motion.
+    force_weights : (N, 3n) array
+        Weights of the forces at the evaluations [1/N], by which history variables contribute.
     """
     dynamics = equations.dynamics
     t = dynamics.tables
@@ -254,7 +244,7 @@ def reaction_vjp(
     mass_kg = dynamics.mass.inertia_kg[:, dofs]
     inertia = dynamics.combine_transposed(t.s, mass_kg * weights)
     by_x[:, dofs] += inertia / dynamics.step_s**2
-    return ReactionGradient(by_x, by_p, force_weights=force_weights)
+    return by_x, by_p, force_weights
 
 
 def reaction_forces(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array) -> Array:

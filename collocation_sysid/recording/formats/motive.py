@@ -10,7 +10,7 @@ skipped; unlabelled markers are taken only on request.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from ...errors import InputError
 from .raw_tracks import Header, LabelChooser, RawTracks, tracks_of_table
@@ -20,14 +20,6 @@ from .units import length_unit_of_text
 BEGINNING = "Format Version"
 _MEASURED = "Marker"
 _RATES = ("Export Frame Rate", "Capture Frame Rate")
-
-
-@dataclass(frozen=True)
-class _MarkerColumns:
-    """Type of a marker's columns, and the indices of its columns of x, y and z."""
-
-    kind: str
-    coordinate_columns: tuple[int, int, int]
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
@@ -63,7 +55,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     raw = tracks_of_table(
         table,
         labels,
-        coordinate_columns=[each.coordinate_columns for each in columns.values()],
+        coordinate_columns=[places for _, places in columns.values()],
         chosen=chosen,
         time=1,
         unit=length_unit_of_text(unit, "line 1, Length Units"),
@@ -71,7 +63,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         rate_hz=header.number(rate_key),
         rate_key=rate_key,
     )
-    solved = {label: columns[label].kind for label in raw.labels}
+    solved = {label: columns[label][0] for label in raw.labels}
     notes = (
         f"marker {label} has no measured columns; those of Type '{kind}' were used, which Motive "
         "computes from a fitted rigid body"
@@ -98,9 +90,9 @@ def _column_headings(above: Sequence[Row], axes: Row) -> list[tuple[str, str, st
 
 def _marker_columns(
     heads: Sequence[tuple[str, str, str, str]], line: int
-) -> dict[str, _MarkerColumns]:
-    """Return the columns of every marker by its name, in the order of the columns; measured columns
-    have priority over fitted ones.
+) -> dict[str, tuple[str, tuple[int, int, int]]]:
+    """Return the type of every marker's columns and the indices of its columns of x, y and z, by its
+    name, in the order of the columns; measured columns have priority over fitted ones.
     """
     by_kind: dict[tuple[str, str], dict[str, int]] = {}
     for column, (kind, name, quantity, axis) in enumerate(heads):
@@ -111,11 +103,11 @@ def _marker_columns(
             message = f"two markers are named '{name}'; expected names that differ"
             raise InputError(message, where=f"line {line}")
         axes[axis] = column
-    columns: dict[str, _MarkerColumns] = {}
+    columns: dict[str, tuple[str, tuple[int, int, int]]] = {}
     for (name, kind), axes in by_kind.items():
         if sorted(axes) != ["X", "Y", "Z"]:
             message = f"marker '{name}' has the columns {', '.join(axes)}; expected X, Y and Z"
             raise InputError(message, where=f"line {line}")
         if kind == _MEASURED or name not in columns:
-            columns[name] = _MarkerColumns(kind, (axes["X"], axes["Y"], axes["Z"]))
-    return dict(sorted(columns.items(), key=lambda item: item[1].coordinate_columns))
+            columns[name] = kind, (axes["X"], axes["Y"], axes["Z"])
+    return dict(sorted(columns.items(), key=lambda item: item[1][1]))

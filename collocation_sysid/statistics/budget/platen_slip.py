@@ -250,9 +250,8 @@ def _relaxed(stiffness: sp.csc_array, force_n: Array, kept: Index, positions_m: 
     moving = np.setdiff1d(np.arange(len(force_n)), kept)
     is_kept: NDArray[np.bool_] = np.zeros(len(force_n), dtype=bool)
     is_kept[kept] = True
-    free = free_rigid_modes(
-        positions_m.reshape(-1, 3), is_kept.reshape(-1, 3)
-    ).displacements.reshape(len(force_n), -1)
+    _, moved = free_rigid_modes(positions_m.reshape(-1, 3), is_kept.reshape(-1, 3))
+    free = moved.reshape(len(force_n), -1)
     modes = (free / np.linalg.norm(free, axis=0)).T[:, moving]
     # Units of the border: a stiffness, so that pivots are comparable.
     scale = float(np.abs(stiffness.diagonal()).mean())

@@ -13,7 +13,6 @@ directions that the parameters do not affect (restricted maximum likelihood; Pat
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -81,7 +80,7 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
     if block.places_m is None or not present.any():
         return None
     distances_m = np.linalg.norm(block.places_m[:, None] - block.places_m, axis=2)
-    contrasts = []
+    contrasts: list[tuple[Array, Array, Array]] = []
     samples = np.unique(np.linspace(0, len(residual) - 1, MOST_SAMPLES).astype(int))
     for t in samples:
         present_channels = np.flatnonzero(present[t])
@@ -95,15 +94,15 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
         ]
         if free.shape[1] > 2:
             contrasts.append(
-                _Contrasts(
+                (
                     free.T @ residual[t, present_channels],
                     free,
-                    distances_m=distances_m[np.ix_(present_channels, present_channels)],
+                    distances_m[np.ix_(present_channels, present_channels)],
                 )
             )
     if not contrasts:
         return None
-    count = sum(len(each.values) for each in contrasts)
+    count = sum(len(values) for values, *_ in contrasts)
     nearest = float(np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1)))
     longest = max(LONGEST * float(distances_m.max()), 2 * nearest)
     white, _ = _restricted_likelihood(contrasts, 0.0, length_m=1.0)
@@ -115,7 +114,7 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
     least, level, share, length = min(candidates)
     p = float(chi2_sf(max(0.0, white - least), 2))
     shape = _correlation_matrix(distances_m, share, length_m=float(length))
-    share_known = count / max(1, sum(len(each.matrix) for each in contrasts))
+    share_known = count / max(1, sum(len(matrix) for _, matrix, _ in contrasts))
     freedom = max(
         1.0, len(contrasts) * share_known * np.trace(shape) ** 2 / float(np.sum(shape**2))
     )
@@ -129,36 +128,23 @@ def _correlation_matrix(distances_m: Array, share: float, length_m: float) -> Ar
     return (1 - share) * np.eye(len(distances_m)) + share * np.exp(-distances_m / length_m)
 
 
-class _Contrasts(NamedTuple):
-    """Combinations of the residuals of one sample that the parameters do not affect.
-
-    Attributes
-    ----------
-    values : (k,) array
-        Contrasts z, in units of σ.
-    matrix : (n, k) array
-        Orthonormal columns that form them from the n channels of the sample.
-    distances_m : (n, n) array
-        Distances of the channels' points on the undeformed body [m].
-    """
-
-    values: Array
-    matrix: Array
-    distances_m: Array
-
-
 def _restricted_likelihood(
-    contrasts: list[_Contrasts], share: float, length_m: float
+    contrasts: list[tuple[Array, Array, Array]], share: float, length_m: float
 ) -> tuple[float, float]:
-    """Return −2 log-likelihood up to a constant, and the variance s² that maximises the likelihood."""
+    """Return −2 log-likelihood up to a constant, and the variance s² that maximises the likelihood.
+
+    Contrasts are combinations (k,) of the residuals of one sample, in units of σ, that the
+    parameters do not affect, the orthonormal columns (n, k) that form them from n channels, and the
+    distances (n, n) of the channels' points on the undeformed body [m].
+    """
     squares = 0.0
     logarithms = 0.0
     count = 0
-    for each in contrasts:
-        correlation = _correlation_matrix(each.distances_m, share, length_m=length_m)
-        root = np.linalg.cholesky(each.matrix.T @ correlation @ each.matrix)
-        squares += float(np.sum(np.linalg.solve(root, each.values) ** 2))
+    for values, matrix, distances_m in contrasts:
+        correlation = _correlation_matrix(distances_m, share, length_m=length_m)
+        root = np.linalg.cholesky(matrix.T @ correlation @ matrix)
+        squares += float(np.sum(np.linalg.solve(root, values) ** 2))
         logarithms += 2 * float(np.log(np.diag(root)).sum())
-        count += len(each.values)
+        count += len(values)
     variance = max(squares / count, 1e-300)
     return count * float(np.log(variance)) + logarithms, variance
