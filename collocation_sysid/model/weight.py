@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -149,7 +149,7 @@ class Weight(ForceTerm):
             gravity_m_s2=experiment.gravity_m_s2,
             applied_n=applied,
             has_gravity_input=False,
-            **_zero_loads(applied)._asdict(),
+            **_zero_loads(applied),
         )
 
     @classmethod
@@ -164,7 +164,7 @@ class Weight(ForceTerm):
             gravity_m_s2=np.zeros(3),
             applied_n=nothing,
             has_gravity_input=False,
-            **_zero_loads(nothing)._asdict(),
+            **_zero_loads(nothing),
         )
 
     def with_theta(self, theta: Theta) -> Self:
@@ -194,11 +194,11 @@ class Weight(ForceTerm):
         nodes = self.body.pattern.size // 3
         for k, load in enumerate(loads):
             if isinstance(load, PointMass):
-                joining.joining_kg[k] = np.repeat(load.node_mass_kg(nodes), 3)
+                joining["joining_kg"][k] = np.repeat(load.node_mass_kg(nodes), 3)
             else:
                 forces_n = load.node_forces_n(t_s, nodes)
-                joining.joining_n[k] = forces_n.reshape(len(t_s), -1)
-        return replace(self, has_gravity_input=has_gravity_input, **joining._asdict())
+                joining["joining_n"][k] = forces_n.reshape(len(t_s), -1)
+        return replace(self, has_gravity_input=has_gravity_input, **joining)
 
     @property
     def size(self) -> int:  # type: ignore[override]
@@ -338,30 +338,16 @@ def _own_kg(body: Body) -> Array:
     return body.mass_of_dofs(np.full(len(body.constants), np.nan))
 
 
-class _JoiningLoads(NamedTuple):
-    """Arrays of the L loads whose time is estimated, see `Weight`.
-
-    Attributes
-    ----------
-    joining_kg : (L, 3n)
-        Mass of each load at every dof [kg]; zero for a force.
-    joining_n : (L, T, 3n)
-        Complete force of each load [N]; zero for a mass.
-    share : (T, L)
-        Share of each load, as a change from the stated share.
+def _zero_loads(rows: Array, count: int = 0) -> dict[str, Array]:
+    """Return new arrays of zeros for L loads whose time is estimated, by the name of the field:
+    masses (L, 3n), forces (L, T, 3n), shares (T, L).
     """
-
-    joining_kg: Array
-    joining_n: Array
-    share: Array
-
-
-def _zero_loads(rows: Array, count: int = 0) -> _JoiningLoads:
-    """Return new arrays of zeros for L loads: masses (L, 3n), forces (L, T, 3n), shares (T, L)."""
     times, dofs = rows.shape
-    return _JoiningLoads(
-        np.zeros((count, dofs)), np.zeros((count, times, dofs)), share=np.zeros((times, count))
-    )
+    return {
+        "joining_kg": np.zeros((count, dofs)),
+        "joining_n": np.zeros((count, times, dofs)),
+        "share": np.zeros((times, count)),
+    }
 
 
 def _sum_over_nodes(dofs: Array) -> Array:

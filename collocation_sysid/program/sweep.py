@@ -156,25 +156,6 @@ class FactorisedStep(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class LinearisedChunk:
-    """Consecutive rows that are linearised and factorised together.
-
-    Attributes
-    ----------
-    rows : slice
-        Their grid times.
-    linearisation : Linearisation
-        Their forces and derivatives.
-    steps : list of FactorisedStep
-        One entry per row, in ascending order.
-    """
-
-    rows: slice
-    linearisation: Linearisation
-    steps: list[FactorisedStep]
-
-
-@dataclass(frozen=True, eq=False)
 class PrescribedColumns:
     """Prescribed rows of the solution Y: changes of the displacements of grasped dofs.
 
@@ -501,8 +482,8 @@ class Sweep:
         histories = self.dynamics_at(equations).histories(x)
         later = deque[StencilRow](maxlen=reach)
         adjoints = [history.adjoint() for history in histories]
-        for chunk in self.chunks(x, equations, backward=True, histories=histories):
-            for step in reversed(chunk.steps):
+        for _, _, steps in self.chunks(x, equations, backward=True, histories=histories):
+            for step in reversed(steps):
                 t = step.t
                 row = step.row
                 p = row.p
@@ -653,8 +634,9 @@ class Sweep:
         first: int = 0,
         histories: Sequence[AnyHistory] = (),
         accuracy: float = ACCURACY,
-    ) -> Iterator[LinearisedChunk]:
-        """Iterate over the linearised and factorised time steps, a few at a time, using threads.
+    ) -> Iterator[tuple[slice, Linearisation, list[FactorisedStep]]]:
+        """Iterate over the linearised and factorised time steps, a few at a time, using threads:
+        their grid times, their forces and derivatives, and an entry for each row, ascending.
 
         A chunk is valid until the next one is computed, because factors reuse memory.
 
@@ -733,7 +715,7 @@ class Sweep:
                 at.by_position_skew,
                 at.by_velocity_skew,
             )
-            yield LinearisedChunk(here, at, steps=list(steps))
+            yield here, at, list(steps)
 
     def _factorise(
         self,
@@ -901,21 +883,21 @@ class ForwardSubstitution:
                 columns.prescribed.write_into(t, start)
             self.past.appendleft(start)
             yield np.zeros(self.shape) if columns.start_m is None else start
-        for chunk in solver.chunks(
+        for rows, linearisation, steps in solver.chunks(
             x, setting, first=done, histories=histories, accuracy=self.accuracy
         ):
             residual = None
             if columns.has_step:
-                residual = np.stack([self._residual(s, acceleration[s.t]) for s in chunk.steps])
+                residual = np.stack([self._residual(s, acceleration[s.t]) for s in steps])
                 self.violation_n = max(self.violation_n, float(np.abs(residual).max(initial=0.0)))
             sides = columns.right_hand_sides(
-                chunk.rows,
-                chunk.linearisation,
-                acceleration=acceleration[chunk.rows],
+                rows,
+                linearisation,
+                acceleration=acceleration[rows],
                 residual=residual,
                 free=solver.free,
             )
-            for step, right, force in zip(chunk.steps, *sides, strict=True):
+            for step, right, force in zip(steps, *sides, strict=True):
                 solution = np.zeros(self.shape) if out is None else out[step.t]
                 with solver.stopwatch.solving():
                     self.solve_step(step, right, force=force, out=solution)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -146,10 +146,7 @@ def place_markers(
             nodes[k], weights[k] = shape.weights_at_node(vertex)
             distance[k] = node_distance[vertex]
         else:
-            located = shape.weights_at_point(point)
-            nodes[k] = located.nodes
-            weights[k] = located.weights
-            distance[k] = located.distance_m
+            nodes[k], weights[k], distance[k] = shape.weights_at_point(point)
         if distance[k] > limit_m:
             what = (
                 f"marker '{labels[k]}'"
@@ -167,24 +164,6 @@ def place_markers(
                 f"than the {limit_m:.4g} m allowed; {remedy}"
             )
     return Placement(nodes, weights, distance_m=distance, node_count=len(nodes_m))
-
-
-class LocatedPoint(NamedTuple):
-    """A point as a linear combination of the nodes of one element.
-
-    Attributes
-    ----------
-    nodes : (npe,) int array
-        Nodes of the element.
-    weights : (npe,) array
-        Values of their shape functions at the point, which sum to one.
-    distance_m : float
-        Distance of the point from the surface [m]; 0 inside the body.
-    """
-
-    nodes: Index
-    weights: Array
-    distance_m: float
 
 
 class LocatedBody:
@@ -226,15 +205,15 @@ class LocatedBody:
         cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
 
-    def weights_at_point(self, point: Array) -> LocatedPoint:
-        """Return nodes and weights of a point (3,), and its distance from the surface.
+    def weights_at_point(self, point: Array) -> tuple[Index, Array, float]:
+        """Return the nodes (npe,) of the element that contains a point (3,), the values (npe,) of
+        their shape functions there, which sum to one, and the distance of the point from the
+        surface [m], 0 inside the body.
 
         A point outside the body is an extrapolation from the nearest element.
         """
         cell, distance = self.nearest_cell(point)
-        return LocatedPoint(
-            self.body.cells[cell], self._shape_functions_at(point, cell), distance_m=distance
-        )
+        return self.body.cells[cell], self._shape_functions_at(point, cell), distance
 
     def nearest_cell(self, point: Array) -> tuple[int, float]:
         """Return the index of the element that contains a point (3,), or is nearest to it, and its
@@ -259,11 +238,11 @@ class LocatedBody:
         """Return nodes (npe,) and weights (npe,) of the point of the body that is nearest to a
         point (3,): the point itself if it is inside.
         """
-        located = self.weights_at_point(point)
-        if located.distance_m > 0.0:
+        nodes, weights, distance_m = self.weights_at_point(point)
+        if distance_m > 0.0:
             nearest_m, _ = self.nearest_surface_point(point)
-            located = self.weights_at_point(nearest_m)
-        return located.nodes, located.weights
+            nodes, weights, _ = self.weights_at_point(nearest_m)
+        return nodes, weights
 
     def places_of_points(self, points_m: Array) -> Array:
         """Return the places (M, 3) on the undeformed body [m] of points (M, 3) [m] that are

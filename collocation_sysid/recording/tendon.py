@@ -100,9 +100,7 @@ class Tendon(Actuator[PolylineLength]):
         """Return the length of the polyline in a body."""
         shape = LocatedBody(body.nodes_m, body)
         embedded = [shape.weights_at_point(point) for point in self.points_m]
-        nodes = np.array([each.nodes for each in embedded])
-        weights = np.array([each.weights for each in embedded])
-        distances = np.array([each.distance_m for each in embedded])
+        nodes, weights, distances = map(np.array, zip(*embedded, strict=True))
         worst = int(distances.argmax())
         if distances[worst] > FARTHEST_POINT_EDGES * shape.mean_edge_m:
             raise InputError(

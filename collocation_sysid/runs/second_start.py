@@ -4,7 +4,7 @@
   modulus and a ratio near one half a body can move almost like a stiffer, compressible one.
 - *Laws in powers of the stretches*: with every order and every sign of the exponents there is
   another optimum, and no search crosses an exponent of zero, at which a term vanishes. The closed
-  forms of specimens tell whether there is a better one, see `methods.power_law_start`.
+  forms of specimens tell whether there is a better one, see `methods.starts.power_law`.
 - *Default bounds*: they are those of foams and rubbers. A search that ends at one of them is
   continued within what is physically possible, for metals, liquids and auxetic bodies. A factor
   that may be negative is then estimated on a linear scale, and a first exponent of Ogden's law that

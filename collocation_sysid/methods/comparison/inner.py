@@ -9,7 +9,7 @@ smoothly, z = middle + half · sin(s).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import Bounds, OptimizeResult
@@ -112,24 +112,6 @@ def minimise_merit(
     return follow.converged
 
 
-class _MeritEvaluation(NamedTuple):
-    """Merit function at one point.
-
-    Attributes
-    ----------
-    z : (variables,) array
-        Variables.
-    value : float
-        Merit m; infinite if an element is inverted.
-    gradient : (variables,) array
-        ∂m/∂z; NaN if an element is inverted.
-    """
-
-    z: Array
-    value: float
-    gradient: Array
-
-
 class _ConvergenceCheck:
     """Callback that reports iterates of the scaled problem and checks convergence.
 
@@ -160,10 +142,10 @@ class _ConvergenceCheck:
         `converged` and the replacement value of the scaled problem are updated. Exceptions of
         `report` and of the merit function are not caught.
         """
-        point = self.scaled.evaluate_at(s)
-        self.scaled.replacement_value = STEEP * abs(point.value) + 1e-300
-        projected = self.scaled.project_gradient(s, point.z, gradient=point.gradient)
-        self.report(point.z, point.value, projected)
+        z, value, gradient = self.scaled.evaluate_at(s)
+        self.scaled.replacement_value = STEEP * abs(value) + 1e-300
+        projected = self.scaled.project_gradient(s, z, gradient=gradient)
+        self.report(z, value, projected)
         self.converged = bool(np.abs(projected).max(initial=0.0) <= self.tolerance)
         return self.converged
 
@@ -225,7 +207,7 @@ class _ScaledMerit:
         self.angle = np.arcsin(share)
         self.start = np.zeros(len(self.free))
         self.replacement_value = np.inf
-        self._last: tuple[Array, _MeritEvaluation] | None = None
+        self._last: tuple[Array, tuple[Array, float, Array]] | None = None
 
     def to_variables(self, s: Array) -> Array:
         """Return all variables (variables,) from s (free,); constant ones have their initial
@@ -249,16 +231,15 @@ class _ScaledMerit:
         slopes[self.mapped] = np.cos(self._angles(s)) / np.cos(self.angle)
         return slopes
 
-    def evaluate_at(self, s: Array) -> _MeritEvaluation:
-        """Return the merit function at s (free,); a call with the same s as the last one does not
-        evaluate again. See `MeritFunction.value_and_gradient` for inverted elements and the
-        exceptions.
+    def evaluate_at(self, s: Array) -> tuple[Array, float, Array]:
+        """Return z (variables,), the merit m and ∂m/∂z (variables,) at s (free,); a call with the
+        same s as the last one does not evaluate again. See `MeritFunction.value_and_gradient` for
+        inverted elements and the exceptions.
         """
         if self._last is None or not np.array_equal(self._last[0], s):
             z = self.to_variables(s)
             value, gradient = self.merit.value_and_gradient(z)
-            point = _MeritEvaluation(z, value, gradient=gradient)
-            self._last = s.copy(), point
+            self._last = s.copy(), (z, value, gradient)
         return self._last[1]
 
     def value(self, s: Array) -> float:
@@ -271,9 +252,9 @@ class _ScaledMerit:
         """Return m and ∂m/∂s (free,) at s (free,); infinite and NaN if an element is inverted. See
         `MeritFunction.value_and_gradient` for the exceptions.
         """
-        point = self.evaluate_at(s)
+        _, value, gradient = self.evaluate_at(s)
         scale = self.unit * self._slopes(s)
-        return point.value, point.gradient[self.free] * scale
+        return value, gradient[self.free] * scale
 
     def finite_value_and_gradient(self, s: Array) -> tuple[float, Array]:
         """Return m and ∂m/∂s (free,) at s (free,); `replacement_value` and zeros if the merit is

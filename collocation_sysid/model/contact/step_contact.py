@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,22 +22,6 @@ from .contact_law import POINT_BATCH, ContactLaw
 MARGIN = 0.25
 # Share of this distance by which a coordinate may change before candidates are searched again.
 CHANGE = 1 / 3
-
-
-class LawInputs(NamedTuple):
-    """Inputs of a law's `point_force_function` at i candidates.
-
-    Attributes
-    ----------
-    u : (3 or 6, i) array
-        Positions [m] and, if the law depends on them, velocities [m/s], relative to the obstacle's
-        frame.
-    data : (d, i) array
-        Data of the points.
-    """
-
-    u: Array
-    data: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +75,10 @@ class ContactCandidates:
             ),
         )
 
-    def inputs(self, xi: Array, nu: Array, constants: Array, step_s: float) -> LawInputs:
-        """Return the inputs of the law at the candidates.
+    def inputs(self, xi: Array, nu: Array, constants: Array, step_s: float) -> tuple[Array, Array]:
+        """Return the inputs of the law's `point_force_function` at i candidates: positions [m] and,
+        if the law depends on them, velocities [m/s] (3 or 6, i) relative to the obstacle's frame,
+        and the data (d, i) of the points.
 
         Parameters
         ----------
@@ -109,10 +94,8 @@ class ContactCandidates:
             [each.reshape(-1, 3).take(self._nodes, axis=0) for each in moving], axis=1
         )
         frame = nodes[-VECTORS_PER_POINT:]
-        return LawInputs(
-            self.points.interpolate(nodes[:-VECTORS_PER_POINT] - frame[0]),
-            self._data_with(frame, constants, step_s=step_s),
-        )
+        u = self.points.interpolate(nodes[:-VECTORS_PER_POINT] - frame[0])
+        return u, self._data_with(frame, constants, step_s=step_s)
 
     @cached_property
     def _nodes(self) -> Index:
@@ -139,14 +122,6 @@ class ContactCandidates:
             self._last_data.clear()
             self._last_data[key] = data
         return data
-
-
-class _Evaluation(NamedTuple):
-    """Active points in a state ξ (1, 3n) [m] and ν (1, 3n) [m/s]."""
-
-    xi: Array
-    nu: Array
-    points: ActivePoints
 
 
 class StepContact(LocalForce):
@@ -178,21 +153,21 @@ class StepContact(LocalForce):
         self._step_s = step_s
         self._from = np.full((1, 1), np.nan)
         self._last_candidates: ContactCandidates | None = None
-        self._last_evaluation: _Evaluation | None = None
+        self._last_evaluation: tuple[Array, Array, ActivePoints] | None = None
         self._margin_m = MARGIN * law.surface.edge_m
 
     def force(self, xi: Array, nu: Array) -> Array:
         """Return the contact forces (3n,) [N] at ξ [m] and ν [m/s], each (1, 3n); zero without
         contact.
         """
-        last = self._last_evaluation
-        if last is not None and np.array_equal(last.xi, xi) and np.array_equal(last.nu, nu):
-            return last.points.assemble(xi.size)
+        if self._last_evaluation is not None:
+            last_xi, last_nu, points = self._last_evaluation
+            if np.array_equal(last_xi, xi) and np.array_equal(last_nu, nu):
+                return points.assemble(xi.size)
         candidates = self._candidates(xi[0], nu[0])
         if candidates is None:
             return np.zeros(xi.size)
-        inputs = self._inputs(candidates, xi, nu)
-        push = self._law.point_force_function.evaluate(inputs.u, inputs.data)
+        push = self._law.point_force_function.evaluate(*self._inputs(candidates, xi, nu))
         return candidates.points.assemble(push, xi.size)
 
     def active_points(
@@ -203,7 +178,7 @@ class StepContact(LocalForce):
         if candidates is None:
             return None
         inputs = self._inputs(candidates, xi, nu)
-        force, slopes = self._law.point_force_function.evaluate_with_jacobian(inputs.u, inputs.data)
+        force, slopes = self._law.point_force_function.evaluate_with_jacobian(*inputs)
         (touching,) = np.nonzero(force.any(axis=0))
         points = ActivePoints(
             self._law,
@@ -213,10 +188,10 @@ class StepContact(LocalForce):
             slopes=slopes,
             rates=rates,
         )
-        self._last_evaluation = _Evaluation(xi, nu, points)
+        self._last_evaluation = xi, nu, points
         return points
 
-    def _inputs(self, candidates: ContactCandidates, xi: Array, nu: Array) -> LawInputs:
+    def _inputs(self, candidates: ContactCandidates, xi: Array, nu: Array) -> tuple[Array, Array]:
         """Return the inputs of the law at candidates in the state ξ and ν, (1, 3n) each."""
         return candidates.inputs(xi[0], nu[0], constants=self._constants, step_s=self._step_s)
 

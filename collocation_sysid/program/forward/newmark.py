@@ -70,21 +70,6 @@ class _State:
     local_n: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _PrescribedMotion:
-    """Motion of the p prescribed dofs at one time.
-
-    Attributes
-    ----------
-    positions_m, velocities_m_s, accelerations_m_s2 : (p,) arrays
-        Positions [m], velocities [m/s] and accelerations [m/s²], ascending by dof.
-    """
-
-    positions_m: Array
-    velocities_m_s: Array
-    accelerations_m_s2: Array
-
-
 @one_blas_thread()
 def simulate_newmark(
     experiment: Experiment,
@@ -172,8 +157,8 @@ class _NewmarkEquations(StepEquations):
         All forces, with loads of the end of the step and local forces averaged over the step.
     prescribed_dofs : (p,) array
         Prescribed dofs.
-    prescribed : _PrescribedMotion
-        Their motion at the end of the step.
+    prescribed : (3, p) array
+        Their positions [m], velocities [m/s] and accelerations [m/s²] at the end of the step.
     """
 
     def __init__(
@@ -182,7 +167,7 @@ class _NewmarkEquations(StepEquations):
         step_s: float,
         forces: Forces,
         prescribed_dofs: Index,
-        prescribed: _PrescribedMotion,
+        prescribed: Array,
     ) -> None:
         rest = forces.without_local_forces()
         super().__init__(
@@ -222,7 +207,7 @@ class _NewmarkEquations(StepEquations):
         end of the step.
         """
         moved = x.copy()
-        moved[self._prescribed_dofs] = self._prescribed.positions_m
+        moved[self._prescribed_dofs] = self._prescribed[0]
         return moved
 
     def kinematics(self, x: Array) -> tuple[Array, Array]:
@@ -233,8 +218,8 @@ class _NewmarkEquations(StepEquations):
         v = self._slope * x + self._known_v
         a = self._slope**2 * x + self._known_a
         # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-        v[self._prescribed_dofs] = self._prescribed.velocities_m_s
-        a[self._prescribed_dofs] = self._prescribed.accelerations_m_s2
+        v[self._prescribed_dofs] = self._prescribed[1]
+        a[self._prescribed_dofs] = self._prescribed[2]
         return v, a
 
     def _end_states(self, x: Array) -> tuple[Array, Array]:
@@ -439,9 +424,10 @@ class _Stepper:
 
     def _prescribed_motion(
         self, solver: NewtonSolver, time_s: float, step_s: float, holding_s: float
-    ) -> _PrescribedMotion:
-        """Return the motion of the solver's prescribed dofs at `time_s`, by central differences
-        over `step_s` [s]; grasps are those that hold at `holding_s`.
+    ) -> Array:
+        """Return positions [m], velocities [m/s] and accelerations [m/s²] (3, p) of the solver's
+        prescribed dofs at `time_s`, by central differences over `step_s` [s]; grasps are those that
+        hold at `holding_s`.
 
         At the ends of a grasp's time, differences are one-sided and the acceleration is zero if
         there is no later pose.
@@ -464,5 +450,4 @@ class _Stepper:
             )
             place = np.ix_(grasp.nodes, grasp.axis_indices)
             motion[:, *place] = now, velocity, acceleration
-        now, velocity, acceleration = motion.reshape(3, -1)[:, solver.is_prescribed]
-        return _PrescribedMotion(now, velocity, accelerations_m_s2=acceleration)
+        return motion.reshape(3, -1)[:, solver.is_prescribed]

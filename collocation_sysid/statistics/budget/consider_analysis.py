@@ -275,38 +275,18 @@ def _changes_by_effects(
         forces_n=forces,
         rows_n=rows,
     )
-    for response in propagate_columns(
+    for reading, _, values, changes in propagate_columns(
         part, solver, columns=columns, inertia_n=rows[:, transcription.sensed_dofs]
     ):
-        yield response.reading.residual_changes(response.values, response.changes, phi=part.phi)
-
-
-class ColumnResponse(NamedTuple):
-    """Response of one measurement to columns of a forward substitution.
-
-    Attributes
-    ----------
-    reading : MeasurementResidual
-        Measurement model.
-    motion : ObservedMotion
-        Its motion with the changes by the columns.
-    values : array
-        Values of its observable at its samples.
-    changes : array
-        Changes of `values` by the c columns, with the columns as last axis.
-    """
-
-    reading: MeasurementResidual
-    motion: ObservedMotion
-    values: Array
-    changes: Array
+        yield reading.residual_changes(values, changes, phi=part.phi)
 
 
 def propagate_columns(
     iterate: ExperimentIterate, solver: Sweep, columns: SweepColumns, inertia_n: Array | float = 0.0
-) -> Iterator[ColumnResponse]:
-    """Propagate columns of a forward substitution to the observables; yield one response for each
-    measurement of the experiment, in their order.
+) -> Iterator[tuple[MeasurementResidual, ObservedMotion, Array, Array]]:
+    """Propagate columns of a forward substitution to the observables; yield for each measurement of
+    the experiment, in their order, its residual, its motion with the changes by the columns, the
+    values of its observable, and their changes by the c columns, with the columns as last axis.
 
     Parameters
     ----------
@@ -337,9 +317,7 @@ def propagate_columns(
         values, slopes = reading.observable.linearise(
             motion, phi, columns=columns_numbered, size=size
         )
-        yield ColumnResponse(
-            reading, motion, values=values, changes=slopes.by_common[..., : columns.count]
-        )
+        yield reading, motion, values, slopes.by_common[..., : columns.count]
 
 
 def _without_row_changes(motion: ObservedMotion, inertia_n: Array | float) -> ObservedMotion:
