@@ -7,11 +7,11 @@ recording belong into the packages `program`, `model` and `recording`.
 - `feature`: `Feature`, the functions that a feature may declare.
 - `registry`: the features, in the order of the residuals.
 - `measurement_results`: predictions and errors of measurements, as in ``result.json``.
-- `marker_feature`, `wrench_feature`, `custom_sensor_feature`, `camera_feature`: measurements.
-- `wrench_causes`, `wrench_at_guess`: likely errors in the description of force sensors, after a fit
-  and by the simulation at the guess.
-- `camera_misspecifications`, `camera_image_misspecifications`, `camera_clock_misspecifications`:
-  likely errors in the description of cameras, their images and times.
+- `measurements`: comparison of predictions with measurements, for all kinds.
+- `wrenches`: likely errors in the description of force sensors, after a fit (`causes`) and by the
+  simulation at the guess (`at_guess`).
+- `cameras`: likely errors in the description of depth cameras (`poses`), their images (`images`) and
+  times (`times`).
 - `image_tracks`: tracks of points in the images of ordinary cameras, with all their parts.
-- `contact_feature`: contact with obstacles.
+- `contact`: obstacles (`obstacles`), and bodies in parts or inside obstacles (`placement`).
 """

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from ..statistics.concerns import declare_messages, declare_topics
-from .camera_feature import CAMERAS
-from .contact_feature import CONTACT
+from .cameras.feature import CAMERAS
+from .contact.feature import CONTACT
 from .feature import Feature
 from .image_tracks.track_feature import IMAGE_TRACKS
-from .wrench_feature import WRENCH
+from .wrenches.feature import WRENCH
 
 FEATURES: tuple[Feature, ...] = (WRENCH, CONTACT, CAMERAS, IMAGE_TRACKS)
 for _feature in FEATURES:

@@ -22,7 +22,7 @@ from ..common.array_types import Array
 from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
 from ..errors import InputError
-from ..features.contact_feature import contact_fields
+from ..features.contact.feature import contact_fields
 from ..features.measurements import recorded_series
 from ..fem.body import Body
 from ..recording.experiment import Experiment

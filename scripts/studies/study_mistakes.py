@@ -25,8 +25,8 @@ from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.features.camera_feature import depth_image_hypotheses, may_be_images
-from collocation_sysid.features.wrench_causes import wrench_mistakes
+from collocation_sysid.features.cameras.feature import depth_image_hypotheses, may_be_images
+from collocation_sysid.features.wrenches.causes import wrench_mistakes
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem

@@ -25,7 +25,7 @@ from kit.problem_files import pictures_drawn, run_command
 from kit.results import a_result
 
 import collocation_sysid as cs
-from collocation_sysid.features.camera_misspecifications import camera_hypotheses
+from collocation_sysid.features.cameras.poses import camera_hypotheses
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.depth.depth_comparison import camera_residuals
 from collocation_sysid.program.depth.visible_surface import VisibleSurface

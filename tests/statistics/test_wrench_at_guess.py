@@ -10,7 +10,7 @@ import pytest
 from kit.problems import GUESS
 from kit.wrench_fits import UNKNOWN, swung
 
-from collocation_sysid.features.wrench_at_guess import (
+from collocation_sysid.features.wrenches.at_guess import (
     WrenchDeviation,
     has_inertial_wrenches,
     wrench_deviations,

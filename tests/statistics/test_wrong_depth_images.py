@@ -13,12 +13,9 @@ import pytest
 from depth_twins import TRUTH, hanging_twin, swinging_twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 
-from collocation_sysid.features.camera_clock_misspecifications import camera_clock_hypotheses
-from collocation_sysid.features.camera_feature import depth_image_hypotheses
-from collocation_sysid.features.camera_image_misspecifications import (
-    camera_image_hypotheses,
-    equilibrium_shapes_m,
-)
+from collocation_sysid.features.cameras.feature import depth_image_hypotheses
+from collocation_sysid.features.cameras.images import camera_image_hypotheses, equilibrium_shapes_m
+from collocation_sysid.features.cameras.times import camera_clock_hypotheses
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import check_problem, misspecification_hypotheses

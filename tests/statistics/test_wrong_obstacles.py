@@ -11,12 +11,10 @@ from contact_twins import DRAGGED_NOISE_N, poked_twin, sheared_twin
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import obstacles, wrench_times
 
+from collocation_sysid.features.contact.obstacles import obstacle_hypotheses
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import Nuisance, Plane
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.statistics.misspecification.obstacle_misspecifications import (
-    obstacle_hypotheses,
-)
 
 NAMED = {
     name: (twin, fault)

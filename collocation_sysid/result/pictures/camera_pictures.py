@@ -17,7 +17,7 @@ from ...common.array_types import Array
 from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
 from ..replay import MotionRecord, image_key
 
-# Beginning of the names of pictures; `features.camera_feature` has their caption.
+# Beginning of the names of pictures; `features.cameras.feature` has their caption.
 KIND = "depth"
 # Name of the points in the legend of a film.
 LEGEND_ENTRY = "depth image"

@@ -1,12 +1,10 @@
 """Misspecification hypotheses: mistakes in a description that would explain the misfit.
 
 - `misspecification_hypothesis`: a hypothesis, its strength and how hypotheses are ranked.
-- `plausibility`: contradictions that no simulation is needed for; `placement_causes`: loose parts,
-  and bodies inside obstacles; `modal_misspecifications`: predictions by natural modes;
-  `initial_motion`: bodies that were not at rest at the beginning.
-- `obstacle_misspecifications`: obstacles and their loads; `specimen_misspecifications`: homogeneous
-  tests.
+- `plausibility`: contradictions that no simulation is needed for; `modal_misspecifications`:
+  predictions by natural modes; `initial_motion`: bodies that were not at rest at the beginning.
+- `specimen_misspecifications`: homogeneous tests.
 - `fit_misspecifications`: hypotheses after a fit.
 
-Hypotheses about force sensors and cameras are in the package `features`.
+Hypotheses about force sensors, cameras and obstacles are in the package `features`.
 """

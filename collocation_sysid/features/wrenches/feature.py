@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..methods.solution import Solution
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
-from ..statistics.misspecification.plausibility import load_sign_hypotheses
-from .feature import Feature, SimulatedCheck
-from .wrench_at_guess import MESSAGE_OF_OFFSET, wrench_deviations
-from .wrench_causes import CHECKED_SAMPLES, MESSAGES, wrench_causes, wrench_mistakes
+from ...methods.solution import Solution
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
+from ...statistics.misspecification.plausibility import load_sign_hypotheses
+from ..feature import Feature, SimulatedCheck
+from .at_guess import MESSAGE_OF_OFFSET, wrench_deviations
+from .causes import CHECKED_SAMPLES, MESSAGES, wrench_causes, wrench_mistakes
 
 # Longest fit of the first samples to the markers that needs no request [s].
 LONGEST_FIT_S = 10.0

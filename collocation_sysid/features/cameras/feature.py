@@ -6,20 +6,20 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..common.array_types import Array, root_mean
-from ..methods.solution import Solution
-from ..methods.starts.stiffness_scan import typical_constants
-from ..problem import Problem
-from ..program.collocation import ExperimentIterate
-from ..program.depth.depth_comparison import depth_residuals, outline_distances_px
-from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from ..statistics.concerns import Concern, concern_if
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
-from .camera_clock_misspecifications import MESSAGES_OF_TIMES, camera_clock_hypotheses
-from .camera_image_misspecifications import MESSAGES_OF_IMAGES, camera_image_hypotheses
-from .camera_misspecifications import MESSAGES_OF_POSES, camera_hypotheses, require_depth_units
-from .feature import Feature, SimulatedCheck
-from .measurement_results import PredictionErrors
+from ...common.array_types import Array, root_mean
+from ...methods.solution import Solution
+from ...methods.starts.stiffness_scan import typical_constants
+from ...problem import Problem
+from ...program.collocation import ExperimentIterate
+from ...program.depth.depth_comparison import depth_residuals, outline_distances_px
+from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
+from ...statistics.concerns import Concern, concern_if
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
+from ..feature import Feature, SimulatedCheck
+from ..measurement_results import PredictionErrors
+from .images import MESSAGES_OF_IMAGES, camera_image_hypotheses
+from .poses import MESSAGES_OF_POSES, camera_hypotheses, require_depth_units
+from .times import MESSAGES_OF_TIMES, camera_clock_hypotheses
 
 # Messages of concerns about a fit or a prediction, by code.
 MESSAGES = {

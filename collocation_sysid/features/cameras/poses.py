@@ -15,14 +15,14 @@ from itertools import chain, combinations, product
 import numpy as np
 from scipy.spatial import KDTree
 
-from ..common.array_types import Array
-from ..errors import InputError
-from ..program.depth.camera_alignment import thinned
-from ..program.depth.surface_correspondences import initial_gate_m
-from ..program.depth.visible_surface import VisibleSurface
-from ..recording.depth_camera import Depth, points_from_image
-from ..recording.experiment import Experiment
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ...common.array_types import Array
+from ...errors import InputError
+from ...program.depth.camera_alignment import thinned
+from ...program.depth.surface_correspondences import initial_gate_m
+from ...program.depth.visible_surface import VisibleSurface
+from ...recording.depth_camera import Depth, points_from_image
+from ...recording.experiment import Experiment
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES_OF_POSES = {

@@ -14,22 +14,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..common.array_types import Array
-from ..errors import SimulationError
-from ..fem.laws.constants import is_modulus
-from ..fem.laws.moduli import engineering_constants
-from ..model.nuisance_map import NuisanceMap
-from ..program.depth.camera_alignment import AlignedPose, ExactCloud, iterate_alignments, thinned
-from ..program.depth.depth_camera_model import DepthCameraModel
-from ..program.depth.visible_surface import VisibleSurface
-from ..program.forward.initial_equilibrium import equilibrium
-from ..program.forward.newton_solver import NewtonSolver
-from ..recording.depth_camera import DepthCamera
-from ..recording.experiment import Experiment
-from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from ..recording.sample_times import TIME_TOLERANCE_S
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
-from ..statistics.thresholds import LEAST_IMPROVEMENT, MISFIT
+from ...common.array_types import Array
+from ...errors import SimulationError
+from ...fem.laws.constants import is_modulus
+from ...fem.laws.moduli import engineering_constants
+from ...model.nuisance_map import NuisanceMap
+from ...program.depth.camera_alignment import AlignedPose, ExactCloud, iterate_alignments, thinned
+from ...program.depth.depth_camera_model import DepthCameraModel
+from ...program.depth.visible_surface import VisibleSurface
+from ...program.forward.initial_equilibrium import equilibrium
+from ...program.forward.newton_solver import NewtonSolver
+from ...recording.depth_camera import DepthCamera
+from ...recording.experiment import Experiment
+from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
+from ...recording.sample_times import TIME_TOLERANCE_S
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ...statistics.thresholds import LEAST_IMPROVEMENT, MISFIT
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES_OF_IMAGES = {

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from ..common.array_types import Array
-from ..methods.solution import Solution
-from ..model.contact.contact_summary import (
+from ...common.array_types import Array
+from ...methods.solution import Solution
+from ...model.contact.contact_summary import (
     ContactSummary,
     contact_summaries,
     surface_gaps_and_pressures,
 )
-from ..program.collocation import ExperimentIterate
-from ..recording.experiment import Experiment
-from ..statistics.concerns import Concern, Topic, concern_if
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
-from ..statistics.misspecification.obstacle_misspecifications import MESSAGES, obstacle_hypotheses
-from ..statistics.misspecification.placement_causes import placement_mistakes
-from .feature import Feature
+from ...program.collocation import ExperimentIterate
+from ...recording.experiment import Experiment
+from ...statistics.concerns import Concern, Topic, concern_if
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ..feature import Feature
+from .obstacles import MESSAGES, obstacle_hypotheses
+from .placement import placement_mistakes
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0

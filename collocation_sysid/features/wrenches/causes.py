@@ -17,22 +17,22 @@ from typing import Any
 
 import numpy as np
 
-from ..common.array_types import Array
-from ..errors import InputError, SimulationError
-from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Solution
-from ..methods.starts.continuation import first_samples
-from ..program.collocation import Collocation, ExperimentIterate
-from ..program.markers.marker_residual import MarkerResidual
-from ..program.observables import ObservedMotion, ReactionForces
-from ..program.transcription import Transcription
-from ..program.wrench_residual import WrenchResidual, without_grasp_sensors
-from ..recording.measured_wrench import Wrench
-from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
-from ..recording.poses import Frame
-from ..statistics.axes import with_other_axes
-from ..statistics.budget.shape_error import other_section
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ...common.array_types import Array
+from ...errors import InputError, SimulationError
+from ...methods.reduced_space import ReducedSpace
+from ...methods.solution import Solution
+from ...methods.starts.continuation import first_samples
+from ...program.collocation import Collocation, ExperimentIterate
+from ...program.markers.marker_residual import MarkerResidual
+from ...program.observables import ObservedMotion, ReactionForces
+from ...program.transcription import Transcription
+from ...program.wrench_residual import WrenchResidual, without_grasp_sensors
+from ...recording.measured_wrench import Wrench
+from ...recording.nuisance import TOOL_CENTRE, TOOL_MASS
+from ...recording.poses import Frame
+from ...statistics.axes import with_other_axes
+from ...statistics.budget.shape_error import other_section
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES = {

@@ -13,8 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ...recording.obstacle_solids import Plane
-from .misspecification_hypothesis import Hypothesis
-from .obstacle_misspecifications import signed_distances_m
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
+from .obstacles import signed_distances_m
 
 # Penetration of a solid from which on a node is inside, over the body's diagonal.
 DEEP = 0.01

@@ -14,16 +14,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..common.array_types import Array
-from ..program.collocation import ExperimentIterate
-from ..program.wrench_residual import WrenchResidual
-from ..recording.experiment import Experiment
-from ..recording.measured_wrench import COMPONENTS, UNITS
-from ..statistics.axes import with_other_axes
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ...common.array_types import Array
+from ...program.collocation import ExperimentIterate
+from ...program.wrench_residual import WrenchResidual
+from ...recording.experiment import Experiment
+from ...recording.measured_wrench import COMPONENTS, UNITS
+from ...statistics.axes import with_other_axes
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
 
 # Message of the offset by the code of its concern; those of other hypotheses are in
-# `wrench_causes`.
+# `causes`.
 MESSAGE_OF_OFFSET = {
     "description/wrench-offset": "most of its deviation from the simulation at the guess{after} is an "
     "offset, in {component} {offset} ({deviations:.3g} standard deviations of its noise): zero the "

@@ -1,0 +1,1 @@
+"""Likely mistakes in the description of depth cameras, and concerns about them."""
