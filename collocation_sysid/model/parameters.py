@@ -309,7 +309,9 @@ def complete_parameter(
     if not isinstance(user_statement, Unknown):
         value = float(user_statement)
         if is_known:
-            return Parameter(name, value, is_fixed=True)
+            is_signed = value < 0 and constant.may_be_negative
+            scale = "linear" if is_signed else "log"
+            return Parameter(name, value, is_fixed=True, scale=scale)
         _require_admissible(constant, value, f"{name}: fixed")
         return Parameter(name, value, is_fixed=True, scale=constant.scale)
     user_statement = _with_usual_guess(name, user_statement, constant)

@@ -290,6 +290,18 @@ LEAST_KIND_CHANGE = Threshold(
     "the gauge length: that of a dogbone between its grips is 10 % too long.",
     study="specimens",
 )
+LIKELIER_FAR = Threshold(
+    6.0,
+    "The same decrease as `LIKELIER` where the other kind changes E by `FAR_KIND_CHANGE`: a wrong "
+    "answer then costs more than a question. Right tests reach it in at most 2 of 100 cases.",
+    study="specimens",
+)
+FAR_KIND_CHANGE = Threshold(
+    0.4,
+    "Change of the logarithm of E, a factor of 1.5, from which on another kind of test needs less "
+    "evidence, and the fit of the stated kind need not be unlikely.",
+    study="specimens",
+)
 DENSITY_DEVIATION = Threshold(
     0.05,
     "Deviation of the mass over the volume of the mesh from the known density: data sheets "

@@ -90,7 +90,9 @@ SECOND_STRAIN = Quantity("second_strain", "ratio", unit="1", words=STRAIN.words,
 LATERAL_STRAIN = Quantity(
     "lateral_strain", "ratio", unit="1", words=STRAIN.words, qualifier="lateral"
 )
-VOLUME_RATIO = Quantity("volume_ratio", "ratio", unit="1", words="volumenverhältnis", unitless=True)
+VOLUME_RATIO = Quantity(
+    "volume_ratio", "ratio", unit="1", words="volumenverhältnis j", unitless=True
+)
 SECOND_STRESS = Quantity(
     "second_stress", "pressure", unit="pa", words=STRESS.words, qualifier="second"
 )
@@ -127,6 +129,7 @@ QUALIFIERS = {
         *("deviatoric", "hydrostatic", "mises", "tresca"),
         *("volumetric", "rate", "energy", "error", "fehler", "deviation", "abweichung", "std"),
         *("uncertainty", "residual", "target", "setpoint", "command", "commanded", "sollwert"),
+        *("amplitude", "range", "modulus", "strength", "limit", "noise"),
     },
 }
 

@@ -49,8 +49,10 @@ from ..thresholds import (
     BETTER,
     CERTAIN,
     DECISIVE,
+    FAR_KIND_CHANGE,
     LEAST_KIND_CHANGE,
     LIKELIER,
+    LIKELIER_FAR,
     MISFIT,
     NOISE_LEVEL,
     PLAUSIBLE_NUISANCE,
@@ -187,7 +189,12 @@ def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
     freedom = max(1, count - stated.collocation.nq)
     is_unlikely = stated_loss > freedom + UNLIKELY * np.sqrt(2 * freedom)
     change = abs(np.log(_young_pa(refits[possible[0]]) / _young_pa(stated)))
-    is_likelier = best >= LIKELIER and is_noise and is_unlikely and change > LEAST_KIND_CHANGE
+    # The stress in unloading is not that of the law.
+    has_unloading = any(is_unloading(specimen_strains(each)[0]) for each in experiments)
+    is_likelier = is_noise and (
+        (best >= LIKELIER and is_unlikely and change > LEAST_KIND_CHANGE)
+        or (best >= LIKELIER_FAR and change > FAR_KIND_CHANGE and not has_unloading)
+    )
     code = "specimen-kind/likelier" if is_likelier else "specimen-kind/open"
     return [Hypothesis(code, of, data=data, strength=np.sqrt(stated_loss / min(loss.values())))]
 
