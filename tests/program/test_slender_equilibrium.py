@@ -19,7 +19,6 @@ from collocation_sysid import (
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.forward.newton_solver import NewtonOptions, NewtonSolver
 from collocation_sysid.program.forward.retraction import Retraction
-from collocation_sysid.program.linear_algebra.factorisation import Factoriser
 
 SIZE_M = (0.18, 0.02, 0.02)
 CELLS = (18, 1, 3)
@@ -49,20 +48,20 @@ def theta_of(body: Body, poisson: float) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize(
     ("element", "poisson", "most"),
-    [("tet4", 0.45, 12), ("tet4", 0.49, 12), ("tet10-p0", 0.49, 12), ("tet10-p0", 0.499, 40)],
+    [("tet4", 0.45, 12), ("tet4", 0.49, 12), ("tet10-p0", 0.49, 13), ("tet10-p0", 0.4999, 13)],
 )
 def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(
     element, poisson, most, monkeypatch
 ):
     bar = notched_bar(element)
     factorised = []
-    factorise = Factoriser.factorise
+    factorise = NewtonSolver.factorise
 
     def counting(self, *matrix, **options):
         factorised.append(self)
         return factorise(self, *matrix, **options)
 
-    monkeypatch.setattr(Factoriser, "factorise", counting)
+    monkeypatch.setattr(NewtonSolver, "factorise", counting)
     x = equilibrium(bar, theta_of(bar.body, poisson)).reshape(-1, 3)
     sag_m = -(x - bar.body.nodes_m)[:, 2].min()
     assert sag_m > 0.5 * SIZE_M[0]

@@ -14,6 +14,7 @@ from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ..linear_algebra.factorisation import NONE
 from ..linear_algebra.lapack import one_blas_thread
+from .load_steps import follow_loads
 from .newton_solver import (
     Linearise,
     NewtonFailure,
@@ -23,6 +24,9 @@ from .newton_solver import (
     SolutionPath,
     simulation_error,
 )
+
+# Distance of prescribed dofs from the carried body, over its size, up to which they are in place.
+ON_PLACE = 1e-12
 
 
 @one_blas_thread()
@@ -36,10 +40,11 @@ def equilibrium(
     """Return the static equilibrium (3n,) [m] under gravity and external forces, with grasped dofs
     prescribed.
 
-    Newton's method starts from the undeformed body in its grasps, or from `start`. If it fails,
-    load and relative displacements of the grasps are applied in increments, and obstacles approach
-    from where they do not touch the body. A body with memory has relaxed, or has been loaded for as
-    long as the experiment states.
+    Newton's method starts from the undeformed body in its grasps, or from `start`; in a body of
+    elements with mean dilatation its steps follow the loads, see `load_steps`. If it fails, load
+    and relative displacements of the grasps are applied in increments, and obstacles approach from
+    where they do not touch the body. A body with memory has relaxed, or has been loaded for as long
+    as the experiment states.
 
     Parameters
     ----------
@@ -85,11 +90,20 @@ def _solve_equilibrium(
     forces = with_start_memory(forces, experiment.loaded_since_s)
     separate = _with_separate_obstacles(forces, shape)
 
-    guess = shape.ravel() if start is None and experiment.obstacles else start
+    def equations(share: float) -> tuple[Residual, Linearise]:
+        return static_equations(scale_loads(forces, share), share, free=solver.free)
+
+    guess = start
+    if start is None and experiment.obstacles:
+        guess = shape.ravel()
+    elif start is None and experiment.body.element.mean_dilatation:
+        held = solver.is_prescribed
+        if np.abs(goals_m[held] - shape.ravel()[held]).max(initial=0.0) <= ON_PLACE * solver.size_m:
+            guess = follow_loads(solver, forces, shape.ravel(), equations)
     path = SolutionPath(separate.ravel(), halvings=solver.options.max_halvings, guess=guess)
     while path.share < 1.0:
         x, share = path.next_guess()
-        residual, linearise = static_equations(scale_loads(forces, share), share, free=solver.free)
+        residual, linearise = equations(share)
         # Grasps that are off are there at the end: the way there may be any.
         goal = (
             goals_m

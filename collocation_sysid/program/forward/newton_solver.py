@@ -462,7 +462,7 @@ class NewtonSolver:
         factor = iterate.factor
         length = np.linalg.norm(iterate.step)
         share = 1.0
-        update = self._retraction if keep_definite and self._has_no_obstacle else add_increment
+        update = self.retraction if keep_definite and self._has_no_obstacle else add_increment
         for _ in range(self.options.max_backtracks):
             increment = np.zeros_like(x)
             increment[self.free] = share * iterate.step
@@ -492,7 +492,7 @@ class NewtonSolver:
         raise NewtonFailure(x, "no step along the Newton direction decreases the residual")
 
     @cached_property
-    def _retraction(self) -> Retraction:
+    def retraction(self) -> Retraction:
         """Retraction that applies increments towards an equilibrium and displaces the prescribed
         dofs exactly; computed on first use.
         """
@@ -527,12 +527,16 @@ class NewtonSolver:
         """
         try:
             with self.stopwatch.solving():
-                factor = self.factoriser.factorise(
-                    at.symmetric, at.skew, is_single=not keep_definite
+                factor = (
+                    self.factoriser.factorise_definite(at.symmetric)
+                    if keep_definite and not at.skew.any()
+                    else self.factoriser.factorise(
+                        at.symmetric, at.skew, is_single=not keep_definite
+                    )
                 )
         except np.linalg.LinAlgError as error:
             raise NewtonFailure(x, f"the equations are singular: {error}") from error
-        if keep_definite and not factor.positive_definite:
+        if factor is None or (keep_definite and not factor.positive_definite):
             raise NewtonFailure(x, "the stiffness is not positive definite")
         return factor
 

@@ -96,6 +96,12 @@ class Retraction:
             moved[axis.free, k] = axis.factor.solve(right[axis.free, k] - known)
         return moved.ravel()
 
+    def relative_gradient(self, x: Array, increment: Array) -> Array:
+        """Return the gradients ∇δ F⁻¹ (points, 3, 3) of an increment (3n,) in the shape x (3n,)
+        [m].
+        """
+        return self._deformation(increment) @ np.linalg.inv(self._deformation(x))
+
     def _target(self, x: Array, increment: Array) -> Array:
         """Return the new deformation gradients at all quadrature points after an increment (3n,) of
         positions x (3n,) [m], (3 · points, 3), derivatives along X first.
