@@ -14,8 +14,8 @@ order, in place of the stress after the step. Both have the same limit, so the s
 and convergence remains quadratic (Magisano, Leonetti and Garcea, Comput. Methods Appl. Mech. Engrg.
 313, 2017, for all stresses).
 
-Equilibria far from the first guess do not profit: there the stiffness ceases to be positive definite
-at stresses that the iterates really have.
+Searches for equilibria use it only while the loads grow in steps (`load_steps`): after a long step
+under the complete load the stiffness is indefinite at stresses that the iterates really have.
 """
 
 from __future__ import annotations
