@@ -217,12 +217,13 @@ def readable_stress(values_pa: Iterable[float]) -> tuple[float, str]:
     return next((each for each in units if each[0] * largest < 1e4), (1e-9, "GPa"))
 
 
-def quantity(value: float, unit: str) -> str:
-    """Return a size in `unit` with two significant digits, see `short`, and its unit, of a stress
-    [Pa] in a unit in which it is below 1000; without a unit the number alone.
+def quantity(value: float, unit: str, digits: int | None = None) -> str:
+    """Return a size with its unit, a stress [Pa] in a unit in which it is below 1000; without a unit
+    the number alone. `digits` are the significant digits, by default those of `short`.
     """
     factor, shown = readable_stress([10 * value]) if unit == "Pa" else (1.0, unit)
-    return f"{short(factor * value)} {shown}".rstrip()
+    text = short(factor * value) if digits is None else number(factor * value, digits)
+    return f"{text} {shown}".rstrip()
 
 
 def number(value: float | None, digits: int = 5) -> str:

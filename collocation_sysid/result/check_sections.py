@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..common.display import Line, Shown, Table, duration, labelled
+from ..common.display import Line, Shown, Table, duration, labelled, quantity
 from ..fem.laws.constants import symbol_of, unit_of
 from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
 from ..runs.check.body_check import grasp_sentence
@@ -283,7 +283,7 @@ def _guess_rows(findings: CheckResult) -> dict[str, str]:
     """Return table rows with the guess of each body and the deviation from the markers there."""
     rows = {
         "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
-            f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()
+            f"{symbol_of(name)} {quantity(value, unit_of(name), digits=3)}"
             for name, value in body.guess.items()
         )
         for body in findings.bodies

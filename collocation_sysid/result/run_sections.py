@@ -33,7 +33,7 @@ from ..common.pages import explain_command, page_url
 from ..common.serialisation import content, copy_fields
 from ..errors import listed
 from ..features.measurement_results import PredictionErrors, SimulatedExperiment
-from ..fem.laws.constants import symbol_of, symbol_with_unit, unit_of
+from ..fem.laws.constants import symbol_of, unit_of
 from ..recording.deviation import in_readable_unit
 from ..runs.result_content import Elapsed, Result
 from ..statistics.assessment import Assessment
@@ -331,13 +331,8 @@ def estimate_row(result: Result, name: str) -> tuple[str, ...]:
     these words. Instead of the guess of a fixed or tied parameter the cell is "fixed" or
     "tied".
     """
-    values = result.collect_estimates()
-    each = values[name]
-    factor, unit = 1.0, unit_of(name)
-    if unit == "Pa":
-        factor, unit = readable_stress(
-            e.value for n, e in values.items() if unit_of(n) == "Pa" and (not e.fixed or n == name)
-        )
+    each = result.collect_estimates()[name]
+    factor, unit = _readable_unit(result, name)
     deviation, statistical, systematic = (
         None if size is None else factor * size
         for size in (
@@ -385,13 +380,25 @@ def _deviation_text(deviation: float | None) -> str:
     return "" if deviation is None else two_digits(deviation)
 
 
+def _readable_unit(result: Result, name: str) -> tuple[float, str]:
+    """Return factor and name of the unit of an estimate in tables; all moduli have the same unit."""
+    if unit_of(name) != "Pa":
+        return 1.0, unit_of(name)
+    return readable_stress(
+        each.value
+        for other, each in result.collect_estimates().items()
+        if unit_of(other) == "Pa" and (not each.fixed or other == name)
+    )
+
+
 def refinement_table(result: Result) -> Table | Line:
     """Return the table of measured discretisation errors, a line for each estimate that has one:
     the errors of step and mesh with their observed orders, the corrected value and the combined
     interval.
 
-    Unknown numbers are empty. If no estimate has such an error, a sentence is returned that no
-    estimate changed; the result must therefore be that of a refinement.
+    Unknown numbers are empty; columns without any number are left out. If no estimate has such an
+    error, a sentence is returned that no estimate changed; the result must therefore be that of a
+    refinement.
     """
     if not result.collect_numerical_errors():
         return Line(
@@ -400,21 +407,26 @@ def refinement_table(result: Result) -> Table | Line:
     rows = []
     for name, error in result.collect_numerical_errors().items():
         each = result.collect_estimates()[name]
+        factor, unit = _readable_unit(result, name)
+        deviation = each.combined_std_error and factor * each.combined_std_error
         rows.append(
             (
-                symbol_with_unit(name),
-                "" if error.step is None else f"{error.step:+.3g}",
+                f"{symbol_of(name)} {unit}".rstrip(),
+                "" if error.step is None else f"{factor * error.step:+.2g}",
                 "" if error.step_order is None else f"{error.step_order:.1f}",
-                "" if error.mesh is None else f"{error.mesh:+.3g}",
+                "" if error.mesh is None else f"{factor * error.mesh:+.2g}",
                 "" if error.mesh_order is None else f"{error.mesh_order:.1f}",
-                rounded(each.value, each.combined_std_error),
-                _interval_text(each.combined95, 1.0, each.combined_std_error),
+                rounded(factor * each.value, deviation),
+                "" if deviation is None else two_digits(deviation),
+                _interval_text(each.combined95, factor, deviation),
             )
         )
+    columns = ("", "half the step", "order", "half the edges", "order", "corrected", "±")
+    kept = [k for k in range(8) if k == 0 or any(row[k] for row in rows)]
     return Table(
         "",
-        ("", "half the step", "order", "half the edges", "order", "corrected", "95 % interval"),
-        rows=tuple(rows),
+        tuple((*columns, "95 % interval")[k] for k in kept),
+        rows=tuple(tuple(row[k] for k in kept) for row in rows),
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from ..common.display import Line, Shown, Table, flattened_parts, number
+from ..common.display import Line, Shown, Table, flattened_parts, number, quantity
 from ..common.serialisation import copy_fields
 from ..errors import listed
 from ..features.measurement_results import FittedExperiment, PredictionErrors, SimulatedExperiment
@@ -164,7 +164,7 @@ def _estimates(result: Result) -> Iterator[Shown]:
         yield Table("", ("", "value", "±", "95 % interval", "± stat"), rows=tuple(rows))
     if fixed:
         stated = (
-            f"{symbol_of(name)} {number(values[name].value)} {unit_of(name)}".strip()
+            f"{symbol_of(name)} {quantity(values[name].value, unit_of(name), digits=5)}"
             for name in fixed
         )
         yield f"fixed: {', '.join(stated)}"

@@ -13,7 +13,6 @@ from kit.results import FIT, a_result, value
 
 import collocation_sysid as cs
 from collocation_sysid.common.display import (
-    number,
     plain_text,
     quantity,
     readable_stress,
@@ -21,10 +20,11 @@ from collocation_sysid.common.display import (
     two_digits,
 )
 from collocation_sysid.result.pictures.confidence import Confidence
-from collocation_sysid.result.run_sections import _cards
+from collocation_sysid.result.run_sections import _cards, refinement_table
 from collocation_sysid.result.run_summary import next_step, run_summary
 from collocation_sysid.runs.misspecifications import NO_CAUSE
 from collocation_sysid.runs.result_content import Result
+from collocation_sysid.statistics.budget.discretisation_error import DiscretisationError
 
 MOST_LINES = 16
 
@@ -142,7 +142,7 @@ def test_a_fixed_bulk_modulus_does_not_choose_the_unit():
     fixed = replace(result.parameters["lambda_pa"], value=1e9, fixed=True)
     shown = lines(replace(result, parameters={**result.parameters, "lambda_pa": fixed}))
     assert any(line.startswith("μ Pa ") for line in shown)
-    assert any(line.startswith("fixed: λ 1e9 Pa") for line in shown)
+    assert any(line.startswith("fixed: λ 1 GPa") for line in shown)
 
 
 def test_a_summary_of_specimens_has_no_row_of_what_is_fixed_or_absent():
@@ -156,8 +156,21 @@ def test_a_summary_of_specimens_has_no_row_of_what_is_fixed_or_absent():
     symbols = [line.split()[0] for line in shown if " … " in line]
     assert symbols == ["μ", "E"]
     assert [line for line in shown if line.startswith("fixed: ")] == [
-        f"fixed: κ {number(young.value)} Pa"
+        f"fixed: κ {quantity(young.value, 'Pa', digits=5)}"
     ]
+
+
+def test_the_table_of_a_refinement_has_the_units_of_the_estimates_and_no_empty_column():
+    result = solved()
+    stiff = replace(result.parameters["mu_pa"], value=84e3, combined_std_error=2e4)
+    error = DiscretisationError(None, 2.8e3, None, None, 84e3, (5.3e4, 1.34e5))
+    stiff = replace(stiff, combined95=(5.3e4, 1.34e5), numerical_error=error)
+    table = refinement_table(replace(result, parameters={"mu_pa": stiff}, derived={}))
+    heads, row = plain_text([table], width=200).splitlines()
+    assert heads.split("  ")[-1].strip() == "95 % interval"
+    assert "order" not in heads
+    assert "step" not in heads
+    assert row.split() == ["μ", "kPa", "+2.8", "84", "20", "53", "…", "134"]
 
 
 @pytest.mark.parametrize(
