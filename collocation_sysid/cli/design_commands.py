@@ -178,5 +178,6 @@ def plan(
     output.print_result(plan_json(answer), plan_summary(answer, folder))
     if answer.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
-    if answer.answer.status not in ("converged", "flat") or answer.exceeds_error:
+    exceeds = answer.exceeds_error or answer.exceeds_body_limits
+    if answer.answer.status not in ("converged", "flat") or exceeds:
         raise typer.Exit(EXIT_NOT_CONVERGED)

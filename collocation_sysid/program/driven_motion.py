@@ -104,6 +104,11 @@ class DrivenMotion:
         return self.collocation.transcriptions[0]
 
     @property
+    def theta(self) -> Array:
+        """Constants θ of the body."""
+        return self.transcription.constants.theta(self.q)
+
+    @property
     def t_s(self) -> Array:
         """Grid times (N,) [s]."""
         return self.transcription.dynamics.t_s

@@ -25,7 +25,7 @@ from collocation_sysid.extras.planning.planned_body import PlannedBody
 from collocation_sysid.extras.planning.planned_program import PlannedProgram
 from collocation_sysid.extras.planning.reduced_solver import ReducedTolerances, solve_reduced
 from collocation_sysid.extras.planning.spline_motion import rotation_expression
-from collocation_sysid.extras.planning.task import Task, sampled_references
+from collocation_sysid.extras.planning.task import AvoidSection, Task, sampled_references
 
 LIMITS = Limits.model_validate(
     {
@@ -42,7 +42,7 @@ TIGHT = ReducedTolerances(progress=0.0)
 
 
 @cache
-def hung_bar() -> cs.Problem:
+def hung_bar(*obstacles: cs.Obstacle) -> cs.Problem:
     """A bar of 20 nodes hung by its upper face, whose lower end is tracked."""
     body = cs.Body(cs.box_mesh((0.02, 0.02, 0.12), (1, 1, 4)), density_kg_m3=800.0)
     t_s = 0.02 * np.arange(11)
@@ -52,7 +52,7 @@ def hung_bar() -> cs.Problem:
     experiment = cs.Experiment(
         body,
         t_s,
-        [cs.Grasp(upper, hand)],
+        [cs.Grasp(upper, hand), *obstacles],
         tracked,
         nuisance=cs.Nuisance.none(),
         air_density_kg_m3="none",
@@ -399,6 +399,61 @@ def test_a_conic_program_without_a_solution_keeps_the_best_plan(monkeypatch):
         plan_motion(hung_bar(), task(), LIMITS)
 
 
+# Limits of the body -------------------------------------------------------------------------------
+
+# A wall that the bar would hit.
+WALL = cs.Obstacle(shape=cs.Plane((-1.0, 0.0, 0.0), (0.074, 0.0, 0.0)), name="wall")
+
+
+def test_derivatives_of_limits_of_the_body_are_their_differences():
+    wanted = task(avoid={"largest_stretch": 1.02, "clearance_m": 0.06},
+                  hand={"intervals": 8, "free": SIX_AXES})  # fmt: skip
+    planned = PlannedProgram.from_task(PlannedBody.read(hung_bar(WALL)), wanted, LIMITS)
+    limits = planned.body_limits
+    rng = np.random.default_rng(0)
+    x = planned.start + 2e-3 * rng.normal(size=(len(planned.grid_since_s), len(planned.start)))
+    x[:, planned.driven.dofs[planned.planned_columns.max() + 1 :]] = planned.start[
+        planned.driven.dofs[planned.planned_columns.max() + 1 :]
+    ]
+    slopes = rng.normal(size=(*x.shape, 2))
+    sampled, moved = x[limits.sample_rows], slopes[limits.sample_rows]
+    enters = rng.random(limits.values(sampled).shape) < 0.1
+    values, found = limits.linearise(x, slopes, enters)
+    assert values == pytest.approx(limits.values(sampled)[enters])
+    assert len({limits.names[k] for k in np.nonzero(enters)[1]}) == 2
+    h = 1e-7
+    for column in range(2):
+        ends = [limits.values(sampled + sign * h * moved[..., column]) for sign in (1, -1)]
+        differences = ((ends[0] - ends[1]) / (2 * h))[enters]
+        assert np.abs(found[:, column] - differences).max() < 1e-5 * np.abs(found).max()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("avoid", "obstacles"), [({"largest_stretch": 1.05}, ()), ({"clearance_m": 0.012}, (WALL,))]
+)
+def test_the_body_keeps_its_limits(avoid, obstacles):
+    wanted = task(reference=[
+        {"point": "tip", "t_s": [0.5], "position_m": [(0.045, 0.0, np.nan)], "relative": True}
+    ], duration_s=0.5, hand={"intervals": 10})  # fmt: skip
+    problem = hung_bar(*obstacles)
+    loose = {key: 10.0 if key == "largest_stretch" else 1e-9 for key in avoid}
+    free = plan_motion(problem, wanted.model_copy(update={"avoid": AvoidSection(**loose)}), LIMITS)
+    kept = plan_motion(problem, wanted.model_copy(update={"avoid": AvoidSection(**avoid)}), LIMITS)
+    ((key, limit),) = avoid.items()
+    sign = 1 if key == "largest_stretch" else -1
+    limits, rows = kept.program.body_limits, kept.program.sample_rows
+    before, after = (limits.extremes(each.answer.x[rows])[key] for each in (free, kept))
+    assert sign * before > sign * limit  # the limit has an effect
+    assert sign * after <= sign * limit
+    assert after == pytest.approx(limit, rel=0.01)
+    # Finer time steps, which this test has not, decide whether the limit is kept.
+    assert kept.exceeds_body_limits == (sign * kept.body_extremes[key] > sign * limit)
+    assert kept.answer.status in ("converged", "flat")
+    assert kept.answer.history[-1] > free.answer.history[-1]
+    assert kept.tracking_error(kept.program.references[0]).largest_m < 4e-3
+
+
 # The full program ---------------------------------------------------------------------------------
 
 NARROW = LIMITS.model_copy(
@@ -681,6 +736,7 @@ def test_mistakes_in_task_files_are_explained(tmp_path: Path, line, instead, mes
             {"hand": {"free": ["rx"], "end_rotation_deg": (70.0, 0.0, 0.0)}},
             "turns by 70.*rotation_deg = 60",
         ),
+        ({"avoid": {"clearance_m": 0.01}}, "the recording has no obstacles"),
         ({"end": {"window_s": 0.02}}, "window_s = 0.02, which is 1 samples"),
         (
             {"reference": [{"point": "tip", "t_s": [5.0], "position_m": [(0.0, 0.0, 0.0)]}]},

@@ -44,17 +44,17 @@ class FullProgram:
     Raises
     ------
     InputError
-        If the body or a force has history variables, whose derivatives are not sparse.
+        If the body or a force has history variables, or the body has limits.
     """
 
     def __init__(self, program: PlannedProgram) -> None:
         self.program = program
         self.driven = program.driven
         self.collocation = program.driven.collocation
-        if self.collocation.has_eliminated_histories:
+        if self.collocation.has_eliminated_histories or program.body_limits is not None:
             raise InputError(
-                "the body or a force on it has memory, which the solver interior-point does not "
-                "support; expected reduced-space",
+                "interior-point supports neither memory of a body or force, nor limits of [avoid]; "
+                "expected reduced-space",
                 None,
                 where="--solver",
             )
@@ -283,7 +283,7 @@ def solve_full(
     Raises
     ------
     InputError
-        If the body or a force has history variables.
+        If the body or a force has history variables, or the body has limits.
     """
     full = FullProgram(program)
     errors: list[BaseException] = []

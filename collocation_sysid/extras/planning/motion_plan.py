@@ -288,6 +288,24 @@ class MotionPlan:
         positions = self.fine.positions_m
         return self.program.residual_vibration_m(positions.reshape(len(positions), -1))
 
+    @cached_property
+    def body_extremes(self) -> dict[str, float]:
+        """Largest stretch, and smallest distance from obstacles [m], at the samples, by the name of
+        the limit; of those that the task limits.
+        """
+        limits = self.program.body_limits
+        positions = self.fine.positions_m
+        return {} if limits is None else limits.extremes(positions.reshape(len(positions), -1))
+
+    @property
+    def exceeds_body_limits(self) -> bool:
+        """Whether the largest stretch or the clearance of the task is not kept."""
+        avoid, found = self.program.task.avoid, self.body_extremes
+        stretch, clearance_m = avoid.largest_stretch, avoid.clearance_m
+        return (stretch is not None and found["largest_stretch"] > stretch) or (
+            clearance_m is not None and found["clearance_m"] < clearance_m
+        )
+
     @property
     def exceeds_error(self) -> bool:
         """Whether the error is larger than the task accepts."""
@@ -312,7 +330,8 @@ class MotionPlan:
         for name in dict.fromkeys(limits.names):
             chosen = np.array([each == name for each in limits.names])
             # Of the objective, twice that of the steps, by one percent of the limit.
-            gain = 0.02 * float(self.answer.multipliers[chosen].sum()) / max(value, 1e-300)
+            multipliers = self.answer.multipliers[: len(chosen)][chosen]
+            gain = 0.02 * float(multipliers.sum()) / max(value, 1e-300)
             binds = np.zeros(len(limits.t_s), dtype=bool)
             at = np.searchsorted(limits.t_s, limits.times_s[chosen] - 1e-12)
             np.logical_or.at(binds, at, limits.shares(self.answer.c)[chosen] > BINDING)

@@ -157,6 +157,7 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
         },
         "limits_reached": plan.list_active_limits(),
         "binding_limits": [each._asdict() for each in plan.binding_limits],
+        "body": plan.body_extremes,
         "largest_error_m": plan.largest_error_m,
         "accepted_error_m": program.task.largest_error_m,
         "sufficient_duration_s": plan.sufficient_duration_s,
@@ -187,6 +188,18 @@ def _limit_lines(plan: MotionPlan) -> list[Shown]:
                 f"largest_error_m; expected {longer}wider limits",
                 "check",
             )
+        )
+    units = {
+        "largest_stretch": ("largest stretch", 1.0, ""),
+        "clearance_m": ("clearance", 1e3, " mm"),
+    }
+    for key, value in plan.body_extremes.items():
+        words, factor, unit = units[key]
+        limit = factor * getattr(task.avoid, key)
+        lines.append(f"{words}: {factor * value:.4g}{unit} (limit {limit:.4g}{unit})")
+    if plan.exceeds_body_limits:
+        lines.append(
+            Line("no motion was found that keeps the limits of the body; see [avoid]", "check")
         )
     if not plan.binding_limits:
         lines.append(f"limits reached: {', '.join(plan.list_active_limits()) or 'none'}")

@@ -26,12 +26,12 @@ from scipy.spatial.transform import Rotation
 from ...common.array_types import Array, Index
 from ...common.time_dependence import at_times
 from ...errors import InputError
-from ...model.parameters import ThetaMap
 from ...program.driven_motion import Drive, DrivenMotion
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.modes.natural_modes import natural_modes
 from ...recording import Experiment, PoseSequence
 from ..design.hand_limits import HandBounds, Limits
+from .body_limits import BodyLimits
 from .planned_body import PlannedBody
 from .spline_motion import LIMIT_POINTS, HandFrame, HandLimits, PoseLimit, SplineSpace
 from .task import AXES, Reference, Task, point_names, point_places, sampled_references
@@ -213,6 +213,12 @@ class PlannedProgram:
             If the body has no equilibrium in the initial pose.
         """
         template = body.template
+        if task.avoid.clearance_m is not None and not template.obstacles:
+            raise InputError(
+                "the recording has no obstacles; expected clearance_m for a body beside one",
+                None,
+                where="avoid.clearance_m",
+            )
         sample_s = task.sample_s or template.timestep_s
         count = round(task.duration_s / sample_s)
         if not FEWEST_SAMPLES <= count <= MOST_SAMPLES:
@@ -281,11 +287,10 @@ class PlannedProgram:
         variances, directions = np.linalg.eigh(covariance)
         chosen = np.flatnonzero(variances > SMALLEST_VARIANCE * variances.max(initial=0.0))
         steps = directions[:, chosen] * np.sqrt(len(chosen) * variances[chosen])
-        constants = ThetaMap(self.driven.transcription.parameters, self.experiment.body)
         found = []
         for step in np.concatenate([steps.T, -steps.T]):
             driven = replace(self.driven, q=self.driven.q + step)
-            start = equilibrium(self.experiment, constants.theta(driven.q), start=self.start)
+            start = equilibrium(self.experiment, driven.theta, start=self.start)
             found.append(replace(self, driven=driven, start=start))
         return tuple(found)
 
@@ -346,6 +351,15 @@ class PlannedProgram:
         )
         placed = self.frame.position_m + coordinates[:, :3] - turned.apply(self.body.hand_m)
         return PoseSequence(t_s + self.experiment.t_s[0], placed, quaternions_xyzw=turned.as_quat())
+
+    @cached_property
+    def body_limits(self) -> BodyLimits | None:
+        """Limits of the body; None if the task has none."""
+        avoid = self.task.avoid
+        if avoid.largest_stretch is None and avoid.clearance_m is None:
+            return None
+        theta = self.driven.theta
+        return BodyLimits(self.experiment, theta, self.sample_rows, **vars(avoid))
 
     @cached_property
     def hand_limits(self) -> LimitsOverTime:
@@ -561,8 +575,7 @@ def _space(task: Task, bounds: HandBounds) -> SplineSpace:
 def _lowest_frequency_hz(driven: DrivenMotion, start: Array) -> float:
     """Return the lowest natural frequency about the equilibrium [Hz]; NaN if nothing oscillates."""
     transcription = driven.transcription
-    theta = ThetaMap(transcription.parameters, transcription.body).theta(driven.q)
-    forces = at_times(transcription.dynamics.with_theta(theta).forces, slice(1))
+    forces = at_times(transcription.dynamics.with_theta(driven.theta).forces, slice(1))
     found = natural_modes(forces, start, free_dofs=transcription.free_dofs, count=1)
     return float(found.frequencies_hz[0]) if len(found.frequencies_hz) else np.nan
 

@@ -4,7 +4,8 @@ At each iteration one forward sweep gives the derivatives Z of the motion by the
 residuals S x − b of the body and the affine residual of the jerk, the step minimises the
 linearised sum of squares with Levenberg's damping, subject to the limits of the hand. Limits of
 translations are convex and enter as they are (second-order cones), those of rotations linearised.
-Every iterate respects all limits. A step counts only if the simulated motion is better.
+Every iterate respects all limits of the hand. Limits of the body are linearised where they are
+near; iterates respect them once they do so. A step counts only if the simulated motion is better.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from scipy.linalg import solve_triangular
 from ...common.array_types import Array
 from ...errors import SimulationError
 from ..design.hand_limits import WITHIN
+from .body_limits import NEAR
 from .planned_program import LinearisedLimits, PlannedProgram
 
 # Tolerance of the conic program of a step, relative.
@@ -212,6 +214,7 @@ def solve_reduced(
     matrix, target = program.residuals
     by_jerk, jerk = program.effort
     value = _mean_objective(programs, c, motions)
+    violation = _violation(program, motions)
     multipliers = np.zeros(len(program.hand_limits.names))
     answer = PlanAnswer(c, motions[0], multipliers, "iteration limit", [value])
     damping, failures = 0.0, 0
@@ -236,14 +239,16 @@ def solve_reduced(
                         np.vstack([undamped, np.diag(lengths)]),
                         np.concatenate([present, np.zeros(len(c))]),
                     )
-                step, trial_multipliers = minimise_within_limits(root, offset, near)
+                step, trial_multipliers = _step(program, root, offset, near, motions, slopes)
                 trial = c + step
                 change = undamped @ step
                 predicted = -float(change @ (2 * present + change))
                 size = float(np.abs(step).max())
-                if size <= limits.step or predicted <= limits.decrease * (value + 1e-300):
+                allowed = violation <= LARGEST_SHARE - 1
+                is_flat = allowed and predicted <= limits.decrease * (value + 1e-300)
+                if size <= limits.step or is_flat:
                     answer.multipliers = trial_multipliers
-                    answer.status = "converged" if damping < 1e-3 else "stalled"
+                    answer.status = "converged" if damping < 1e-3 and allowed else "stalled"
                     if damping < 1e-3:
                         return answer
                 moved, decrease = motions, -np.inf
@@ -253,30 +258,82 @@ def solve_reduced(
                             p.simulate(trial, near=x + by_c @ step)
                             for p, x, by_c in zip(programs, motions, slopes, strict=True)
                         ]
-                        decrease = value - _mean_objective(programs, trial, moved)
-                if decrease > 1e-4 * predicted:
+                        if _violation(program, moved) <= max(violation, LARGEST_SHARE - 1):
+                            decrease = value - _mean_objective(programs, trial, moved)
+                # While a limit of the body is exceeded, the violation decreases instead.
+                if decrease > (1e-4 * predicted if allowed else -np.inf):
                     break
                 failures += 1
                 if failures > limits.failures or answer.status == "stalled":
                     answer.status = "stalled"
                     return answer
                 damping = max(4 * damping, 1e-3)
-            ratio = decrease / predicted
-            damping = damping / 5 if ratio > 0.5 else damping
+            damping = damping / 5 if decrease > 0.5 * predicted else damping
             damping = 0.0 if damping < 1e-6 else damping
             failures = 0
             c, motions, value = trial, moved, value - decrease
+            violation = _violation(program, motions)
             answer.c, answer.x, answer.multipliers = c, motions[0], trial_multipliers
             answer.history.append(value)
             past = answer.history[-4:]
-            if len(past) == 4 and past[0] - value < limits.progress * past[0]:
+            if allowed and len(past) == 4 and past[0] - value < limits.progress * past[0]:
                 answer.status = "flat"
                 break
     except np.linalg.LinAlgError:  # the best plan remains
         answer.status = "stalled"
+    except HandLimitsExcludeTask:
+        if program.body_limits is None:
+            raise
+        answer.status = "stalled"
     except KeyboardInterrupt:
         answer.status = "interrupted"
     return answer
+
+
+def _step(
+    program: PlannedProgram,
+    root: Array,
+    offset: Array,
+    near: LinearisedLimits,
+    motions: list[Array],
+    slopes: list[Array],
+) -> tuple[Array, Array]:
+    """Return the step within the limits `near` of the hand and those of the body, and the
+    multipliers, see `minimise_within_limits`; the last are of those limits of the body that entered.
+    """
+    body = program.body_limits
+    if body is None:
+        return minimise_within_limits(root, offset, near)
+    enters = [body.values(x[body.sample_rows]) > NEAR for x in motions]
+    for _ in range(MOST_LINEARISATIONS):
+        pairs = [body.linearise(*each) for each in zip(motions, slopes, enters, strict=True)]
+        values, by_c = (np.concatenate(each) for each in zip(*pairs, strict=True))
+        # Of what is exceeded, half is asked for, so that there is a step within the other limits.
+        values = np.where(values > LARGEST_SHARE - 1, values / 2, values)
+        step, multipliers = minimise_within_limits(
+            root,
+            offset,
+            near._replace(
+                rows=np.concatenate([near.rows, values]),
+                row_slopes=np.concatenate([near.row_slopes, by_c]),
+            ),
+        )
+        expected = [(x + z @ step)[body.sample_rows] for x, z in zip(motions, slopes, strict=True)]
+        exceeded = [
+            ~known & (body.values(x) > 0) for known, x in zip(enters, expected, strict=True)
+        ]
+        if not any(each.any() for each in exceeded):
+            break
+        enters = [known | more for known, more in zip(enters, exceeded, strict=True)]
+    return step, multipliers
+
+
+def _violation(program: PlannedProgram, motions: list[Array]) -> float:
+    """Return the largest value of a limit of the body, negative if all are respected."""
+    body = program.body_limits
+    if body is None:
+        return -np.inf
+    return max(float(body.values(x[body.sample_rows]).max()) for x in motions)
 
 
 def _mean_objective(programs: Sequence[PlannedProgram], c: Array, motions: list[Array]) -> float:

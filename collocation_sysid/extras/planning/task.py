@@ -17,6 +17,7 @@ from pydantic import Field, ValidationError, model_validator
 from ...common.array_types import Array
 from ...common.schema_tables import Section, Vector, require_one
 from ...common.validated_types import (
+    AboveOne,
     AtLeastOne,
     Boundless,
     Finite,
@@ -184,6 +185,21 @@ class HandSection(Section):
         return self
 
 
+class AvoidSection(Section):
+    """Limits of the body at the samples.
+
+    Attributes
+    ----------
+    largest_stretch
+        Largest principal stretch of an element.
+    clearance_m
+        Smallest distance of the body from the obstacles of the problem.
+    """
+
+    largest_stretch: AboveOne | None = None
+    clearance_m: Positive | None = None
+
+
 class Task(Section):
     """task.toml: a motion to be planned.
 
@@ -205,6 +221,8 @@ class Task(Section):
         State of the body at the end.
     hand
         Motion of the hand.
+    avoid
+        Limits of the body.
     """
 
     duration_s: Positive
@@ -214,6 +232,7 @@ class Task(Section):
     reference: list[ReferenceSection] = Field(default_factory=list)
     end: EndSection = Field(default_factory=EndSection)
     hand: HandSection = Field(default_factory=HandSection)
+    avoid: AvoidSection = Field(default_factory=AvoidSection)
 
     @model_validator(mode="after")
     def _require_purpose(self) -> Task:
