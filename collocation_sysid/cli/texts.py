@@ -31,6 +31,7 @@ class NewProblemKind(StrEnum):
     SPECIMEN = "specimen"
     TENSION = "tension"
     SWING = "swing"
+    VIDEO = "video"
 
 
 @command(commands, "methods", "methods interior-point")

@@ -41,6 +41,8 @@ SWUNG = {"young_pa": 8000.0, "poisson": 0.3, "gamma_r_s": 0.005, "gamma_m_1_s": 
 # ten, with the verdict "good".
 SWING_SEED = 109
 BENCH_SEED = 1
+# Rendered video: images, their rate, tracked points, and seed of the errors of the camera.
+VIDEO_IMAGES, VIDEO_HZ, VIDEO_POINTS, VIDEO_SEED = 84, 60, 16, 5
 
 
 def swing(folder: Path) -> None:
@@ -131,9 +133,30 @@ def specimen(folder: Path) -> None:
     write_text_file(folder / "pull.csv", "\n".join(["stretch,stress (kPa)", *rows, ""]))
 
 
+def video(folder: Path) -> None:
+    """Write the tracks of a rendered video of a foam bar, its calibration, and the stated pose of
+    the camera.
+    """
+    import rendered_video
+
+    rendered_video.mesh(rendered_video.COARSE).write(folder / "body.vtu")
+    write_poses_csv(folder / "poses.csv", rendered_video.poses(np.arange(-3, 156) * 0.01))
+    shape = rendered_video.motion(rendered_video.surface()[0])
+    t_s = np.arange(VIDEO_IMAGES) / VIDEO_HZ
+    described = rendered_video.film(folder, "front", shape, t_s, VIDEO_SEED, VIDEO_POINTS)
+    for name in ("front.mp4", "mask.png"):
+        (folder / name).unlink()
+    file = folder / "problem.toml"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    k = next(k for k, line in enumerate(lines) if line.startswith("pose = "))
+    _, _, comment = lines[k].partition("#")
+    lines[k] = f"pose = {rendered_video.pose_text(described.pose)}   #{comment}"
+    write_text_file(file, "\n".join([*lines, ""]))
+
+
 KINDS = {"swing": swing, "compression": compression, "tension": tension, "specimen": specimen}
 
 if __name__ == "__main__":
     require_no_arguments(__doc__)
-    for kind, write in KINDS.items():
+    for kind, write in (KINDS | {"video": video}).items():
         write(TEMPLATES / kind)

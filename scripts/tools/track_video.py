@@ -4,6 +4,8 @@ Points are corners that are found within a mask in the first image, points that 
 centres of ArUco or AprilTag markers. Corners and stated points are followed by the pyramidal method
 of Lucas and Kanade, forwards and backwards: the likelihood of a sample decreases with the distance
 by which the way back misses the point, and a point that misses by more than --lost pixels is lost.
+In order that errors of single steps do not add up, the surroundings of each point are then aligned
+with the first image by an affine transform (enhanced correlation coefficient).
 Needs OpenCV: pip install 'collocation-sysid[video]'.
 
     python scripts track_video film.mp4 --out front.csv [--mask body.png] [--most 30]
@@ -30,6 +32,11 @@ HALF_TRUST_PX = 0.5
 # Quality of corners relative to the best, and their least distance [pixels].
 LEAST_QUALITY = 0.02
 LEAST_DISTANCE_PX = 12
+# Half size of the surroundings that are aligned with the first image [pixels], least correlation of
+# an alignment that is used, and its largest distance from the point that is followed [pixels].
+HALF_PATCH_PX = 15
+LEAST_CORRELATION = 0.85
+FARTHEST_PX = 4.0
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
@@ -110,6 +117,7 @@ def follow(
     options = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": LEVELS, "criteria": stop}
     times, pixels, likelihood = [], [], []
     before: np.ndarray | None = None
+    patches: list[_Patch] = []
     now = start.astype(np.float32)
     alive = np.ones(len(start), dtype=bool)
     for t_s, image in images:
@@ -124,11 +132,52 @@ def follow(
             alive &= (found[:, 0] == 1) & (returned[:, 0] == 1) & (missed <= lost_px) & inside
             trust = np.exp(-missed / HALF_TRUST_PX)
             now = np.where(alive[:, None], ahead[:, 0], now).astype(np.float32)
+            for k in np.flatnonzero(alive):
+                now[k] = patches[k].aligned(plain, now[k])
+        else:
+            patches = [_Patch(plain, point) for point in start]
         times.append(t_s)
         pixels.append(np.where(alive[:, None], now, np.nan))
         likelihood.append(np.where(alive, trust, 0.0))
         before = plain
     return Tracks(names, np.array(times), np.array(pixels), np.array(likelihood))
+
+
+class _Patch:
+    """Surroundings of a point (2,) in the first image."""
+
+    def __init__(self, image: np.ndarray, point: np.ndarray) -> None:
+        cv2 = opencv()
+        size = 2 * HALF_PATCH_PX + 1
+        self.patch = cv2.getRectSubPix(image, (size, size), point.astype(np.float32).tolist())
+        self.linear = np.eye(2)
+
+    def aligned(self, image: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Return the pixel (2,) near `point` at which the image agrees with the patch up to an
+        affine transform; `point` if it does not.
+        """
+        cv2 = opencv()
+        corner = np.floor(point) - 2 * HALF_PATCH_PX
+        (left, top), side = corner.astype(int).tolist(), 4 * HALF_PATCH_PX + 1
+        height, width = image.shape
+        if left < 0 or top < 0 or left + side > width or top + side > height:
+            return point
+        middle = np.full(2, float(HALF_PATCH_PX))
+        shift = point - corner - self.linear @ middle
+        warp = np.column_stack([self.linear, shift]).astype(np.float32)
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 1e-4)
+        part = image[top : top + side, left : left + side]
+        try:
+            correlation, warp = cv2.findTransformECC(
+                self.patch, part, warp, cv2.MOTION_AFFINE, stop, None, 3
+            )
+        except cv2.error:  # it does not converge
+            return point
+        found = warp[:, :2] @ middle + warp[:, 2] + corner
+        if correlation < LEAST_CORRELATION or np.linalg.norm(found - point) > FARTHEST_PX:
+            return point
+        self.linear = warp[:, :2].astype(float)
+        return found
 
 
 def tag_centres(images: Iterable[tuple[float, np.ndarray]], dictionary: str) -> Tracks:

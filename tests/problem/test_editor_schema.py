@@ -39,7 +39,7 @@ def validate(file: Path, schema: str) -> None:
     jsonschema.Draft202012Validator(json.loads(schema)).validate(content)
 
 
-@pytest.mark.parametrize("kind", ["compression", "swing", "tension"])
+@pytest.mark.parametrize("kind", ["compression", "swing", "tension", "video"])
 def test_a_template_names_the_schema_and_follows_it(kind, tmp_path):
     assert first_line(TEMPLATES / kind / "problem.toml") == f"#:schema {SCHEMA_FILE}"
     file, *others = create_problem(tmp_path / "mine", kind)

@@ -128,8 +128,13 @@ class ImageTrackResidual(CorrespondingSensorResidual):
         return ca.vertcat(ca.dot(walk, drift[:WALK_TERMS]), ca.dot(walk, drift[WALK_TERMS:]))
 
     def numbers(self, predicted: Array) -> Array:
-        """Return predictions (S, N, 3) as pixels (S, 2N)."""
-        return predicted[..., :2].reshape(len(predicted), -1)
+        """Return predictions (S, N, 3) as pixels (S, 2N); NaN for measured ones that are not
+        compared, because the point is hidden or not on the body.
+        """
+        pixels = predicted[..., :2]
+        if self.sensor.pixels is not None:
+            pixels = np.where(self.is_compared[: len(pixels), :, :2], pixels, np.nan)
+        return pixels.reshape(len(pixels), -1)
 
     @property
     def observable_sigmas(self) -> Array:
