@@ -73,7 +73,9 @@ def surface() -> tuple[Array, Array, Array]:
     for axis in range(3):
         first, second = (k for k in range(3) if k != axis)
         for end in (0.0, SIZE_M[axis]):
-            steps = [np.linspace(0, SIZE_M[k], round(SIZE_M[k] / SQUARE_M) + 1) for k in (first, second)]
+            steps = [
+                np.linspace(0, SIZE_M[k], round(SIZE_M[k] / SQUARE_M) + 1) for k in (first, second)
+            ]
             a, b = np.meshgrid(*steps, indexing="ij")
             face = np.zeros((a.size, 3))
             face[:, axis], face[:, first], face[:, second] = end, a.ravel(), b.ravel()
@@ -126,7 +128,9 @@ class Described:
         their standard deviations.
         """
         stated = pose.copy()
-        stated[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(TURN_RAD * rng.normal(size=3)).as_matrix()
+        stated[:3, :3] = (
+            pose[:3, :3] @ Rotation.from_rotvec(TURN_RAD * rng.normal(size=3)).as_matrix()
+        )
         stated[:3, 3] += SHIFT_M * rng.normal(size=3)
         focal_px = FOCAL_PX * (1 + FOCAL * rng.normal())
         centre_px = CENTRE_PX + CENTRE_SIGMA_PX * rng.normal(size=2)
@@ -236,9 +240,7 @@ def film(
     video.release()
     cv2.imwrite(str(folder / "mask.png"), mask_of(shape, pose, float(t_s[0])))
     options = ["--mask", str(folder / "mask.png"), "--most", str(most)]
-    track_video.main(
-        [str(folder / f"{name}.mp4"), "--out", str(folder / f"{name}.csv"), *options]
-    )
+    track_video.main([str(folder / f"{name}.mp4"), "--out", str(folder / f"{name}.csv"), *options])
     rows = ", ".join(f"{each:.2f}" for each in described.matrix.ravel())
     calibration = f"""%YAML:1.0
 ---

@@ -66,7 +66,10 @@ def test_predicted_pixels_are_the_projections_of_the_markers() -> None:
     tracks = tracks_of(**EXACT)
     simulated = cs.simulate(swung([tracks]), TRUTH, "midpoint", substeps=1)
     pixels = simulated.custom_sensor_values[0].reshape(len(T_S), -1, 2)
-    np.testing.assert_allclose(pixels, projected(filming("front"), motion_m()), atol=1e-9)
+    expected = projected(filming("front"), motion_m())
+    is_hidden = np.isnan(pixels).all(axis=2)
+    assert is_hidden.any(axis=0).sum() == 1  # one point is on a face that looks away
+    np.testing.assert_allclose(pixels[~is_hidden], expected[~is_hidden], atol=1e-9)
 
 
 def test_images_between_the_samples_are_interpolated() -> None:

@@ -133,7 +133,8 @@ class ImageTrackResidual(CorrespondingSensorResidual):
         """
         pixels = predicted[..., :2]
         if self.sensor.pixels is not None:
-            pixels = np.where(self.is_compared[: len(pixels), :, :2], pixels, np.nan)
+            is_hidden = self.sensor.is_seen[..., None] & ~self.is_compared[..., :2]
+            pixels = np.where(is_hidden[: len(pixels)], np.nan, pixels)
         return pixels.reshape(len(pixels), -1)
 
     @property
