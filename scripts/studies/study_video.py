@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import rendered_video
 from make_templates import VIDEO_IMAGES, VIDEO_POINTS, write_poses_csv
+from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
 from collocation_sysid.problem.new_problem import create_problem
@@ -27,7 +28,7 @@ NAMES = tuple(rendered_video.EYES_M)
 DURATION_S = VIDEO_IMAGES / 60
 
 
-def film_problem(folder: Path, shape, rate_hz: float, cameras: int, seed: int) -> Path:
+def film_problem(folder: Path, shape: CubicSpline, rate_hz: float, cameras: int, seed: int) -> Path:
     """Write the problem of videos with a rate in a folder, and return its file."""
     file, *_ = create_problem(folder, "video")
     text = file.read_text(encoding="utf-8")
@@ -77,7 +78,7 @@ def main() -> None:
                     low, high = np.array(answer.interval(name)) / truth[name]
                     value = answer.estimates[name].value / truth[name]
                     cells += [f"{value:.3f}", f"{low:.3f} … {high:.3f}"]
-                residual = max((answer.result.fit.experiments[0].reading_rms or {}).values())
+                residual = max((answer.result.fit.experiments["swing"].reading_rms or {}).values())
                 which = f"{cameras} camera{'s' * (cameras > 1)}, {rate_hz:.0f} Hz, seed {seed}"
                 print(
                     f"| {which} | {' | '.join(cells)} | {residual:.2f} | {answer.trust.verdict} | "
