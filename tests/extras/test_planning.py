@@ -26,6 +26,8 @@ from collocation_sysid.extras.planning.planned_program import PlannedProgram
 from collocation_sysid.extras.planning.reduced_solver import ReducedTolerances, solve_reduced
 from collocation_sysid.extras.planning.spline_motion import rotation_expression
 from collocation_sysid.extras.planning.task import AvoidSection, Task, sampled_references
+from collocation_sysid.extras.planning.trajectory_log import write_trajectory_mcap
+from collocation_sysid.recording.pose_files import read_poses
 
 LIMITS = Limits.model_validate(
     {
@@ -803,6 +805,63 @@ def test_poses_at_any_rate_move_the_body_as_planned():
     executed = body.experiment(plan.poses(t_s), plan.t_s, {"tip": np.array([0.01, 0.01, 0.0])})
     moved = cs.simulate(executed, TRUTH, "midpoint", substeps=4).markers_m[:, 0]
     assert np.abs(moved - plan.points_m["tip"]).max() < 2e-6
+
+
+@pytest.mark.long
+def test_an_execution_is_compared_with_the_plan_and_identified_from():
+    plan = bar_plan()
+    t_s, rng = plan.t_s, np.random.default_rng(0)
+    noise = 1e-3 * rng.normal(size=(len(t_s), 1, 3))
+    planned = plan.execution(t_s, np.zeros((len(t_s), 1, 3)))
+
+    def problem(young_pa, parameters):
+        """The execution by a body with another modulus."""
+        tracks_m = cs.simulate(planned, TRUTH | {"young_pa": young_pa}, "midpoint", substeps=4)
+        seen = plan.execution(t_s, tracks_m.markers_m + noise, plan.poses(np.linspace(0, 1, 201)))
+        return cs.Problem([seen], parameters)
+
+    assert cs.run(problem(TRUTH["young_pa"], TRUTH)).trust.verdict == "good"
+    assert cs.run(problem(0.4 * TRUTH["young_pa"], TRUTH)).trust.verdict != "good"
+    free = TRUTH | {"young_pa": cs.Unknown(TRUTH["young_pa"])}
+    again = cs.solve(problem(0.4 * TRUTH["young_pa"], free)).parameters
+    assert again["young_pa"] == pytest.approx(0.4 * TRUTH["young_pa"], rel=0.05)
+
+
+def test_the_trajectory_in_an_mcap_file_is_that_of_the_plan(tmp_path: Path):
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    planned = program(hand={"free": SIX_AXES, "intervals": 8})
+    c = 0.05 * np.random.default_rng(0).normal(size=planned.space.size)
+    plan = replace(bar_plan(), program=planned, answer=replace(bar_plan().answer, c=c))
+    t_s = np.linspace(0.0, 0.8, 21)
+    write_trajectory_mcap(plan, tmp_path / "plan.mcap", t_s)
+    read = read_poses(f"{tmp_path}/plan.mcap#/hand_pose")
+    assert read.t_s - read.t_s[0] == pytest.approx(t_s, abs=1e-9)
+    assert read.positions_m == pytest.approx(plan.poses(t_s).positions_m, abs=1e-12)
+    with open(tmp_path / "plan.mcap", "rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        ((*_, message),) = reader.iter_decoded_messages(topics=["/hand_trajectory"])
+    h = 1e-5
+    for k in (5, 13):
+        point, at = message.points[k], t_s[k]
+        assert point.time_from_start.nanosec == round(1e9 * at)
+        ends = [plan.poses(np.array([at + s * h])) for s in (-1, 0, 1)]
+        places = np.array([each.positions_m[0] for each in ends])
+        turns = [Rotation.from_quat(each.quaternions_xyzw[0]) for each in ends]
+        twist, growth = point.velocities[0], point.accelerations[0]
+        velocity = (places[2] - places[0]) / (2 * h)
+        assert components(twist.linear) == pytest.approx(velocity, abs=1e-6)
+        spin = (turns[2] * turns[0].inv()).as_rotvec() / (2 * h)
+        assert components(twist.angular) == pytest.approx(spin, abs=1e-6)
+        acceleration = (places[2] - 2 * places[1] + places[0]) / h**2
+        assert components(growth.linear) == pytest.approx(acceleration, abs=1e-3)
+        rates = [(turns[j + 1] * turns[j].inv()).as_rotvec() / h for j in (0, 1)]
+        assert components(growth.angular) == pytest.approx((rates[1] - rates[0]) / h, abs=1e-3)
+
+
+def components(vector) -> list[float]:
+    return [vector.x, vector.y, vector.z]
 
 
 @pytest.mark.long

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -19,7 +19,7 @@ from ...common.array_types import Array
 from ...errors import InputError, SimulationError
 from ...problem import Problem
 from ...program.simulation import Trajectory, simulate
-from ...recording import PoseSequence
+from ...recording import Experiment, Markers, PoseSequence
 from ...runs.solved_problem import SolvedProblem
 from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.hand_limits import REACHED, Limits
@@ -142,6 +142,34 @@ class MotionPlan:
         return PoseSequence(
             poses.t_s - start_s, poses.positions_m, quaternions_xyzw=poses.quaternions_xyzw
         )
+
+    def execution(
+        self, t_s: Array, tracks_m: Array, poses: PoseSequence | None = None
+    ) -> Experiment:
+        """Return the recording of an execution, to be compared with the prediction (a problem with
+        fixed parameters) or to be identified from beside the first recording.
+
+        Parameters
+        ----------
+        t_s : (T,) array
+            Times since the start of the motion [s]; the body is in equilibrium at the first.
+        tracks_m : (T, M, 3) array
+            Positions of the markers of the recording, in their order [m]; NaN where missing.
+        poses : PoseSequence, optional
+            Measured poses over the times since the start, in the format of the problem; those of
+            the plan by default.
+        """
+        body = self.program.body
+        markers = body.template.markers
+        held = body.template.grasps[body.grasp_number].poses.first_motion
+        times = np.asarray(t_s, dtype=np.float64)
+        moved = replace((poses or self.poses(times)).after(held), first_motion=held)
+        places = body.marker_places_m
+        experiment = body.experiment(moved, times, places)
+        seen = Markers(
+            times, tracks_m, markers.sigma_m, markers.names, np.array([*places.values()])
+        )
+        return replace(experiment, name="execution", markers=seen)
 
     @cached_property
     def points_m(self) -> dict[str, Array]:

@@ -21,12 +21,14 @@ from ...result.run_writers import replaced_folder
 from ..design.hand_motion import angular_motion
 from .motion_plan import MotionPlan
 from .plan_pictures import plan_figures
+from .trajectory_log import write_trajectory_mcap
 
 PLAN_FILE = "plan.json"
 POSES_FILE = "poses.csv"
 HAND_FILE = "hand.csv"
 PREDICTION_FILE = "predicted_points.csv"
 FILM_FILE = "motion.gif"
+TRAJECTORY_FILE = "trajectory.mcap"
 # Form of plan.json.
 SCHEMA = 1
 FRAMES_PER_SECOND = 25.0
@@ -37,6 +39,7 @@ def write_plan(
     folder: str | Path,
     rate_hz: float | None = None,
     with_film: bool = True,
+    with_mcap: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> Path:
     """Write the folder of a plan atomically, and return its path.
@@ -52,19 +55,24 @@ def write_plan(
         Rate of poses.csv and hand.csv; four times that of the samples by default.
     with_film : bool
         Whether to render the motion as a film.
+    with_mcap : bool
+        Whether to write trajectory.mcap, see `write_trajectory_mcap`.
     say : callable
         Called with the present activity.
 
     Raises
     ------
     InputError
-        If the folder contains anything but an earlier plan, or cannot be written.
+        If the folder contains anything but an earlier plan, or cannot be written, or a package for
+        the MCAP file is missing.
     """
     target = Path(folder)
     with replaced_folder(target, marker_file=PLAN_FILE, content_word="plan") as place:
         t_s = command_times_s(plan, rate_hz)
         write_poses_csv(place / POSES_FILE, plan.poses(t_s))
         write_columns_csv(place / HAND_FILE, hand_columns(plan, t_s))
+        if with_mcap:
+            write_trajectory_mcap(plan, place / TRAJECTORY_FILE, t_s)
         if plan.points_m:
             write_markers_csv(
                 place / PREDICTION_FILE,

@@ -290,7 +290,7 @@ def projected_gram(fit: LinearisedFit, blocks: Sequence[Array]) -> Array:
         weight = (block.compute_root_weight() * block.is_measured)[..., None]
         both = np.concatenate([block.residual[..., None], change * weight], axis=3)
         stacked.append(both.reshape(-1, both.shape[-1]))
-        slopes.append(block.jacobian.reshape(-1, block.jacobian.shape[-1]))
+        slopes.append(block.jacobian.reshape(len(stacked[-1]), block.jacobian.shape[-1]))
     values = np.concatenate(stacked)
     jacobian = np.concatenate(slopes)[:, free]
     of_prior = np.zeros((len(fit.prior_residual), values.shape[1]))
