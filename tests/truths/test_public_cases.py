@@ -5,6 +5,11 @@ The folder is not part of the repository; without it the tests are skipped.
 
 from __future__ import annotations
 
+import contextlib
+import runpy
+import shutil
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -144,3 +149,107 @@ def test_another_law_is_named_and_no_turn():
     laws = " ".join(run.trust.reasons)
     assert "compare-models" in laws or "material" in laws
     assert np.isfinite(run.parameters["young_pa"])
+
+
+# Inputs of another form ---------------------------------------------------------------------------
+
+
+def copied(name: str, folder: Path) -> Path:
+    """Copy of a case, which may write beside its inputs."""
+    assert CASES is not None
+    return Path(shutil.copytree(CASES / name, folder / name))
+
+
+def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """The command line in a process of its own, with a working folder."""
+    code = "import sys; sys.path[:] = [p for p in sys.path if p]; import collocation_sysid.cli as c; c.main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
+
+
+def test_nothing_of_the_working_folder_is_executed(tmp_path):
+    case = copied("working_folder_executed", tmp_path)
+    laws = "neo-hookean,mooney-rivlin"
+    done = command("compare-models", "problem.toml", "--materials", laws, "--out", "o", folder=case)
+    assert done.returncode == 0, done.stderr
+    assert not (case / "executed.txt").exists()
+
+
+def test_settings_of_pictures_in_the_working_folder_have_no_effect(tmp_path):
+    case = copied("volume_ratio_header", tmp_path)
+    shutil.copy(copied("matplotlibrc_obeyed", tmp_path) / "matplotlibrc", case)
+    done = command("solve", "problem.toml", "--out", "o", folder=case)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("number", ["0", "8", "53"])
+def test_depth_images_of_a_wrong_shape_have_one_line(number):
+    assert CASES is not None
+    with pytest.raises(cs.InputError, match="depth_m"):
+        cs.Problem.read(CASES / "depth_array_shapes" / number / "problem.toml")
+
+
+def test_a_table_of_priors_that_is_not_called_is_accepted_or_refused():
+    assert CASES is not None
+    with contextlib.suppress(cs.InputError):
+        runpy.run_path(str(CASES / "nuisance_none_not_called" / "case.py"))
+
+
+def test_tracks_of_two_coordinates_are_used():
+    assert CASES is not None
+    run = runpy.run_path(str(CASES / "planar_tracks_dropped" / "case.py"))["run"]
+    assert any(
+        "present in less than half" in note for note in (*run.all_notes, *run.solution.notes)
+    )
+    assert run.parameters["young_pa"] == pytest.approx(2e4, rel=0.05)
+
+
+FILMED = """
+[object]
+mesh = "hook.msh"
+density_kg_m3 = 500.0
+material = "st-venant-kirchhoff"
+damping = "material"
+rest_shape = "stress_free"
+[parameters]
+young_pa = {}
+poisson = {}
+gamma_r_s = {}
+gamma_m_1_s = 0.0
+[environment]
+air_density_kg_m3 = "none"
+[[experiment]]
+name = "swing"
+[experiment.grasp]
+nodes = "clamp"
+poses = "poses.csv"
+[[experiment.image_tracks]]
+name = "front"
+file = "FILE"
+sigma_px = 0.5
+[experiment.image_tracks.places_m]
+end_out = [-0.02540, 0.06979, 0.00464]
+end_in = [-0.01564, 0.04298, -0.00464]
+end_top = [-0.02052, 0.05638, 0.01500]
+mid_out = [0.03438, 0.06665, 0.00044]
+mid_in = [0.02260, 0.03893, 0.00077]
+mid_top = [0.03069, 0.05155, 0.01500]
+[experiment.image_tracks.camera]
+matrix = [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]]
+pose = [[1, 0, 0, 0.03], [0, 0, 1, -0.6], [0, -1, 0, 0], [0, 0, 0, 1]]
+"""
+
+
+def test_pixels_of_one_camera_are_solved(tmp_path):
+    case = copied("pixel_tracks", tmp_path)
+    (case / "problem.toml").write_text(FILMED.replace("FILE", "uv.csv"))
+    run = cs.run(cs.Problem.read(case / "problem.toml"))
+    assert_within(run, "young_pa", 60e3)
+    assert_within(run, "poisson", 0.35)
+    assert_within(run, "gamma_r_s", 2e-3)
