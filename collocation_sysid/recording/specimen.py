@@ -11,10 +11,11 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
-from ..common.checked_arrays import float_converter
+from ..common.checked_arrays import float_array, float_converter
 from ..common.declarations import declaration, key
 from ..common.validated_types import Finite, NotNegative, Positive
 from ..errors import InputError
@@ -45,6 +46,8 @@ STRAIN_ZERO = 2e-3
 AREA_ERROR = 0.01
 # Standard deviation of a measured lateral stretch: 0.1 mm on a width of 20 mm.
 LATERAL_SIGMA = 5e-3
+# Strain of a table of a relaxation modulus, at which every law is linear.
+RELAXED_STRAIN = 1e-4
 STRESS_NAME = "stress"
 SECOND_STRESS_NAME = "second stress"
 LATERAL_NAME = "lateral stretch"
@@ -225,6 +228,47 @@ class Specimen:
         if self.length_m is None or self.area_m2 is None:
             return deformation
         return replace(deformation, area_over_length_m=self.area_m2 / self.length_m)
+
+    @classmethod
+    def relaxation(
+        cls, t_s: ArrayLike, modulus_pa: ArrayLike, sigma_pa: float, test: str = "uniaxial"
+    ) -> Specimen:
+        """Return the test of a table of the relaxation modulus E(t) or, with "simple-shear", G(t):
+        the stress over time at a small strain (`RELAXED_STRAIN`) that is applied at t = 0, over that
+        strain.
+
+        Parameters
+        ----------
+        t_s : (T,) array
+            Times since the strain was applied, positive.
+        modulus_pa : (T,) array
+            Relaxation modulus [Pa]; NaN where missing.
+        sigma_pa : float
+            Standard deviation of the noise of the modulus [Pa].
+        test : {"uniaxial", "simple-shear"}
+
+        Raises
+        ------
+        InputError
+            If the times are not positive and increasing, or for another test.
+        """
+        times = float_array(t_s, "t_s", ((None,),))
+        if not len(times) or times[0] <= 0 or (np.diff(times) <= 0).any():
+            raise InputError("expected positive times that increase", None, where="t_s")
+        if test not in ("uniaxial", "simple-shear"):
+            fault = f'found "{test}"; expected "uniaxial" for E(t) or "simple-shear" for G(t)'
+            raise InputError(fault, None, where="test")
+        modulus = float_array(modulus_pa, "modulus_pa", ((len(times),),), False)
+        # A ramp that is short compared with the first time; before it the specimen is at rest.
+        ramp_s = 1e-6 * times[0]
+        return cls(
+            test,
+            RELAXED_STRAIN * np.r_[0.0, 1.0, np.ones(len(times))],
+            RELAXED_STRAIN * np.r_[np.nan, np.nan, modulus],
+            sigma_pa=RELAXED_STRAIN * sigma_pa,
+            t_s=np.r_[-ramp_s, 0.0, times],
+            strain_zero=0.0,
+        )
 
     def __repr__(self) -> str:
         return f"Specimen({self.test!r}: {len(self.strain)} samples)"
