@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,27 +20,6 @@ from .pattern import SymmetricPattern, dofs_of
 # Number of cached matrices: four for each of the latest eight choices of instances, namely the
 # operator, its transpose, and the assembly of the symmetric and of the skew parts.
 CACHED_MATRICES = 32
-
-
-class NonzeroWeights(NamedTuple):
-    """Nonzero weights of nodes in the vectors of instances, one entry for each axis.
-
-    Attributes
-    ----------
-    instance : (P,) int
-        Index of the instance.
-    coordinate : (P,) int
-        Coordinate of the vectors, among the 3L of an instance.
-    dof : (P,) int
-        Dof of the body, 3 · node + axis.
-    weight : (P,)
-        Weight of the node in the vector.
-    """
-
-    instance: Index
-    coordinate: Index
-    dof: Index
-    weight: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,25 +155,22 @@ class ForcePoints:
     @cached_property
     def _operator(self) -> sp.csr_array:
         """Sparse matrix (i · 3L, 3n) from node positions to vectors."""
-        entries = self.nonzero_weights
-        rows = entries.instance * self.dofs + entries.coordinate
+        instance, coordinate, dof, weight = self.nonzero_weights
+        rows = instance * self.dofs + coordinate
         shape = self.count * self.dofs, 3 * self.node_count
-        return sp.csr_array((entries.weight, (rows, entries.dof)), shape=shape)
+        return sp.csr_array((weight, (rows, dof)), shape=shape)
 
     @cached_property
-    def nonzero_weights(self) -> NonzeroWeights:
-        """Nonzero weights of all instances, by instance, then vector, node and axis."""
+    def nonzero_weights(self) -> tuple[Index, Index, Index, Array]:
+        """Instances, coordinates, dofs and values of all nonzero weights, by instance, then vector,
+        node and axis.
+        """
         instance, vector, place = np.nonzero(self.node_weights)
         weight = self.node_weights[instance, vector, place]
         axes = np.arange(3)
         dofs = dofs_of(self.nodes[instance, place][:, None]).ravel()
         coordinates = (3 * vector[:, None] + axes).ravel()
-        return NonzeroWeights(
-            instance=np.repeat(instance, 3),
-            coordinate=coordinates,
-            dof=dofs,
-            weight=np.repeat(weight, 3),
-        )
+        return np.repeat(instance, 3), coordinates, dofs, np.repeat(weight, 3)
 
     @cached_property
     def _onto_couplings(self) -> sp.csc_array:
@@ -210,12 +186,9 @@ class ForcePoints:
         """Return the sparse matrix that sums lower triangles (i, d(d + 1)/2) of all instances,
         stacked column after column, into the entries of the couplings.
         """
-        entries = self.nonzero_weights
-        order = np.argsort(entries.instance, kind="stable")
-        instance = entries.instance[order]
-        local = entries.coordinate[order]
-        dof = entries.dof[order]
-        weight = entries.weight[order]
+        instance, local, dof, weight = self.nonzero_weights
+        order = np.argsort(instance, kind="stable")
+        instance, local, dof, weight = instance[order], local[order], dof[order], weight[order]
         starts = np.searchsorted(instance, np.arange(self.count + 1))
         sizes = np.diff(starts)
         parts = []

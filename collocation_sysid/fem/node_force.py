@@ -67,14 +67,6 @@ class ForceContext(NamedTuple):
     is_start: ca.SX
 
 
-class _ForceExpression(NamedTuple):
-    """Output of `NodeForce.expression`, in the symbols of its inputs u and data."""
-
-    u: ca.SX
-    data: ca.SX
-    output: ca.SX
-
-
 # Offsets of the attributes of a `ForceContext` in the data of a law, in their order.
 CONTEXT_OFFSETS = (0, 1, 4, 5, 6, 9, 10, 11)
 CONTEXT_SIZE = CONTEXT_OFFSETS[-1]
@@ -249,11 +241,11 @@ class NodeForce:
         return self._relative_skew_parts[1] > SYMMETRY_TOLERANCE
 
     @cached_property
-    def _symbols(self) -> _ForceExpression:
-        """Expression of the force on a node or the simplest face, in symbols of its inputs."""
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Symbols u and data, and the force on a node or the simplest face in them."""
         u = ca.SX.sym("u", self.input_size(self._smallest_dofs))
         data = ca.SX.sym("data", CONTEXT_SIZE)
-        return _ForceExpression(u, data, output=self.expression(u, data))
+        return u, data, self.expression(u, data)
 
     @cached_property
     def _force_and_jacobian(self) -> ca.Function:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,22 +11,6 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
 from ..common.unique_codes import unique_codes
-
-
-class FullEntries(NamedTuple):
-    """Entries of both triangles of a symmetric matrix, with M ≥ m entries.
-
-    Attributes
-    ----------
-    rows, columns : (M,) int
-        Row and column of each entry.
-    source : (M,) int
-        Index of the entry among the m of the lower triangle; the mirrored entry has the same.
-    """
-
-    rows: Index
-    columns: Index
-    source: Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +80,16 @@ class SymmetricPattern:
         return positions
 
     @cached_property
-    def full(self) -> FullEntries:
-        """Entries of both triangles, sorted by column, then row."""
+    def full(self) -> tuple[Index, Index, Index]:
+        """Rows and columns of the entries of both triangles, sorted by column, then row, and the
+        entry of the lower triangle of each.
+        """
         strict = self.rows != self.columns
         rows = np.concatenate([self.rows, self.columns[strict]])
         columns = np.concatenate([self.columns, self.rows[strict]])
         source = np.concatenate([np.arange(self.entry_count), np.flatnonzero(strict)])
         order = np.lexsort((rows, columns))
-        return FullEntries(rows[order], columns[order], source=source[order])
+        return rows[order], columns[order], source[order]
 
     def matrix(self, values: NDArray[np.float64], skew: Array | None = None) -> sp.csc_array:
         """Return the full matrix, sparse (3n, 3n) with both triangles, with the lower triangles

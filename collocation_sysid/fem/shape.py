@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from functools import cache, cached_property
 from itertools import permutations
-from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,25 +29,6 @@ from .pattern import SymmetricPattern
 _ROWS = np.array([0, 1, 2, 1, 2, 2])
 _COLUMNS = np.array([0, 0, 0, 1, 1, 2])
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-
-
-class _DofPairs(NamedTuple):
-    """Contributions of the second derivatives of segments to those by pairs of dofs.
-
-    Attributes
-    ----------
-    row, column : (C,) int
-        Dofs, in the lower triangle.
-    weight : (C,)
-        Product of the weights of both dofs.
-    source : (C,) int
-        Index among the 6 J entries: the lower triangle of each of J segments in turn.
-    """
-
-    row: Index
-    column: Index
-    weight: Array
-    source: Index
 
 
 class PolylineLength:
@@ -78,12 +58,14 @@ class PolylineLength:
     @cached_property
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
-        pairs = self._pairs
-        return SymmetricPattern.from_entries(pairs.row, pairs.column, nodes=self.node_count)
+        rows, columns, *_ = self._pairs
+        return SymmetricPattern.from_entries(rows, columns, nodes=self.node_count)
 
     @cached_property
-    def _pairs(self) -> _DofPairs:
-        """Contributions of all segments to the second derivatives."""
+    def _pairs(self) -> tuple[Index, Index, Array, Index]:
+        """Contributions of all segments to the second derivatives: rows and columns of pairs of dofs,
+        weights, and entries of the second derivatives by d.
+        """
         segment_parts = []
         for j in range(self._segments):
             segment = self._differences[[j]].tocoo()
@@ -93,18 +75,16 @@ class PolylineLength:
             a, b = np.nonzero(dofs[:, None] >= dofs)
             place = 6 * j + _PLACE[axes[a], axes[b]]
             segment_parts.append((dofs[a], dofs[b], weights[a] * weights[b], place))
-        rows, columns, weights, places = (
-            np.concatenate(parts) for parts in zip(*segment_parts, strict=True)
-        )
-        return _DofPairs(rows, columns, weight=weights, source=places)
+        rows, columns, weights, places = map(np.concatenate, zip(*segment_parts, strict=True))
+        return rows, columns, weights, places
 
     @cached_property
     def _assembly_matrix(self) -> sp.csr_array:
         """Matrix (6 J, entries) from second derivatives by d to those by x."""
-        pairs = self._pairs
-        entries = self.couplings.positions_of(pairs.row, pairs.column)
+        rows, columns, weights, places = self._pairs
+        entries = self.couplings.positions_of(rows, columns)
         shape = (6 * self._segments, self.couplings.entry_count)
-        return sp.csr_array((pairs.weight, (pairs.source, entries)), shape=shape)
+        return sp.csr_array((weights, (places, entries)), shape=shape)
 
     def evaluate(self, x: Array) -> Array:
         """Return the lengths L (T,) at positions (T, 3n)."""
@@ -159,15 +139,6 @@ _PERMUTATIONS = [
 ]
 
 
-class _HessianTerms(NamedTuple):
-    """Terms factor · x[dof] of the entries (row, column) of H(x), (M,) each."""
-
-    row: Index
-    column: Index
-    dof: Index
-    factor: Array
-
-
 class EnclosedVolume:
     """Volume V(x) [m³] of the cones from an apex over faces.
 
@@ -196,8 +167,10 @@ class EnclosedVolume:
         return self if is_same else EnclosedVolume(self.faces, self.node_count, apex_m=apex_m)
 
     @cached_property
-    def _terms(self) -> _HessianTerms:
-        """Terms of H in the lower triangle."""
+    def _terms(self) -> tuple[Index, Index, Index, Array]:
+        """Rows, columns, dofs and factors (M,) of the terms factor · x[dof] of the lower triangle of
+        H(x).
+        """
         form = _cubic_form(self.faces.shape[1])
         i, j, k = np.nonzero(np.abs(form) > 1e-14)
         term_parts = []
@@ -211,21 +184,21 @@ class EnclosedVolume:
             for parts in zip(*term_parts, strict=True)
         )
         lower = rows >= columns
-        return _HessianTerms(rows[lower], columns[lower], dof=by[lower], factor=factor[lower])
+        return rows[lower], columns[lower], by[lower], factor[lower]
 
     @cached_property
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
-        terms = self._terms
-        return SymmetricPattern.from_entries(terms.row, terms.column, nodes=self.node_count)
+        rows, columns, *_ = self._terms
+        return SymmetricPattern.from_entries(rows, columns, nodes=self.node_count)
 
     @cached_property
     def _hessian_matrix(self) -> sp.csr_array:
         """Matrix (3n, entries) from x to H."""
-        terms = self._terms
-        entries = self.couplings.positions_of(terms.row, terms.column)
+        rows, columns, dofs, factors = self._terms
+        entries = self.couplings.positions_of(rows, columns)
         shape = (self.couplings.size, self.couplings.entry_count)
-        return sp.csr_array((terms.factor, (terms.dof, entries)), shape=shape)
+        return sp.csr_array((factors, (dofs, entries)), shape=shape)
 
     @cached_property
     def rim(self) -> Index:

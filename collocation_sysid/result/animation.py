@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -223,28 +222,6 @@ def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
     return np.minimum(np.rint(share * (len(t_s) - 1)), len(t_s) - 1).astype(np.int64)
 
 
-class _DrawnTrajectory(NamedTuple):
-    """Trajectory of a film with its drawing.
-
-    Attributes
-    ----------
-    name : str
-        Label of the trajectory.
-    positions_m : (T, n, 3)
-        Positions of the nodes.
-    markers_m : (T, M, 3)
-        Positions of the markers.
-    title : Text
-        Title above the body.
-    """
-
-    name: str
-    positions_m: Array
-    markers_m: Array
-    body: BodyDrawing
-    title: Text
-
-
 class FilmFigure:
     """Figure that shows the samples of a film one after another.
 
@@ -292,7 +269,8 @@ class FilmFigure:
         self.figure, axes = sheet(FILM_WIDTH_MM, total)
         self.figure.set_facecolor("white")
         axes.text(FILM_WIDTH_MM / 2, total - 3, headline, ha="center", va="top", fontsize=TEXT_PT)
-        self.drawings: list[_DrawnTrajectory] = []
+        # Name, positions (T, n, 3), markers (T, M, 3), body and title of each trajectory.
+        self.drawings: list[tuple[str, Array, Array, BodyDrawing, Text]] = []
         view = SheetView.fit_points(
             camera, everything, room_mm=(width - 8, height), corner_mm=(4, FOOT_HEIGHT_MM)
         )
@@ -336,9 +314,7 @@ class FilmFigure:
                 nodes=replay.surface_nodes,
                 edge_colour=wire,
             )
-            self.drawings.append(
-                _DrawnTrajectory(name, positions, markers_m=markers, body=body, title=title)
-            )
+            self.drawings.append((name, positions, markers, body, title))
 
     def _draw_errors(
         self,
@@ -392,20 +368,20 @@ class FilmFigure:
         """
         replay = self.replay
         measured = replay.measured_m[sample]
-        for drawn in self.drawings:
+        for name, positions_m, markers_m, body, title in self.drawings:
             outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[sample]
-            drawn.body.update(
-                drawn.positions_m[sample],
+            body.update(
+                positions_m[sample],
                 replay.is_prescribed[sample],
                 markers_m=measured,
                 outlines_m=outlines_m,
                 camera_points_m=replay.camera_points_m(sample),
             )
-            distances = np.linalg.norm(drawn.markers_m[sample] - measured, axis=1)
+            distances = np.linalg.norm(markers_m[sample] - measured, axis=1)
             present = distances[np.isfinite(distances)]
             off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
-            is_compared = measured.size and drawn.markers_m is not replay.measured_m
-            drawn.title.set_text(f"{drawn.name}: {off}" if is_compared else drawn.name)
+            is_compared = measured.size and markers_m is not replay.measured_m
+            title.set_text(f"{name}: {off}" if is_compared else name)
         if self.cursor is not None:
             now_s = replay.t_s[sample] - replay.t_s[0]
             self.cursor.set_xdata([now_s, now_s])

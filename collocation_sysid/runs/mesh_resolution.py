@@ -23,7 +23,7 @@ from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
 from .check.body_check import LINEAR, bending_concerns, slenderness
-from .check.declared_simulation import is_declared_simulated
+from .check.grasp_extent import is_declared_simulated
 
 # Value of `RefinementLevel.refined` of a solve on a finer mesh.
 MESH = "mesh"
@@ -178,7 +178,7 @@ def _coarse_mesh_concerns(problem: Problem) -> Iterator[Concern]:
             continue
         names = [repr(each.name) for each in fitted if each.body is body]
         of = f"in the body of {', '.join(names)}" if len(bodies) > 1 else ""
-        for concern in bending_concerns(body, slenderness(body.mesh)):
+        for concern in bending_concerns(body, *slenderness(body.mesh)):
             yield Concern(concern.code, concern.grade, data={**concern.data, "of": of})
 
 

@@ -79,43 +79,6 @@ class _PhaseSearch:
     elements: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _SmoothFitQuality:
-    """Quality of the fit with the smooth field.
-
-    Attributes
-    ----------
-    chi_squared : float
-        χ² of the measurements.
-    misfit : float
-        χ² per measurement.
-    determined : float
-        Effective number of parameters and shapes that the data determine; one that is determined by
-        its prior in part counts in part.
-    """
-
-    chi_squared: float
-    misfit: float
-    determined: float
-
-    def lack_of_fit(self, chi_squared: float) -> float:
-        """Return the temperature T of `statistics.phase_sampling` for a fit with phases of this χ²:
-        its excess over the smooth fit per determined parameter, at least one.
-        """
-        return max(1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined))
-
-
-def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
-    """Return the quality of the fit with the smooth field: its χ² and the number of parameters that
-    it determines, from `fit`, linearised at its solution.
-    """
-    return _SmoothFitQuality(
-        fit.compute_chi_squared(),
-        _chi_squared_per_measurement(fit),
-        determined=factorise_information(fit).count_determined(),
-    )
-
-
 def solve_two_phases(
     problem: Problem, start: str | Path | WarmStart | None, solve_once: SolveOnce
 ) -> Solution:
@@ -147,53 +110,29 @@ def solve_two_phases(
     solution = solve_once(problem.with_fields({search.name: search.modes.to_smooth_field()}), start)
     if not solution.status.converged:
         return solution
-    smooth = _smooth_fit(linearise_fit(solution.collocation, solution.z))
-    sampled = _sample_posterior(problem, search, solution=solution, smooth=smooth)
-    phase = _representative_phases(
-        sampled.posterior.draws.compute_probability(), search.modes.volumes_m3
-    )
+    posterior, temperature, rounds, is_simulated = _sample_posterior(problem, search, solution)
+    phase = _representative_phases(posterior.draws.compute_probability(), search.modes.volumes_m3)
     best = solve_once(
         problem.with_fields({search.name: replace(search.modes, phase=phase)}),
         WarmStart.of(solution),
     )
     if not best.status.converged:
         return best
-    samples = _samples(sampled, search=search, solution=best)
-    best = _with_samples(best, replace(samples, smooth_misfit=smooth.misfit))
+    samples = _samples(posterior, is_simulated, search=search, solution=best)
+    misfit = _chi_squared_per_measurement(linearise_fit(solution.collocation, solution.z))
+    best = _with_samples(best, replace(samples, smooth_misfit=misfit))
     note = (
         f"two phases of {search.name}: started from a smooth field (χ² per measurement "
-        f"{smooth.misfit:.3g}), {sampled.rounds} rounds of samples; the inclusion has "
+        f"{misfit:.3g}), {rounds} rounds of samples; the inclusion has "
         f"{int(phase.sum())} of {len(phase)} elements; the posterior is tempered by "
-        f"{sampled.temperature:.3g}, the lack of fit per shape of the smooth field"
+        f"{temperature:.3g}, the lack of fit per shape of the smooth field"
     )
     return replace(best, notes=(note, *best.notes))
 
 
-@dataclass(frozen=True, eq=False)
-class _SampledPosterior:
-    """Samples of the posterior, and how they were found.
-
-    Attributes
-    ----------
-    posterior : PhasePosterior
-        Samples.
-    temperature : float
-        Lack of fit T by which the posterior is tempered.
-    rounds : int
-        Number of linearisations.
-    simulated : int
-        Number of samples that have been simulated at the last linearisation.
-    """
-
-    posterior: PhasePosterior
-    temperature: float
-    rounds: int
-    simulated: int
-
-
 def _sample_posterior(
-    problem: Problem, search: _PhaseSearch, solution: Solution, smooth: _SmoothFitQuality
-) -> _SampledPosterior:
+    problem: Problem, search: _PhaseSearch, solution: Solution
+) -> tuple[PhasePosterior, float, int, bool]:
     """Sample the posterior of phases and parameters, from the solution with a smooth field on."""
     in_logarithms = _linearise_at(problem, search, solution=solution)
     phases = initial_phases(
@@ -226,7 +165,10 @@ def _sample_posterior(
             break
     temperature = 1.0
     if np.isfinite(least_chi_squared):
-        temperature = smooth.lack_of_fit(least_chi_squared)
+        # Temperature of `statistics.phase_sampling`: lack of fit per shape of the smooth field.
+        fit = linearise_fit(solution.collocation, solution.z)
+        determined = max(1.0, factorise_information(fit).count_determined())
+        temperature = max(1.0, (least_chi_squared - fit.compute_chi_squared()) / determined)
     if temperature > 1:
         posterior = PhasePosterior.sample(
             posterior.surrogate,
@@ -235,7 +177,7 @@ def _sample_posterior(
             seed=2 * rounds + 2,
             temperature=temperature,
         )
-    return _SampledPosterior(posterior, temperature, rounds, simulated=len(simulated.p))
+    return posterior, temperature, rounds, len(simulated.p) >= FEWEST_SIMULATED
 
 
 def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
@@ -365,9 +307,10 @@ def _contrast_prior(problem: Problem, search: _PhaseSearch) -> ContrastPrior:
     return ContrastPrior(0.0, search.modes.field.deviation)
 
 
-def _samples(sampled: _SampledPosterior, search: _PhaseSearch, solution: Solution) -> PhaseSamples:
+def _samples(
+    posterior: PhasePosterior, is_simulated: bool, search: _PhaseSearch, solution: Solution
+) -> PhaseSamples:
     """Return samples of the logarithms in the elements of the part with the field."""
-    posterior = sampled.posterior
     surrogate = posterior.surrogate
     others = surrogate.other_columns
     is_shared = others < surrogate.fit.shared_count
@@ -403,7 +346,7 @@ def _samples(sampled: _SampledPosterior, search: _PhaseSearch, solution: Solutio
         misfit=_chi_squared_per_measurement(fit),
         smooth_misfit=np.nan,
         scale_reduction=posterior.draws.compute_scale_reduction(),
-        is_simulated=sampled.simulated >= FEWEST_SIMULATED,
+        is_simulated=is_simulated,
     )
 
 

@@ -66,25 +66,6 @@ def damping_stress(
 
 
 @dataclass(frozen=True, eq=False)
-class ForceDerivatives:
-    """Force f on all nodes at one state, and derivatives by u = (x, v, θ), of U = 6n + k numbers.
-
-    Attributes
-    ----------
-    force : (3n,) array
-        f [N].
-    first : (3n, U) array
-        ∂f/∂u.
-    second : (U, U) array
-        ∂²(wᵀf)/∂u² for the weights w of the forces.
-    """
-
-    force: Array
-    first: Array
-    second: Array
-
-
-@dataclass(frozen=True, eq=False)
 class PlainInternalForce:
     """Internal force of a body by the plain formula, with automatic derivatives.
 
@@ -156,9 +137,9 @@ class PlainInternalForce:
             ca.Function("second", inputs, [ca.densify(second)]),
         )
 
-    def evaluate(self, x: Array, v: Array, w: Array, theta: Array) -> ForceDerivatives:
-        """Return force and derivatives of one state by u = (x, v, θ), with mass-proportional
-        damping.
+    def evaluate(self, x: Array, v: Array, w: Array, theta: Array) -> tuple[Array, Array, Array]:
+        """Return the force f (3n,) [N] of one state with mass-proportional damping, and by U numbers
+        u = (x, v, θ) the derivatives ∂f/∂u (3n, U) and ∂²(wᵀf)/∂u² (U, U).
 
         Parameters
         ----------
@@ -187,7 +168,7 @@ class PlainInternalForce:
         jacobian[:, -1] -= self.body.dof_mass * v
         hessian[size : 2 * size, -1] -= self.body.dof_mass * w
         hessian[-1, size : 2 * size] -= self.body.dof_mass * w
-        return ForceDerivatives(force, jacobian, second=hessian)
+        return force, jacobian, hessian
 
 
 def check_internal_forces(
@@ -269,19 +250,17 @@ def _check_derivatives(
         scale=size,
     )
     if plain is not None:
-        expected = plain.evaluate(x, v, w, theta)
+        plain_force, plain_first, plain_second = plain.evaluate(x, v, w, theta)
         difference = f"of {elements} differs from the plain formula with automatic derivatives"
         check.require_equal(
-            force, expected.force, statement=f"the compiled force {difference}", scale=size
+            force, plain_force, statement=f"the compiled force {difference}", scale=size
         )
         check.require_equal(
-            first,
-            expected.first,
-            statement=f"the compiled first derivative of the force {difference}",
+            first, plain_first, statement=f"the compiled first derivative of the force {difference}"
         )
         check.require_equal(
             second,
-            expected.second,
+            plain_second,
             statement=f"the compiled second derivative of the force {difference}",
             tolerance=SECOND_DERIVATIVES,
         )

@@ -98,7 +98,7 @@ def test_a_film_is_a_gif_in_the_run_folder_by_default(run, tmp_path):
 def test_the_simulation_is_drawn_as_edges_over_the_fit(run):
     _, (swing, nod) = read_run(run)
     film = FilmFigure(swing)
-    assert [each.name for each in film.drawings] == ["fitted", "simulated"]
+    assert [name for name, *_ in film.drawings] == ["fitted", "simulated"]
     film.show_sample(3)
     (*_, fitted, _), (*_, simulated, title) = film.drawings
     assert len(fitted.faces.get_facecolor()) > 1
@@ -127,7 +127,7 @@ def test_the_body_fills_a_large_part_of_the_frame(run):
     _, (swing, _) = read_run(run)
     film = FilmFigure(swing)
     film.show_sample(3)
-    corners = np.concatenate([path.vertices for path in film.drawings[0].body.faces.get_paths()])
+    corners = np.concatenate([path.vertices for path in film.drawings[0][3].faces.get_paths()])
     width, height = np.ptp(corners, axis=0)
     room = film.figure.axes[0].get_ylim()[1] - HEAD_HEIGHT_MM - FOOT_HEIGHT_MM
     assert max(height / room, width / FILM_WIDTH_MM) > 0.6
@@ -137,7 +137,7 @@ def test_the_film_shows_the_distance_of_markers(run):
     _, (swing, _) = read_run(run)
     film = FilmFigure(swing)
     film.show_sample(8)
-    title = film.drawings[0].title
+    title = film.drawings[0][-1]
     assert title.get_text() == "fitted: 0.00 mm"
     assert film.time_label.get_text() == "0.08 s"
 

@@ -10,7 +10,7 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.result.probe_sections import _conclusions
-from collocation_sysid.runs.check.body_check import Slenderness, bending_concerns
+from collocation_sysid.runs.check.body_check import bending_concerns
 from collocation_sysid.statistics.assessment import _noisy_marker_concerns
 from collocation_sysid.statistics.concerns import Concern
 from collocation_sysid.statistics.estimates import derived_estimates
@@ -50,7 +50,7 @@ def test_a_modulus_of_one_parameter_is_as_identifiable_as_this():
 
 def test_fewer_elements_than_needed_are_shown_as_fewer():
     body: Any = SimpleNamespace(element=SimpleNamespace(name="tet10-p0"))
-    (concern,) = bending_concerns(body, Slenderness(1.0, 0.02, cells_across=1.97))
+    (concern,) = bending_concerns(body, 1.0, 0.02, 1.97)
     assert "only about 1.9 tet10-p0 elements" in concern.message
     assert "to 2 or more" in concern.message
 

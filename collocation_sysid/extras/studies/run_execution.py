@@ -274,23 +274,8 @@ class RunOptions:
             )
 
 
-@dataclass(frozen=True)
-class RunExecutor:
-    """Executor of runs.
-
-    Attributes
-    ----------
-    submit : callable
-        Function of a planned run that returns the future of its record.
-    worker_count : int
-        Number of runs at once.
-    stop : callable
-        Function that tells all running runs to end, without waiting for them.
-    """
-
-    submit: Callable[[PlannedRun], Future]
-    worker_count: int
-    stop: Callable[[], Any]
+# Start of a run, which returns the future of its record; number of workers; end of all runs.
+Executor = tuple[Callable[[PlannedRun], Future], int, Callable[[], Any]]
 
 
 def run_all(
@@ -326,18 +311,19 @@ def run_all(
     """
     if not planned:
         return
-    with (_cluster_executor if options.scheduler else _thread_executor)(options) as pool:
-        futures = {pool.submit(run): run for run in planned}
+    executor = _cluster_executor if options.scheduler else _thread_executor
+    with executor(options) as (submit, worker_count, stop):
+        futures = {submit(run): run for run in planned}
         try:
             for future in as_completed(futures):
                 record = _result_record(future, futures[future], limits=options)
                 if record["outcome"] != STOPPED:
                     store.save(record)
-                    on_record(record, pool.worker_count)
+                    on_record(record, worker_count)
         except BaseException:
             for future in futures:
                 future.cancel()
-            pool.stop()
+            stop()
             raise
 
 
@@ -357,11 +343,11 @@ def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> R
 
 
 @contextmanager
-def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
+def _thread_executor(limits: RunOptions) -> Iterator[Executor]:
     """Context with an executor of threads, which wait for processes on this machine: as many at
     once as `limits` states, else one for each available thread.
 
-    The end of the context waits for submitted runs; only `RunExecutor.stop` ends running ones.
+    The end of the context waits for submitted runs; only `stop` ends running ones.
     """
     worker_count = limits.workers or available_threads()
     stop = threading.Event()
@@ -371,15 +357,15 @@ def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
             """Start a run and return the future of its record."""
             return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
 
-        yield RunExecutor(submit, worker_count, stop=stop.set)
+        yield submit, worker_count, stop.set
 
 
 @contextmanager
-def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
+def _cluster_executor(limits: RunOptions) -> Iterator[Executor]:
     """Context with an executor on the workers of the scheduler in `limits`, one run at once for
     each of their threads.
 
-    `RunExecutor.stop` tells running runs to end, through an event of the cluster; the end of the
+    `stop` tells running runs to end, through an event of the cluster; the end of the
     context alone does not stop them. It waits for submitted runs, and closes the connection.
     """
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
@@ -391,7 +377,7 @@ def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
                 """Start a run and return the future of its record."""
                 return executor.submit(_execute_on_worker, run.as_dict(), limits.time_limit_s, flag)
 
-            yield RunExecutor(submit, max(1, sum(client.nthreads().values())), stop=stop.set)
+            yield submit, max(1, sum(client.nthreads().values())), stop.set
 
 
 def _execute_on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:

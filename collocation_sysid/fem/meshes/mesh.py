@@ -115,8 +115,7 @@ class TetMesh:
         element_arrays = checked_arrays(
             cell_arrays or {}, len(elements), kind="cell", of="elements"
         )
-        cleaned = clean_mesh(raw_points, elements)
-        used = cleaned.used
+        points, oriented, used, notes = clean_mesh(raw_points, elements)
         new_index = np.full(len(raw_points), -1)
         new_index[used] = np.arange(len(used))
         faces = {
@@ -124,14 +123,14 @@ class TetMesh:
             for name, f in (face_sets or {}).items()
         }
         self._set(
-            points_m=_read_only(cleaned.points_m),
-            tetrahedra=_read_only(cleaned.tetrahedra),
+            points_m=_read_only(points),
+            tetrahedra=_read_only(oriented),
             point_arrays={name: _read_only(values[used]) for name, values in arrays.items()},
             cell_arrays={name: _read_only(values) for name, values in element_arrays.items()},
             face_sets={name: _read_only(corners) for name, corners in faces.items()},
             file_index=_read_only(used),
             file_node_count=len(raw_points),
-            notes=cleaned.notes,
+            notes=notes,
             is_generated=is_generated,
         )
 

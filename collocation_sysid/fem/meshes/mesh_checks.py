@@ -129,32 +129,14 @@ def checked_arrays(
     return checked
 
 
-@dataclass(frozen=True, eq=False)
-class CleanedMesh:
-    """Mesh without unused nodes, all of whose elements have positive volumes.
-
-    Attributes
-    ----------
-    points_m : (n', 3)
-        Node positions [m].
-    tetrahedra : (E, 4) int64
-        Nodes of each element, counted in `points_m`.
-    used : (n',) int64
-        Index of each node before others were dropped, increasing.
-    notes : tuple of str
-        Sentences about what was cleaned and what looks suspicious.
-    """
-
-    points_m: np.ndarray
-    tetrahedra: np.ndarray
-    used: np.ndarray
-    notes: tuple[str, ...]
-
-
-def clean_mesh(points_m: np.ndarray, tetrahedra: np.ndarray) -> CleanedMesh:
+def clean_mesh(
+    points_m: np.ndarray, tetrahedra: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Drop nodes that are no element's corner and reverse negatively oriented elements.
 
-    Orders are kept; the arguments are not changed.
+    Orders are kept; the arguments are not changed. Return node positions (n', 3) [m], nodes (E, 4) of
+    each element, the index (n',) that each node had before, and sentences about what was cleaned and
+    what looks suspicious.
 
     Parameters
     ----------
@@ -187,7 +169,7 @@ def clean_mesh(points_m: np.ndarray, tetrahedra: np.ndarray) -> CleanedMesh:
             "re-oriented, which is harmless."
         )
     notes += _note_parts(used_points, oriented)
-    return CleanedMesh(used_points, oriented, used=used, notes=tuple(notes))
+    return used_points, oriented, used, tuple(notes)
 
 
 def orient_elements(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -88,8 +88,8 @@ def tetrahedralize_surface(
     if not cached.exists():
         with replaced_file(cached) as draft:
             # A mesh that is refused must not be kept.
-            cleaned = clean_mesh(*run_ftetwild(points, faces, edge_length_m=edge_length_m))
-            write_tetrahedra(draft, cleaned.points_m, tetrahedra=cleaned.tetrahedra)
+            made = run_ftetwild(points, faces, edge_length_m=edge_length_m)
+            write_tetrahedra(draft, *clean_mesh(*made)[:2])
     content = read_tetrahedra(cached)
     return content.points_m, content.tetrahedra
 

@@ -6,7 +6,6 @@ The 3-D axes of matplotlib cost tenths of a second each and leave wide margins.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,24 +23,6 @@ ELEVATION_DEG = 18.0
 AMBIENT_BRIGHTNESS = 0.62
 # Direction towards the light in the axes of the camera.
 LIGHT_DIRECTION = np.array([-0.4, 0.5, 0.8]) / np.linalg.norm([-0.4, 0.5, 0.8])
-
-
-class VisibleFaces(NamedTuple):
-    """Triangles of a surface that are turned towards the viewer, from far to near.
-
-    Attributes
-    ----------
-    polygons : (k, 3, 2)
-        Corners in the picture [m].
-    brightness : (k,)
-        From `AMBIENT_BRIGHTNESS` to 1.
-    indices : (k,)
-        Indices of these triangles in the surface.
-    """
-
-    polygons: Array
-    brightness: Array
-    indices: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +97,12 @@ class ParallelCamera:
         """Return the coordinate (…) [m] of points (…, 3) [m] towards the viewer."""
         return np.asarray(points_m) @ self.axes[2]
 
-    def visible_faces(self, positions_m: Array, surface: Triangles) -> VisibleFaces:
+    def visible_faces(
+        self, positions_m: Array, surface: Triangles
+    ) -> tuple[Array, Array, NDArray[np.int64]]:
         """Return the triangles that are turned towards the viewer, from far to near; those that
-        others hide are included.
+        others hide are included: corners (k, 3, 2) in the picture [m], brightness (k,) up to 1, and
+        indices (k,) in the surface.
 
         Parameters
         ----------
@@ -133,11 +117,8 @@ class ParallelCamera:
         front = np.flatnonzero(normals[:, 2] > 0)
         order = front[np.argsort(corners[front, :, 2].mean(axis=1), kind="stable")]
         light = np.clip(normals[order] @ LIGHT_DIRECTION, 0.0, 1.0)
-        return VisibleFaces(
-            corners[order, :, :2],
-            AMBIENT_BRIGHTNESS + (1 - AMBIENT_BRIGHTNESS) * light,
-            indices=order,
-        )
+        brightness = AMBIENT_BRIGHTNESS + (1 - AMBIENT_BRIGHTNESS) * light
+        return corners[order, :, :2], brightness, order
 
     def are_hidden(
         self, points_m: Array, positions_m: Array, surface: Triangles

@@ -206,17 +206,13 @@ class BodyDrawing:
             Points of cameras [m]; unchanged by default.
         """
         camera = self.view.camera
-        visible_faces = camera.visible_faces(positions_m, self.surface)
-        faces = visible_faces.indices
-        brightness = visible_faces.brightness
+        polygons, brightness, faces = camera.visible_faces(positions_m, self.surface)
         if colours is not None:
             # Colours of a field are shaded half as much, so that they can be compared.
             brightness = (1 + brightness) / 2
         unshaded = self.part_colours if colours is None else colours
         shaded: Any = brightness[:, None] * unshaded[faces]
-        self.faces.set_verts(
-            list(self.view.origin_mm + self.view.mm_per_m * visible_faces.polygons)
-        )
+        self.faces.set_verts(list(self.view.origin_mm + self.view.mm_per_m * polygons))
         if self.edge_colour is not None:
             return
         self.faces.set_facecolor(shaded)

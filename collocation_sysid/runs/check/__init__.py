@@ -2,7 +2,7 @@
 
 `check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
 `body_check` (meshes and grasps), `grasp_extent` (nodes that end before their box),
-`declared_simulation`, `measurements`, `modes_check` (natural modes and the time grid), `cost` and
+`measurements`, `modes_check` (natural modes and the time grid), `cost` and
 `derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from ...common.array_types import Array
 from ...common.serialisation import content
@@ -102,30 +102,11 @@ class QuickCheck:
     holds: tuple[GraspCheck, ...]
 
 
-class LiftedKind(NamedTuple):
-    """Variables that only programs with lifted variables have.
-
-    Attributes
-    ----------
-    group : str
-        Their kind, see `LiftedVariables.kind`.
-    field : str
-        Field of `CheckResult` with their number.
-    row : str
-        Name of their row in a table.
-    meaning : str
-        What they are.
-    """
-
-    group: str
-    field: str
-    row: str
-    meaning: str
-
-
+# Variables that only programs with lifted variables have: group, field of `CheckResult`, name of the
+# row of the table, and meaning.
 LIFTED_KINDS = (
-    LiftedKind("memory", "overstresses", "memory", "the viscoelastic stresses"),
-    LiftedKind("reaction", "wrenches", "reactions", "the measured wrenches or stresses"),
+    ("memory", "overstresses", "memory", "the viscoelastic stresses"),
+    ("reaction", "wrenches", "reactions", "the measured wrenches or stresses"),
 )
 
 
@@ -203,10 +184,10 @@ class CheckResult(QuickCheck):
         of a row in a table.
         """
         return {
-            kind.row: f"{number:,} additional variables and constraints of the method "
-            f"interior-point for {kind.meaning}, included in the nonzeros"
-            for kind in LIFTED_KINDS
-            if (number := getattr(self, kind.field))
+            row: f"{number:,} additional variables and constraints of the method "
+            f"interior-point for {meaning}, included in the nonzeros"
+            for _, field, row, meaning in LIFTED_KINDS
+            if (number := getattr(self, field))
         }
 
     @property
@@ -452,7 +433,7 @@ def _program_fields(
     return {
         "variables": collocation.variable_count,
         "constraints": collocation.constraint_count,
-        **{k.field: lifted_count(lifted, k.group) for k in LIFTED_KINDS},
+        **{field: lifted_count(lifted, group) for group, field, _, _ in LIFTED_KINDS},
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,

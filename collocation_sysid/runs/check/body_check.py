@@ -55,31 +55,11 @@ class ElementShape:
         Mean ratio: 1 for the regular tetrahedron, towards 0 the flatter it is.
     aspect_ratio : float
         Longest edge over smallest height: 1.22 for the regular tetrahedron.
-    longest_edge_m : float
-        Length of the longest edge.
     """
 
     element: int
     quality: float
     aspect_ratio: float
-    longest_edge_m: float
-
-
-@dataclass(frozen=True)
-class Slenderness:
-    """Slenderness of a body, and number of elements across its thickness.
-
-    Attributes
-    ----------
-    length_m, thickness_m : float
-        Longest extent, and thickness where the body bends.
-    cells_across : float
-        Thickness over the size of a cell of six tetrahedra.
-    """
-
-    length_m: float
-    thickness_m: float
-    cells_across: float
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
@@ -93,19 +73,14 @@ def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
     quality = mean_ratios(mesh.points_m, mesh.tetrahedra)
     longest = edge_lengths(mesh.points_m, mesh.tetrahedra).max(axis=1)
     return tuple(
-        ElementShape(
-            int(e),
-            float(quality[e]),
-            aspect_ratio=float(longest[e] / heights[e]),
-            longest_edge_m=float(longest[e]),
-        )
+        ElementShape(int(e), float(quality[e]), aspect_ratio=float(longest[e] / heights[e]))
         for e in np.argsort(quality, kind="stable")[:count]
     )
 
 
-def slenderness(mesh: TetMesh) -> Slenderness:
-    """Return length and thickness [m] of an undeformed body, and the number of elements across its
-    thickness.
+def slenderness(mesh: TetMesh) -> tuple[float, float, float]:
+    """Return the longest extent [m] of an undeformed body, its thickness where it bends [m], and the
+    number of cells of six tetrahedra across the thickness.
     """
     # Edges of the box with the same second moments, however it is turned.
     edges = np.sqrt(12 * np.linalg.eigvalsh(_covariance(mesh)))
@@ -114,11 +89,11 @@ def slenderness(mesh: TetMesh) -> Slenderness:
     area = float(_areas(mesh.points_m[mesh.surface]).sum())
     thickness = min(float(edges[0]), 6 * mesh.volume_m3 / area)
     cell = float(np.cbrt(6 * np.median(mesh.volumes_m3)))
-    return Slenderness(float(edges[-1]), thickness, cells_across=thickness / cell)
+    return float(edges[-1]), thickness, thickness / cell
 
 
 def element_concerns(
-    body: Body, theta: Array, shape: Slenderness, worst: ElementShape
+    body: Body, theta: Array, shape: tuple[float, float, float], worst: ElementShape
 ) -> list[Concern]:
     """Return concerns about flat elements, locking, and too few elements across the thickness."""
     name = body.element.name
@@ -142,33 +117,28 @@ def element_concerns(
             limit=limit,
             remedy=FOR_VOLUME,
         ),
-        *bending_concerns(body, shape),
+        *bending_concerns(body, *shape),
     ]
 
 
-def bending_concerns(body: Body, shape: Slenderness) -> list[Concern]:
+def bending_concerns(
+    body: Body, length_m: float, thickness_m: float, cells_across: float
+) -> list[Concern]:
     """Return the concern "mesh/few", as a list, if a slender body has too few elements across its
-    thickness; else empty.
-
-    Parameters
-    ----------
-    body : Body
-        Body with its elements.
-    shape : Slenderness
-        Slenderness of the body.
+    thickness; else empty. The numbers are those of `slenderness`.
     """
     name = body.element.name
     needed = CELLS_ACROSS.get(name, 0.0)
-    slender = shape.length_m > LEAST_SLENDERNESS * shape.thickness_m
+    slender = length_m > LEAST_SLENDERNESS * thickness_m
     off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
     return concern_if(
-        slender and shape.cells_across < needed - ROUNDING,
+        slender and cells_across < needed - ROUNDING,
         False,
         code="mesh/few",
         # Rounded down, so that it is below the number that is needed.
-        cells=np.floor(10 * shape.cells_across) / 10,
+        cells=np.floor(10 * cells_across) / 10,
         element=name,
-        thickness_mm=1e3 * shape.thickness_m,
+        thickness_mm=1e3 * thickness_m,
         off=off,
         level=level,
         remedy=f"{FOR_BENDING}, or refine" if name == LINEAR else "refine",
@@ -318,7 +288,7 @@ def check_body(
         smallest_element_quality=quality.quality_min,
         median_element_quality=quality.quality_median,
         worst_elements=worst,
-        cells_across=shape.cells_across,
+        cells_across=shape[2],
         guess=_constants_at_guess(body, theta),
         concerns=(
             *(() if is_homogeneous else element_concerns(body, theta, shape=shape, worst=worst[0])),

@@ -8,7 +8,6 @@ estimated too high: a cantilever's deflection grows with the third to fourth pow
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from ...fem.meshes.selection import Box
 from ...problem import Problem
 from ...recording import Experiment, Grasp
 from ...statistics.concerns import Concern
-from .declared_simulation import is_declared_simulated
 
 # Distance between the end of the box and the outermost held nodes, as a share of the free length,
 # from which it is reported: it changes the stiffness in bending by 1.5 to 2 %.
@@ -26,27 +24,17 @@ LARGEST_SHARE = 0.005
 LAYER_SHARE = 1e-6
 
 
-@dataclass(frozen=True)
-class GraspGap:
-    """Distance between one face of a grasp's box and the nodes that the box selects.
-
-    Attributes
-    ----------
-    axis : str
-        x, y or z, the normal of the face.
-    gap_m : float
-        Distance of the outermost held nodes from the face, inside the box [m].
-    free_m : float
-        Length of the free part of the body beyond these nodes along the axis [m].
+def is_declared_simulated(problem: Problem) -> bool:
+    """Return whether the assumptions state that the damping law is exact, which declares that the
+    recordings were simulated: the law of a real body is never known.
     """
-
-    axis: str
-    gap_m: float
-    free_m: float
+    return problem.uncertainty.assumptions.damping_law == "none"
 
 
-def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[GraspGap]:
-    """Yield the gaps of a grasp that exceed `LARGEST_SHARE` of the free length.
+def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[tuple[str, float, float]]:
+    """Yield the gaps of a grasp that exceed `LARGEST_SHARE` of the free length: axis, distance [m] of
+    the outermost held nodes from the face of the box, and length [m] of the free part of the body
+    beyond these nodes.
 
     None for grasps that are not selected by a box, that hold some axes only (platens and planes of
     symmetry), or whose nodes are one layer along the axis, and for faces of the box beyond which
@@ -66,7 +54,7 @@ def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[GraspGap]:
             free_m = (direction * along_m).max() - reach_m
             gap_m = direction * face_m - reach_m
             if LARGEST_SHARE * free_m < gap_m < free_m:
-                yield GraspGap(axis, gap_m=float(gap_m), free_m=float(free_m))
+                yield axis, float(gap_m), float(free_m)
 
 
 def grasp_extent_concerns(problem: Problem) -> list[Concern]:
@@ -95,15 +83,15 @@ def _gap_concerns(problem: Problem) -> Iterator[Concern]:
         if experiment.validation or experiment.specimen is not None:
             continue
         for grasp in experiment.body_grasps:
-            for gap in grasp_gaps(experiment, grasp):
+            for axis, gap_m, free_m in grasp_gaps(experiment, grasp):
                 yield Concern(
                     "description/grasp-extent",
                     "check",
                     data={
                         "experiment": experiment.name,
-                        "axis": gap.axis,
-                        "gap_mm": 1e3 * gap.gap_m,
-                        "free_mm": 1e3 * gap.free_m,
-                        "percent": 100 * gap.gap_m / gap.free_m,
+                        "axis": axis,
+                        "gap_mm": 1e3 * gap_m,
+                        "free_mm": 1e3 * free_m,
+                        "percent": 100 * gap_m / free_m,
                     },
                 )
