@@ -49,6 +49,9 @@ MESH_AMPLITUDES = (0.5, 3.5)
 # Share of the weight in a scan that is taken as the whole weight.
 WHOLE_WEIGHT = (0.4, 2.0)
 
+# Experiment without a mistake, and data of its message; None if it is impossible.
+Correction = tuple[Experiment, dict[str, object]] | None
+
 
 @dataclass(frozen=True)
 class LinearCorrection:
@@ -61,32 +64,6 @@ class LinearCorrection:
     """
 
     share: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Change:
-    """One possible change of the body, as columns of the linearised fit.
-
-    Attributes
-    ----------
-    columns : tuple of int
-        Columns that belong to it.
-    is_whole : bool
-        Whether the change happens as a whole (a law), or with amplitudes that are estimated.
-    kind : str
-        Code of the hypothesis.
-    laws : tuple of (Material or None, DampingLaw or None)
-        Laws of the changed body.
-    axis : int
-        Axis of a change of the width.
-    """
-
-    columns: tuple[int, ...]
-    is_whole: bool
-    kind: str
-    material: str = ""
-    damping: str = ""
-    axis: int = 0
 
 
 def other_materials(body: Body) -> tuple[str, ...]:
@@ -125,24 +102,61 @@ def with_laws(body: Body, material: Material | None, damping: DampingLaw | None)
     return body.with_parts(tuple(replace(part, **changed) for part in body.parts))
 
 
-def _law_effect(at: ExperimentAtAnswer, material: str, damping: str) -> Effect | None:
-    """Return the effect of other laws with the same constants, "" for the stated one: the
-    difference of the forces along the answer.
+def _likely_mistakes(body: Body) -> Iterator[Deviation]:
+    """Yield the likely mistakes about a body: its laws and, if it can be made again, its section,
+    its widths, and a mesh that was made under its weight. The name of a row is the code of its
+    hypothesis.
     """
-    own = at.stress_free_body
-    other = with_laws(own, MATERIALS.get(material), DAMPINGS.get(damping))
-    return Effect(at.internal_n(body=other) - at.internal_force_n)
+    materials = ("", *other_materials(body))
+    dampings = ("", *other_dampings(body))
+    for laws in [(m, d) for m in materials for d in dampings][1:]:
+        yield _other_laws(*laws)
+    if not _is_uniform(body):
+        return
+    if other_section(body.mesh, body.nodes.points_m) is not None:
+        yield SECTION
+    yield from map(_other_width, range(3))
+    if not isinstance(body.rest_shape, UnderGravity):
+        yield REST_SHAPE
 
 
-def _width_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Return the effect of a body that is wider along an axis of the mesh (index), about the middle
-    of its grasped nodes, as a share of the width.
+def _other_laws(material: str, damping: str) -> Deviation:
+    """Return the row of other laws with the same constants, by their names, "" for the stated one."""
+
+    def effect(at: ExperimentAtAnswer, _: int) -> Effect:
+        other = with_laws(at.stress_free_body, MATERIALS.get(material), DAMPINGS.get(damping))
+        return Effect(at.internal_n(body=other) - at.internal_force_n)
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        laws = MATERIALS.get(material), DAMPINGS.get(damping)
+        other = with_body(experiment, with_laws(experiment.body, *laws))
+        return other and (other, {"material": material, "damping": damping})
+
+    which = "/both" if material and damping else "" if material else "/damping"
+    return Deviation(f"law{which}", "1", effect=effect, corrected=corrected, is_whole=True)
+
+
+def _other_width(axis: int) -> Deviation:
+    """Return the row of a body that is wider along an axis of the mesh (index), about the middle of
+    its grasped nodes, as a share of the width.
     """
-    moved_m = np.zeros_like(at.body.nodes_m)
-    points_m = at.body.nodes_m
-    dofs = at.iterate.equations.prescribed.dofs
-    moved_m[:, axis] = points_m[:, axis] - points_m[np.unique(dofs // 3), axis].mean()
-    return shape_effect(at, moved_m)
+
+    def effect(at: ExperimentAtAnswer, _: int) -> Effect:
+        moved_m = np.zeros_like(at.body.nodes_m)
+        points_m = at.body.nodes_m
+        dofs = at.iterate.equations.prescribed.dofs
+        moved_m[:, axis] = points_m[:, axis] - points_m[np.unique(dofs // 3), axis].mean()
+        return shape_effect(at, moved_m)
+
+    def corrected(experiment: Experiment, amplitudes: Array) -> Correction:
+        (width,) = amplitudes.tolist()
+        factors = np.ones(3)
+        factors[axis] += width
+        other = None if abs(width) > WIDEST else with_shape(experiment, factors)
+        way = "narrow" if width > 0 else "wide"
+        return other and (other, {"axis": AXES[axis], "percent": 100 * abs(width), "way": way})
+
+    return Deviation("mesh-width", "1", effect=effect, corrected=corrected)
 
 
 def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
@@ -153,47 +167,43 @@ def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
     return Effect(at.force_change_by_reference(sag))
 
 
-def _list_changes(body: Body) -> tuple[list[Deviation], list[_Change]]:
-    """Return the columns of the linearised fit, and the changes of the body that consist of them."""
-    rows: list[Deviation] = []
-    changes: list[_Change] = []
+def _stress_free(experiment: Experiment, amplitudes: Array) -> Correction:
+    """Return the experiment with the mesh as made under gravity along a direction; None if the
+    amplitudes are not those of the whole weight.
+    """
+    share = float(np.linalg.norm(amplitudes))
+    if not WHOLE_WEIGHT[0] < share < WHOLE_WEIGHT[1]:
+        return None
+    down = amplitudes / share
+    held = np.unique(np.concatenate([grasp.nodes for grasp in experiment.body_grasps]))
+    scanned = UnderGravity(held, gravity_m_s2=GRAVITY_M_S2 * down)
+    other = with_shape(experiment, np.ones(3), rest_shape=scanned)
+    return other and (other, {"down": ", ".join(f"{each:.2f}" for each in down)})
 
-    def add(name: str, effect: object) -> int:
-        rows.append(Deviation(name, "1", effect=effect))  # type: ignore[arg-type]
-        return len(rows) - 1
 
-    materials = other_materials(body)
-    dampings = other_dampings(body)
-    of_law: dict[tuple[str, str], int] = {}
-    for pair in [(m, d) for m in ("", *materials) for d in ("", *dampings)][1:]:
-        of_law[pair] = add("law", lambda at, _, pair=pair: _law_effect(at, *pair))
-        changes.append(_Change((of_law[pair],), True, _law_code(*pair), *pair))
-    if not _is_uniform(body):
-        return rows, changes
-    if other_section(body.mesh, body.nodes.points_m) is not None:
-        column = add("section", lambda at, _: section_effect(at))
-        changes.append(_Change((column,), True, "mesh-section"))
-    for axis in range(3):
-        column = add("width", lambda at, _, axis=axis: _width_effect(at, axis))
-        changes.append(_Change((column,), False, "mesh-width", axis=axis))
-    if not isinstance(body.rest_shape, UnderGravity):
-        columns = [
-            add("scan", lambda at, _, axis=axis: _scan_effect(at, axis)) for axis in range(3)
-        ]
-        changes.append(_Change(tuple(columns), False, "rest-shape"))
-    return rows, changes
+def _of_other_section(experiment: Experiment, _: Array) -> Correction:
+    """Return the experiment with a round section in place of a square one, or the reverse."""
+    other = with_other_section(experiment)
+    if other is None:
+        return None
+    is_round = other.body.mesh.volume_m3 < experiment.body.mesh.volume_m3
+    real, meshed = ("round", "square") if is_round else ("square", "round")
+    return other, {"real": real, "meshed": meshed}
+
+
+SECTION = Deviation(
+    "mesh-section",
+    "1",
+    effect=lambda at, _: section_effect(at),
+    corrected=_of_other_section,
+    is_whole=True,
+)
+REST_SHAPE = Deviation("rest-shape", "1", axes="x y z", effect=_scan_effect, corrected=_stress_free)
 
 
 def _is_uniform(body: Body) -> bool:
     """Return whether a body consists of one part without a field, so that it can be made again."""
     return len(body.parts) == 1 and all(part.field is None for part in body.parts)
-
-
-def _law_code(material: str, damping: str) -> str:
-    """Return the code of the hypothesis of another material, another damping law, or both."""
-    if material and damping:
-        return "law/both"
-    return "law" if material else "law/damping"
 
 
 def screened_bodies(
@@ -219,25 +229,28 @@ def screened_bodies(
     of the body, or without a grasp.
     """
     collocation = solution.collocation
-    body = experiment.body
     if experiment.obstacles or experiment.specimen is not None or not experiment.body_grasps:
         return
-    rows, changes = _list_changes(body)
+    rows = [*_likely_mistakes(experiment.body)]
     if not rows:
         return
     columns = changed_residuals(collocation, solution.z, [(row, 1.0) for row in rows])
     gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
     found: list[tuple[float, Hypothesis]] = []
-    for change in changes:
-        own = [1 + column for column in change.columns]
-        whole = np.ones(len(own)) if change.is_whole else None
-        decrease, amplitudes = linear_step(gram, own, whole)
-        if is_far and change.kind == "law":
+    first = 1
+    for row in rows:
+        own = range(first, first + len(row.list_components()))
+        first = own.stop
+        decrease, amplitudes = linear_step(gram, own, np.ones(len(own)) if row.is_whole else None)
+        if is_far and row.name == "law":
             decrease = np.inf
-        corrected = _changed_experiment(experiment, change, amplitudes)
-        if decrease < LEAST_DECREASE or corrected is None:
+        assert row.corrected is not None
+        correction = row.corrected(experiment, amplitudes)
+        if decrease < LEAST_DECREASE or correction is None:
             continue
-        found.append((decrease, _hypothesis(experiment, change, amplitudes, corrected)))
+        other, data = correction
+        hypothesis = Hypothesis(row.name, f"'{experiment.name}'", data=data, corrected=other)
+        found.append((decrease, hypothesis))
     found.sort(key=lambda each: -each[0])
     count = Counter[str]()
     for _, hypothesis in found:
@@ -314,56 +327,6 @@ def linear_step(
     if amplitudes is None:
         amplitudes = -np.linalg.lstsq(among, gram[own, 0], rcond=1e-8)[0].astype(np.float64)
     return float(-2 * amplitudes @ gram[own, 0] - amplitudes @ among @ amplitudes), amplitudes
-
-
-def _changed_experiment(
-    experiment: Experiment, change: _Change, amplitudes: Array
-) -> Experiment | None:
-    """Return the experiment with a changed body; None if that is impossible, or the change is too
-    large to be a mistake of this kind.
-    """
-    body = experiment.body
-    if change.kind == "mesh-section":
-        return with_other_section(experiment)
-    if change.is_whole:
-        laws = MATERIALS.get(change.material), DAMPINGS.get(change.damping)
-        return with_body(experiment, with_laws(body, *laws))
-    if change.kind == "mesh-width":
-        if abs(amplitudes[0]) > WIDEST:
-            return None
-        factors = np.ones(3)
-        factors[change.axis] += amplitudes[0]
-        return with_shape(experiment, factors)
-    share = float(np.linalg.norm(amplitudes))
-    if not WHOLE_WEIGHT[0] < share < WHOLE_WEIGHT[1]:
-        return None
-    held = np.unique(np.concatenate([grasp.nodes for grasp in experiment.body_grasps]))
-    scanned = UnderGravity(held, gravity_m_s2=GRAVITY_M_S2 * amplitudes / share)
-    return with_shape(experiment, np.ones(3), rest_shape=scanned)
-
-
-def _hypothesis(
-    experiment: Experiment, change: _Change, amplitudes: Array, corrected: Experiment
-) -> Hypothesis:
-    """Return the hypothesis of a change of the body, not yet tested by a refit."""
-    of = f"'{experiment.name}'"
-    data: dict[str, object] = {"material": change.material, "damping": change.damping}
-    if change.kind == "mesh-width":
-        width = float(amplitudes[0])
-        data = {
-            "axis": AXES[change.axis],
-            "percent": 100 * abs(width),
-            "way": "narrow" if width > 0 else "wide",
-        }
-    elif change.kind == "mesh-section":
-        real = (
-            "round" if corrected.body.mesh.volume_m3 < experiment.body.mesh.volume_m3 else "square"
-        )
-        data = {"real": real, "meshed": "square" if real == "round" else "round"}
-    elif change.kind == "rest-shape":
-        down = amplitudes / np.linalg.norm(amplitudes)
-        data = {"down": ", ".join(f"{each:.2f}" for each in down)}
-    return Hypothesis(change.kind, of, data=data, corrected=corrected)
 
 
 def mirror_images(experiment: Experiment) -> Iterator[Hypothesis]:
