@@ -267,11 +267,10 @@ def uncertainty_from_fit(
             "more than the parameters that they determine; state the standard deviation of the noise "
             "(sigma_m) and noise = 'given'"
         )
-    bars = _error_bars(fit, factored, requested=error_model)
-    basis = bars.basis
-    of_all, bounded = _reported_covariance(bars.covariance, fit, parameters=parameters, q=q)
+    covariance, determined, of_noise, basis = _error_bars(fit, factored, requested=error_model)
+    of_all, bounded = _reported_covariance(covariance, fit, parameters=parameters, q=q)
     scatter = _compare_recordings(fit, parameters, q=q, errors=error_model)
-    widened = _widen_by_scatter(of_all[:shared, :shared], bars.quantiles, scatter=scatter)
+    widened = _widen_by_scatter(of_all[:shared, :shared], of_noise, scatter=scatter)
     of_q = widened.covariance
     quantiles = widened.quantiles
     estimates = user_estimates(
@@ -289,8 +288,8 @@ def uncertainty_from_fit(
     sizes = relative_derivatives(parameters, q)
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
     # One factor for all: different ones would widen combinations that are known well.
-    of_noise = np.nanmax(bars.quantiles, initial=normal_isf(0.025)) / normal_isf(0.025)
-    complete = of_noise**2 * bars.determined[:shared, :shared]
+    factor = np.nanmax(of_noise, initial=normal_isf(0.025)) / normal_isf(0.025)
+    complete = factor**2 * determined[:shared, :shared]
     open_ways = sizes[:, None] * factored.fit.null_space[:shared]
     return Uncertainty(
         **vars(basis),
@@ -318,30 +317,12 @@ def uncertainty_from_fit(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _ErrorBars:
-    """Error bars of a fit before parameters at a bound and recordings are considered.
-
-    Attributes
-    ----------
-    covariance : (p, p) array
-        Covariance of all parameters, in the solver's coordinates.
-    determined : (p, p) array
-        The same in the directions that are determined, finite.
-    quantiles : (nq,) array
-        Half widths of the 95 % intervals of shared parameters, in standard deviations.
-    basis : ErrorBasis
-        Error model that was used.
-    """
-
-    covariance: Array
-    determined: Array
-    quantiles: Array
-    basis: ErrorBasis
-
-
-def _error_bars(fit: LinearisedFit, factored: Information, requested: ErrorModel) -> _ErrorBars:
-    """Choose an error model and return the error bars that follow from it.
+def _error_bars(
+    fit: LinearisedFit, factored: Information, requested: ErrorModel
+) -> tuple[Array, Array, Array, ErrorBasis]:
+    """Choose an error model, and return the covariance (p, p) of all parameters in the solver's
+    coordinates, the same in the directions that are determined, finite, the half widths (nq,) of
+    the 95 % intervals of shared parameters in standard deviations, and the error model.
 
     Correlated errors are used if they are requested, or with "auto" if tests find them; with the
     stated σ, and unless requested, only if they widen a standard error by more than `CONSEQUENCE`.
@@ -375,12 +356,8 @@ def _error_bars(fit: LinearisedFit, factored: Information, requested: ErrorModel
         covariance = covariance.copy()
         covariance[shared, shared] += fit.phase_covariance
         determined[shared, shared] += fit.phase_covariance
-    return _ErrorBars(
-        covariance,
-        determined,
-        quantiles=student_ppf(0.975, freedom),
-        basis=ErrorBasis(kind, used, level=level, dependence=dependence, outliers=outliers),
-    )
+    basis = ErrorBasis(kind, used, level=level, dependence=dependence, outliers=outliers)
+    return covariance, determined, student_ppf(0.975, freedom), basis
 
 
 def _reported_covariance(

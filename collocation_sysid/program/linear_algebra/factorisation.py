@@ -220,27 +220,6 @@ class _RefinedFactor:
         return solution
 
 
-class _CompleteRows(NamedTuple):
-    """Structure of both triangles of a matrix in compressed rows.
-
-    Attributes
-    ----------
-    row_starts : (k + 1,) array of int32
-        Index of the first entry of each row, and the number of entries.
-    columns : (e,) array of int32
-        Column of each entry, ascending in each row.
-    lower_positions : (e,) array
-        Position of the value of each entry among those of the lower triangle.
-    skew_signs : (e,) array
-        Sign of the value of each entry of a skew matrix, relative to that of the lower triangle.
-    """
-
-    row_starts: NDArray[np.int32]
-    columns: NDArray[np.int32]
-    lower_positions: Index
-    skew_signs: Array
-
-
 class _OrderedColumns(NamedTuple):
     """Structure of both triangles of a matrix in compressed columns, in the order in which SuperLU
     fills in little.
@@ -582,27 +561,25 @@ class Factoriser:
         return pool[-1].factor_size
 
     @cached_property
-    def _rows(self) -> _CompleteRows:
-        """Both triangles of the matrix on the free dofs, row by row."""
+    def _rows(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Index, Array]:
+        """Both triangles of the matrix on the free dofs, row by row: as `_upper`, and the sign of
+        the value of each entry of a skew matrix, relative to that of the lower triangle.
+        """
         order = np.lexsort((self._full_columns, self._full_rows))
         starts = np.searchsorted(self._full_rows[order], np.arange(self.size + 1))
         # SciPy would convert longer integers with every matrix.
-        return _CompleteRows(
-            starts.astype(np.int32),
-            self._full_columns[order].astype(np.int32),
-            lower_positions=self._full_source[order],
-            skew_signs=self._signs[order],
-        )
+        columns = self._full_columns[order].astype(np.int32)
+        return starts.astype(np.int32), columns, self._full_source[order], self._signs[order]
 
     def complete_matrix(self, values: Array, skew: Array) -> sp.csr_array:
         """Return the matrix (k, k) of lower triangles `values` (m,) of the symmetric and `skew`
         (m,) or (0,) of the skew part.
         """
-        rows = self._rows
-        entries = values[rows.lower_positions]
+        starts, columns, lower_positions, skew_signs = self._rows
+        entries = values[lower_positions]
         if skew.size:
-            entries += rows.skew_signs * skew[rows.lower_positions]
-        return sp.csr_array((entries, rows.columns, rows.row_starts), shape=(self.size, self.size))
+            entries += skew_signs * skew[lower_positions]
+        return sp.csr_array((entries, columns, starts), shape=(self.size, self.size))
 
     @cached_property
     def _upper(self) -> tuple[Index, Index, Index]:
