@@ -62,13 +62,15 @@ def recording_from_log(
         smooth = grasps[number].poses.interpolation
         poses = PoseSequence.from_matrices(t_s, matrices, interpolation=smooth)
         grasps[number] = replace(grasps[number], poses=poses)
-    instruments = [*experiment.readings, *experiment.wrenches]
+    # Instruments are numbered from 1: custom sensors first, then the sensors of grasps.
+    count = len(experiment.readings)
+    numbers = iter([*range(count + 1, count + len(experiment.wrenches) + 1), *range(1, count + 1)])
     measurements: list[Measurement | None] = []
     for sensor in experiment.measurements:
         if sensor is experiment.markers:
             measurements.append(sensor.with_samples(t_s, tracks_m))
             continue
-        number = 1 + instruments.index(sensor)
+        number = next(numbers)
         samples = {when: values for of, when, values in intake.all_samples(log) if of == number}
         inside = [when for when in sorted(samples) if when <= len(t_s) - 1]
         values = np.array([samples[when] for when in inside])
