@@ -19,6 +19,8 @@ from .common.display import plain_text
 from .common.step_counting import StepUnit, counted_phase
 from .common.time_limit import TimeLimitReached, time_limit
 from .errors import InputError, SimulationError
+from .features.specimens.notes import one_kind_notes
+from .features.specimens.offsets import stress_offset_notes
 from .fem.two_phase import TwoPhaseModes
 from .methods.experiment_executors import connect_executor
 from .methods.reduced_space import ReducedSpace
@@ -61,8 +63,6 @@ from .statistics.probes.profile_likelihood import Profile, profile_of_solution
 from .statistics.probes.relaxed_assumptions import Probe, SolvedFit, probed_changes
 from .statistics.probes.routine_probes import is_alarming, probed_deviations
 from .statistics.residuals.residual_diagnostics import diagnose_markers
-from .statistics.specimen_notes import one_kind_notes
-from .statistics.specimen_offsets import stress_offset_notes
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -198,7 +198,7 @@ class Deviation:
     of: Component = "recording"
     axes: str = ""
     effect: Callable[..., object] | None = None
-    corrected: Callable[..., tuple[Any, Mapping[str, object]] | None] | None = None
+    corrected: Callable[..., tuple[object, Mapping[str, object]] | None] | None = None
     is_whole: bool = False
     of_specimens: bool = False
     is_one_sided: bool = False

@@ -11,7 +11,6 @@ from ..statistics.misspecification.fit_misspecifications import (
     motion_misspecifications,
 )
 from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
-from ..statistics.misspecification.specimen_misspecifications import find_specimen_misspecifications
 
 # Note on tests of hypotheses without a result.
 NO_CAUSE = "possible causes of the misfit were tested: none explains it"
@@ -26,8 +25,8 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
     are noise.
 
-    Hypotheses of the features and about specimens are always tested; others only if a
-    measurement of an experiment misses, see `motion_misspecifications`.
+    Hypotheses of the features are always tested; others only if a measurement of an experiment
+    misses, see `motion_misspecifications`.
 
     Parameters
     ----------
@@ -45,7 +44,6 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     hypotheses = [
         hypothesis for feature in FEATURES for hypothesis in feature.fit_hypotheses(solution)
     ]
-    hypotheses += find_specimen_misspecifications(solution)
     hypotheses += motion_misspecifications(solution, hypotheses, budget=budget)
     return rank(hypotheses)
 

@@ -9,6 +9,7 @@ import numpy as np
 from ..common.array_types import root_mean
 from ..errors import SimulationError
 from ..features.registry import FEATURES
+from ..features.specimens.concerns import as_specimen_concerns
 from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
 from ..model.schemes import as_scheme
@@ -42,7 +43,6 @@ from ..statistics.misspecification.plausibility import (
 from ..statistics.misspecification.track_misspecifications import copied_measurements
 from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.scale_identifiability import scale_concerns
-from ..statistics.specimen_concerns import as_specimen_concerns
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
 from .check.modes_check import ModesCheck, check_modes

@@ -15,7 +15,6 @@ Checks
     `identifiability` and `scale_identifiability` describe what the data determine. The package
     `probes` relaxes assumptions and refits parts of the data; the package `misspecification`
     generates and tests hypotheses about mistakes in the description (`axes`: exchanged or reversed
-    axes). `specimen_concerns`, `specimen_notes`, `specimen_offsets` and
-    `stability_concerns` judge specimens and materials. `assessment` combines everything into a
-    verdict with the messages of `concerns`.
+    axes). `stability_concerns` judges materials. `assessment` combines everything into a verdict
+    with the messages of `concerns`.
 """

@@ -19,7 +19,7 @@ def test_only_the_registry_lists_the_features():
     """Modules above use a feature by its functions, or one result of it, but not its description."""
     names = {
         node.targets[0].id
-        for path in (PACKAGE / "features").rglob("*_feature.py")
+        for path in (PACKAGE / "features").rglob("*feature.py")
         for node in ast.parse(path.read_text()).body
         if isinstance(node, ast.Assign)
         and isinstance(node.value, ast.Call)

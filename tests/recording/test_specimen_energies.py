@@ -10,10 +10,10 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import collocation_sysid as cs
+from collocation_sysid.features.specimens.hypotheses import _hypotheses
 from collocation_sysid.recording.homogeneous_deformation import DEFORMATIONS
 from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
 from collocation_sysid.recording.specimen_stretches import isochoric_stretches
-from collocation_sysid.statistics.misspecification.specimen_misspecifications import _hypotheses
 
 EXACT = {"strain_zero": 0.0, "area_error": 0.0}
 STRAIN = np.array([-0.4, -0.1, 0.05, 0.3, 0.8])

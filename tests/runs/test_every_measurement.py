@@ -25,6 +25,7 @@ from collocation_sysid.features.measurements import (
     lost_samples,
     reason_against_copy,
 )
+from collocation_sysid.features.specimens.concerns import SPECIMEN_CODES, as_specimen_concerns
 from collocation_sysid.program.depth.surface_comparison import DepthError, SurfaceComparison
 from collocation_sysid.runs.verdict import _outlier_counts
 from collocation_sysid.statistics.assessment import (
@@ -38,7 +39,6 @@ from collocation_sysid.statistics.misspecification.track_misspecifications impor
     copied_measurements,
     filtered_signals,
 )
-from collocation_sysid.statistics.specimen_concerns import SPECIMEN_CODES, as_specimen_concerns
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 NUMBERS = ("markers", "wrench", "custom sensor", "specimen")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
+from collocation_sysid.features.specimens.concerns import as_specimen_concerns
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.recording.specimen_checks import order_warnings
 from collocation_sysid.statistics.concerns import Concern
-from collocation_sysid.statistics.specimen_concerns import as_specimen_concerns
 
 FIXED = {"kappa_pa": 1e9, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 LAWS = {

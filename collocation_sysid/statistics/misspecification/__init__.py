@@ -3,8 +3,7 @@
 - `misspecification_hypothesis`: a hypothesis, its strength and how hypotheses are ranked.
 - `plausibility`: contradictions that no simulation is needed for; `modal_misspecifications`:
   predictions by natural modes; `initial_motion`: bodies that were not at rest at the beginning.
-- `specimen_misspecifications`: homogeneous tests.
 - `fit_misspecifications`: hypotheses after a fit.
 
-Hypotheses about force sensors, cameras and obstacles are in the package `features`.
+Hypotheses about force sensors, cameras, specimens and obstacles are in the package `features`.
 """

@@ -10,14 +10,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..common.array_types import Array
-from ..common.display import short
-from ..errors import listed
-from ..recording.experiment import Experiment
-from ..recording.specimen import STRESS_NAME
-from .distributions import f_sf
-from .linearised import LinearisedFit
-from .thresholds import GROSS_MISFIT, NAMED_ERRORS, NOTEWORTHY, OFFSET_FALSE_ALARMS
+from ...common.array_types import Array
+from ...common.display import short
+from ...errors import listed
+from ...recording.experiment import Experiment
+from ...recording.specimen import STRESS_NAME
+from ...statistics.distributions import f_sf
+from ...statistics.linearised import LinearisedFit
+from ...statistics.thresholds import GROSS_MISFIT, NAMED_ERRORS, NOTEWORTHY, OFFSET_FALSE_ALARMS
 
 # Standard deviation of the prior of an offset, over sigma of the stress: without a prior, errors of
 # the law appear as offsets that no load cell has.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from ..fem.laws.constants import without_region
-from ..model.parameters import Parameters
-from ..recording.experiment import Experiment
+from ...fem.laws.constants import without_region
+from ...model.parameters import Parameters
+from ...recording.experiment import Experiment
 
 # Moduli of small strain, whose meaning does not depend on the law.
 MODULI = frozenset({"young_pa", "poisson", "lambda_pa", "mu_pa", "kappa_pa"})

@@ -45,7 +45,8 @@ from ...recording.specimen import (
 )
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
-from ..thresholds import (
+from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ...statistics.thresholds import (
     BETTER,
     CERTAIN,
     DECISIVE,
@@ -60,7 +61,6 @@ from ..thresholds import (
     UNIT_LIKE,
     UNLIKELY,
 )
-from .misspecification_hypothesis import Hypothesis, HypothesisTest
 
 # Fewest samples of a specimen whose curve distinguishes hypotheses.
 FEWEST_SAMPLES = 4

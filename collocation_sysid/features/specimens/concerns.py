@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..recording.experiment import Experiment
-from ..recording.specimen import LATERAL_NAME
-from ..recording.specimen_files import specimen_strains
-from .concerns import Concern
+from ...recording.experiment import Experiment
+from ...recording.specimen import LATERAL_NAME
+from ...recording.specimen_files import specimen_strains
+from ...statistics.concerns import Concern
 
 # Code of the concern about a specimen by that of the general concern with the same data.
 SPECIMEN_CODES: Mapping[str, str] = {
