@@ -60,6 +60,17 @@ def test_a_wrong_value_is_named_with_what_was_expected(call: Any, message: str):
         call()
 
 
+@pytest.mark.parametrize("call", [cs.solve, cs.run])
+def test_a_body_that_is_held_at_all_nodes_is_refused(call: Any):
+    held = lifted(grasps=cs.Grasp(range(8), cs.PoseSequence.fixed()))
+    known = {"poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
+    problem = cs.Problem(held, {"young_pa": cs.Unknown(1e4), **known})
+    with pytest.raises(InputError, match="grasps hold all 8 nodes, so that nothing can move"):
+        call(problem)
+    with pytest.raises(InputError, match="hold all 8 nodes"):
+        cs.simulate(held, {"young_pa": 1e4, **known})
+
+
 def test_scalars_of_numpy_count_as_those_of_python():
     body = cs.Body(cs.box_mesh((0.1, 0.1, 0.1), np.array([1, 1, 1])), "neo-hookean", np.float32(30))
     assert type(body.parts[0].density_kg_m3) is float

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ...common.time_limit import require_time
-from ...errors import SimulationError
+from ...errors import InputError, SimulationError
 from ...recording.experiment import Experiment
 from ..linear_algebra.factorisation import Factor, Factoriser
 from ..linear_algebra.reused_factor import (
@@ -170,6 +170,11 @@ class NewtonSolver:
         Accumulates the time spent.
     prescribed : (n, 3) or (3n,) array of bool, optional
         Prescribed coordinates; by default those at the experiment's first time.
+
+    Raises
+    ------
+    InputError
+        If all coordinates are prescribed.
     """
 
     def __init__(
@@ -187,6 +192,11 @@ class NewtonSolver:
         at_start = experiment.is_prescribed(experiment.t_s[:1])[0]
         holding = at_start if prescribed is None else prescribed
         self.free = np.flatnonzero(~holding)
+        if not self.free.size:
+            raise InputError(
+                f"{experiment.description}: its grasps hold all {len(self.body.nodes_m)} nodes, so that "
+                "nothing can move; expected fewer nodes"
+            )
         self.is_prescribed = np.flatnonzero(holding)
         self.pattern = experiment.sparsity
         self.factoriser = Factoriser.cached(self.pattern, self.free)
