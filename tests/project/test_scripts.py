@@ -30,6 +30,7 @@ COMMANDS = (
     "study_mismatch --schemes midpoint --substeps 1",
     "study_mistakes --groups tracks --only wxyz --seeds 1",
     "study_refinement --twins 1",
+    "study_shipped --only table1/problem_scheme.toml",
     "study_specimen_coverage --twins 2 --case 0",
     "study_starts --starts 1 --bodies cylinder",
     "study_step --twins 1",
