@@ -219,6 +219,12 @@ class CustomSensor(Measurement):
         for name, sigma in self.unknowns.items():
             yield GAUGE, self.unknown_label(name), sigma
 
+    def other_views(self, experiment: Any) -> Iterator[tuple[str, Self]]:
+        """Yield sensors of the same kind at other places that a check compares, each after a
+        phrase; a sensor that is attached to the body has none.
+        """
+        return iter(())
+
     # The expression ---------------------------------------------------------------------------
 
     @property

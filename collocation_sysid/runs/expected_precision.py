@@ -15,13 +15,16 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..errors import InputError, SimulationError
+from ..fem.laws.constants import symbol_of
 from ..program.collocation import Collocation
 from ..program.measured_motion import fitted_values
 from ..program.simulation import simulate
+from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.specimen import Specimen, cell_of_other_test
 from ..recording.specimen_files import specimen_strains
+from ..statistics.budget.combined_intervals import NORMAL_95
 from ..statistics.budget.consider_analysis import UNWEIGHTED, changes_of_assumptions
 from ..statistics.budget.uncertainty_budget import VarianceSources
 from ..statistics.combinations import (
@@ -122,6 +125,71 @@ def expected_precision(
             for name, value in fit.derived.values.items()
             if value
         },
+    )
+
+
+def expected_deviations(collocation: Collocation, z: Array) -> dict[str, float]:
+    """Return the relative standard deviation of each estimated scalar parameter by noise of the
+    stated σ and the errors of the sensors, if all residuals were zero at z.
+    """
+    collocation = replace(collocation, huber=UNWEIGHTED)
+    fit = linearise_fit(collocation, z)
+    exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
+    fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
+    q = z[: collocation.nq]
+    known = uncertainty_from_fit(fit, collocation.parameters, q, ErrorModel("given", "independent"))
+    kept = [k for k in collocation.parameters.scalar_coordinates if not fit.at_bound[k]]
+    deviations = np.sqrt(np.diag(known.complete_covariance))
+    return {known.names[k]: float(deviations[k]) for k in kept}
+
+
+def views_note(collocation: Collocation, z: Array) -> str:
+    """Return a note on what is expected of the sensors that could be elsewhere, with each alone and
+    with the best of their other places; empty if there is no such sensor.
+    """
+    experiments = [each.experiment for each in collocation.transcriptions]
+    number = next(
+        (
+            k
+            for k, each in enumerate(experiments)
+            if any(True for sensor in each.readings for _ in sensor.other_views(each))
+        ),
+        None,
+    )
+    if number is None:
+        return ""
+    experiment = experiments[number]
+
+    def expected(readings: Sequence[CustomSensor]) -> dict[str, float]:
+        changed = replace(experiment, readings=tuple(readings))
+        return expected_deviations(
+            *_extended(collocation, z, [*experiments[:number], changed, *experiments[number + 1 :]])
+        )
+
+    def in_words(what: str, deviations: Mapping[str, float]) -> str:
+        known = (
+            f"{symbol_of(name)} ±{100 * NORMAL_95 * each:.2g} %"
+            for name, each in deviations.items()
+        )
+        return f"{what} {', '.join(known)}"
+
+    stated = [*experiment.readings]
+    views = [each for each in stated if any(True for _ in each.other_views(experiment))]
+    now = expected(stated)
+    lines = [in_words("as stated", now)]
+    if len(views) > 1:
+        for view in views:
+            alone = [each for each in stated if each is view or each not in views]
+            lines.append(in_words(f"with '{view.name}' alone", expected(alone)))
+    tried = [(expected([*stated, other]), what) for what, other in views[0].other_views(experiment)]
+    if tried and now:
+        first = next(iter(now))
+        best, what = min(tried, key=lambda each: each[0].get(first, np.inf))
+        lines.append(in_words(f"with {what}", best))
+    return (
+        f"expected 95 % intervals by noise and errors of the sensors of '{experiment.name}' (other "
+        "systematic effects come in addition): "
+        f"{'; '.join(lines)}"
     )
 
 

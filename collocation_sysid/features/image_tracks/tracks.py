@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, root_mean
 from ...common.checked_arrays import float_array, read_only_floats, unconverted, unconverted_or_none
@@ -42,6 +43,15 @@ OF_TIME = ("delay_s", "clock_rate", "line_delay_error_s")
 TRACK_DRIFT = Deviation(
     "track_drift", "", sigma=None, of="gauge", changes=(), reach=UNLIMITED_REACH
 )
+# Places of another camera that a check compares: words, axis of the camera about which it is turned
+# around the body, and angle [degrees].
+VIEWS = (
+    ("turned by 90° to the right around the body", 1, -90.0),
+    ("turned by 90° to the left around the body", 1, 90.0),
+    ("turned by 60° upwards around the body", 0, -60.0),
+)
+# Cosine between the normal of a face and the view, above which it is tracked.
+FACING = 0.3
 # Prior of the pose of a camera that is found from the body at rest [rad, m]: it is not a statement.
 UNKNOWN_TURN_RAD = 20 * DEGREE
 UNKNOWN_SHIFT_M = 0.2
@@ -297,6 +307,46 @@ class ImageTracks(CustomSensor):
             if sigma:
                 for label in place_labels(point):
                     yield SURFACE_PLACE, label, float(sigma)
+
+    def other_views(self, experiment: Experiment) -> Iterator[tuple[str, Self]]:
+        """Yield the camera at each of `VIEWS`, of which it sees as many points of the body, spread
+        over the visible surface, whose places are unknown; none for a camera that moves.
+        """
+        if self.camera.poses is not None or not self.has_known_pose:
+            return
+        body = experiment.body
+        nodes_m = experiment.rigid_positions(experiment.t_s[:1])[0]
+        middle_m = nodes_m.mean(axis=0)
+        corners = nodes_m[body.mesh.surface]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        pose = self.camera.pose
+        for words, axis, angle_deg in VIEWS:
+            turn = Rotation.from_rotvec(np.deg2rad(angle_deg) * pose[:3, axis]).as_matrix()
+            moved = pose.copy()
+            moved[:3, :3] = turn @ pose[:3, :3]
+            moved[:3, 3] = middle_m + turn @ (pose[:3, 3] - middle_m)
+            away = moved[:3, 3] - corners.mean(axis=1)
+            facing = np.einsum("fi,fi->f", normals, away) / np.linalg.norm(away, axis=1)
+            faces = np.flatnonzero(facing > FACING)
+            if not len(faces):
+                continue
+            rest_m = body.nodes_m[body.mesh.surface[faces]].mean(axis=1)
+            chosen = [0]
+            while len(chosen) < min(len(self.names), len(faces)):
+                gaps = np.linalg.norm(rest_m[:, None] - rest_m[chosen], axis=2)
+                chosen.append(int(gaps.min(axis=1).argmax()))
+            names = [f"{words} {k + 1}" for k in range(len(chosen))]
+            seen = replace(
+                self,
+                name=words,
+                camera=replace(self.camera, pose=moved),
+                pixels=np.zeros((len(self.t_s), len(chosen), 2)),
+                names=names,
+                places_m=rest_m[chosen],
+                place_sigma_m=float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
+            )
+            yield f"another such camera {words}", seen
 
     def drift_labels(self, point: str) -> list[str]:
         """Return the labels of the terms of the drift of a track, u first."""

@@ -44,7 +44,7 @@ from ...statistics.misspecification.plausibility import size_and_density_hypothe
 from ...statistics.misspecification.track_misspecifications import copied_measurements
 from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
-from ..expected_precision import expected_precision, with_measurements
+from ..expected_precision import expected_precision, views_note, with_measurements
 from .body_check import (
     BodyCheck,
     ElementShape,
@@ -306,6 +306,7 @@ def check_problem(
     if simulated is not first and not start_notes:
         report_progress("computing what the recordings determine")
         combinations = _expected_combinations(problem, collocation, z)
+        notes += filter(None, [views_note(collocation, z)] if collocation.nq else [])
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
