@@ -160,3 +160,5 @@ def test_tracks_are_simulated_and_identified_from(filmed: Path) -> None:
     fitted = result["fit"]["experiments"]["swing"]
     assert fitted["reading_rms"]["front"] < 0.3
     assert fitted["reading_unit"] == {"front": "px"}
+    assert run_command("plot", "found").code == 0
+    assert [*(filmed / "found").rglob("reading_swing_front.png")]

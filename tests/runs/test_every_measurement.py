@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from kit.depth import hanging
+from kit.filmed import swung, tracks_of
 from kit.fits import PARAMETERS, autoregressive, problem
 from kit.problems import hung_cube, measured
 from scipy.signal import butter, sosfiltfilt
@@ -41,7 +42,7 @@ from collocation_sysid.statistics.misspecification.track_misspecifications impor
 )
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
-NUMBERS = ("markers", "wrench", "custom sensor", "specimen")
+NUMBERS = ("markers", "wrench", "custom sensor", "specimen", "image tracks")
 
 
 @cache
@@ -58,6 +59,8 @@ def only(kind, cube=None):
         force = cs.Wrench(cube.t_s, ones[:, None] * [[1.0, 1.0, 1.0]], sigma_n=0.1)
         grasps = [replace(cube.grasps[0], wrench=force)]
         return replace(cube, grasps=grasps, markers=None)
+    if kind == "image tracks":
+        return swung(readings=[tracks_of()], markers=None)
     if kind == "depth camera":
         points_m = np.random.default_rng(0).uniform(0.1, 0.2, size=(20, 3))
         return hanging((cs.Depth("front", [0.0], [points_m], 1e-3),))
@@ -140,6 +143,7 @@ BLOCKS = {
     "custom sensor": ("sigma", (3, 1)),
     "specimen": ("sigma", (3, 1)),
     "depth camera": ("sigma_m of depth", (5, 3)),
+    "image tracks": ("sigma_px", (5, 2)),
 }
 SAMPLES = 80
 
@@ -273,7 +277,10 @@ def with_values(experiment, values):
     if measurement is experiment.markers:
         tracks_m = values.reshape(measurement.positions_m.shape)
         return replace(experiment, markers=replace(measurement, positions_m=tracks_m))
-    other = replace(measurement, values=values)
+    if isinstance(measurement, cs.ImageTracks):
+        other = replace(measurement, pixels=values.reshape(len(values), -1, 2))
+    else:
+        other = replace(measurement, values=values)
     if experiment.readings:
         return replace(experiment, readings=[other])
     return replace(experiment, grasps=[replace(experiment.grasps[0], wrench=other)])
@@ -374,11 +381,13 @@ CHECKS = {
         custom="statistics/test_sensor_causes.py::test_a_mistake_of_a_sensor_is_named",
         specimen="statistics/test_specimen_misspecifications.py::test_another_kind_of_test_is_named",
         depth="statistics/test_wrong_depth_images.py::test_solve_names_a_wrong_matrix",
+        image="statistics/test_wrong_tracks.py::test_lost_tracks_are_named",
     ),
     "the same in `check`": elsewhere(
         markers="statistics/test_wrong_descriptions.py::test_a_wrong_description_is_named_before_solving",
         wrench="statistics/test_wrench_causes.py::test_a_mistake_is_named_before_solving",
         depth="statistics/test_wrong_depth_images.py::test_check_names_a_flipped_image",
+        image="statistics/test_wrong_tracks.py::test_wrong_descriptions_of_a_camera_are_named",
     ),
     "mistakes in the description of body": elsewhere(
         markers="statistics/test_body_causes.py::test_hidden_errors_of_a_bent_bar_are_named",
@@ -397,6 +406,7 @@ CHECKS = {
         specimen="result/test_specimen_output.py::test_an_undetermined_parameter_is_stated_once",
         depth="result/test_depth_pictures.py::"
         "test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart",
+        image="problem/test_image_tracks_table.py::test_tracks_are_simulated_and_identified_from",
     ),
 }
 TESTS = Path(__file__).parents[1]
