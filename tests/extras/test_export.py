@@ -153,6 +153,16 @@ def test_an_ensemble_has_an_export_for_each_draw(run_folder, tmp_path):
     assert elasticity is not None
     stated = float(elasticity.get("young", ""))
     assert stated == pytest.approx(run.samples(2)["young_pa"].iloc[0], rel=1e-4)
+    mujoco = pytest.importorskip("mujoco")
+    tips_m = []
+    for k in (1, 2):
+        path = tmp_path / "mujoco" / f"sample_{k:03d}" / "body.xml"
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, nstep=50)
+        tips_m.append(data.flexvert_xpos.copy())
+    assert np.isfinite(tips_m).all()
+    assert np.abs(tips_m[1] - tips_m[0]).max() > 0  # the bodies differ
 
 
 # What files hold

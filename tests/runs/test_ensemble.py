@@ -69,3 +69,23 @@ def test_residuals_and_predictions_sum_to_the_measurements(run):
     assert predicted.attrs["units"] == "Pa"
     assert residual.attrs["sigma"] == pytest.approx([gauge.sigma])
     assert predicted.sel(time=0.0).sizes == {"quantity": 1}
+
+
+@pytest.mark.slow
+def test_draws_contain_the_truth_as_often_as_they_state():
+    """E of 40 twins with their own noise, in the middle 80 % of the draws of their runs."""
+    strain = np.linspace(0.01, 0.2, 15)
+    truth = {"young_pa": 1e5, "poisson": 0.45}
+    blank = cs.Specimen("uniaxial", strain, 0 * strain, 1.0, strain_zero=0.0, area_error=0.0)
+    (exact_pa,) = cs.simulate(blank.experiment(), truth).custom_sensor_values
+    inside = []
+    for seed in range(40):
+        noise_pa = np.random.default_rng(seed).normal(0, 500.0, len(strain))
+        twin = replace(blank, stress_pa=exact_pa[:, 0] + noise_pa, sigma_pa=500.0)
+        unknown = {"young_pa": cs.Unknown(2e5), "poisson": 0.45}
+        exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
+        problem = cs.Problem([twin.experiment()], unknown, uncertainty=exact)
+        draws = cs.run(problem, seek_causes=False).samples(2000, seed=seed)["young_pa"]
+        low, high = draws.quantile([0.1, 0.9])
+        inside.append(low < truth["young_pa"] < high)
+    assert 26 <= sum(inside) <= 38  # 32 expected; 99 % of such counts if the draws are right
