@@ -46,6 +46,8 @@ from .solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
 from .starts.initial_trajectories import complete_variables, simulate_trajectories
 from .trajectory_sweeps import trajectory_positions
 
+# Time limit of a run whose problem states none [s].
+UNLIMITED_S = 1e6
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0
 # Note on a search that ended because new correspondences changed the loss.
@@ -73,7 +75,8 @@ class ReducedSpace(SearchOptions):
         `tolerance`. The default is far below the error of any mesh, and saves a sweep or two.
     max_time_s : float
         Time limit of a run [s]: the search ends with the best iterate, and later steps, such as
-        error bars, are left out.
+        error bars, are left out. If none is stated, the search for a start ends after 40 s where
+        Poisson's ratio is above 0.499 and the elements are not "tet10-p0".
     """
 
     name: ClassVar[str] = "reduced-space"
@@ -81,7 +84,7 @@ class ReducedSpace(SearchOptions):
     coarse_start: Literal["auto", False] = "auto"
     coarse_start_nodes: AtLeastOne = 1500
     coarse_start_tolerance: Positive = 1e-6
-    max_time_s: Positive = 1e6
+    max_time_s: Positive = UNLIMITED_S
 
     @one_blas_thread()
     def __call__(

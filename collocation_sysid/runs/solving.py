@@ -16,7 +16,7 @@ from ..features.measurements import lost_samples
 from ..features.registry import FEATURES
 from ..fem.laws.constants import without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
-from ..methods.reduced_space import ReducedSpace
+from ..methods.reduced_space import UNLIMITED_S, ReducedSpace
 from ..methods.solution import Method, Solution, Status, Watch
 from ..methods.starts.initial_trajectories import associated_at_guess
 from ..methods.starts.stiffness_scan import Scan, rescue, start_problem
@@ -72,6 +72,8 @@ MOST_BOUNDS = 3
 COARSE_TOLERANCE = 1e-4
 # Poisson's ratio from which elements that do not average the volume need many small steps.
 INCOMPRESSIBLE = 0.499
+# Longest search for a start with such elements if no limit is stated [s].
+START_S = 40.0
 # Most repetitions of a solve whose estimates change the correspondences of the measurements.
 MOST_REREADINGS = 5
 
@@ -138,8 +140,9 @@ def solve(
         with time_limit(solver.max_time_s):
             solution = _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
     except TimeLimitReached:
+        limit_s = _start_limit_s(problem, solver)
         raise InputError(
-            f"no start of the search was found within {solver.max_time_s:g} s; raise the limit, "
+            f"no start of the search was found within {limit_s:g} s; raise the limit, "
             f"or give guesses{_incompressible_remedy(problem)}",
             problem.path,
             where="solver.reduced-space.max_time_s",
@@ -148,6 +151,14 @@ def solve(
         remedy = _incompressible_remedy(problem)
         solution = replace(solution, message=solution.message.rstrip(".") + f"{remedy}.")
     return solution
+
+
+def _start_limit_s(problem: Problem, solver: Method) -> float:
+    """Return the longest time of the search for a start [s]: that of the method, or `START_S` where
+    none is stated and the elements are not made for the Poisson's ratio.
+    """
+    limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else float("inf")
+    return START_S if limit_s == UNLIMITED_S and _incompressible_remedy(problem) else limit_s
 
 
 def _incompressible_remedy(problem: Problem) -> str:
@@ -447,9 +458,10 @@ def _program_and_start(
     has_guesses = not collocation.parameters.list_names_without_guess()
     if has_guesses:
         require_memory(problem, collocation, method=solver)
-    collocation, scan, note = start_problem(
-        collocation, getattr(solver, "needs_complete_start", False)
-    )
+    with time_limit(_start_limit_s(problem, solver)):
+        collocation, scan, note = start_problem(
+            collocation, getattr(solver, "needs_complete_start", False)
+        )
     if not has_guesses:  # the estimate evaluates the program at a guess
         require_memory(problem, collocation, method=solver)
     if scan is not None:

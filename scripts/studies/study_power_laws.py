@@ -6,7 +6,8 @@ compression to 40 %, tension to 30 % with lateral stretches, and simple shear to
 own noise of 100 Pa and, of the lateral stretches, of 0.005. The table has the processor time and the
 iterations of each search, whether it converged, how many terms the tests determine, and the error
 of the fit: the root mean square of the residuals, in standard deviations of the measurements, with
-those of the zeros of the strains and of the areas, which are estimated.
+those of the zeros of the strains and of the areas, which are estimated. A second table has the
+verdict and the combined intervals of the foams.
 
 With `--curves FOLDER`, published curves in that folder are fitted too, if it has them: all three
 tests of Treloar, each test alone, silicone by Meunier et al. (2008), and white matter of the brain
@@ -110,7 +111,22 @@ def main() -> None:
     for seed in range(options.foams):
         for law in ("hyperfoam-1", "hyperfoam-2"):
             rows.append(row(f"foam, noise {seed}", law, foam_tests(law, seed)))
-    print(markdown(HEADS, rows))
+    print(markdown(HEADS, rows), flush=True)
+    foams = [foam_intervals(seed) for seed in range(options.foams)]
+    print(markdown(("foam", "CPU s", "verdict", *FOAM), foams))
+
+
+def foam_intervals(seed: int) -> tuple[str, ...]:
+    """Return the combined intervals of the constants of a simulated foam as a row of the table."""
+    began = time.process_time()
+    answer = cs.run(cs.Problem(foam_tests("hyperfoam-2", seed), unknowns("hyperfoam-2")))
+    intervals = [answer.interval(name) for name in FOAM]
+    return (
+        f"noise {seed}",
+        f"{time.process_time() - began:.1f}",
+        answer.trust.verdict,
+        *("none" if each is None else f"{each[0]:.4g} … {each[1]:.4g}" for each in intervals),
+    )
 
 
 def curve(file: Path, law: str, unit: float, sigma_pa: float) -> cs.Experiment:

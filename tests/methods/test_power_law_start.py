@@ -32,9 +32,11 @@ FOAM_TESTS = (
 )
 
 
-def measured(law: str, truth: dict[str, float], tests, sigma_pa: float) -> list[cs.Specimen]:
+def measured(
+    law: str, truth: dict[str, float], tests, sigma_pa: float, seed: int = 0
+) -> list[cs.Specimen]:
     """Simulated tests with noise, with the lateral stretch of the second one if it is free."""
-    random = np.random.default_rng(0)
+    random = np.random.default_rng(seed)
     specimens = []
     for number, (test, strain) in enumerate(tests):
         lateral = np.ones_like(strain) if number == 1 else None
@@ -108,6 +110,18 @@ def test_terms_of_a_foam_are_found_with_one_ratio_of_compressibility():
     assert items["alpha_1"].guess == pytest.approx(8.0, rel=0.05)
     assert items["alpha_2"].guess == pytest.approx(-2.0, abs=0.8)
     assert items["beta_1"].guess == pytest.approx(0.1, abs=0.03)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(4))
+def test_intervals_of_two_terms_of_a_foam_contain_the_truth(seed):
+    tests = measured("hyperfoam-2", FOAM, FOAM_TESTS, 100.0, seed)
+    answer = cs.run(without_guess("hyperfoam-2", tests))
+    assert answer.trust.verdict == "good"
+    for name, truth in FOAM.items():
+        low, high = answer.interval(name)
+        assert low < truth < high
+        assert high - low < max(abs(truth), 1.0)
 
 
 def test_different_ratios_of_compressibility_are_found_where_tests_determine_them():

@@ -15,6 +15,7 @@ from collocation_sysid.common.time_limit import (
     unlimited,
 )
 from collocation_sysid.methods.solution import Status
+from collocation_sysid.runs import solving
 
 SOON = cs.ReducedSpace(max_time_s=1e-9)
 
@@ -49,7 +50,11 @@ def test_a_run_states_what_the_limit_left_out(monkeypatch):
     assert "no error bars" in reason
 
 
-def test_a_run_without_a_start_names_elements_that_are_not_made_for_incompressible_bodies():
+@pytest.mark.parametrize("method", [SOON, cs.ReducedSpace()])
+def test_a_run_without_a_start_names_elements_that_are_not_made_for_incompressible_bodies(
+    method, monkeypatch
+):
+    monkeypatch.setattr(solving, "START_S", -1.0)
     body = cs.Body(
         cs.box_mesh((0.02, 0.02, 0.04), (1, 1, 1)), density_kg_m3=1000.0, element="tet10"
     )
@@ -59,5 +64,5 @@ def test_a_run_without_a_start_names_elements_that_are_not_made_for_incompressib
     experiment = cs.Experiment(body, t_s, [grasp], markers, nuisance=cs.Nuisance.none())
     values = {"poisson": 0.4999, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
     with pytest.raises(cs.InputError, match="tet10-p0") as refused:
-        cs.solve(cs.Problem([experiment], values | {"young_pa": cs.Unknown()}), SOON)
+        cs.solve(cs.Problem([experiment], values | {"young_pa": cs.Unknown()}), method)
     assert "max_time_s" in str(refused.value)
