@@ -11,9 +11,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -95,7 +98,7 @@ def surface() -> tuple[Array, Array, Array]:
 
 def motion(points_m: Array) -> CubicSpline:
     """Return the positions (V, 3) of points of the undeformed bar as a function of time [s]."""
-    t_s = np.arange(round((END_S - BEGIN_S) / STEP_S) + 1) * STEP_S + BEGIN_S
+    t_s = STEP_S * np.arange(round((END_S - BEGIN_S) / STEP_S) + 1.0) + BEGIN_S
     fine = mesh(FINE)
     body = cs.Body(fine, density_kg_m3=DENSITY_KG_M3, element="tet10")
     held = cs.Grasp(np.flatnonzero(body.nodes_m[:, 2] > TOP_M), poses(t_s))
@@ -152,15 +155,15 @@ def numbers(values: Array) -> str:
     return " ".join(f"{each:.8g}" for each in np.ravel(values))
 
 
-def render(shape: CubicSpline, pose: Array, t_s: Array, seed: int) -> Iterator[Array]:
+def render(shape: CubicSpline, pose: Array, t_s: Array, seed: int) -> Iterator[NDArray[np.uint8]]:
     """Yield images (rows, columns, 3) of the bar at times (S,) [s], blue first, from a pose (4, 4).
 
     `shape` returns the points of `surface` at a time.
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
     import cv2
-    import mujoco
 
+    mujoco: Any = import_module("mujoco")
     rng = np.random.default_rng(seed)
     points, triangles, places = surface()
     _, texture = cv2.imencode(".png", speckles(rng))
@@ -207,7 +210,7 @@ def render(shape: CubicSpline, pose: Array, t_s: Array, seed: int) -> Iterator[A
             yield np.clip(image, 0, 255).astype(np.uint8)
 
 
-def mask_of(shape: CubicSpline, pose: Array, t_s: float) -> Array:
+def mask_of(shape: CubicSpline, pose: Array, t_s: float) -> NDArray[np.uint8]:
     """Return an image that is white where the bar is at a time, without its edge."""
     import cv2
 
@@ -215,7 +218,8 @@ def mask_of(shape: CubicSpline, pose: Array, t_s: float) -> Array:
     pixels = own[:, :2] / own[:, 2:] * FOCAL_PX + CENTRE_PX
     mask = np.zeros(IMAGE_PX[::-1], dtype=np.uint8)
     cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels).astype(np.int32)), 255)
-    return cv2.erode(mask, np.ones((EDGE_PX, EDGE_PX), dtype=np.uint8))
+    eroded = cv2.erode(mask, np.ones((EDGE_PX, EDGE_PX), dtype=np.uint8))
+    return np.asarray(eroded, dtype=np.uint8)
 
 
 def film(
@@ -233,7 +237,7 @@ def film(
     described = Described.drawn(pose, np.random.default_rng(seed))
     rate_hz = 1 / float(t_s[1] - t_s[0])
     video = cv2.VideoWriter(
-        str(folder / f"{name}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), rate_hz, IMAGE_PX
+        str(folder / f"{name}.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, IMAGE_PX
     )
     for image in render(shape, pose, t_s + described.late_s, seed):
         video.write(image)

@@ -90,7 +90,8 @@ def read_regression(path: Path) -> Regression:
         data[:, 1:],
         y,
         table[:, :2].T,
-        *table[:, 2:].T,
+        table[:, 2],
+        table[:, 3],
         float(squares),
     )
 

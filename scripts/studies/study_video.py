@@ -36,7 +36,7 @@ def film_problem(folder: Path, shape: CubicSpline, rate_hz: float, cameras: int,
     table, after = table.split("[transcription]")
     tables = []
     t_s = np.arange(round(DURATION_S * rate_hz)) / rate_hz
-    write_poses_csv(folder / "poses.csv", rendered_video.poses(np.arange(-3, 156) * 0.01))
+    write_poses_csv(folder / "poses.csv", rendered_video.poses(0.01 * np.arange(-3.0, 156.0)))
     for name in NAMES[:cameras]:
         described = rendered_video.film(folder, name, shape, t_s, seed, VIDEO_POINTS)
         own = table.replace("front", name)
