@@ -30,7 +30,7 @@ from ..extras.studies import (
 )
 from ..extras.studies.model_variants import models, parse_branches, parse_dampings, parse_materials
 from ..extras.studies.study_arguments import parse_methods, parse_varied_keys, read_truth
-from ..extras.studies.study_kinds import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
+from ..extras.studies.study_planning import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
 from ..extras.studies.study_rows import SuccessCriterion
 from ..fem.kernels import available_threads
 from ..problem import Problem

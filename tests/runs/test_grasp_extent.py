@@ -17,8 +17,8 @@ from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.grasp_extent import grasp_extent_concerns, grasp_extent_notes
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 
-# A cube of 100 mm with layers of nodes every 20 mm.
-CUBE = Body(box_mesh((0.1, 0.1, 0.1), (5, 5, 5)), density_kg_m3=30.0)
+# A cube of 100 mm with layers of nodes every 20 mm along z.
+CUBE = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 5)), density_kg_m3=30.0)
 
 
 def held_above(height_m: float, axes: str = "xyz", support: str = "") -> Problem:

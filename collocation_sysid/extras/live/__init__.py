@@ -7,11 +7,12 @@ Use `LiveEstimator`: `LiveEstimator.update` takes one frame and returns estimate
 - `frames`: frames as Python values, JSON lines or rows of a table; `sources`: streams of frames.
 - `frame_buffer`: buffer that turns frames into time steps with interpolated poses; `initial_rest`:
   the end of a rest before the motion.
-- `live_model`: the model of a problem's recording; `window_pass`: the window of recent time steps,
-  with its information and prior. Time marching with sensitivities is `program.streaming`.
+- `live_model`: the model of a problem's recording, and the batch solution at the end;
+  `window_pass`: the window of recent time steps, with its information and prior. Time marching with
+  sensitivities is `program.streaming`.
 - `time_budget`: computing time per frame; `stiffness_search`: initial values without a guess.
-- `live_trust`: verdict of a live estimate; `batch_solution`: batch solution at the end;
-  `live_display`: terminal and film; `live_recording`: file for the Rerun viewer.
+- `live_trust`: verdict of a live estimate; `live_display`: terminal and film; `live_recording`: file
+  for the Rerun viewer.
 """
 
 from .estimator import LiveEstimator, LiveOptions, LiveUpdate

@@ -34,7 +34,6 @@ from ...statistics.assessment import GROSS_MISFIT, Assessment
 from ...statistics.concerns import concern_if
 from ...statistics.estimates import Estimate, user_estimates
 from ...statistics.linearised import AT_BOUND
-from .batch_solution import recording_from_log, solve_recording
 from .frame_buffer import LARGEST_GAP, BufferedFrame, FrameBuffer
 from .frames import (
     Frame,
@@ -46,7 +45,7 @@ from .frames import (
     parse_wrenches,
 )
 from .initial_rest import InitialRest
-from .live_model import model_from_problem
+from .live_model import model_from_problem, recording_from_log, solve_recording
 from .live_trust import (
     LARGEST_SETTLED_DISTANCE,
     ResidualScatter,

@@ -1,6 +1,6 @@
 """Studies of many runs, and comparison of models.
 
-Studies: `study_kinds` names their kinds, `study_arguments` parses command-line arguments,
+Studies: `study_arguments` parses command-line arguments,
 `study_planning` plans the runs, `run_execution` executes them (each in its own process, see
 `run_worker`) and stores their records, `study_rows` converts records to rows of numbers, and
 `study_page` and `study_plots` present them. `study_progress` shows progress in the terminal, also

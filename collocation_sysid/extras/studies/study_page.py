@@ -17,8 +17,7 @@ from ...fem.laws.constants import symbol_of, symbol_with_unit, unit_of
 from .law_disagreements import is_comparable, law_table
 from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
 from .run_execution import Record, RunStore
-from .study_kinds import METHOD_STUDY, MODEL_STUDY
-from .study_planning import PlannedRun, shortened_keys
+from .study_planning import METHOD_STUDY, MODEL_STUDY, PlannedRun, shortened_keys
 from .study_plots import comparison_plots, model_plots, sweep_plots
 from .study_rows import (
     COLUMNS,

@@ -29,6 +29,15 @@ from ...recording.formats.logs import stored_files
 from .model_variants import ModelVariant
 from .study_arguments import require_few
 
+# Kinds of studies: the names of their commands, which are in summary.json and in folder names.
+METHOD_STUDY = "compare-methods"
+MODEL_STUDY = "compare-models"
+SWEEP_STUDY = "sweep"
+STUDY_TITLES = {
+    METHOD_STUDY: "Comparison of methods",
+    MODEL_STUDY: "Comparison of models",
+    SWEEP_STUDY: "Sweep",
+}
 # Hexadecimal digits of a run's key: 80 bits, so that two of 10,000 runs never agree.
 KEY_LENGTH = 20
 
