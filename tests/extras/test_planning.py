@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from kit.problem_files import run_command, write_problem
-from scipy.linalg import expm
+from scipy.linalg import eigh, expm
+from scipy.signal import lsim
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
@@ -233,6 +234,54 @@ def test_a_mass_on_a_spring_moves_with_the_least_jerk_of_the_closed_form():
         np.array([way_m, 0, 0, way_m, 0]) @ adjoint, rel=0.02
     )
     assert plan.residual_vibration_m < 1e-3 * way_m
+
+
+def test_a_linear_beam_is_moved_as_by_inversion_of_its_modes():
+    """Small motions without weight: modes of the stiffness from differences of forces, whose
+    responses to the hand are integrated exactly.
+    """
+    (hung,) = hung_bar().experiments
+    weightless = replace(hung, gravity_m_s2=np.zeros(3))
+    unknown = {name: cs.Unknown(value) for name, value in TRUTH.items()}
+    wanted = task(duration_s=0.4, sample_s=0.01, end={"window_s": 0.1}, reference=[
+        {"point": "tip", "t_s": [0.0, 0.15, 0.25, 0.4, 0.5], "relative": True, "sigma_m": 1e-5,
+         "position_m": [(x, np.nan, np.nan) for x in (0, 3e-4, 7e-4, 1e-3, 1e-3)]}
+    ], hand={"free": ["x"], "intervals": 16, "jerk_weight": 1e-6})  # fmt: skip
+    problem = cs.Problem([weightless], unknown, substeps=4)
+    planned = PlannedProgram.from_task(PlannedBody.read(problem), wanted, LIMITS)
+    answer = solve_reduced(planned, tolerances=TIGHT)
+
+    body, free = weightless.body, planned.driven.transcription.free_dofs
+    rest, h = body.nodes_m.ravel(), 1e-6
+    ends = [rest + sign * h * np.eye(len(rest))[free] for sign in (1, -1)]
+    pushes = [body.force(each, np.zeros_like(each), planned.driven.theta) for each in ends]
+    stiffness = -((pushes[0] - pushes[1]) / (2 * h))[:, free]
+    mass = np.repeat(body.node_mass, 3)[free]
+    squares, modes = eigh((stiffness + stiffness.T) / 2, np.diag(mass))
+    along_x = np.arange(len(rest)) % 3 == 0
+    count = len(squares)
+    system = np.zeros((2 * count, 2 * count))
+    system[:count, count:] = np.eye(count)
+    system[count:, :count] = -np.diag(squares)
+    system[count:, count:] = -np.diag(TRUTH["gamma_r_s"] * squares + TRUTH["gamma_m_1_s"])
+    driven = np.concatenate([np.zeros(count), -modes.T @ (mass * along_x[free])])
+    t_s = np.linspace(0.0, planned.grid_since_s[-1], 2 * len(planned.grid_since_s) - 1)
+    place, rate, growth = (planned.space.affine(t_s, order)[0][:, 0] for order in range(3))
+    matrices = (system, driven[:, None], np.eye(2 * count), np.zeros((2 * count, 1)))
+    response = np.zeros((len(planned.grid_since_s), len(rest), planned.space.size))
+    response[:, along_x] = place[::2, None]
+    for k in range(planned.space.size):
+        _, states, _ = lsim(matrices, growth[:, k] + TRUTH["gamma_m_1_s"] * rate[:, k], t_s)
+        response[:, free, k] += states[::2, :count] @ modes.T
+    matrix, target = planned.residuals
+    by_jerk, jerk = planned.effort
+    rows = np.vstack([matrix @ response.reshape(-1, planned.space.size), by_jerk])
+    still = np.tile(rest, len(response))
+    c = np.linalg.lstsq(rows, -np.concatenate([matrix @ still - target, jerk]), rcond=None)[0]
+    way = planned.coordinates(c, t_s)[:, 0]
+    assert np.abs(way).max() > 5e-4
+    error = np.abs(planned.coordinates(answer.c, t_s)[:, 0] - way).max()
+    assert error < 5e-3 * np.ptp(way)
 
 
 def test_a_plan_is_a_stationary_point_of_the_simulated_objective():
