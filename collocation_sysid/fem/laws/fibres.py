@@ -21,10 +21,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...common.array_types import Array, Index
 from ...common.checked_arrays import float_array
@@ -45,7 +46,7 @@ ISOTROPIC = 1e-9
 Direction = Annotated[Text | Vector, ByForm(str)]
 
 
-def _directions(value: Any) -> str | Array:
+def _directions(value: str | ArrayLike) -> str | Array:
     """Return a name, or vectors (3,) or (E, 3)."""
     return value if isinstance(value, str) else float_array(value, "direction", ((3,), (None, 3)))
 
