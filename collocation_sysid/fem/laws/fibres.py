@@ -43,6 +43,8 @@ from .materials import Material
 ENGAGED = 1e-3
 # Largest relative change of the energy of an isotropic material by rounding if F becomes F R.
 ISOTROPIC = 1e-9
+# A normal with a smaller share across the direction is parallel to it.
+PARALLEL = 1e-6
 Direction = Annotated[Text | Vector, ByForm(str)]
 
 
@@ -164,10 +166,9 @@ class Fibres:
             normal = np.eye(3)[np.abs(first).argmin(axis=1)] if third is None else third
             names = ("direction", "normal")
         x = _normalised(first, names[0], cells)
-        z = normal - np.sum(normal * x, axis=1, keepdims=True) * x
-        size = np.linalg.norm(normal, axis=1, keepdims=True)
-        z = _normalised(np.where(np.linalg.norm(z, axis=1, keepdims=True) > 1e-6 * size, z, 0.0),
-                        names[1], cells)  # fmt: skip
+        across = normal - np.sum(normal * x, axis=1, keepdims=True) * x
+        sizes = [np.linalg.norm(each, axis=1, keepdims=True) for each in (across, normal)]
+        z = _normalised(np.where(sizes[0] > PARALLEL * sizes[1], across, 0.0), names[1], cells)
         return np.stack([x, np.cross(z, x), z], axis=2)
 
 
@@ -336,8 +337,8 @@ def _require_isotropic(matrix: Material) -> None:
 
 def _plausible(constants: Iterable[Constant]) -> list[float]:
     """Return admissible values of constants."""
-    return [
-        float(np.clip(1.0 if c.usual is None else c.usual, *c.bounds)) if c.scale == "linear"
-        else float(c.usual or np.sqrt(c.bounds[0] * c.bounds[1]))
-        for c in constants
-    ]  # fmt: skip
+    values = []
+    for c in constants:
+        usual = 1.0 if c.scale == "linear" else float(np.sqrt(c.bounds[0] * c.bounds[1]))
+        values.append(float(np.clip(usual if c.usual is None else c.usual, *c.bounds)))
+    return values
