@@ -329,6 +329,13 @@ def pressed(heights_m: list[float]) -> Experiment:
     return Experiment(body, t_s, grasps, markers, **still)
 
 
+def test_without_motion_memory_is_advised_and_no_law_of_damping():
+    still = [pressed([0.0, -0.001])]
+    (concern,) = probe_concerns([probe(1.0)], {"young_pa": 1.0}, still)
+    assert "compare-models --prony 0,1" in concern.message
+    assert "--damping" not in concern.message
+
+
 @pytest.mark.parametrize(
     ("heights_m", "drifts"),
     [
