@@ -380,7 +380,7 @@ def test_only_faces_towards_the_viewer_are_drawn_the_nearest_last():
     assert (mesh.points_m[mesh.surface[chosen], 2] == 1.0).all()  # of the top
     assert ((brightness > 0.5) & (brightness <= 1.0)).all()
     oblique = ParallelCamera.from_direction((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))
-    assert len(oblique.visible_faces(mesh.points_m, mesh.surface).polygons) == 6
+    assert len(oblique.visible_faces(mesh.points_m, mesh.surface)[0]) == 6
 
 
 def test_lines_behind_the_body_are_hidden():
@@ -683,7 +683,7 @@ def test_grasped_nodes_on_the_sides_are_marked():
     drawn = BodyDrawing(axes, view, seen.surface, nodes=seen.surface_nodes)
     drawn.update(body.nodes_m, np.ones(len(body.nodes_m), bool), np.empty((0, 3)))
     marked = len(drawn.grasped.get_xdata())
-    faces = camera.visible_faces(body.nodes_m, seen.surface).indices
+    *_, faces = camera.visible_faces(body.nodes_m, seen.surface)
     assert marked == len(np.unique(seen.surface_nodes[faces])) > len(np.unique(seen.surface[faces]))
 
 
