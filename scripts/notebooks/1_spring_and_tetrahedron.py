@@ -14,7 +14,7 @@
 # %% [markdown]
 # # 1 · Spring and tetrahedron
 #
-# Tutorial on direct collocation, part 1 of 3. Next part: [2 · Cylinder](2_cylinder.ipynb)
+# Tutorial on direct collocation, part 1 of 4. Next part: [2 · Cylinder](2_cylinder.ipynb)
 #
 # The tutorial explains how the stiffness and the damping of a soft body are estimated from its
 # recorded motion. Part 1 derives the method for a spring and for one tetrahedron, with CasADi and

@@ -14,7 +14,7 @@
 # %% [markdown]
 # # 2 · Cylinder
 #
-# Tutorial on direct collocation, part 2 of 3. Previous part:
+# Tutorial on direct collocation, part 2 of 4. Previous part:
 # [1 · Spring and tetrahedron](1_spring_and_tetrahedron.ipynb). Next part:
 # [3 · Trust](3_trust.ipynb)
 #

@@ -14,7 +14,7 @@
 # %% [markdown]
 # # 3 · Trust
 #
-# Tutorial on direct collocation, part 3 of 3. Previous part: [2 · Cylinder](2_cylinder.ipynb)
+# Tutorial on direct collocation, part 3 of 4. Previous part: [2 · Cylinder](2_cylinder.ipynb)
 #
 # This part examines the uncertainty of the parameters that part 2 estimated from the recording of a
 # swinging foam cylinder.

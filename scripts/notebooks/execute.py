@@ -16,7 +16,7 @@ import nbformat
 from nbclient import NotebookClient
 
 HERE = Path(__file__).parent
-NAMES = ("1_spring_and_tetrahedron", "2_cylinder", "3_trust")
+NAMES = ("1_spring_and_tetrahedron", "2_cylinder", "3_trust", "4_plan")
 CELL_TIMEOUT_S = 600  # on slow machines the first run also compiles kernels
 
 

@@ -20,6 +20,7 @@ NAMES = {
     "1_spring_and_tetrahedron": "1 · Spring and tetrahedron",
     "2_cylinder": "2 · Cylinder",
     "3_trust": "3 · Trust",
+    "4_plan": "4 · Plan",
 }
 PAGES = ("README.md", f"{NOTEBOOKS}/README.md")
 BEGIN = "<!-- badges of scripts/tools/badges.py -->"
