@@ -170,7 +170,7 @@ def test_a_curve_of_another_kind_of_test_is_never_good(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("tau_s", "young_pa"), [(0.6, 4e4), (5.0, 3e5)])
-def test_a_liquid_is_named_and_has_an_instantaneous_modulus(tmp_path, tau_s, young_pa):
+def test_a_liquid_has_an_instantaneous_modulus_and_no_other(tmp_path, tau_s, young_pa):
     times_s = np.linspace(0.0, 8 * tau_s, 70)
     ramp_s = 0.1 * tau_s
     strain = np.minimum(times_s / ramp_s, 1) * 0.02
@@ -187,8 +187,11 @@ def test_a_liquid_is_named_and_has_an_instantaneous_modulus(tmp_path, tau_s, you
         ("hold", "uniaxial", columns, [f"sigma_pa = {sigma_pa}"]),
         top='[[object.prony]]\nname = "b"\n',
     )
-    assert codes(run)[0] == "information/liquid"
+    # Noise may leave a long-term modulus of some Pa, which then has no interval of its own.
+    is_named = codes(run)[:1] == ["information/liquid"]
+    assert is_named or run.estimates["young_pa"].statistical_std_error is None
     assert_within(run, "instantaneous_young_pa", young_pa)
+    assert run.parameters["b.tau_s"] == pytest.approx(tau_s, rel=0.03)
 
 
 @pytest.mark.long

@@ -21,7 +21,7 @@ from ...recording.measured_wrench import Wrench
 from ...recording.measurement import Measurement
 from ..axes import with_other_axes
 from ..linearised import LinearisedFit, linearise_fit
-from ..thresholds import BETTER
+from ..thresholds import BETTER, LEAST_DECREASE
 from .misspecification_hypothesis import Hypothesis
 from .model_misspecifications import linear_step, projected_gram
 
@@ -155,24 +155,25 @@ def _linear_mistakes(
     units = np.diag(1 / sensor.value_sigmas)
     columns = [np.broadcast_to(units[k], measured.shape) for k in used]
     zeros = np.zeros(measured.shape[1])
-    zeros[used] = _amplitudes(fit, columns, own)
+    decrease, zeros[used] = _linear_step(fit, columns, own)
     whole = np.nanmean((origin.measured_values - measured)[:, used] + zeros[used], axis=0)
     shown = ", ".join(f"{each:.3g}" for each in whole)
     data = {"offset": f"{shown} {sensor.unit}".rstrip()}
-    yield Hypothesis("sensor-zero", data=data, corrected=(measured - zeros, t_s))
+    if decrease > LEAST_DECREASE:
+        yield Hypothesis("sensor-zero", data=data, corrected=(measured - zeros, t_s))
     if fit.blocks[own].is_static or len(t_s) < 3:
         return
     rates = np.nan_to_num(np.gradient(predicted, t_s, axis=0))
-    (more_s,) = _amplitudes(fit, [rates / sensor.value_sigmas], own)
+    decrease, (more_s,) = _linear_step(fit, [rates / sensor.value_sigmas], own)
     lag_s = float(np.mean(t_s - origin.sample_times_s) + more_s)
-    if 0 < abs(lag_s) < LATEST * float(np.ptp(t_s)):
+    if decrease > LEAST_DECREASE and 0 < abs(lag_s) < LATEST * float(np.ptp(t_s)):
         named = {"by_ms": 1e3 * abs(lag_s), "when": "later" if lag_s > 0 else "earlier"}
         yield Hypothesis("sensor-clock", data=named, corrected=(measured, t_s + more_s))
 
 
-def _amplitudes(fit: LinearisedFit, columns: Sequence[Array], own: int) -> Array:
-    """Return the amplitudes of changes (S, m) of the residuals of one block (index) that explain
-    the residuals of a fit best.
+def _linear_step(fit: LinearisedFit, columns: Sequence[Array], own: int) -> tuple[float, Array]:
+    """Return the decrease of χ², and the amplitudes, of changes (S, m) of the residuals of one block
+    (index) that explain the residuals of a fit best.
     """
     blocks = [np.zeros((*each.residual.shape, len(columns))) for each in fit.blocks]
     samples, groups, each = fit.blocks[own].residual.shape
@@ -180,4 +181,4 @@ def _amplitudes(fit: LinearisedFit, columns: Sequence[Array], own: int) -> Array
     for k, column in enumerate(columns):
         changes[:, : column.shape[1], k] = column
     blocks[own] = changes.reshape(blocks[own].shape)
-    return linear_step(projected_gram(fit, blocks), range(1, 1 + len(columns)))[1]
+    return linear_step(projected_gram(fit, blocks), range(1, 1 + len(columns)))
