@@ -336,7 +336,7 @@ class Solution:
             for entry, full, value in zip(nuisance.entries, nuisance.names, values, strict=True):
                 known.append(full)
                 names = {full, entry.label, entry.label.rpartition(" [")[0], entry.row.name}
-                if entry.row == GAUGE:
+                if entry.row.name == GAUGE.name:
                     sensor = readings[entry.number]
                     own = {sensor.unknown_label(each): each for each in sensor.unknowns}
                     names.add(own[entry.label])
