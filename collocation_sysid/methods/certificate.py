@@ -13,7 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.sparse import csgraph
 
 from ..common.array_types import Array
 from ..program.collocation import BOUND_TOLERANCE, Collocation, convert_variables
@@ -22,6 +24,8 @@ from .starts.initial_point import adjoint_multipliers
 
 # Eigenvalues of the reduced Hessian below this share of the largest are rounding.
 SMALLEST_CURVATURE = 1e-12
+# Unknowns of time steps that are factorised together.
+LARGEST_BLOCK = 1000
 
 
 @dataclass(frozen=True)
@@ -99,12 +103,12 @@ def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certifica
     distance = np.minimum(variables - lower, upper - variables)
     is_free = is_parameter & (distance > BOUND_TOLERANCE)
     try:
-        factor = spla.splu(by_position.tocsc())
+        solution = _solve_in_steps(by_position, jacobian[:, np.flatnonzero(is_free)].toarray())
     except RuntimeError:  # singular
         return None
     basis = np.zeros((len(variables), int(is_free.sum())))
     basis[np.flatnonzero(is_free), np.arange(basis.shape[1])] = 1.0
-    basis[is_position] = -factor.solve(jacobian[:, np.flatnonzero(is_free)].toarray())
+    basis[is_position] = -solution
     hessian = program.hessian(variables, 1.0, multipliers=adjoint[0])
     reduced = basis.T @ (hessian @ basis)
     curvatures = np.asarray(np.linalg.eigvalsh((reduced + reduced.T) / 2), dtype=float)
@@ -120,3 +124,25 @@ def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certifica
         float(complementarity.max(initial=0.0)),
         curvatures,
     )
+
+
+def _solve_in_steps(matrix: sp.csc_array, right: Array) -> Array:
+    """Solve a sparse system of the equations of motion, a few blocks of its block triangular form, which
+    are the time steps, at a time.
+    """
+    match = csgraph.maximum_bipartite_matching(matrix.tocsr(), perm_type="row")
+    if (match < 0).any():
+        raise RuntimeError("the matrix is structurally singular")
+    by_row = matrix.tocsr()[match]
+    count, step = csgraph.connected_components(by_row, connection="strong")
+    rows, columns = by_row.nonzero()
+    if (step[rows] < step[columns]).any():
+        step = count - 1 - step  # the steps on which others depend come first
+    group = (np.cumsum(np.bincount(step)) // LARGEST_BLOCK)[step]
+    order = np.argsort(group, kind="stable")
+    solution = np.zeros_like(right)
+    for block in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        equations = by_row[block]
+        rest = right[match[block]] - equations @ solution
+        solution[block] = spla.splu(equations[:, block].tocsc()).solve(rest)
+    return solution

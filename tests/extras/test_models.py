@@ -583,18 +583,25 @@ def test_a_constant_at_its_bound_is_marked_and_named(tmp_path):
     assert "bound" not in advice(rows_of(inside, other))
 
 
-@pytest.mark.parametrize(("c01_pa", "at_bound"), [(-2e4, {"c01_pa": "lower"}), (2e4, {})])
-def test_a_fit_records_which_constants_end_at_bounds(tmp_path, c01_pa, at_bound):
+@pytest.mark.parametrize(
+    ("c01_pa", "stated", "at_bound"),
+    [
+        (-2e4, "{ lower = 1.0 }", {"c01_pa": "lower"}),
+        (-2e4, "{}", {}),  # the default bound is no physical limit
+        (2e4, "{}", {}),
+    ],
+)
+def test_a_fit_records_which_constants_end_at_bounds(tmp_path, c01_pa, stated, at_bound):
     stretch = np.linspace(1.05, 2.0, 12)
     stress_pa = 2 * (stretch - stretch**-2) * (8e4 + c01_pa / stretch)
     rows = [f"{a},{b}" for a, b in zip(stretch, stress_pa, strict=True)]
     (tmp_path / "pull.csv").write_text("\n".join(["stretch,stress (Pa)", *rows]) + "\n")
     (tmp_path / "problem.toml").write_text(
-        """[object]
+        f"""[object]
 material = "mooney-rivlin"
 [parameters]
-c10_pa = {}
-c01_pa = {}
+c10_pa = {{}}
+c01_pa = {stated}
 kappa_pa = 1e9
 [[experiment]]
 name = "pull"
