@@ -140,6 +140,7 @@ limits = cs.Limits.model_validate(
 )
 plan = cs.plan_motion(run, task, limits)
 error = plan.tracking_error(plan.program.references[0])
+assert error.band_m
 print(f"predicted error of the tip: {1e3 * error.rms_m:.2f} mm RMS, {1e3 * error.largest_m:.2f} mm")
 print(f"95 % band: ± {1e3 * error.band_m:.2f} mm; limits reached: {plan.list_active_limits()}")
 
@@ -199,6 +200,8 @@ for name in ("young_pa", "gamma_r_s"):
         f"{after.value:.4g} ± {after.statistical_std_error:.2g}"
     )
 old, new = (each.estimates["young_pa"].statistical_std_error for each in (run, again))
+assert old is not None
+assert new is not None
 assert new < old
 
 # %% [markdown]

@@ -16,10 +16,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 from studies import markdown, number, save
 
@@ -29,6 +29,8 @@ from collocation_sysid.errors import SimulationError
 from collocation_sysid.extras.design.hand_limits import Limits
 from collocation_sysid.extras.planning import MotionPlan, Task, plan_motion
 from collocation_sysid.methods.comparison.penalty import Penalty
+
+mujoco: Any = import_module("mujoco")
 
 HEIGHT_M, RADIUS_M, MASS_KG = 0.12, 0.02, 0.06
 PLANT = {"young_pa": 20e3, "poisson": 0.3, "gamma_r_s": 4e-3}
@@ -136,7 +138,7 @@ class Plant:
         self.data.qpos[:], self.data.qvel[:] = self.state
         count = round(time_s / SAMPLE_S)
         each = round(SAMPLE_S / STEP_S)
-        fine_s = STEP_S * np.arange(count * each + 2)
+        fine_s = STEP_S * np.arange(count * each + 2.0)
         places = motion(fine_s)[:, [0, 1, 2, 4]]
         speeds = np.gradient(places, STEP_S, axis=0)
         accelerations = np.gradient(speeds, STEP_S, axis=0)
@@ -151,7 +153,7 @@ class Plant:
             for k in range(sample * each, (sample + 1) * each):
                 self._step(places[k], speeds[k], accelerations[k])
         self.lag_m = float(np.abs(self.data.qpos[:4] - places[count * each]).max())
-        return SAMPLE_S * np.arange(count + 1), np.array(positions), poses
+        return SAMPLE_S * np.arange(count + 1.0), np.array(positions), poses
 
 
 def _description(mesh: cs.TetMesh, held: Any) -> str:

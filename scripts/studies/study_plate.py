@@ -20,11 +20,13 @@ from pathlib import Path
 import casadi as ca
 import meshio
 import numpy as np
+from numpy.typing import NDArray
 from studies import markdown
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.recording.grasp import Axes
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 # Hole of this radius about (1, 1) in a unit plate; its thickness is that of one layer.
@@ -79,20 +81,20 @@ def plate_experiment(
     points = mesh.points_m
     shift = -0.3 * t_s / (STEPS - 1)
 
-    def held(inside: Array, axis: int, moved: Array | float = 0.0) -> cs.Grasp:
+    def held(inside: NDArray[np.bool_], axes: Axes, moved: Array | float = 0.0) -> cs.Grasp:
         positions = np.zeros((STEPS, 3))
-        positions[:, axis] = moved
+        positions[:, "xyz".index(axes)] = moved
         still = np.tile([0.0, 0.0, 0.0, 1.0], (STEPS, 1))
         poses = cs.PoseSequence(t_s, positions, still)
-        return cs.Grasp(np.flatnonzero(inside), poses, axes="xyz"[axis])
+        return cs.Grasp(np.flatnonzero(inside), poses, axes=axes)
 
     close = 1e-6
     grasps = [
-        held(points[:, 0] < close, 0, 0.5 * shift),
-        held(points[:, 1] < close, 1, shift),
-        held(points[:, 0] > 1 - close, 0),
-        held(points[:, 1] > 1 - close, 1),
-        held(points[:, 2] > -1, 2),
+        held(points[:, 0] < close, "x", 0.5 * shift),
+        held(points[:, 1] < close, "y", shift),
+        held(points[:, 0] > 1 - close, "x"),
+        held(points[:, 1] > 1 - close, "y"),
+        held(points[:, 2] > -1, "z"),
     ]
     radius = np.hypot(points[:, 0] - 1, points[:, 1] - 1)
     arc = points[(np.abs(radius - RADIUS) < close) & (points[:, 2] < close)]

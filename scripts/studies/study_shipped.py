@@ -58,7 +58,7 @@ def solved(python: Path, file: Path, limit_s: float) -> list[str]:
     """Return the cells of one solve with the version that `python` imports: verdict, estimates, and
     processor time.
     """
-    limits = 2 * (int(limit_s),)
+    limits = int(limit_s), int(limit_s)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryDirectory() as folder:
         words = ["solve", file, "--no-pictures", "-q", "--allow-code", "--out", f"{folder}/run"]
