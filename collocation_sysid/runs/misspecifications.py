@@ -34,7 +34,8 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
         The fit.
     budget : int, optional
         Largest number of sweeps over the first samples for all refits together; by default five
-        times the work of the fit, at most 200.
+        times the work of the fit, at most 200, and those of the mirror images of a body that the
+        fit turned or shifted far, at most 40 for each.
 
     Returns
     -------

@@ -179,6 +179,7 @@ def test_far_from_the_stated_pose_materials_are_tested_whatever_a_linear_step_sa
     ],
 )
 def test_hidden_errors_of_a_bent_bar_are_named(error: str, cause: str):
+    """Refits of mirror images had left no sweeps for those of the law and of a hanging scan."""
     near = {name: Unknown(1.3 * value) for name, value in TRUTH.items()}
     problem = replace(twin(error, 0, near), substeps=2)
     assert find_misspecifications(solve(problem))[0].cause == cause

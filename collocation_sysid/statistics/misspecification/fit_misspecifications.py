@@ -100,7 +100,8 @@ def motion_misspecifications(
         nearly certain (`CERTAIN`).
     budget : int, optional
         Largest number of sweeps over the first samples for all refits together; by default five
-        times the work of the fit, at most 200.
+        times the work of the fit, at most 200, and those of the mirror images of a body that the
+        fit turned or shifted far, at most 40 for each.
     """
     fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
     hypotheses = [each for experiment in fitted for each in same_tracks(experiment)]
@@ -207,8 +208,10 @@ def _refit_hypotheses(
     lags = [] if first.is_static else _clock_hypotheses(alone, first, stated=stated, of=of)
     comparison = ModalComparison.from_experiment(first, solution.parameters)
     turned = [] if comparison is None else _gravity_hypotheses(first, comparison)
-    mirrored = mirror_images(first) if discrepancy > MIRRORED else ()
+    mirrored = [*mirror_images(first)] if discrepancy > MIRRORED else []
     is_far = max(map(_pose_deviation, solution.parts)) > FAR
+    if is_far and budget is None:  # mirror images come first, and leave the others their sweeps
+        alone.sweeps += alone.each * len(mirrored)
     bodies = [*screened_bodies(solution, first, is_far=is_far)]
     alone.near_answer.update(each.corrected for each in bodies)
     # The first samples may end before the unloading: the complete fit is what must improve.
