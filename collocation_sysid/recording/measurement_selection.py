@@ -46,7 +46,9 @@ def shortened_experiment(
     """
     fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
     for sensor in experiment.separate_sensors:
-        needed_s = sensor.needed_until_s(fewest) - TIME_TOLERANCE_S
+        times_s = sensor.sample_times_s
+        inside_s = times_s[times_s >= experiment.t_s[0] - TIME_TOLERANCE_S][:fewest]
+        needed_s = max(sensor.needed_until_s(fewest), inside_s[-1]) - TIME_TOLERANCE_S
         count = max(count, int(np.searchsorted(experiment.t_s, needed_s)) + 1)
     t_s = experiment.t_s[:count]
 

@@ -10,6 +10,7 @@ from kit.problems import hung_cube
 from kit.wrenches import sensing
 
 from collocation_sysid.recording import Gauge, Wrench
+from collocation_sysid.recording.measurement_selection import shortened_experiment
 
 
 def forces() -> Wrench:
@@ -50,3 +51,14 @@ def test_every_measurement_can_be_replaced_or_left_out():
     np.testing.assert_array_equal(moved.measurements[0].measured_values, shifted.values)
     with pytest.raises(ValueError, match="argument"):
         cube.with_measurements([markers])
+
+
+def test_a_shortened_recording_keeps_three_samples_of_a_slow_sensor():
+    """The picture of the first steps of a recording with a slower camera had ended in an error."""
+    cube = hung_cube(20)
+    slow_s = cube.t_s[1::6]
+    string = Gauge(
+        "string", lambda at: at.position_m[0, 0], slow_s, 0 * slow_s, 1e-3, [[0, 0, 0]], unit="m"
+    )
+    short = shortened_experiment(replace(cube, readings=[string]), 4, shortens_sensors=True)
+    assert short.t_s[-1] == pytest.approx(slow_s[2])
