@@ -134,6 +134,8 @@ TOPICS: dict[str, Topic] = {
             "{remedy}",
             "mesh-mirrored": "the mesh is a mirror image of the body, along its {axis} axis: compare "
             "it with the real body",
+            "mesh-mirrored/or-images": "the images are flipped (u to the left, or v upwards), or the mesh "
+            "is a mirror image of the body, along its {axis} axis: compare both with the real body",
             "rest-shape": "the mesh is the shape of the body under its weight, with gravity along "
             "({down}) of the mesh, not a stress-free one: state object.rest_shape",
             "several": "a correction of the description brings the residuals to the noise, but the "

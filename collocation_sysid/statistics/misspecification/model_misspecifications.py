@@ -346,6 +346,8 @@ def mirror_images(experiment: Experiment) -> Iterator[Hypothesis]:
     middle_m = _middle_of_grasps_m(experiment)
     surface = points_m[np.unique(body.mesh.surface)]
     tree = KDTree(surface)
+    is_filmed = any(each.unit == "px" for each in experiment.measurements)
+    code = "mesh-mirrored/or-images" if is_filmed else "mesh-mirrored"
     for axis, name in enumerate(AXES):
         factors = np.ones(3)
         factors[axis] = -1.0
@@ -354,9 +356,8 @@ def mirror_images(experiment: Experiment) -> Iterator[Hypothesis]:
             continue
         mirrored = with_shape(experiment, factors)
         if mirrored is not None:
-            yield Hypothesis(
-                "mesh-mirrored", f"'{experiment.name}'", data={"axis": name}, corrected=mirrored
-            )
+            of = f"'{experiment.name}'"
+            yield Hypothesis(code, of, data={"axis": name}, corrected=mirrored)
 
 
 def _middle_of_grasps_m(experiment: Experiment) -> Array:
