@@ -140,7 +140,7 @@ def video(folder: Path) -> None:
     import rendered_video
 
     rendered_video.mesh(rendered_video.COARSE).write(folder / "body.vtu")
-    write_poses_csv(folder / "poses.csv", rendered_video.poses(np.arange(-3, 156) * 0.01))
+    write_poses_csv(folder / "poses.csv", rendered_video.poses(np.arange(-3.0, 156.0) * 0.01))
     shape = rendered_video.motion(rendered_video.surface()[0])
     t_s = np.arange(VIDEO_IMAGES) / VIDEO_HZ
     described = rendered_video.film(folder, "front", shape, t_s, VIDEO_SEED, VIDEO_POINTS)
