@@ -190,7 +190,11 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
 
 
 def score_warnings(scores: Sequence[Score]) -> list[str]:
-    """Return a warning for each prediction that is worse than the undeformed body."""
+    """Return a warning for each prediction that is worse than the undeformed body.
+
+    `scores` must contain the score of the undeformed body for every body and recording of a
+    prediction; a missing one is a KeyError.
+    """
     from ..extras.benchmark.scores import PREDICTION, UNDEFORMED
 
     trivial = {

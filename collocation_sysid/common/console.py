@@ -29,7 +29,9 @@ class PlainConsole(Console):
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """Yield rich's segments with visible marks in place of control characters."""
+        """Yield rich's segments with visible marks in place of control characters; rich's own
+        control segments are unchanged.
+        """
         for segment in super().render(renderable, options):
             yield (segment if segment.control else segment._replace(text=printable(segment.text)))
 

@@ -61,7 +61,9 @@ class Line:
     name: str = ""
 
     def to_spans(self) -> tuple[Span, ...]:
-        """Return the sentence as pieces, each with a style of its own."""
+        """Return the sentence as pieces, each with a style of its own; a text is one piece without
+        style.
+        """
         return (Span(self.text),) if isinstance(self.text, str) else self.text
 
 

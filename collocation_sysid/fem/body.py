@@ -778,6 +778,7 @@ class Body(Discretisation):
         ----------
         x, v : (1, 3n)
             Positions [m] and velocities [m/s].
+        theta : (k,)
         velocity_slope : float
             Derivative of the velocities by the positions [1/s]. Rayleigh's forces −γ_r K v then
             count with the stress that their derivative K contains.

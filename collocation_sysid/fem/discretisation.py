@@ -187,6 +187,7 @@ class Discretisation(ConstantsModel):
         ----------
         number : int
             Index of the part.
+        theta : (k,)
         internal_variables : (T, any), optional
             Internal variables of the points; not used for a stress-free shape that is not the mesh.
         with_second_derivatives : bool

@@ -80,7 +80,18 @@ class PointLaw:
         return self.material.psi(F, theta[: len(self.material.constants)])
 
     def damping_potential(self, psi: ca.SX, F: ca.SX, rate: ca.SX, theta: ca.SX) -> ca.SX:
-        """Return the density ψ_d of the potential of the damping law; 0 if it has none."""
+        """Return the density ψ_d of the potential of the damping law; 0 if it has none.
+
+        Parameters
+        ----------
+        psi : SX
+            Energy density as an expression in F.
+        F, rate : SX
+            Stacked deformation gradient, with m if the dilatation is averaged, and its rate;
+            further symbols of `psi` and their rates may follow if the law accepts them.
+        theta : (k,) SX
+            Constants of the law.
+        """
         potential = self.damping.potential
         return potential(psi, F, rate, **self._damping_constants(theta)) if potential else ca.SX(0)
 
@@ -93,6 +104,7 @@ class PointLaw:
         ----------
         F, rate : (9,) SX
             Stacked deformation gradient and its rate.
+        theta : (k,) SX
         """
         if not self.damping.stress:
             return None

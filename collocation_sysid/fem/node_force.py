@@ -129,6 +129,8 @@ class NodeForce:
             See `NodeForce`.
         *constants : Constant
             Definitions of constants whose bounds, symbols or scales do not follow from the names.
+        nodes : Selection or (k,) int array, optional
+            None for all.
         name : str, optional
             Name for messages; that of the function by default.
         on : {"nodes", "faces"}
@@ -394,14 +396,21 @@ def _as_column(values: Column) -> ca.SX:
 
 
 def face_middle(values: ca.SX) -> ca.SX:
-    """Return the mean (3,) over the last three nodes of a face of a nodal vector (3k,), k = 3 or
-    6.
+    """Return the mean (3,) over the last three nodes of a face of a nodal vector (3k,), k = 3 or 6.
+
+    These nodes share the force on the face: the corners, or the mid nodes of a quadratic face.
     """
     return ca.sum2(ca.reshape(values, 3, values.numel() // 3)[:, -3:]) / 3
 
 
 def area_vector(places: Sequence[ca.SX]) -> ca.SX:
-    """Return the normal of a face times its area (3,)."""
+    """Return the normal of a face times its area (3,).
+
+    Parameters
+    ----------
+    places : sequence of (3,) SX
+        Corners a, b, c, and the nodes on ab, bc, ca of a quadratic face.
+    """
     corners = places[:3]
     middles = places[3:]
     pairs = zip(corners, middles, strict=True) if middles else ((corner,) for corner in corners)

@@ -297,6 +297,7 @@ class FieldModes:
 
         Parameters
         ----------
+        coefficients : (k,)
         weights : (T, E)
             Weights of the cells.
         """

@@ -209,7 +209,25 @@ def experiment_named(
 
 
 def film_samples(t_s: Array, fps: float, slowdown: float) -> NDArray[np.int64]:
-    """Return the indices (k,) of the samples to show in a film's frames."""
+    """Return the indices (k,) of the samples to show in a film's frames.
+
+    The samples are taken as evenly spaced, and may be skipped or repeated. The last frame shows the
+    last sample, or an earlier one by at most half the time between frames.
+
+    Parameters
+    ----------
+    t_s : (T,)
+        Times of the samples [s], ascending, at least one.
+    fps : float
+        Frames per second, above zero.
+    slowdown : float
+        How many times slower than the recording the film is; above zero.
+
+    Raises
+    ------
+    InputError
+        If the film would have more than `MAX_FILM_FRAMES` frames.
+    """
     duration = float(t_s[-1] - t_s[0])
     count = round(duration * slowdown * fps) + 1
     if count > MAX_FILM_FRAMES:

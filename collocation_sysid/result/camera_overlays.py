@@ -45,6 +45,8 @@ class DepthProjection:
 
     Attributes
     ----------
+    view : DepthCameraModel
+        Model of the depth camera.
     skin : VisibleSurface
         Visible surface of the body.
     phi : (k,)
@@ -66,6 +68,7 @@ class DepthProjection:
 
         Parameters
         ----------
+        phi : (k,)
         shape_m : (n, 3)
             Node positions that define the broad side.
         up : (3,)
@@ -131,6 +134,16 @@ class DepthProjection:
     def point_rows(self, sample: int, points_m: Array, rays: Array, distances_m: Array) -> Array:
         """Return the rows (P, 8) of `MotionRecord.visible_points` for all P given points of one
         sample.
+
+        Parameters
+        ----------
+        sample : int
+            Index of the camera's sample.
+        points_m, rays : (P, 3)
+            Points [m] and viewing directions in the camera's frame.
+        distances_m : (P,)
+            Distance behind the surface [m]; NaN for points that do not count, whose rows are
+            returned, too.
         """
         world = self.view.to_world(self.phi, points_m, rays=rays, image=sample)
         t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
@@ -140,6 +153,13 @@ class DepthProjection:
         """Return rows (k, 8) of `MotionRecord.visible_points` with the outlines of a shape.
 
         The last row has the time alone, so that the sample is known also if no face is in view.
+
+        Parameters
+        ----------
+        sample : int
+            Index of the camera's sample.
+        shape_m : (n, 3)
+            Node positions [m].
         """
         drawn = np.vstack([self.outlines(shape_m, sample), np.full((1, 2), np.nan)])
         rows = np.full((len(drawn), 8), np.nan)
@@ -155,6 +175,20 @@ def surface_rows(surface: SurfaceComparison, up: Array) -> Array:
     Only points within the gate of the correspondences are contained, those of images without any
     compared point are left out. Points within the gate that are not compared, such as grazing ones,
     have the distance NaN.
+
+    Parameters
+    ----------
+    surface : SurfaceComparison
+        Points of one depth camera and the surface.
+    up : (3,)
+        Unit vector against gravity.
+
+    Returns
+    -------
+    (k, 8) array
+        Rows of `MotionRecord.visible_points`: the points of all images, then the outlines of the
+        surface in at most `MAX_OUTLINED_SAMPLES` evenly chosen ones of these images; no rows if no
+        point of any image is compared.
     """
     correspondences = surface.correspondences
     shapes_m = surface.shapes_m
@@ -195,6 +229,10 @@ def visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str,
 def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
     """Return the first image of each depth camera with the undeformed body, before anything is
     fitted.
+
+    The arrays (k, 8), by name of the camera, have the rows of `MotionRecord.visible_points`; empty
+    without depth cameras. The body is where the grasps carry it rigidly, and distances from it are
+    NaN. The first image is the first one that has points.
     """
     nuisance = NuisanceMap.from_experiment(experiment)
     by_camera = {}

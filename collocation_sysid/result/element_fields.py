@@ -113,7 +113,12 @@ class ElementFields:
 
 def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the compiled function "fields", the values of `FIELD_NAMES` in this order at a
-    quadrature point times its undeformed volume.
+    quadrature point times its undeformed volume; see `ElementKernel` for the inputs.
+
+    Parameters
+    ----------
+    law : PointLaw
+        Law with the energy density at a point, and its constants.
     """
     point = quadrature_point(element, law, "x")
     fields = ca.vertcat(*_point_fields(law, point.scale_constants()))

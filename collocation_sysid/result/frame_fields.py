@@ -61,6 +61,11 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
 
     If the experiment has no folder of frames, those of the run folder itself are returned, which
     belong to its only fitted experiment.
+
+    Raises
+    ------
+    InputError
+        If the run folder has no frames of that experiment, or a damaged list of frames.
     """
     listings = (run / experiment / FRAMES_FILE, run / FRAMES_FILE)
     listing = next((each for each in listings if each.is_file()), None)
@@ -77,7 +82,20 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
 
 
 def cells_below_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the index (F,) of the tetrahedron that each boundary triangle is a side of."""
+    """Return the index (F,) of the tetrahedron that each boundary triangle is a side of.
+
+    Parameters
+    ----------
+    tetrahedra : (E, 4)
+        Corner nodes of the tetrahedra.
+    faces : (F, 3)
+        Corner nodes of the triangles, in any order.
+
+    Raises
+    ------
+    KeyError
+        If a triangle is no side of any tetrahedron.
+    """
     sides = np.sort(tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
     known = {tuple(side): k // 4 for k, side in enumerate(sides.reshape(-1, 3).tolist())}
     return np.array([known[tuple(face)] for face in np.sort(faces, axis=1).tolist()])

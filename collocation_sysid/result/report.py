@@ -113,7 +113,10 @@ def report_text(report: TitledParts, file: Path) -> str:
 
 
 def report_html(report: TitledParts) -> str:
-    """Return a report as the HTML text of one page that contains its pictures."""
+    """Return a report as the HTML text of one page that contains its pictures.
+
+    Nothing is loaded from a network; pictures are embedded.
+    """
     page = files("collocation_sysid.result").joinpath("report.html").read_text("utf-8")
     # A text cannot hold these places, since "<" is escaped.
     page = page.replace("<!--TITLE-->", escape(report.title))

@@ -204,7 +204,23 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
 
 
 def write_all_frames(finished: SolvedProblem, place: Path) -> None:
-    """Write the ParaView frames of every fitted experiment, see `write_frames`."""
+    """Write the ParaView frames of every fitted experiment, see `write_frames`; existing ones are
+    replaced.
+
+    With several fitted experiments each has a subfolder of its name, which is made if missing.
+    Besides the data of `write_frames` and `_constant_cell_data`, the frames have the residuals of
+    the equations of motion, "residual_force_n" [N], which are zero at prescribed dofs.
+
+    Parameters
+    ----------
+    place : Path
+        Existing folder to write into.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
+    """
     for part in finished.solution.parts:
         transcription = part.transcription
         positions = part.x.reshape(len(part.x), -1, 3)

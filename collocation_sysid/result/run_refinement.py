@@ -118,7 +118,19 @@ def refine_run(
 
 
 def with_refinement(before: Result, refinement: Refinement, parameters: Parameters) -> Result:
-    """Return a result with the measured discretisation error in place of the estimated one."""
+    """Return a result with the measured discretisation error in place of the estimated one; nothing
+    is written.
+
+    Values, intervals and budget of the estimates whose error was measured are updated, and so is
+    the verdict with its concerns; other estimates are unchanged.
+
+    Parameters
+    ----------
+    before : Result
+        Content of ``result.json`` after the solve; not modified.
+    parameters : Parameters
+        Parameters of the problem, with their coordinates and bounds.
+    """
     optimum = _estimates_at_optimum(before, parameters)
 
     def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:

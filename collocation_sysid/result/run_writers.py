@@ -45,7 +45,28 @@ def write_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write an unstructured grid of one cell type as a .vtu file, VTK XML with base64 data."""
+    """Write an unstructured grid of one cell type as a .vtu file, VTK XML with base64 data.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write; an existing one is replaced.
+    points_m : (n, 3)
+        Positions of the points [m].
+    cells : (E, nodes per cell)
+        Point indices of each cell, in the order of meshio for this type.
+    point_data : mapping of name to (n,) or (n, k), optional
+        Data at the points.
+    cell_data : mapping of name to (E,) or (E, k), optional
+        Data of the cells.
+
+    Raises
+    ------
+    InputError
+        For an unknown cell type, or data of another length.
+    OSError
+        If the file cannot be written, as without its folder.
+    """
     import meshio  # which takes a while to import
 
     if meshio_type not in VTK_CELL_TYPES:
@@ -79,7 +100,19 @@ def _checked_arrays(
 
 
 def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:
-    """Write the list of frames that ParaView opens as one animation."""
+    """Write the list of frames that ParaView opens as one animation; an existing file is replaced.
+
+    Parameters
+    ----------
+    frames : sequence of (float, str or Path)
+        Time [s] and file of each frame; files are stored relative to the folder of `path`, and
+        need not exist yet.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written, as without its folder.
+    """
     folder = Path(path).parent.resolve()
     lines = []
     for t_s, file in frames:

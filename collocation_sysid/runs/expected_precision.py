@@ -92,6 +92,7 @@ def expected_precision(
 
     Parameters
     ----------
+    z : (variables,) array
     deviations : mapping of str to float or None
         Standard deviations of the assumptions of the budget.
 

@@ -234,7 +234,34 @@ def simulate_with_parameters(
     parameters: Mapping[str, float],
     report: Callable[[float], None] | None = None,
 ) -> ForwardSimulation:
-    """Simulate a recording with given parameters, and compare it with the measurements."""
+    """Simulate a recording with given parameters, and compare it with the measurements.
+
+    Parameters
+    ----------
+    problem : Problem
+        The integrator and step of `problem.rollout` are used: Newmark's scheme by default, and a
+        finer step than in the fit.
+    experiment : Experiment
+        The recording, with which the simulation is compared.
+    transcription : Transcription
+        The recording as it was fitted, see `transcription_and_nuisance`.
+    phi : (k,) array
+        Nuisance parameters of the recording, in units of their prior standard deviations.
+    parameters : mapping of name to value
+        All parameters of the problem, in SI units.
+    report : callable, optional
+        Called with the completed share, from 0 to 1.
+
+    Returns
+    -------
+    ForwardSimulation
+        `nuisance`, `places_m`, `own` and `copy_error` are empty or None.
+
+    Raises
+    ------
+    InputError, SimulationError
+        Where the simulation fails.
+    """
     integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
     corrected = with_contact_energy(transcription.corrected_experiment(phi))
     trajectory = simulate(
@@ -281,6 +308,11 @@ def fitted_nuisance(experiment: Experiment, solution: Solution) -> tuple[Transcr
     the estimate, or for validation by a solve in reduced space with the material at its estimate.
 
     k is 0 without any. Whether that solve converged is not checked.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If that solve is interrupted.
     """
     if (part := solution.part_of(experiment.name)) is not None:
         return part.transcription, part.phi

@@ -240,7 +240,16 @@ class ElementSurrogate:
         )
 
     def simulate_errors(self, logarithms: Array, changes: Array) -> SimulatedSamples:
-        """Simulate samples, and return the errors of the linearised residuals."""
+        """Simulate samples, and return the errors of the linearised residuals; samples that cannot
+        be simulated are left out.
+
+        Parameters
+        ----------
+        logarithms : (K, E) array
+            Logarithms relative to the mean in each element.
+        changes : (K, p) array
+            Changes of the other parameters.
+        """
         simulated = []
         residuals = []
         for each, change in zip(logarithms, changes, strict=True):
@@ -417,6 +426,18 @@ def exact_residuals(
 ) -> Array:
     """Return the residuals (n,) of all measurements at simulated trajectories, in the order and
     with the weights of `linearise_fit`.
+
+    Parameters
+    ----------
+    p : (np,) array
+        All parameters.
+    guess : sequence of (N, 3n) array, optional
+        Trajectories at similar parameters [m].
+
+    Raises
+    ------
+    SimulationError
+        If the body cannot be simulated at p.
     """
     positions, failure = simulate_trajectories(collocation, p, guess=guess)
     if failure is not None:

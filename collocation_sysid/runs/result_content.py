@@ -204,7 +204,13 @@ class FieldResult:
     phases: PhaseSummary | None = None
 
     def coefficient_names(self, name: str) -> list[str]:
-        """Return the names of the coefficients of a smooth field; none for a two-phase one."""
+        """Return the names of the coefficients of a smooth field; none for a two-phase one.
+
+        Parameters
+        ----------
+        name : str
+            Name of the constant that varies, with its region.
+        """
         region, dot, _ = name.rpartition(".")
         count = self.shapes.modes if self.phases is None else 0
         return [f"{region}{dot}{field_coefficient(k).name}" for k in range(count)]

@@ -248,7 +248,9 @@ class SolvedProblem:
         return modulus_axis_sentence(self.systematic_effects, self.estimates, anisotropy)
 
     def collect_discretisation_errors(self) -> Mapping[str, DiscretisationError]:
-        """Return the known discretisation errors, by name of the estimate."""
+        """Return the known discretisation errors, by name of the estimate; empty without
+        `refinement`.
+        """
         return {} if self.refinement is None else self.refinement.errors
 
     @cached_property

@@ -519,6 +519,15 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
     Otherwise `first` itself is returned; after an interrupt of another search a copy of the best
     one with the status and message of the interrupt. The history, counts and times of the result
     are those of its own search alone. Exceptions of the method are not caught.
+
+    Parameters
+    ----------
+    solver : Method
+        Method to use, also with workers, see `with_workers`.
+    first : Solution
+        Solution of the first search.
+    watch : callable or None
+        Called with every iteration of the other searches.
     """
     best = _better_of(solver, first, watch, choose=second_start)
     return continued_beyond_bounds(solver, best, watch)

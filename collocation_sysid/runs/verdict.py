@@ -168,7 +168,8 @@ def _outlier_counts(solution: Solution) -> tuple[int, int]:
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
     """Yield concerns about implausible sizes and densities, or else about an implausible stiffness
-    at the estimates, of each fitted body, and about an unknown scale of the moduli.
+    at the estimates, of each fitted body, and about an unknown scale of the moduli; all are
+    doubtful, except densities that are unusual for the way in which a body was made.
     """
     for body in dict.fromkeys(
         transcription.body for transcription in solution.collocation.transcriptions
@@ -187,6 +188,8 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
     """Yield a concern for each static experiment whose `sigma_m`, relative to the size of the body,
     is larger than the noise of cameras.
+
+    In motions the autocorrelation of the residuals shows this; static experiments have none.
     """
     for experiment in (
         transcription.experiment for transcription in solution.collocation.transcriptions

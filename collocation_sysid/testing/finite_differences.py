@@ -54,7 +54,24 @@ def assert_derivative(
     scale: ArrayLike = 1.0,
     directions: int = 2,
 ) -> None:
-    """Compare a derivative with central differences of the function in random normal directions."""
+    """Compare a derivative with central differences of the function in random normal directions.
+
+    Parameters
+    ----------
+    function : callable
+        Function of an array like `point`.
+    jacobian_times : callable
+        Product of its derivative at `point` with a direction, of the same shape as the function.
+    tolerance : float
+        Largest norm of the error, relative to the norm of the difference quotient.
+    scale : array or float
+        Size of a large change of `point`; a thousandth of it is one step.
+
+    Raises
+    ------
+    AssertionError
+        If the error exceeds the tolerance, or shapes differ.
+    """
     for _ in range(directions):
         direction = np.asarray(scale) * rng.standard_normal(np.shape(point))
         expected = directional_derivative(function, point, direction=direction)

@@ -186,7 +186,14 @@ class EnergyDerivatives:
         return StressState(outputs[0].ravel(), outputs[1].ravel(), tangent=outputs[2])
 
     def evaluate_kernel(self, F: Array, values: Array | None = None) -> StressState:
-        """Return energy, stress, stiffness and `by_constants`, differentiated as in kernels."""
+        """Return energy, stress, stiffness and `by_constants`, differentiated as in kernels.
+
+        Parameters
+        ----------
+        F : (9,) array
+        values : (k,) array, optional
+            Values of the constants in place of those of this object.
+        """
         constants = self.values if values is None else values
         outputs = [each.full() for each in self._kernel_function.call([F, constants])]
         return StressState(

@@ -121,6 +121,7 @@ class PropertyCheck:
             Function of an array like `point`, which returns m numbers.
         derivative : (m, n) array
             Derivative by the n entries of `point`.
+        point : (n,) array
         statement : str
             What it means if they differ.
         scale : (n,) array or float

@@ -107,7 +107,8 @@ class SensorExpression:
 
     def make_inputs(self) -> dict[str, Array]:
         """Return the undeformed values of the inputs by name: for a sensor on P points positions
-        and zeros of velocity and acceleration, (3, P) each.
+        and zeros of velocity and acceleration, (3, P) each; at a grasp ones (3, 1) for force and
+        torque.
         """
         _, *names = (each.name for each in fields(self.sensor.quantities))
         if self.sensor.grasp is not None:

@@ -50,7 +50,19 @@ def smooth_poses(
     turn_rad: Sequence[float] = (0.2, -0.15, 0.3),
     angular_frequency_rad_s: float = 20.0,
 ) -> PoseSequence:
-    """Return a periodic motion that starts at rest from the identity, sampled from its formula."""
+    """Return a periodic motion that starts at rest from the identity, sampled from its formula.
+
+    Translation and rotation vector are (1 − cos ωt) times `sway_m` and `turn_rad`.
+
+    Parameters
+    ----------
+    t_s : (T,) array
+        Times [s].
+    sway_m, turn_rad : three floats
+        Half the largest translation [m] and rotation vector [rad].
+    angular_frequency_rad_s : float
+        ω [rad/s].
+    """
     share = 1 - np.cos(angular_frequency_rad_s * t_s)
     rotations = Rotation.from_rotvec(np.outer(share, turn_rad))
     positions_m = np.outer(share, sway_m)

@@ -252,6 +252,18 @@ class MotionObjective:
         Views of cameras are not considered. The result has no coefficients, and an empty history,
         if a force is measured too, the memory would be too large, or the simulation fails. Ctrl-C
         ends the search with the best so far.
+
+        Parameters
+        ----------
+        options : DesignOptions
+            `TO_FIRST_ORDER` times its `evaluations` are made, with its waves and seed.
+        say : callable
+            Function that is called with the progress, a text.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If it is interrupted before the first evaluation.
         """
         sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:

@@ -191,7 +191,14 @@ class PredictedErrors:
         return cls(covariance, values, slopes=slopes, estimated_count=estimated_count)
 
     def slopes_of(self, names: Sequence[str]) -> Array:
-        """Return the rows (k, nq) of `slopes` for these names."""
+        """Return the rows (k, nq) of `slopes` for these names; for all estimated parameters if
+        `names` is empty.
+
+        Raises
+        ------
+        KeyError
+            For an unknown name.
+        """
         chosen = names or list(self.slopes)[: self.estimated_count]
         return np.array([self.slopes[name] for name in chosen])
 

@@ -138,6 +138,8 @@ def verify_export(
     ----------
     body : IdentifiedBody
         The body that was exported.
+    target_name : str
+        Name of a target in `TARGETS`.
     folder : str or Path
         Folder of `write_export`; the target runs in a temporary copy.
 
@@ -176,7 +178,13 @@ def comparison_table(name: str, comparisons: Sequence[PredictionComparison]) -> 
 
 
 def target_named(name: str) -> ExportTarget:
-    """Return the target in `TARGETS` called `name`."""
+    """Return the target in `TARGETS` called `name`.
+
+    Raises
+    ------
+    InputError
+        If there is no target of that name.
+    """
     if name not in TARGETS:
         known = (*TARGETS, rerun_recording.TARGET)
         raise InputError(f"no target {name!r}; available: {', '.join(known)}{hint_at(name, known)}")

@@ -93,6 +93,11 @@ def without_obstacles(experiment: Experiment) -> Experiment:
     Measurements are replaced by one marker at the first node with zeros as positions, because an
     experiment must have some and all of them may be of the obstacles. Initial positions and
     velocities are those of the body's nodes alone.
+
+    Raises
+    ------
+    InputError
+        If the body then has no initial equilibrium, because only obstacles support it.
     """
     body = experiment.body
     t_s = experiment.t_s

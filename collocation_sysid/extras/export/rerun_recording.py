@@ -122,7 +122,25 @@ def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
 def vertex_colours(
     faces: NDArray[np.integer], values: Array, limits: tuple[float, float], count: int
 ) -> NDArray[np.uint8]:
-    """Return the colours of vertices from values on the triangles around them."""
+    """Return the colours of vertices from values on the triangles around them.
+
+    The value of a vertex is the mean over the triangles around it; values beyond the limits have
+    the colour of the nearest limit, and so have vertices without a triangle at the value 0.
+
+    Parameters
+    ----------
+    faces : (F, 3)
+        Vertices of the triangles.
+    values : (T, F)
+        Values on the triangles; NaN counts as the lower limit.
+    limits : (low, high)
+        Ends of the colour scale (cividis).
+
+    Returns
+    -------
+    (T, n, 4)
+        Red, green, blue and opacity, from 0 to 255.
+    """
     low, high = limits
     finite = np.nan_to_num(values, nan=low)
     sums = np.zeros((len(values), count))

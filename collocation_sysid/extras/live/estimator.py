@@ -738,6 +738,8 @@ class LiveEstimator:
     def distance_from_linearisation(self) -> float:
         """Return the largest distance of the estimate from the linearisation points of the rows in
         the window, in standard errors of single material parameters.
+
+        Infinite if there is no pass, or if it failed.
         """
         if self.first_pass is None or self.first_pass.has_failed:
             return np.inf

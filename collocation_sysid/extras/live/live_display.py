@@ -43,8 +43,10 @@ FRAMES_A_SECOND = 25
 
 
 def sparkline(values: Sequence[float], columns: int = COLUMNS) -> str:
-    """Return the last values as a line of bars, on a logarithmic scale if all of them are
-    positive.
+    """Return the last values as a line of bars, on a logarithmic scale if all of them are positive.
+
+    The smallest of these values has the lowest bar, the largest the highest. Equal values, or any
+    NaN among them, give bars of middle height; no values, an empty text.
     """
     last = np.array(values[-columns:], dtype=float)
     if not len(last):

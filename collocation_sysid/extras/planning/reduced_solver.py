@@ -112,6 +112,22 @@ def minimise_within_limits(
 ) -> tuple[Array, Array]:
     """Return the step d (c,) that minimises ½ ‖R d + q‖² within linearised limits, and the
     multipliers of these: of each vector's norm, then of each row.
+
+    Limits of norms are second-order cones; Clarabel solves the conic program.
+
+    Parameters
+    ----------
+    root : (c, c) array
+        Triangle R.
+    offset : (c,) array
+        Vector q.
+
+    Raises
+    ------
+    HandLimitsExcludeTask
+        If no step satisfies the limits.
+    LinAlgError
+        If the conic program is not solved.
     """
     count = len(offset)
     vectors = len(limits.vectors)
@@ -164,6 +180,11 @@ def minimise_within_limits(
 def smoothest_motion(program: PlannedProgram) -> Array:
     """Return the unknowns of the motion with the least jerk within the limits: no motion, unless
     the end of the hand is given.
+
+    Raises
+    ------
+    HandLimitsExcludeTask
+        If no motion satisfies the limits.
     """
     matrix, constant = program.effort
     scale = 1.0 / max(float(np.abs(matrix).max()), 1e-300)

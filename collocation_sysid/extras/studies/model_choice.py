@@ -196,6 +196,14 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
     """Return the model to use: the one with fewest parameters among the converged models that
     predict as well as the best within `LIKELY` standard errors, of several the one with the
     smallest error.
+
+    If no converged model has predicted all held-out data it is the one with the least AIC; None if
+    none has an AIC either.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, which must have "delta_aic" and "log_ratio"; not modified.
     """
     best = _best_prediction(rows)
     if best is None:
@@ -475,7 +483,11 @@ class Evidence:
 
 
 def evidence_from_fit(fit: LinearisedFit) -> Evidence:
-    """Return the evidence of a model from its linearised fit at the solution."""
+    """Return the evidence of a model from its linearised fit at the solution.
+
+    The equivalent number of independent measurements follows from the correlation of the residuals
+    of each block; it is the number of measurements if the residuals are zero up to rounding.
+    """
     factored = factorise_information(fit)
     rounding = ROUNDING**2 * fit.count_measurements()
     independent = float(fit.count_measurements())
@@ -627,6 +639,11 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
     If it is the only fitted recording, the measurements after two thirds of its duration are
     removed, see `without_later_measurements`. Otherwise the recording becomes one for validation,
     and the time is −∞. `problem` is not modified.
+
+    Raises
+    ------
+    StopIteration
+        If the problem has no recording with this name.
     """
     chosen = next(e for e in problem.experiments if e.name == name)
     if len(fitted_recordings(problem)) > 1:

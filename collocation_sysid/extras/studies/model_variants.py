@@ -245,6 +245,19 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
 
     Labels are the names of the files without suffix, or the paths of all of them if two have the
     same name. Files are not read, and overrides are stored in the models, not applied.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        At least one problem, each with its file.
+    overrides : sequence of str
+        Overrides "key=value", the same for all files.
+
+    Raises
+    ------
+    InputError
+        If the files do not fit the same recordings and samples, so that neither predictions nor AIC
+        could be compared, or a file is given twice.
     """
     first, *others = map(_measured_counts, problems)
     for problem, measured in zip(problems[1:], others, strict=True):
@@ -458,7 +471,10 @@ def _with_memory(
 
 
 def as_inline_toml(value: Any) -> str:
-    """Return a value in TOML's inline syntax, on one line."""
+    """Return a value in TOML's inline syntax, on one line; mappings, lists, tuples, texts, booleans
+    and numbers are supported. None and other types are not: their text is no TOML, without an
+    error.
+    """
     if isinstance(value, Mapping):
         return (
             "{"

@@ -42,7 +42,20 @@ def main() -> None:
 
 
 def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
-    """Execute a planned run and return its record; errors become part of the record."""
+    """Execute a planned run and return its record; errors become part of the record.
+
+    Parameters
+    ----------
+    planned : dict
+        A `PlannedRun` as a dictionary.
+
+    Returns
+    -------
+    dict
+        "outcome" (`FINISHED` or `ERROR`) and "message". Of a finished run also "model", see
+        `fit_record`, if `test_name` is not None (a comparison of models), else "result" and "tip",
+        see `_tip_record`. Of an unexpected error also "traceback".
+    """
     try:
         problem = Problem.read(
             planned["problem"], planned["overrides"], allow_code=planned["allow_code"]

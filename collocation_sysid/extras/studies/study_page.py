@@ -84,7 +84,9 @@ class StudyReport:
 
     def build_views(self) -> list[Table]:
         """Return the tables for the terminal, each within 80 columns, with short headings: of a
-        comparison of methods success, quality and cost.
+        comparison of methods success, quality and cost; of a comparison of models fit, prediction
+        and parameters, and estimates in which equally good laws disagree, if there are any; of a
+        sweep estimates, and quality and cost.
         """
         if self.kind == METHOD_STUDY:
             return comparison_views(method_rows(self.list_rows()))
@@ -292,7 +294,11 @@ def report_json(report: StudyReport) -> dict[str, Any]:
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """Return rows as CSV text, a header and one line for each row."""
+    """Return rows as CSV text, a header and one line for each row; the columns are those of all
+    rows, in the order of their first occurrence. Values that a row lacks, and None, are empty;
+    other values are written as text by `str`, also lists and mappings. Without rows the text is an
+    empty line.
+    """
     columns = dict.fromkeys(name for row in rows for name in row)
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
@@ -303,7 +309,8 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 def report_section(report: StudyReport) -> TitledParts:
     """Return sentences, notes, tables (`StudyReport.build_views()`) and failures of a study as a
-    section with its title, for a paper's appendix or an issue.
+    section with its title, for a paper's appendix or an issue; without failures it has no part on
+    them.
     """
     failures = (Items(tuple(report.list_failures())),) if report.list_failures() else ()
     without = tuple(TitledParts("Runs without a result", (each,)) for each in failures)
@@ -328,7 +335,12 @@ Cell = Callable[[Row], str]
 
 def comparison_views(summaries: Sequence[Row]) -> list[Table]:
     """Return three tables, "Success", "Quality" and "Cost", with a line for each method and short
-    headings.
+    headings; the column of evaluations is left out if no method counts them.
+
+    Parameters
+    ----------
+    summaries : sequence of Row
+        Rows of `method_rows`, at least one; None is shown as a dash.
     """
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
@@ -362,6 +374,11 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
 def run_view(rows: Sequence[Row]) -> Table:
     """Return the table "Runs" of all runs of a comparison of methods, ordered by start, with
     headings in words.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one; None is shown as a dash.
     """
     names = {"start": _text_cell("start"), "method": _text_cell("method")}
     cells: dict[str, Cell] = {
@@ -387,7 +404,14 @@ def _method_sentence(row: Row) -> str:
 
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
-    """Return how many runs converged, and how much each estimate varies between them, in words."""
+    """Return how many runs converged, and how much each estimate varies between them, in words;
+    estimates of fewer than two runs are left out.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one.
+    """
     converged = [row for row in rows if row["converged"]]
     sentences = [f"{len(converged)} of {len(rows)} runs converged."]
     for name in parameters_in(rows):
@@ -404,6 +428,11 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
 def sweep_views(rows: Sequence[Row], varied_keys: Sequence[str]) -> list[Table]:
     """Return tables of estimates and quality, a line for each run with the values of the swept
     keys.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one.
     """
     places = {short: _varied_cell(key) for key, short in shortened_keys(varied_keys)}
     estimates: dict[str, Cell] = {}

@@ -173,7 +173,14 @@ def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
 
 def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     """Return a figure of loss and violation of the equations of motion against time [s], a line per
-    run and a colour per method.
+    run and a colour per method; values that are not positive are left out.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row` of runs with a result.
+    records : mapping of key of the run to Record
+        Records of these runs, with the history of each "result".
     """
     figure = new_figure(PAGE_MM, 70)
     panels = figure.subplots(1, 2)
@@ -211,6 +218,15 @@ def success_by_distance(
 ) -> Figure:
     """Return a figure of the success rate of each method, with its 95 % interval, against the
     largest ratio of guess to reference, in `DISTANCE_BINS` logarithmic bins.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, at least one, with a guess of each parameter in `centre`.
+    centre : mapping of str to float
+        Positive reference of each parameter, at least one.
+    is_truth_known : bool
+        Whether the reference is the truth, otherwise the best estimate; for the title.
     """
     figure = new_figure(PAGE_MM / 2, 65)
     axes = figure.subplots()
@@ -313,6 +329,16 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
 def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
     """Return a figure of the measured marker farthest from the grasp, and of its forward simulation
     with each method's best solution.
+
+    Measurements are those of the first row. Methods whose best run has no simulated track are left
+    out.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row` of runs with a result, at least one.
+    records : mapping of key of the run to Record
+        Records of these runs, each with a "tip" that is not None, see `run_worker`.
     """
     figure = new_figure(PAGE_MM, 65)
     panels = figure.subplots(1, 3, sharex=True)
@@ -360,6 +386,11 @@ def estimates_against(rows: Sequence[Row], varied_keys: Sequence[str]) -> Figure
 
     Estimates that did not converge are crosses, unknown ones are left out. Values of the first
     other key have colours.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `run_row`, one for each run, at least one with a result.
     """
     names = parameters_in(rows)
     width = max(PAGE_MM / 2, min(PAGE_MM, 80.0 * len(varied_keys)))

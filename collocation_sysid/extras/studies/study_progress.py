@@ -173,7 +173,22 @@ def expected_study_s(
 def remaining_time_s(
     waiting: Sequence[str], walls: Mapping[str, Sequence[float]], worker_count: int
 ) -> float | None:
-    """Return the estimated time for the waiting runs [s]."""
+    """Return the estimated time for the waiting runs [s]; None if no run waits or none has
+    finished.
+
+    A run is expected to take the mean time of its method, or of all runs if its method has none.
+    The estimate is the sum divided by the number of runs at once, but at least the longest expected
+    time.
+
+    Parameters
+    ----------
+    waiting : sequence of str
+        Method of each waiting run.
+    walls : mapping of str to sequence of float
+        Durations of the finished runs by method [s], at least one for each method that is a key.
+    worker_count : int
+        Number of runs that are executed at once.
+    """
     every = [wall for of_method in walls.values() for wall in of_method]
     if not waiting or not every:
         return None

@@ -70,7 +70,19 @@ EVALUATORS = ("auto", "simd", "casadi")
 
 
 def choose_evaluator(choice: str = "auto") -> str:
-    """Return the evaluator to use, "simd" or "casadi"."""
+    """Return the evaluator to use, "simd" or "casadi".
+
+    Parameters
+    ----------
+    choice : {"auto", "simd", "casadi"}
+        "auto" uses the environment variable ``COLLOCATION_SYSID_EVALUATOR`` if it is set, otherwise
+        "simd" if llvmlite is installed.
+
+    Raises
+    ------
+    InputError
+        For an unknown choice, or "simd" without llvmlite.
+    """
     choice = _requested_evaluator(choice)
     has_llvm = find_spec("llvmlite") is not None
     if choice == "simd" and not has_llvm:

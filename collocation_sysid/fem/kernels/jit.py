@@ -191,7 +191,9 @@ def _source_digest() -> str:
 
 
 def compile_module(module: ir.Module, machine: llvm.TargetMachine, quickly: bool) -> bytes:
-    """Return the object code of an LLVM module for a machine, without optimisation if `quickly`."""
+    """Return the object code of an LLVM module for a machine, without optimisation if `quickly`;
+    the target triple of the module is set.
+    """
     module.triple = machine.triple
     parsed = llvm.parse_assembly(str(module))
     parsed.verify()
@@ -215,7 +217,9 @@ def cache_folder() -> Path:
 
 
 def load_object(key: str) -> bytes | None:
-    """Return the code stored for a key."""
+    """Return the code stored for a key; None if there is none, if it is damaged, or if others could
+    have written it.
+    """
     folder = cache_folder()
     if not folder.is_dir() or not _is_trusted(folder):
         return None
@@ -229,7 +233,9 @@ def load_object(key: str) -> bytes | None:
 
 
 def store_object(key: str, code: bytes) -> None:
-    """Store code in the cache under a key, in place of what is there."""
+    """Store code in the cache under a key, in place of what is there; do nothing if the folder
+    cannot be written or trusted (the latter with a warning). The folder is created if missing.
+    """
     folder = cache_folder()
     with suppress(OSError):
         for missing in [p for p in (folder, *folder.parents) if not p.exists()][::-1]:

@@ -236,6 +236,8 @@ def stable_neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
 def st_venant_kirchhoff(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
     """Return the St. Venant–Kirchhoff energy ψ = ½ λ (tr E)² + μ E:E at F (3, 3), with the Green
     strain E = ½ (C − I).
+
+    It softens in compression, and is finite for inverted elements.
     """
     strain = 0.5 * (F.T @ F - ca.SX.eye(3))
     return 0.5 * lambda_pa * ca.trace(strain) ** 2 + mu_pa * ca.sumsqr(strain)
@@ -423,7 +425,22 @@ def damped_psi(damping: DampingLaw, material: Material, F: ca.SX, values: ca.SX)
 
 
 def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return the stress P_v (9,) of Kelvin–Voigt damping and ∂P_v/∂F (9, 9)."""
+    """Return the stress P_v (9,) of Kelvin–Voigt damping and ∂P_v/∂F (9, 9).
+
+    P_v = F S_v with S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹ and the viscosities η = γ_r μ and ζ = γ_r λ.
+    This is the Kirchhoff stress 2η d + ζ (tr d) 1 of the rate of deformation d, the symmetric part
+    of L = Ḟ F⁻¹; its dissipation 2η d:d + ζ (tr d)² is positive for any F.
+
+    Parameters
+    ----------
+    psi : SX
+        Energy density as an expression in `F`; its small-strain λ and μ are used, and for a linear
+        material, whose stiffness does not depend on F, P_v is γ_r times the rate of its stress.
+    F, rate : (9,) SX
+        Symbols of the deformation gradient and its rate Ḟ, stacked column after column.
+    gamma_r_s : SX
+        γ_r [s].
+    """
     stiffness, _ = ca.hessian(psi, F)
     # A linear material does not distinguish the deformed from the undeformed shape.
     if not ca.depends_on(stiffness, F):

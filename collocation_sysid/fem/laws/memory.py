@@ -174,6 +174,10 @@ class MemoryLayout:
     def sum_over_branches(self, values: Array) -> Array:
         """Return the sums (…, width) over the branches of each point: the transpose of
         `to_branches`. For a single branch the argument itself is returned.
+
+        Parameters
+        ----------
+        values : (…, all branches)
         """
         if len(self.branches) == 1:
             return values

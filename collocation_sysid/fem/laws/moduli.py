@@ -98,7 +98,10 @@ def find_source(
     """
 
     def name_of(own: str) -> str | None:
-        """Return the parameter that gives a constant, that of the region first."""
+        """Return the parameter that gives a constant, that of the region first.
+
+        None if there is none.
+        """
         prefixed = f"{region}.{own}" if region else own
         return prefixed if prefixed in known else own if own in known else None
 

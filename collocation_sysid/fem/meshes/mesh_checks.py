@@ -91,7 +91,9 @@ def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
 
 
 def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
-    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1."""
+    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1; the
+    message says if they seem to count from 1.
+    """
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):
         hint = (
@@ -302,6 +304,7 @@ def straightening_notes(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, .
 
     Parameters
     ----------
+    points_m : (n, 3)
     cells : (E, 10)
 
     Returns

@@ -185,6 +185,7 @@ def write_tetrahedra(
     ----------
     path : str or Path
         Replaced if it exists.
+    points_m : (n, 3)
     tetrahedra : (E, 4) int
     point_arrays, cell_arrays : mapping of name to array, optional
         Values of each point and each tetrahedron; none by default.

@@ -85,7 +85,12 @@ class CellBlock:
 
 @dataclass(frozen=True)
 class MeshContent:
-    """Content of a mesh or point file, with the names and forms of meshio."""
+    """Content of a mesh or point file, with the names and forms of meshio.
+
+    Attributes
+    ----------
+    points : (n, k) array
+    """
 
     points: NDArray[Any]
     cells: list[CellBlock]

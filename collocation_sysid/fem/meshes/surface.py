@@ -97,6 +97,9 @@ def tetrahedralize_surface(
 def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (p', 3) and triangles (F', 3) with vertices merged that coincide in single
     precision (10⁻⁶ of the diagonal), and without the triangles that become degenerate.
+
+    Vertices that are linked by a chain of such pairs become one, at the first of them. Unused
+    vertices stay.
     """
     tolerance = 1e-6 * np.linalg.norm(np.ptp(points, axis=0))
     pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
@@ -192,7 +195,13 @@ def _pytetwild_version() -> str:
 def run_ftetwild(
     points: np.ndarray, triangles: np.ndarray, edge_length_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (n, 3) [m] and tetrahedra (E, 4) of fTetWild, run in a separate process."""
+    """Return nodes (n, 3) [m] and tetrahedra (E, 4) of fTetWild, run in a separate process.
+
+    Raises
+    ------
+    InputError
+        If it fails or is not installed.
+    """
     diagonal = np.linalg.norm(np.ptp(points, axis=0))
     lengths = (ASKED_LENGTH * edge_length_m, TOLERANCE * edge_length_m / diagonal)
     words = [repr(float(length)) for length in lengths]

@@ -93,6 +93,13 @@ class Confidence:
 def ellipse_outline(confidence: Confidence, i: int, j: int, points: int = 181) -> Array:
     """Return the outline (points, 2) of the joint 95 % region of two logarithms, about their
     estimates.
+
+    Parameters
+    ----------
+    i, j : int
+        Indices of the two parameters.
+    points : int
+        Number of points of the outline.
     """
     pair = [i, j]
     angle = np.linspace(0.0, 2 * np.pi, points)

@@ -67,8 +67,22 @@ def spectrum_picture(
 
 
 def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
-    """Return frequencies [Hz] and the power spectral density [mm²/Hz] of the markers' mean
-    motion.
+    """Return frequencies [Hz] and the power spectral density [mm²/Hz] of the markers' mean motion.
+
+    Linear trends are removed and a Hann window is applied; the densities of x, y and z are added,
+    those of markers averaged. Gaps are interpolated linearly, and markers present in less than
+    the share `MIN_PRESENT_SHARE` of the samples are left out.
+
+    Parameters
+    ----------
+    tracks_m : (T, M, 3)
+        Positions, NaN where missing.
+
+    Returns
+    -------
+    hertz, density : (k,)
+        Frequencies above zero up to half the sampling rate. The density is NaN where it is zero, or
+        if no marker is present often enough.
     """
     present = np.asarray(np.isfinite(tracks_m).all(axis=2))
     markers = np.flatnonzero(present.mean(axis=0) >= MIN_PRESENT_SHARE)

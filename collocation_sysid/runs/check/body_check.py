@@ -95,7 +95,17 @@ def slenderness(mesh: TetMesh) -> tuple[float, float, float]:
 def element_concerns(
     body: Body, theta: Array, shape: tuple[float, float, float], worst: ElementShape
 ) -> list[Concern]:
-    """Return concerns about flat elements, locking, and too few elements across the thickness."""
+    """Return concerns about flat elements, locking, and too few elements across the thickness.
+
+    Parameters
+    ----------
+    body : Body
+        Body with its mesh and elements.
+    theta : array
+        Constants θ at the guess.
+    worst : ElementShape
+        Element of the lowest quality.
+    """
     name = body.element.name
     poisson = max(engineering_constants(*lame)[1] for lame in body.lame(theta).values())
     limit = LOCKING_POISSON.get(name, np.inf)
@@ -183,6 +193,7 @@ class BodyCheck:
         Volume of the mesh, and mass at the guess, without point masses.
     point_masses_kg : mapping of str to float
         Sum of the point masses of each experiment that has any, by its name.
+    size_m : (x, y, z) extents of the mesh along the axes
     smallest_element_quality, median_element_quality : float
         Mean ratio, see `ElementShape`.
     cells_across : float

@@ -207,6 +207,8 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
 
     Parameters
     ----------
+    chosen : MethodCost
+        Cost of the chosen method.
     others : sequence of MethodCost
         Costs of at least one method; the chosen one may be among them.
     """
@@ -228,6 +230,8 @@ def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Conc
 
     Parameters
     ----------
+    chosen : MethodCost
+        Cost of the chosen method.
     others : sequence of MethodCost
         Costs of all methods; the chosen one may be among them.
     """
@@ -265,6 +269,11 @@ def estimated_sweeps_s(
 def search_factor(experiment: Experiment, free_names: Set[str]) -> float:
     """Return the time of the search in an experiment over that of `TYPICAL_SWEEPS` sweeps, as
     measured for experiments of its kind.
+
+    Parameters
+    ----------
+    free_names : set of str
+        Names of the estimated parameters, which may be coefficients of friction.
     """
     factor = STATIC_FACTOR if experiment.is_static else 1.0
     if any(each.friction in free_names for each in experiment.obstacles):
