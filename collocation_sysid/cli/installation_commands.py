@@ -68,7 +68,9 @@ def installation_sections(report: InstallationReport) -> list[Shown]:
 
 
 def _requirement_text(dependency: Dependency) -> str:
-    """Return the range of required versions, empty for any."""
+    """Return the range of required versions, empty for any; with the remedy where the installed one
+    is not suitable.
+    """
     if dependency.is_suitable:
         return dependency.required
     package = f"{dependency.name}{dependency.required}"
@@ -76,7 +78,9 @@ def _requirement_text(dependency: Dependency) -> str:
 
 
 def _solver_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of the solvers, value by name."""
+    """Return the table rows of the solvers, value by name; a single row if CasADi cannot be
+    imported.
+    """
     if report.solvers is None:
         return {"solvers": "unknown, because CasADi cannot be imported"}
     linear = ", ".join(report.solvers.ipopt_linear) or "none that works"
@@ -89,7 +93,9 @@ def _solver_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _kernel_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of the compiler and the cache of kernels, value by name."""
+    """Return the table rows of the compiler and the cache of kernels, value by name; a single row
+    if llvmlite cannot be imported.
+    """
     kernels = report.kernels
     if kernels is None:
         return {

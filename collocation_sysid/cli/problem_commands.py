@@ -297,7 +297,7 @@ def check(
 
 def _write_camera_overlays(problem: Problem, folder: Path, quiet: bool) -> None:
     """Write a picture of each camera's first image with the undeformed body into the folder, and
-    print the names of the files.
+    print the names of the files. Progress is shown unless `quiet`.
     """
     if not any(each.camera_names for each in problem.experiments):
         return

@@ -164,7 +164,9 @@ def _accepted_type(field: Field[Any], names: Mapping[str, Any]) -> Any:
 
 
 def _refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
-    """Return the error of a converter or of ``__post_init__``."""
+    """Return the error of a converter or of ``__post_init__``; or an `InputError` that names the
+    object and the invalid field. See `validated_classes.Refusal` for the arguments.
+    """
     field = fault["loc"] and type(instance).__dataclass_fields__[fault["loc"][0]]
     converter = field and field.metadata.get("converter")
     if not field or (converter is not None and get_origin(converter) is not tuple):

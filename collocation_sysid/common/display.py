@@ -465,7 +465,9 @@ def _span(span: Span) -> str:
 
 
 def _html_rows(table: Table) -> str:
-    """Return headings and rows of a table as HTML."""
+    """Return headings and rows of a table as HTML; without headings, the first cell of each row is
+    its heading.
+    """
     head = "".join(
         f"<th{_class('n' if table.is_number(k) else '')}>{escape(each)}</th>"
         for k, each in enumerate(table.heads)
@@ -532,7 +534,9 @@ def escape_markdown(text: str) -> str:
 
 
 def _markdown_span(span: Span) -> str:
-    """Return a piece of a sentence as Markdown: bold for "strong", code for "code", else plain."""
+    """Return a piece of a sentence as Markdown: bold for "strong", code for "code", else plain;
+    targets of links are omitted.
+    """
     text = span.text.strip()
     if not text or span.style not in ("strong", "code"):
         return _spaced_like(span.text, escape_markdown(text))

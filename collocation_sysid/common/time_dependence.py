@@ -127,7 +127,9 @@ def values_over_time(instance: Any) -> dict[str, Any]:
 
 
 def _changed(instance: T, function: Callable[..., Any], *others: T) -> T:
-    """Return an object with a function applied to its marked fields other than None."""
+    """Return an object with a function applied to its marked fields other than None; itself if no
+    value changes.
+    """
     changes = {}
     for name, mark in _marks(type(instance)).items():
         value, *rest = (getattr(each, name) for each in (instance, *others))

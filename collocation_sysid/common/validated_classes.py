@@ -141,7 +141,9 @@ def _validator(kind: type) -> Any:
 
 
 def _key_refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
-    """Return the error of ``__post_init__``."""
+    """Return the error of ``__post_init__``; or an `InputError` whose location is the name of the
+    invalid field, and of the entry if the value is a table. See `Refusal` for the arguments.
+    """
     if not fault["loc"]:
         return fault["ctx"]["error"]
     where, value = faulty_entry(instance, fault)

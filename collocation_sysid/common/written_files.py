@@ -122,7 +122,9 @@ def foreign_files(folder: Path) -> Iterator[Path]:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Yield everything below a folder except folders, lists and ignored names, by name."""
+    """Yield everything below a folder except folders, lists and ignored names, by name; links are
+    yielded, not followed.
+    """
     for entry in sorted(os.scandir(folder), key=lambda each: each.name):
         path = folder / entry.name
         if entry.is_dir(follow_symlinks=False):
@@ -134,7 +136,9 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _home(file: Path, folder: Path) -> Path:
-    """Return the nearest folder above a file that has a list, not above `folder`."""
+    """Return the nearest folder above a file that has a list, not above `folder`; `folder` if there
+    is none.
+    """
     for parent in file.parents:
         if parent == folder or (parent / LIST_FILE).is_file():
             return parent

@@ -628,7 +628,9 @@ class Body(Discretisation):
         )
 
     def _part_masses(self, theta: Theta) -> list[Array]:
-        """Return for each part the mass of every dof (3n,) [kg], without tied masses."""
+        """Return for each part the mass of every dof (3n,) [kg], without tied masses; zero outside
+        the part.
+        """
         masses = []
         for part, volume, slopes in zip(
             self.parts, self._lumped_m3, self._mass_slopes, strict=True
@@ -1085,7 +1087,8 @@ class Body(Discretisation):
         self, theta: Theta, tied_kg: Array | None
     ) -> Iterator[tuple[int, Array]]:
         """Yield index in θ and derivative, (3n,) or (T, 3n), of `_damping_coefficients` at `theta`
-        by each γ_m and by each constant of a density.
+        by each γ_m and by each constant of a density; an index can occur more than once, then
+        derivatives add up. `tied_kg` is that of `_damped_masses`.
         """
         yield from self._damped_masses(theta, tied_kg)
         for gamma, own in zip(self._gamma_m_indices, self._mass_slopes, strict=True):

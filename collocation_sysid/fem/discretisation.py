@@ -386,7 +386,9 @@ class Discretisation(ConstantsModel):
     # Assembly -------------------------------------------------------------------------------
 
     def _states(self, *fields: ArrayLike) -> list[Array]:
-        """Return every node field, (n, 3), (T, n, 3) or (T, 3n), as (T, 3n), contiguous."""
+        """Return every node field, (n, 3), (T, n, 3) or (T, 3n), as (T, 3n), contiguous; native
+        code relies on these shapes.
+        """
         nodes = len(self.nodes_m)
         arrays = [np.ascontiguousarray(field, dtype=float) for field in fields]
         for array in arrays:

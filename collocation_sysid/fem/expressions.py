@@ -211,7 +211,7 @@ def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _damping_potential(point: QuadraturePoint, law: PointLaw, energy: ca.SX) -> ca.SX:
-    """Return the damping potential V ψ_d of a point from its elastic energy V ψ."""
+    """Return the damping potential V ψ_d of a point from its elastic energy V ψ; zero without one."""
     strain = point.stack_strain_symbols()
     rate = ca.vertcat(point.gradients["v"], *point.stretches[1:2])
     if law.damping.accepts_symbols:
@@ -266,7 +266,8 @@ def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | None:
     """Return V P_v (9,) of a point and its derivative (9, 9) by F, with the viscous first
-    Piola–Kirchhoff stress P_v and the volume V of the point.
+    Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law has a
+    potential.
     """
     stress_and_slope = law.damping_stress(
         ca.vec(point.compute_material_gradient()),

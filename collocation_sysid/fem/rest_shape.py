@@ -547,7 +547,9 @@ class InverseEquilibrium:
         return RestShape(x, by_input.reshape(-1, *self.points_m.shape))
 
     def _predict(self, theta: Array) -> Array | None:
-        """Return X (n, 3) [m] at θ to first order from the latest solution."""
+        """Return X (n, 3) [m] at θ to first order from the latest solution; None if there is none,
+        θ differs too much, or an element would be nearly inverted.
+        """
         if not self._shapes:
             return None
         key, shape = next(reversed(self._shapes.items()))
@@ -584,7 +586,9 @@ class InverseEquilibrium:
         return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
 
     def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
-        """Return X (n, 3) [m] at a given weight (3n,) [N], from `start` (n, 3)."""
+        """Return X (n, 3) [m] at a given weight (3n,) [N], from `start` (n, 3); None if Newton's
+        method does not converge.
+        """
         x = start.copy()
         for _ in range(OPTIONS.iterations):
             at = self._assemble_forces(x, theta, slopes=True)

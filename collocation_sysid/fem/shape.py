@@ -129,7 +129,9 @@ class PolylineLength:
 
 
 def _directions_and_lengths(vectors: Array) -> tuple[Array, Array]:
-    """Return directions (T, J, 3) and lengths (T, J, 1) of vectors."""
+    """Return directions (T, J, 3) and lengths (T, J, 1) of vectors; directions of length zero are
+    NaN.
+    """
     length = np.linalg.norm(vectors, axis=2, keepdims=True)
     return vectors / length, length
 

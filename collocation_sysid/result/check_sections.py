@@ -114,7 +114,7 @@ def _point_masses(body: BodyCheck) -> str:
 
 def _body_section(body: BodyCheck, details: bool) -> Table:
     """Return the table "Body": size, volume, mass, mesh, with `details` element quality, the rest
-    shape if the mesh was made under gravity, and fields.
+    shape if the mesh was made under gravity, and fields; what is not known of its origin is asked.
     """
     if body.is_homogeneous:
         names = ", ".join(f"'{name}'" for name in body.experiments)
@@ -208,7 +208,8 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
 
 def _measurements_section(findings: QuickCheck, details: bool) -> Table:
     """Return the table of at most `SHOWN_RECORDINGS` recordings with samples, markers and grasps,
-    and of the air densities of all.
+    and of the air densities of all. Without `details`, grasps that are described in the same words
+    appear once.
     """
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
@@ -237,7 +238,9 @@ def _measurements_section(findings: QuickCheck, details: bool) -> Table:
 
 
 def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
-    """Return table rows with a sentence on each grasp of an experiment, by label."""
+    """Return table rows with a sentence on each grasp of an experiment, by label; several grasps
+    are numbered from 1. Empty without grasps.
+    """
     own = [grasp_sentence(grasp) for grasp in holds if grasp.experiment == experiment]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}
@@ -245,7 +248,9 @@ def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
 
 
 def _air_description(density_kg_m3: float) -> str:
-    """Return how the model contains the surrounding air of a density [kg/m³], in words."""
+    """Return how the model contains the surrounding air of a density [kg/m³], in words; zero stands
+    for a vacuum.
+    """
     if not density_kg_m3:
         return "none (as in a vacuum)"
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
@@ -253,7 +258,8 @@ def _air_description(density_kg_m3: float) -> str:
 
 def _marker_summary(recording: RecordingCheck) -> str:
     """Return how many markers a recording has, how many samples are missing, the marker farthest
-    from the body with its distance [mm], and the other instruments, in words.
+    from the body with its distance [mm], and the other instruments, in words; without markers the
+    instruments alone.
     """
     if not recording.markers:
         besides = "" if recording.test else ", no markers"

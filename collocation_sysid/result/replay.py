@@ -367,7 +367,7 @@ class MotionRecord:
 
 def _obstacle_outlines(experiment: Experiment) -> Array | None:
     """Return the outlines of all obstacles at their stated poses at each sample, (T, o, 3) [m] in
-    the world.
+    the world; None without obstacles.
     """
     body = experiment.body.nodes.points_m
     outlines = []

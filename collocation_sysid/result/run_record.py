@@ -299,7 +299,7 @@ def _visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str
 
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
     """Return the estimates (E, 4) of each spatially varying constant of a body, by name of the
-    field.
+    field; empty if there is none.
     """
     estimates = {}
     for part in body.parts:
@@ -313,7 +313,8 @@ def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
 
 def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     """Return the estimated places (M, 3) [m] of the markers of an experiment on the undeformed
-    body, in the order of its marker names.
+    body, in the order of its marker names; None for a validation experiment whose forward
+    simulation failed.
     """
     if experiment in finished.places:
         places = [place.position_m for place in finished.places[experiment].values()]

@@ -205,7 +205,8 @@ def _updated_shares(
     shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
 ) -> dict[str, float]:
     """Return the contributions to an estimate's variance with the measured discretisation error,
-    largest first.
+    largest first; they sum to one. Without a combined standard error before or after they are
+    unchanged.
     """
     if not before.combined_std_error or not after.combined_std_error:
         return dict(shares)
@@ -222,7 +223,9 @@ def _updated_shares(
 
 
 def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
-    """Return the levels that an earlier call finished, with the values of `names` alone."""
+    """Return the levels that an earlier call finished, with the values of `names` alone; empty
+    without a file.
+    """
     if not file.is_file():
         return []
     require_own(file)

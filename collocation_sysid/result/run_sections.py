@@ -240,7 +240,8 @@ def stated_as_undetermined(result: Result) -> set[str]:
 
 def _undetermined_sentence(result: Result) -> list[str]:
     """Return a sentence that names the estimates whose interval is wider than their value, without
-    those that a reason of the verdict names, with the largest contribution to each variance.
+    those that a reason of the verdict names, with the largest contribution to each variance; empty
+    if there is no such estimate.
     """
     stated = stated_as_undetermined(result)
     sources = []
@@ -431,7 +432,9 @@ def refinement_table(result: Result) -> Table | Line:
 
 
 def _interval_text(ends: tuple[float, float] | None, factor: float, deviation: float | None) -> str:
-    """Return the ends of an interval, multiplied by a factor, to the place of a deviation."""
+    """Return the ends of an interval, multiplied by a factor, to the place of a deviation; "" for
+    None.
+    """
     if ends is None:
         return ""
     low, high = (rounded(factor * end, deviation) for end in ends)
@@ -595,7 +598,9 @@ def _error_bars(result: Result) -> Iterator[Shown]:
 
 
 def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield for each experiment a table of the estimated places of its markers [mm]."""
+    """Yield for each experiment a table of the estimated places of its markers [mm]; an experiment
+    without markers is left out.
+    """
     explanation = (
         "Positions on the undeformed body in millimetres, each with its standard error. "
         "Positions that were not given have a prior as wide as the body."

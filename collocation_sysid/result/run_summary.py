@@ -264,7 +264,9 @@ def _fit_errors(fitted: FittedExperiment) -> str:
 
 
 def _simulation_text(simulated: SimulatedExperiment) -> str:
-    """Return the errors of a forward simulation in words."""
+    """Return the errors of a forward simulation in words; of a validation, those of the blind
+    prediction and beside it those of a copy of the nearest measurements.
+    """
     if simulated.failed is not None:
         return f"failed: {simulated.failed}"
     own = copy_fields(PredictionErrors, simulated)

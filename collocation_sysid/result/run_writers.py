@@ -85,7 +85,9 @@ def write_vtu(
 def _checked_arrays(
     kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
 ) -> dict[str, NDArray]:
-    """Return data as arrays with names escaped for XML."""
+    """Return data as arrays with names escaped for XML; booleans, which VTK does not have, become
+    8-bit integers, and other types are neither converted nor checked.
+    """
     arrays = {name: np.asarray(values) for name, values in data.items()}
     for name, array in arrays.items():
         if array.ndim not in (1, 2) or len(array) != count:
@@ -396,7 +398,9 @@ def require_only_written(folder: Path) -> None:
 
 
 def _replace_folder(new: Path, target: Path, backup: Path) -> None:
-    """Rename the folder `new` to `target`."""
+    """Rename the folder `new` to `target`; an existing `target` is moved to `backup`, which must
+    not exist, and removed once that succeeded.
+    """
     if not target.exists():
         new.rename(target)
         return

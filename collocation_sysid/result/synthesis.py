@@ -308,7 +308,9 @@ def _write_specimen(
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[ForceSensorSection]:
-    """Return the table layout of each force sensor, those of grasps before those of obstacles."""
+    """Return the table layout of each force sensor, those of grasps before those of obstacles;
+    empty if `section` is None, for a problem without a file.
+    """
     moved = section.moved_sections if section is not None else []
     return [each.sensor for each in moved if each.sensor is not None]
 
@@ -336,7 +338,9 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
 
 
 def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection | SpecimenSection]:
-    """Return the table of each experiment in the problem file, by name of the experiment."""
+    """Return the table of each experiment in the problem file, by name of the experiment; empty for
+    a problem without a file.
+    """
     if (origin := problem.origin) is None:
         return {}
     file = ProblemFile.model_validate(parse_toml(origin.text, origin.path))

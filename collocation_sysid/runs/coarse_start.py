@@ -137,7 +137,10 @@ class CoarseStart:
         ]
 
     def _interpolated(self, experiment: str, x: Array) -> Array:
-        """Return positions (N, 3n) of the given body from those of the coarse one (N, 3m)."""
+        """Return positions (N, 3n) of the given body from those of the coarse one (N, 3m); nodes of
+        obstacle frames, which come last, are copied, and positions of an experiment whose body is
+        not coarsened are returned themselves.
+        """
         relation = self.relations.get(experiment)
         if relation is None:
             return x

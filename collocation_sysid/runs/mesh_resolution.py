@@ -134,7 +134,8 @@ def _is_reason(few: Concern, refinement: Refinement | None) -> bool:
 
 def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> Iterator[Concern]:
     """Yield a concern about the estimated elastic constant whose change on a finer mesh is largest,
-    if that is more than `LARGEST_CHANGE` of its value.
+    if that is more than `LARGEST_CHANGE` of its value. Constants on a linear scale do not count,
+    since they may be near zero, and of derived moduli only E: λ changes without limit near ν = ½.
     """
     if refinement is None:
         return

@@ -238,7 +238,8 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
 
 def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreement] | None:
     """Return the estimates from single recordings, to first order, and their agreement, by scalar
-    parameter.
+    parameter; None if this was not evaluated. Values are NaN for recordings that do not determine
+    the parameter.
     """
     if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
         return None
@@ -306,7 +307,8 @@ def _sensor_errors(error: PredictionErrors) -> dict[str, Any]:
 
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
     """Return the errors of the forward simulations of all experiments, with the RMS over all marker
-    samples and the maximum over the fitted ones.
+    samples and the maximum over the fitted ones; both None if none of these has markers and a
+    simulation.
     """
     experiments = {}
     squares = []
@@ -325,7 +327,9 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
 
 
 def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
-    """Return the errors of the forward simulation of an experiment."""
+    """Return the errors of the forward simulation of an experiment; if it failed, only the reason
+    and whether the experiment was fitted. `answer.rollouts` must have an entry for it.
+    """
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):

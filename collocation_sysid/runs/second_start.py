@@ -219,7 +219,9 @@ def _usual_modulus(name: str, young_pa: float) -> float:
 
 
 def _power_law_start(solution: Solution) -> SecondStart | None:
-    """Return the start of `power_law_start`."""
+    """Return the start of `power_law_start`; None where there is none, and where the solution has
+    the same exponents or fits as well by the closed forms.
+    """
     collocation = solution.collocation
     start = power_law_start(collocation)
     if start is None:

@@ -559,7 +559,9 @@ class SolvedProblem:
         return by_value
 
     def _collect_relative_deviations(self) -> Array:
-        """Return the combined standard uncertainties (k,) of the relative coordinates."""
+        """Return the combined standard uncertainties (k,) of the relative coordinates; NaN where
+        there is none.
+        """
         known = [_or_nan(self.estimates[n].combined_std_error) for n in self._estimated_names]
         return np.abs(self._relative_by_value()) * np.array(known)
 
@@ -675,7 +677,9 @@ class SolvedProblem:
         return pandas.DataFrame.from_dict(rows, orient="index")
 
     def _row(self, name: str) -> dict[str, float | str]:
-        """Return the row of the estimate `name`, which must exist, in `to_frame`, by column."""
+        """Return the row of the estimate `name`, which must exist, in `to_frame`, by column; NaN
+        for unknown numbers.
+        """
         each = self.estimates[name]
         combined = each.combined95 or (np.nan, np.nan)
         statistical = each.statistical95 or (np.nan, np.nan)

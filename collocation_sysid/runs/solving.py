@@ -210,7 +210,7 @@ def _solve_by(
 
 def _likeliest_lengths(problem: Problem, solution: Solution) -> dict[str, float] | None:
     """Return the most likely of the correlation lengths [m] that the fields of a problem allow, by
-    name of the field.
+    name of the field; None if there is no choice or the solution did not converge.
     """
     fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     has_choice = any(len(field.field.lengths_m) > 1 for field in fields)
@@ -227,7 +227,7 @@ def _solve_by_coarse_start(
     problem: Problem, solver: ReducedSpace, watch: Watch | None, workers: ExperimentExecutor | None
 ) -> Solution | None:
     """Solve a problem with fixed correlation lengths on a coarser mesh first, and from there on its
-    own.
+    own; None if the method's options or the sizes of the bodies do not call for a coarse start.
     """
     coarse_start = plan_coarse_start(problem, solver)
     if coarse_start is None:
@@ -259,7 +259,10 @@ def _solve_on_coarse_mesh(
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
-    """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`."""
+    """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
+    if it did not converge. The problem is `coarse_start.problem`, solved from its guesses or a
+    scan; the other arguments are those of `_solve_once`.
+    """
     tolerance = max(solver.tolerance, COARSE_TOLERANCE)
     with search_activity(f"coarse start on {coarse_start.describe_size()}"):
         try:
@@ -474,7 +477,9 @@ def _program_and_start(
 
 
 def _feature_notes(solution: Solution) -> list[str]:
-    """Return the notes of all features on the fitted experiments of a solution, in their order."""
+    """Return the notes of all features on the fitted experiments of a solution, in their order;
+    empty without any.
+    """
     parts = solution.parts
     lost = [note for part in parts for note in lost_samples(part.transcription.experiment)]
     return lost + [note for part in parts for feature in FEATURES for note in feature.notes(part)]

@@ -363,7 +363,9 @@ def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
 
 
 def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
-    """Return a copy of the solution with bodies whose two-phase fields have these samples."""
+    """Return a copy of the solution with bodies whose two-phase fields have these samples;
+    variables and associations are the same.
+    """
     collocation = solution.collocation
     bodies: dict[int, Body] = {}
     for body in dict.fromkeys(transcription.body for transcription in collocation.transcriptions):

@@ -79,7 +79,9 @@ class PlainInternalForce:
 
     @cached_property
     def _symbols(self) -> list[ca.SX]:
-        """Symbols of one element: x, v and weights w (3·nodes,), geometry (columns: points."""
+        """Symbols of one element: x, v and weights w (3·nodes,), geometry (columns: points; rows:
+        shape gradients, then the volume), and the constants of material and damping law.
+        """
         _, points, width = self.body.geometry.shape
         size = 3 * self.body.element.nodes
         part = self.body.parts[0]

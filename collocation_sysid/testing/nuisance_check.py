@@ -92,7 +92,9 @@ def check_nuisance(
 
 
 def _with_row(experiment: Experiment, row: Deviation) -> Experiment:
-    """Return the experiment in which the parameter of a row is estimated."""
+    """Return the experiment in which the parameter of a row is estimated; the argument is not
+    modified.
+    """
     nuisance = experiment.nuisance
     if row not in KINDS:
         return replace(experiment, nuisance=replace(nuisance, own=(*nuisance.own, row)))

@@ -130,7 +130,9 @@ def _write_body(
 
 
 def _mesh(experiment: Experiment) -> TetMesh:
-    """Return the mesh of the body of an experiment."""
+    """Return the mesh of the body of an experiment; for a material test without a mesh a cube of
+    `CUBE_DIVISIONS`, with sides of `CELL_SIZE_M` and a corner at the origin.
+    """
     if experiment.specimen is None:
         return experiment.body.mesh
     return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0))

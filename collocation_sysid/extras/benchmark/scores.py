@@ -196,7 +196,9 @@ def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
 
 
 def _errors(predicted: Signal, measured: Signal) -> Array:
-    """Return predicted minus measured values (T, C) in the unit of the signals."""
+    """Return predicted minus measured values (T, C) in the unit of the signals; NaN where nothing
+    was measured.
+    """
     return predicted.values - measured.values
 
 

@@ -245,7 +245,7 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
 
 def _relative_to(value: Any, old: Path, new: Path) -> Any:
     """Return nested content of a problem with file names relative to the folder `new` instead of
-    `old`, in new lists and dictionaries.
+    `old`, in new lists and dictionaries; whether the files exist does not matter.
     """
     if isinstance(value, list):
         return [_relative_to(each, old, new=new) for each in value]

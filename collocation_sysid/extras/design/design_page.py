@@ -47,7 +47,8 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
 def _error_table(design: Design) -> Table:
     """Return the table of error bars before and after the design, a line for each parameter or
     modulus: value, relative errors in percent, their range over the draws of θ, and the factor by
-    which the error is reduced.
+    which the error is reduced. Without error bars before the design, "error before" and the factor
+    are empty.
     """
     heads = ("", "value", "error before", "error after", "range over the prior", "reduction factor")
     before = design.before
@@ -69,7 +70,9 @@ def _error_table(design: Design) -> Table:
 
 
 def _percent(share: float) -> str:
-    """Return a relative error `share` as text in percent."""
+    """Return a relative error `share` as text in percent; empty for NaN, "not determined" from 1000
+    % on.
+    """
     if np.isnan(share):
         return ""
     return f"{100 * share:.3g} %" if share < 10 else "not determined"

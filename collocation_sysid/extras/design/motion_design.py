@@ -517,7 +517,8 @@ def _select_experiment(problem: Problem, name: str | None) -> Experiment:
 
 def _no_motion_message(best: SearchResult) -> str:
     """Return a message that says why no motion was found, with a remedy: no simulation reached its
-    end, or markers left the views.
+    end, or markers left the views. `best` is the result of the search, whose value is at least
+    `FORBIDDEN`.
     """
     tried = f"none of the {len(best.history)} motions that were tried"
     if best.value >= 2 * FORBIDDEN:

@@ -102,7 +102,7 @@ def _step_times_s(body: IdentifiedBody) -> Array:
 
 def _obstacle_cards(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
     """Return the obstacles as cards, which precede the steps: a tetrahedron under each facet, a
-    common material, and a contact pair for each obstacle.
+    common material, and a contact pair for each obstacle; empty without obstacles.
     """
     deck = ""
     tetrahedra = body.body.mesh.tetrahedra

@@ -174,7 +174,8 @@ def parse_destination(
 
 def _require_replaceable(file: Path) -> None:
     """Raise `InputError`, naming the file, if it exists and this program did not write it or it was
-    changed since, or if it is a folder or a link, even one to nowhere.
+    changed since, or if it is a folder or a link, even one to nowhere. A file that does not exist
+    is accepted.
     """
     if file.is_dir() and not file.is_symlink():
         raise InputError("this is a folder; expected a file to write", file, where="--to")

@@ -150,7 +150,8 @@ def _geom_attributes(solid: Solid) -> str:
 
 def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
     """Return the XML of the constraints between the mocap bodies of the grasps and the bodies that
-    carry grasped nodes.
+    carry grasped nodes; empty without grasps. They are as stiff as the timestep `step_s` [s]
+    allows.
     """
     return "".join(
         f'<weld body1="hand{k}" body2="grasp{k}" relpose="0 0 0 1 0 0 0" '
@@ -169,7 +170,9 @@ def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
 
 
 def _node_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the free nodes (not held along all axes), each a body on three slides."""
+    """Return the XML of the free nodes (not held along all axes), each a body on three slides; the
+    name of the body contains the index of the node from 0: "node0", "node1", …
+    """
     lines = ""
     mass = body.total_node_mass_kg
     for n in np.flatnonzero(~body.is_node_prescribed):

@@ -89,7 +89,9 @@ class Primitive:
 
 
 def _rotation_of_z_to(axis: Array) -> Rotation:
-    """Return a rotation of the z axis to a vector (3,) of any length above zero."""
+    """Return a rotation of the z axis to a vector (3,) of any length above zero; the angle about
+    the vector is arbitrary.
+    """
     return Rotation.align_vectors(axis[None], np.array([[0.0, 0.0, 1.0]]))[0]
 
 
@@ -197,13 +199,17 @@ class Facets:
 
 
 def _unit_normals(corners: Array) -> Array:
-    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3)."""
+    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3); for a triangle without
+    area NaN, with a RuntimeWarning of NumPy.
+    """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
 def _hull_points(shape: Primitive, rounding_m: float, tolerance_m: float) -> Array:
-    """Return points (p, 3) of a solid that are the furthest along some direction."""
+    """Return points (p, 3) of a solid that are the furthest along some direction; their hull is the
+    solid, with round surfaces replaced by facets.
+    """
     radius_m = rounding_m if shape.kind == "box" else shape.size_m[0]
     wide = float(
         np.clip(4 * np.sqrt(tolerance_m / max(radius_m, tolerance_m)), *FACET_WIDTH_LIMITS_RAD)

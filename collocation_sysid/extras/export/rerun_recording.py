@@ -99,7 +99,8 @@ def write_rerun(run: str | Path, folder: str | Path, experiment: str | None = No
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
     """Return the von Mises stress (T, F) [Pa] on the F triangles of the surface of an experiment,
-    at each sample that of the nearest frame.
+    at each sample that of the nearest frame; None if the run has no frames of it or damaged ones,
+    or the experiment was not fitted.
     """
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
@@ -111,7 +112,8 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
 
 def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
     """Return the smallest and largest stress [Pa] of all experiments as ends of their common colour
-    scale.
+    scale; 0 and 1 if none is known. Entries of `stresses` are (T, F) arrays, or None; NaN does not
+    count.
     """
     known = [each for each in stresses if each is not None and np.isfinite(each).any()]
     if not known:
@@ -363,7 +365,9 @@ class _Recording:
                     self._write_curve(path, t_s, values=curve)
 
     def _write_curve(self, path: str, t_s: Array, values: Sequence[float] | Array) -> None:
-        """Write a number `values` (T,) over the times `t_s` (T,) [s] under the entity `path`."""
+        """Write a number `values` (T,) over the times `t_s` (T,) [s] under the entity `path`; times
+        at which it is not finite are left out.
+        """
         curve = np.asarray(values, dtype=float)
         is_finite = np.isfinite(curve)
         if is_finite.any():
@@ -371,7 +375,9 @@ class _Recording:
             self._send(path, t_s[is_finite], columns=columns, counts=None)
 
     def _send(self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None) -> None:
-        """Send columns of the entity `path` at the times `t_s` (T,) [s]."""
+        """Send columns of the entity `path` at the times `t_s` (T,) [s]; `counts` are the numbers
+        of rows per time, None for one row each.
+        """
         times = [self.rr.TimeColumn(TIMELINE, duration=t_s)]
         data = columns if counts is None else columns.partition(counts)
         self.stream.send_columns(path, times, data)

@@ -209,13 +209,17 @@ def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> 
 
 
 def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
-    """Bind a physics material to a prim, in place."""
+    """Bind a physics material to a prim, in place; materials bound to its descendants prevail.
+    `pxr` are the modules of `_import_usd`.
+    """
     binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
 def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
-    """Set the uniform token attribute `name` of a prim to `text`, in place."""
+    """Set the uniform token attribute `name` of a prim to `text`, in place; `pxr` are the modules
+    of `_import_usd`.
+    """
     kind = pxr.Sdf.ValueTypeNames.Token
     fixed = pxr.Sdf.VariabilityUniform
     prim.CreateAttribute(name, kind, False, fixed).Set(text)
@@ -254,7 +258,9 @@ def _add_gripper(
 
 
 def _set_poses(pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array) -> None:
-    """Place a prim at positions (T, 3) [m] and rotations (T) at times (T,) [s]."""
+    """Place a prim at positions (T, 3) [m] and rotations (T) at times (T,) [s]; its default pose is
+    that of the first row.
+    """
     codes = (_rate_hz(t_s) * t_s).tolist()
     wxyz = rotations.as_quat(scalar_first=True)
     place = prim.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)

@@ -481,7 +481,7 @@ class LiveEstimator:
 
     def _checked_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
         """Return the frame with NaN for markers that are implausibly far from the last known
-        position of every moving grasp, and notes on them.
+        position of every moving grasp, and notes on them; the frame itself is not changed.
         """
         notes = []
         if frame.has_wrench and not self.model.experiment.sensors_by_grasp:
@@ -501,7 +501,9 @@ class LiveEstimator:
         return frame, notes
 
     def _note_outliers(self, is_outlier: NDArray[np.bool_]) -> str:
-        """Add the number of outliers to the counts, and return a note with their names."""
+        """Add the number of outliers to the counts, and return a note with their names;
+        `is_outlier` (M,) says which markers are, at least one.
+        """
         self.counts["wild"] += int(is_outlier.sum())
         names = ", ".join(self.names[m] for m in np.flatnonzero(is_outlier))
         return (
@@ -675,7 +677,8 @@ class LiveEstimator:
 
     def _restart(self) -> None:
         """Keep the information of all samples so far as a prior, discard passes, log and frames,
-        and wait for a new start.
+        and wait for a new start; the estimate stays. The restart is counted in `counts`, as "begun
+        anew".
         """
         if self.first_pass is not None:
             self.prior = self.first_pass.condense_measurements()
@@ -760,7 +763,8 @@ class LiveEstimator:
 
     def _update_estimate(self) -> None:
         """Set the estimate `p` (P,) to the minimum of the joint quadratic loss of the first and the
-        second pass, within bounds and trust region.
+        second pass, within bounds and trust region; without effect before the first pass, or if
+        that failed.
         """
         if self.first_pass is not None and not self.first_pass.has_failed:
             self._combined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
@@ -778,7 +782,7 @@ class LiveEstimator:
 
     def _next_linearisation_point(self, first_pass: WindowPass) -> Array:
         """Return the next linearisation point p (P,) of a pass, in the solver's coordinates
-        (logarithms, or values of linear parameters.
+        (logarithms, or values of linear parameters; not transformed).
         """
         size = self.model.parameter_count
         samples = len(self.log) / self.model.collocation.substeps
@@ -874,7 +878,9 @@ class LiveEstimator:
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
-        """Complete a second pass that lags by few rows, if there is time, before new rows come."""
+        """Complete a second pass that lags by few rows, if there is time, before new rows come; it
+        is then accepted or rejected.
+        """
         second_pass = self.second_pass
         if second_pass is None or second_pass.base is None:
             return 0
@@ -1049,8 +1055,8 @@ class LiveEstimator:
         self._update_estimate()
 
     def _drop_old_rows(self) -> None:
-        """Remove the oldest blocks of rows from the first pass and the log if the window is
-        full.
+        """Remove the oldest blocks of rows from the first pass and the log if the window is full;
+        their information becomes part of the prior of the pass.
         """
         if self.first_pass is None:
             return

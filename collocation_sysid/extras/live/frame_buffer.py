@@ -276,7 +276,9 @@ class FrameBuffer:
         return self.start_s + row * self.interval_s / self.substeps
 
     def _completed_rows(self) -> list[LoggedRow]:
-        """Return the new rows, up to the last pose, and increase `rows` by their number."""
+        """Return the new rows, up to the last pose, and increase `rows` by their number; none
+        before the first pose.
+        """
         rows: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:
             return []
@@ -327,7 +329,9 @@ class FrameBuffer:
         latest_s = now_s - self.neighbouring_samples * self.interval_s + room_s
 
         def ready(of: int, t_s: float) -> bool:
-            """Return whether the rows that a sample at t_s needs are available."""
+            """Return whether the rows that a sample at t_s needs are available; `of` is the number
+            of its instrument, 0 for markers.
+            """
             if not of:
                 return t_s <= latest_s
             instrument = self.instruments[of - 1]

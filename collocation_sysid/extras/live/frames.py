@@ -446,7 +446,9 @@ class FrameReader:
         return positions, quaternions
 
     def _parse_row(self, cells: list[str]) -> Frame | None:
-        """Return the frame of a row of a table, with poses of the body."""
+        """Return the frame of a row of a table, with poses of the body; None for the first row, the
+        header, whose columns are stored.
+        """
         if self._columns is None:
             self._columns = self._checked_header(cells)
             return None
@@ -485,7 +487,8 @@ class FrameReader:
 
     def _list_instrument_columns(self) -> list[Sequence[str]]:
         """Return the column names of each instrument: custom sensors, then the six of each sensor
-        of a grasp, "fx_n" to "tz_nm".
+        of a grasp, "fx_n" to "tz_nm"; the latter with the number of the grasp and a dot in front if
+        there are several.
         """
         before = ["" if len(self.wrenches) == 1 else f"{number}." for number in self.wrenches]
         of_wrenches = [[each + name for name in WRENCH_COLUMNS] for each in before]

@@ -167,7 +167,9 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
 def _draw_parameter(
     figure: Figure, k: int, count: int, name: str, t_s: Array, updates: Sequence[LiveUpdate]
 ) -> tuple[list, list[Array]]:
-    """Add the axes of a parameter to a figure."""
+    """Add the axes of a parameter to a figure; return the three lines of its value and of the ends
+    of its interval, without data yet, and their data (T,), NaN for ends that are unknown.
+    """
     estimates = [update.estimates[name] for update in updates]
     value = np.array([each.value for each in estimates])
     ends = np.array([each.statistical95 or (np.nan, np.nan) for each in estimates])

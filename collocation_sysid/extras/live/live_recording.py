@@ -114,7 +114,8 @@ class LiveRecording:
 
     def _write_estimates(self, update: LiveUpdate) -> None:
         """Write parameters and statistical intervals, the verdict with its reasons if it changed
-        since the last call, and notes, at the present time of the recording.
+        since the last call, and notes, at the present time of the recording; intervals that are
+        None are left out.
         """
         rr = self._rr
         for name, each in update.estimates.items():

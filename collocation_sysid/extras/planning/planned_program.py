@@ -581,7 +581,9 @@ def _lowest_frequency_hz(driven: DrivenMotion, start: Array) -> float:
 
 
 def _window_samples(task: Task, sample_s: float, lowest_hz: float) -> int:
-    """Return the number of samples after the motion in which the body is at rest."""
+    """Return the number of samples after the motion in which the body is at rest; 0 if it need not
+    be.
+    """
     end = task.end
     if not end.at_rest:
         return 0

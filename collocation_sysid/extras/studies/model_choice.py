@@ -102,7 +102,8 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
 
 def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
     """Return the row of a model from its fits, without the columns that compare models
-    ("independent", "delta_aic", "log_ratio", "log_ratio_error", "chosen").
+    ("independent", "delta_aic", "log_ratio", "log_ratio_error", "chosen"); see `model_rows` for the
+    others.
     """
     complete_fit = fits.get("", {})
     predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
@@ -129,7 +130,9 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
 
 
 def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the RMS over the samples of all predictions, in their common unit."""
+    """Return the RMS over the samples of all predictions, in their common unit; None if there is no
+    prediction, one of them is missing, or their units differ.
+    """
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
     if len({each["unit"] for each in predictions}) > 1:

@@ -395,7 +395,9 @@ def _with_part_material(
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
-    """Return the shear modulus at small strain [Pa] that follows from guesses or fixed values."""
+    """Return the shear modulus at small strain [Pa] that follows from guesses or fixed values; None
+    if unknown.
+    """
 
     def guess(name: str) -> float:
         """Return the guess or fixed value of a constant; NaN if it has none."""
@@ -454,7 +456,9 @@ def _with_memory(
     tables: Sequence[Mapping[str, Any]],
     times_s: tuple[float, float],
 ) -> dict[str, Any]:
-    """Return the parameters with a share and a time constant of each branch."""
+    """Return the parameters with a share and a time constant of each branch; those that the file
+    has are kept.
+    """
     names = [each["name"] for each in tables]
     removed_names = {name for name in old if name not in names}
     unchanged = {

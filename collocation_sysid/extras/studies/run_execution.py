@@ -165,7 +165,8 @@ def _watch(
 
 def _crash_message(code: int, stderr: IO[bytes]) -> str:
     """Return how a process with this exit code ended (negative for a signal), with the last line of
-    its error output, if there is any.
+    its error output, if there is any. `stderr` is the file with that output, which is read from its
+    start.
     """
     cause = killed_by(code) or f"the process ended with code {code}"
     stderr.seek(0)
@@ -328,7 +329,9 @@ def run_all(
 
 
 def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
-    """Return the record of a run from its finished future."""
+    """Return the record of a run from its finished future; if that raises, a record of a crash,
+    because its worker was lost.
+    """
     try:
         return future.result()
     except Exception as error:

@@ -80,7 +80,7 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
 
 def _tip_record(finished: Run) -> dict[str, Any] | None:
     """Return measured and simulated track of the marker farthest from the grasp in the undeformed
-    body, of the first fitted experiment, for JSON.
+    body, of the first fitted experiment, for JSON; None without markers.
     """
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers

@@ -222,7 +222,9 @@ def _range_values(key: str, text: str) -> Iterable[str]:
 
 
 def _split_values(text: str) -> list[str]:
-    """Split text at the commas that are outside brackets, braces and quotes."""
+    """Split text at the commas that are outside brackets, braces and quotes; items are stripped,
+    empty ones left out.
+    """
     items = [""]
     open_brackets = 0
     quote = ""

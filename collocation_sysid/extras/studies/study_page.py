@@ -515,7 +515,8 @@ def _transposed_view(
 
 def _ratio_text(row: Row) -> str:
     """Return the ratio of a model's prediction error to the best one as text, with its standard
-    error.
+    error; "–" if "log_ratio" is None, because not all held-out data were predicted. `row` is one of
+    `model_rows`.
     """
     if row["log_ratio"] is None:
         return "–"
@@ -565,7 +566,8 @@ def _number_cell(name: str, factor: float = 1.0, form: str = ".2g", among: str =
 
 def _bounded_cell(name: str) -> Cell:
     """Return the cell of the parameter `name`: a function of a row of `model_rows` that returns its
-    value as text, followed by "(at lower bound)" or "(at upper bound)" if it ended there.
+    value as text, followed by "(at lower bound)" or "(at upper bound)" if it ended there; "–" if
+    the model has no such parameter.
     """
     number = _number_cell(name, 1, form=".4g", among="parameters")
 
@@ -620,7 +622,8 @@ def _column_cell(name: str) -> Cell:
 
 def _estimate_cell(name: str) -> Cell:
     """Return the cell of the estimate of the parameter `name`: a function of a row of `run_row`
-    that returns its value, with the combined standard error if that is known, as text.
+    that returns its value, with the combined standard error if that is known, as text; "–" without
+    an estimate.
     """
 
     def cell(row: Row) -> str:

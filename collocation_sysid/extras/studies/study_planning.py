@@ -364,7 +364,8 @@ def _planned_run(
 
 def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
     """Return SHA-256 hashes, by the name as it is written, of the files that the content of a
-    problem names, so that changed data give another run.
+    problem names, so that changed data give another run. A topic of a log with several files has
+    their hashes, separated by spaces. Names of missing files and of folders are left out.
     """
     hashes = {}
     for text in _texts(content):

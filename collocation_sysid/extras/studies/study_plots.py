@@ -145,7 +145,9 @@ def model_plots(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Figure]:
 
 
 def _model_ends(row: Row, panel: str) -> tuple[float, float, float] | None:
-    """Return low end, value and high end of a model in a panel of `model_plots`."""
+    """Return low end, value and high end of a model in a panel of `model_plots`; None if the model
+    has no such value.
+    """
     if panel == "prediction":
         if row["log_ratio"] is None or not np.isfinite(row["log_ratio_error"]):
             return None
@@ -160,7 +162,9 @@ def _model_ends(row: Row, panel: str) -> tuple[float, float, float] | None:
 
 
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
-    """Return colour and rows of each method by its name, in the order of their first rows."""
+    """Return colour and rows of each method by its name, in the order of their first rows; colours
+    repeat if there are more methods than colours. `rows` are those of `run_row`.
+    """
     methods = dict.fromkeys(row["method"] for row in rows)
     return {
         method: (

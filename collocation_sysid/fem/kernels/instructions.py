@@ -170,7 +170,9 @@ def _emit_comparison(sign: str) -> Emit:
 
 
 def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
-    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans."""
+    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans; as in C,
+    NaN differs from everything, itself included.
+    """
     return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
 
 

@@ -80,7 +80,9 @@ def _initialise() -> None:
 
 
 def _target_machine(quickly: bool) -> llvm.TargetMachine:
-    """Return a code generator for this CPU, without optimisation if `quickly`."""
+    """Return a code generator for this CPU, without optimisation if `quickly`; the engine that uses
+    it owns and frees it.
+    """
     _initialise()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(),

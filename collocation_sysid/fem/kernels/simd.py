@@ -462,7 +462,8 @@ class _KernelEmitter:
 
     def _coefficients(self, coupling: ca.Function, totals: Value) -> list[dict[int, list]]:
         """Emit the evaluation of the coupling, and return for each output, by the index of the
-        column, a list of pairs: offset of a node vector in `totals`, and its coefficient.
+        column, a list of pairs: offset of a node vector in `totals`, and its coefficient. Zero
+        coefficients are left out.
         """
         outputs = [coupling.sparsity_out(k) for k in range(coupling.n_out())]
         entries = [list(zip(*output.get_triplet(), strict=True)) for output in outputs]

@@ -235,7 +235,9 @@ class _SkylineEmitter:
         self.module = ir.Module()
 
     def _begin(self, name: str) -> Sequence[Value]:
-        """Begin a function with the arguments that `ARGUMENTS` states, and return them."""
+        """Begin a function with the arguments that `ARGUMENTS` states, and return them; `b` becomes
+        its builder.
+        """
         integers, maps, arrays = ARGUMENTS[name]
         kinds = [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), name)
@@ -294,7 +296,8 @@ class _SkylineEmitter:
 
     def _scale(self, pivot: Value, last: Value) -> None:
         """Emit the division of the entries beyond a pivot, up to the position `last`, by the pivot,
-        which is stored in D.
+        which is stored in D; the pivot itself and entries before it in its vector become zero. With
+        two sides, add |L_ik D_k U_ik| to the growth of each row i.
         """
         b = self.b
         diagonal = b.load(self._entry(self.sides[0], pivot, place=pivot))

@@ -147,7 +147,9 @@ def _ogden_density(
 def _hyperfoam_density(
     ratio: ca.SX, scaled_excess: ScaledExcess, constants: Mapping[str, ca.SX]
 ) -> ca.SX:
-    """Return the energy density of the foam."""
+    """Return the energy density of the foam; see `_ogden_density` for the arguments and `hyperfoam`
+    for the constants.
+    """
     log_j = ca.log(ratio)
     energy = ca.SX(0)
     for p in term_numbers(constants):

@@ -288,7 +288,9 @@ class StressEvaluator:
         add: bool,
         point_data: Array | None = None,
     ) -> None:
-        """Evaluate a kernel for one part."""
+        """Evaluate a kernel for one part; its evaluator is built at the first use. Up to
+        `SINGLE_THREAD_STATES` states run on one thread.
+        """
         body = self.body
         key = (name, number)
         with COMPILING:

@@ -276,7 +276,9 @@ class _CollapseState:
         return np.where((quality >= limit) & np.isfinite(quality), -quality, np.inf)
 
     def _qualities(self, cells: Index) -> Array:
-        """Return the mean ratios (k,) of elements (k, 4) as of `mean_ratios`."""
+        """Return the mean ratios (k,) of elements (k, 4) as of `mean_ratios`; −1 if an element is
+        inverted, flat up to rounding, or has too long an edge.
+        """
         volumes = signed_volumes(self.points, cells)
         is_valid = volumes > LEAST_VOLUME * self.coarse_edge_m**3
         lengths = edge_lengths(self.points, cells[is_valid])
@@ -294,7 +296,9 @@ class _CollapseState:
         return sp.csr_array((np.ones(self.cells.size), places), shape=shape)
 
     def _independent(self, removed: Index) -> Index:
-        """Return indices, ascending, of nodes (k,) of which no two share an element."""
+        """Return indices, ascending, of nodes (k,) of which no two share an element; of two that
+        do, the earlier one is preferred.
+        """
         rank = np.full(len(self.points), len(removed))
         rank[removed] = np.arange(len(removed))
         chosen: list[Index] = []

@@ -343,7 +343,9 @@ def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
-    """Return a contiguous array that cannot be modified."""
+    """Return a contiguous array that cannot be modified; an argument that is contiguous is itself
+    made read-only and returned.
+    """
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
     return array

@@ -238,7 +238,9 @@ def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
-    """Raise an `InputError` if a used node has coordinates that are not finite."""
+    """Raise an `InputError` if a used node has coordinates that are not finite; `used` are the
+    indices of the nodes that an element has.
+    """
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
         raise InputError(

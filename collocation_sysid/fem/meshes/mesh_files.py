@@ -364,7 +364,9 @@ def _cell_counts(data: MeshContent) -> Counter[str]:
 
 
 def _listed(counts: Mapping[str, int]) -> str:
-    """Return numbers of cells by type as text, such as "12 tetra, 3 line"."""
+    """Return numbers of cells by type as text, such as "12 tetra, 3 line"; "no cells at all" if
+    empty.
+    """
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 

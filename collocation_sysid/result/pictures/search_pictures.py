@@ -97,7 +97,7 @@ def _continuation_stages(history: Sequence[Iteration]) -> list[slice]:
 def _mark_continuation_stages(
     panels: Sequence[Axes], history: Sequence[Iteration], stages: Sequence[slice]
 ) -> None:
-    """Mark the iterations at which the fit takes in more timesteps."""
+    """Mark the iterations at which the fit takes in more time steps: loss and error increase there."""
     if len(stages) < 2:
         return
     for part in stages:

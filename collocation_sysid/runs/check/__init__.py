@@ -383,7 +383,8 @@ def expected_search_s(problem: Problem) -> float | None:
 
 def _fit_to_markers_s(collocation: Collocation, total_s: float, samples: int) -> float:
     """Return the estimated time [s] to fit the first `samples` samples, each counted as one time
-    step, to the markers alone.
+    step, to the markers alone; `total_s` is the time to simulate the complete recordings [s] of
+    `collocation`.
     """
     share = min(1.0, samples / _grid_rows(collocation))
     return FIT_SIMULATIONS * total_s * share
@@ -445,7 +446,8 @@ def _program_fields(
 
 def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesCheck, ...]:
     """Return the natural modes at the guess of each fitted experiment that moves, in their order,
-    with the scheme and step of the collocation.
+    with the scheme and step of the collocation; static and held out experiments are left out. Every
+    parameter must have a guess.
     """
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses
@@ -487,7 +489,9 @@ def _concerns(
 
 
 def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
-    """Return the finding of each body at the guess, with the names of its experiments."""
+    """Return the finding of each body at the guess, with the names of its experiments; every
+    parameter must have a guess.
+    """
     guesses = problem.parameters.guesses
     names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
     specimens = {e.name for e in problem.experiments if e.specimen is not None}

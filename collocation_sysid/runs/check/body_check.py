@@ -317,7 +317,9 @@ def check_body(
 
 
 def _rest_shape(body: Body) -> str | None:
-    """Return the kind of the stated rest shape, "stress_free" or "under_gravity"."""
+    """Return the kind of the stated rest shape, "stress_free" or "under_gravity"; None if none is
+    stated.
+    """
     if body.rest_shape is None:
         return None
     return "stress_free" if body.scan_conditions is None else "under_gravity"
@@ -346,7 +348,8 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
     """Return E [Pa] and ν at small strain of each part, then the constants of the body without
-    coefficients of fields, by name with the region.
+    coefficients of fields, by name with the region; stated moduli replace computed ones. `theta`
+    (k,) are the constants.
     """
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
