@@ -308,12 +308,10 @@ class Depth(Measurement):
             self, t_s=self.sample_times_s[:count], clouds=self.clouds[:count], images_m=images_m
         )
 
-    def needed_until_s(self, fewest: int) -> float:
-        """Return the time [s] by which a sample has points, and of as many samples as there are up
-        to the number `fewest`.
-        """
-        last = max(fewest - 1, self.find_first_sample_with_points())
-        return float(self.sample_times_s[min(last, len(self.sample_times_s) - 1)])
+    @property
+    def first_useful_s(self) -> float:
+        """Time of its first sample with points [s]."""
+        return float(self.sample_times_s[self.find_first_sample_with_points()])
 
     @property
     def point_counts(self) -> list[int]:

@@ -36,6 +36,9 @@ class Measurement:
         Plural of its unlabelled points; not used without any.
     precedence : int
         Of several kinds, the one with the smallest number is the main measurement.
+    counts_pixels : bool
+        Whether its numbers are pixels from a corner of an image: their sign, unit and zero cannot be
+        wrong, and a flipped image shows a mirror image of the body.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # subclasses are dataclasses
@@ -47,6 +50,7 @@ class Measurement:
     symmetry: int = 1
     points_name: ClassVar[str] = "points"
     precedence: ClassVar[int] = 3
+    counts_pixels: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -134,10 +138,9 @@ class Measurement:
         """Return a sensor with at most `most` unlabelled points in each sample; here self."""
         return self
 
-    def needed_until_s(self, fewest: int) -> float:
-        """Return the time [s] that the beginning of a recording must include so that the sensor is
-        useful in it, if possible with the number `fewest` of samples; here any time, −∞.
-        """
+    @property
+    def first_useful_s(self) -> float:
+        """Time of its first sample that shows the body [s]; here any time, −∞."""
         return -np.inf
 
     def until_time(self, end_s: float) -> Self | None:

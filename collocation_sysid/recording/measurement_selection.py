@@ -48,7 +48,7 @@ def shortened_experiment(
     for sensor in experiment.separate_sensors:
         times_s = sensor.sample_times_s
         inside_s = times_s[times_s >= experiment.t_s[0] - TIME_TOLERANCE_S][:fewest]
-        needed_s = max(sensor.needed_until_s(fewest), inside_s[-1]) - TIME_TOLERANCE_S
+        needed_s = max(sensor.first_useful_s, inside_s[-1]) - TIME_TOLERANCE_S
         count = max(count, int(np.searchsorted(experiment.t_s, needed_s)) + 1)
     t_s = experiment.t_s[:count]
 

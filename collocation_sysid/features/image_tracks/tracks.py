@@ -137,6 +137,7 @@ class ImageTracks(CustomSensor):
     noise_key: ClassVar[str] = "sigma_px of image_tracks"
     sigma_text: ClassVar[str] = "its sigma_px"
     precedence: ClassVar[int] = 2
+    counts_pixels: ClassVar[bool] = True
     unit = "px"
 
     name: str

@@ -346,7 +346,7 @@ def mirror_images(experiment: Experiment) -> Iterator[Hypothesis]:
     middle_m = _middle_of_grasps_m(experiment)
     surface = points_m[np.unique(body.mesh.surface)]
     tree = KDTree(surface)
-    is_filmed = any(each.unit == "px" for each in experiment.measurements)
+    is_filmed = any(each.counts_pixels for each in experiment.measurements)
     code = "mesh-mirrored/or-images" if is_filmed else "mesh-mirrored"
     for axis, name in enumerate(AXES):
         factors = np.ones(3)

@@ -33,8 +33,6 @@ SAME_SIZE = 3.0
 MOST_UNITS = 2
 # Largest lag over the length of the recording.
 LATEST = 0.25
-# Unit of values without a sign or a zero, which are counted from a corner of the image.
-PIXEL = "px"
 
 
 def sensor_misfits(solution: Solution, number: int) -> dict[Measurement, float]:
@@ -88,7 +86,8 @@ def sensor_hypotheses(
         own = numbers[id(models[sensor])]
         origin = origins[experiment.measurements.index(sensor)]
         linear = _linear_mistakes(sensor, predictions[sensor], fit, own, origin)
-        whole = () if declared or sensor.unit == PIXEL else _mistakes(sensor, predictions[sensor])
+        is_plain = not declared and not sensor.counts_pixels
+        whole = _mistakes(sensor, predictions[sensor]) if is_plain else ()
         for hypothesis in (*whole, *linear):
             values, t_s = hypothesis.corrected
             try:
@@ -161,7 +160,7 @@ def _linear_mistakes(
     whole = np.nanmean((origin.measured_values - measured)[:, used] + zeros[used], axis=0)
     shown = ", ".join(f"{each:.3g}" for each in whole)
     data = {"offset": f"{shown} {sensor.unit}".rstrip()}
-    if decrease > LEAST_DECREASE and sensor.unit != PIXEL:
+    if decrease > LEAST_DECREASE and not sensor.counts_pixels:
         yield Hypothesis("sensor-zero", data=data, corrected=(measured - zeros, t_s))
     if fit.blocks[own].is_static or len(t_s) < 3:
         return
