@@ -73,8 +73,8 @@ class Certificate:
 
 
 def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certificate | None:
-    """Return the conditions of optimality at variables z, by one sparse factorisation; None if the
-    constraints do not determine the positions there.
+    """Return the conditions of optimality at variables z, by factorisations of groups of time steps;
+    None if the constraints do not determine the positions there.
 
     Parameters
     ----------
