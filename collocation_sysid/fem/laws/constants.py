@@ -100,6 +100,11 @@ class Constant:
                 f"{zero}lower < upper{remedy}"
             )
 
+    @property
+    def plausible(self) -> float:
+        """Usual value, or 1 without one, within the bounds."""
+        return min(max(1.0 if self.usual is None else self.usual, self.bounds[0]), self.bounds[1])
+
 
 # Default bounds of a stiffness [Pa]: softer than any gel, stiffer than any rubber.
 STIFFNESS = (1.0, 1e9)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...common.files import reason
 from ...errors import InputError
-from .constants import DENSITY, GAMMA_M, MASS, Constant
+from .constants import DENSITY, GAMMA_M, MASS
 from .materials import DAMPINGS, DampingLaw, Material, damped_psi
 from .moduli import elastic_names
 
@@ -49,7 +49,7 @@ def require_admissible_damping(damping: DampingLaw, material: Material) -> None:
     function = ca.Function("stress", [rate, F, theta], [ca.densify(ca.vec(stress))])
     rng = np.random.default_rng(0)
     deformation = np.eye(3).ravel() + STRAIN * rng.uniform(-1, 1, 9)
-    values = [_typical_value(constant) for constant in constants]
+    values = [constant.plausible for constant in constants]
     first, second = LARGE_RATE_1_S * rng.uniform(-1, 1, (2, 9))
     stresses = [
         function(each, deformation, values).full().ravel()
@@ -141,9 +141,3 @@ def _failure(damping: DampingLaw, kind: str, error: Exception) -> str:
         f"the {kind} of the damping law {damping.name!r} cannot be evaluated ({reason(error)}); "
         f"expected a function ({', '.join(arguments)}) in CasADi operations"
     )
-
-
-def _typical_value(constant: Constant) -> float:
-    """Return the usual value of a constant, or 1 without one, within its bounds."""
-    value = 1.0 if constant.usual is None else constant.usual
-    return float(np.clip(value, *constant.bounds))

@@ -18,7 +18,6 @@ directions costs nothing; the matrix does not depend on the axes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Annotated, Literal
@@ -325,7 +324,7 @@ def _require_isotropic(matrix: Material) -> None:
     """Raise an `InputError` if the energy changes when the body is turned before it is deformed."""
     F = np.array([[1.10, 0.05, -0.02], [0.03, 0.95, 0.04], [-0.01, 0.06, 1.02]])
     turn = np.array([[0.6, -0.8, 0.0], [0.48, 0.36, -0.8], [0.64, 0.48, 0.6]])
-    values = ca.DM(_plausible(matrix.constants))
+    values = ca.DM([c.plausible for c in matrix.constants])
     energies = [float(ca.DM(ca.evalf(matrix.psi(ca.SX(G), ca.SX(values))))) for G in (F, F @ turn)]
     if not abs(energies[1] - energies[0]) <= ISOTROPIC * abs(energies[0]):
         raise InputError(
@@ -333,12 +332,3 @@ def _require_isotropic(matrix: Material) -> None:
             f"changes from {energies[0]:.6g} to {energies[1]:.6g} if the body is turned before; "
             "expected an isotropic material beside fibres"
         )
-
-
-def _plausible(constants: Iterable[Constant]) -> list[float]:
-    """Return admissible values of constants."""
-    values = []
-    for c in constants:
-        usual = 1.0 if c.scale == "linear" else float(np.sqrt(c.bounds[0] * c.bounds[1]))
-        values.append(float(np.clip(usual if c.usual is None else c.usual, *c.bounds)))
-    return values
