@@ -1,8 +1,10 @@
-"""Datasets by name: measured rubber from the literature, and the project's simulated recordings.
+"""Datasets by name: measured rubber from the literature, the project's simulated recordings, and
+public collections.
 
-Each function returns experiments that can be solved with `Problem`. A dataset is a folder with a
-problem file and tables, which ``collocation-sysid new NAME --dataset DATASET`` copies;
-`read_problem` reads it with its parameters. `dataset_files` finds the folders.
+A dataset is a folder with files; `fetch` returns it. Each function returns experiments that can be
+solved with `Problem`. Datasets of the package (`DATASETS`) have a problem file, too, which
+``collocation-sysid new NAME --dataset DATASET`` copies and `read_problem` reads. Public collections
+are downloaded at their first use.
 
 >>> import collocation_sysid as cs
 >>> tests = cs.datasets.kawabata_1981("mooney-rivlin")  # doctest: +SKIP
@@ -19,11 +21,15 @@ from ..fem.laws.materials import Energy, Material
 from ..recording import Experiment, Specimen
 from ..recording.specimen_files import SpecimenLayout, read_specimen
 from .dataset_files import DATASETS, dataset_file, read_problem
+from .hyperelastic_curves import hyperelastic_curves
+from .public_data import fetch
 
 __all__ = [
     "DATASETS",
     "diani",
+    "fetch",
     "foam_cylinder",
+    "hyperelastic_curves",
     "kawabata_1981",
     "laid_block",
     "noisy_cylinder",
