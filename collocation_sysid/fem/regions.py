@@ -19,7 +19,7 @@ from ..common.array_types import Array, Index
 from ..common.checked_calls import checked
 from ..common.validated_types import Positive, Text
 from ..errors import InputError, hint_at
-from .laws.constants import CONTRAST, DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, Constant
+from .laws.constants import CONTRAST, DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, TAU, Constant
 from .laws.damping_admissibility import require_admissible_damping
 from .laws.fibres import Fibres, reinforced
 from .laws.materials import (
@@ -32,6 +32,7 @@ from .laws.materials import (
     as_material,
 )
 from .laws.moduli import ConstantSource, elastic_names, find_source
+from .laws.time_shift import TimeShift
 from .meshes.mesh import TetMesh
 from .meshes.selection import Selection
 from .node_force import NodeForce
@@ -106,6 +107,11 @@ class BodyPart:
         Constant that varies in space within the part.
     axes : (k, 3, 3) array or None
         Axes of the fibres of each cell, as columns; None without fibres.
+    oscillates : bool
+        Whether every time step is a quarter of the period of a steady oscillation, whose frequency
+        may change where the strain is zero, as in harmonic tests.
+    shift : TimeShift or None
+        Factor on the times of its memory; None for 1.
     """
 
     name: str
@@ -119,6 +125,8 @@ class BodyPart:
     has_free_density: bool = False
     field: FieldModes | None = None
     axes: Array | None = None
+    oscillates: bool = False
+    shift: TimeShift | None = None
 
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
@@ -460,18 +468,21 @@ class ConstantsModel:
         """
         used = {name for source in self.constant_sources(known) for name in source.names.values()}
         used.update(self.list_field_coefficient_names(), self.find_contrast_deviations())
+        used.update(*(part.shift.constants for part in self.parts if part.shift))
         further = (force.constants for force in self.forces)
         return used.union(*({c.name for c in some} for some in (*further, self.frictions)))
 
     def list_parameter_names(self) -> tuple[str, ...]:
         """Return all names that a parameter may have, without repetitions: constants of each part,
-        moduli in their place, both with and without the name of the region, and `mass_kg`.
+        moduli in their place, both with and without the name of the region, those of a shift of
+        the relaxation times, and `mass_kg`.
         """
         names = []
         for part in self.parts:
             part_names = [c.name for c in part.constants] + list(elastic_names(part.material))
             part_names.append(DENSITY.name)
             names += [part.full_name(part_name) for part_name in part_names] + part_names
+            names += part.shift.constants if part.shift else ()
         return tuple(dict.fromkeys([*names, MASS.name, *self.constants]))
 
     def assemble_theta(self, values: Mapping[str, Any]) -> list[Any]:
@@ -494,6 +505,10 @@ class ConstantsModel:
             constants = source.evaluate(values)
             if source.names.get(DENSITY.name) == MASS.name:
                 constants[DENSITY.name] *= part.per_mass_1_m3
+            if part.shift:
+                factor = part.shift.factor(values)
+                for branch in part.prony:
+                    constants[f"{branch.name}.{TAU.name}"] *= factor
             # A field that nothing is said of is as its mean everywhere.
             own_constants = part.constants[: len(part.constants) - len(part.field_constants)]
             theta += [constants[constant.name] for constant in own_constants]

@@ -39,8 +39,10 @@ DECREASE = 1e-3
 # With impacts, the largest infeasibility of a trial over an edge of the mesh; other trials are
 # simulated. Where a body strikes or slips, forces change within a small part of any step.
 SMALL_IMPACT_STRAIN = 1e-4
-# With impacts, the largest decrease of the loss by a full step whose rejection ends the search as
-# converged: simulations repeat a loss to about 1e-9, and the step is within 1e-3 standard errors.
+# Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors. With
+# impacts, whose simulations repeat a loss to about 1e-9, the rejection of such a full step ends the
+# search as converged, otherwise only if shorter steps are rejected, too: the stress of a nearly
+# incompressible body at small strain has few digits.
 INSIGNIFICANT = 1e-6
 # Infeasibility over the body's size that is due to rounding.
 FEASIBLE = 1e-12
@@ -435,11 +437,21 @@ class ReducedSearch:
                 self.ended_by_association = True
                 return Status.CONVERGED
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
-                return Status.STALLED
+                return self._status_without_progress(point, curvature)
             self.trust = SHRINK * length
             rejections += 1
             if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
                 point = self._make_feasible(horizon, point)
+
+    def _status_without_progress(self, point: Iterate, curvature: Array) -> Status:
+        """Return the status after rejections of ever shorter steps: that of convergence if even a
+        full step is predicted to decrease the loss by less than is significant.
+        """
+        self.trust = self.largest_trust
+        full_step = self._next_step(point, curvature)
+        remaining = point.loss - point.predicted_loss(full_step)
+        is_feasible = point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
+        return Status.CONVERGED if is_feasible and remaining <= INSIGNIFICANT else Status.STALLED
 
     def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
         """Return the part of the Hessian (np, np) at `after` that Gauss–Newton neglects: exact, or

@@ -3,12 +3,12 @@
 Use this module for the Prony branches of a material (see `fem.laws.memory`). The internal variables
 that evaluation k passes to the next one are, for each branch,
 
-    m_k = d_k m_{k−1} + a_k S_k,   d_k = e_{k+1},   a_k = e_{k+1} c_k − c_{k+1},
+    m_k = d_k m_{k−1} + a_k S_k,   d_k = e_{k+1},   a_k = e_{k+1} c_k − b_{k+1},
 
 with the stress S of the long-term energy, and the overstress at evaluation k is H_k + s_k S_k with
-H_k = Σ m_{k−1} and s_k = Σ c_k. The start shape has S_0 and Q_0 = c_0 S_0, where c_0 = g exp(−t/τ)
-if a load was applied suddenly a time t ago; c_0 = 0 if the body has relaxed. Columns of derivatives
-follow by the chain rule,
+H_k = Σ m_{k−1} and s_k = Σ c_k. If S changes linearly in time, b = c. The start shape has S_0 and
+Q_0 = c_0 S_0, where c_0 = g exp(−t/τ) if a load was applied suddenly a time t ago; c_0 = 0 if the
+body has relaxed. Columns of derivatives follow by the chain rule,
 
     dF_k ∋ ∂f_H/∂H Σ dm_{k−1},   dm_k = d_k dm_{k−1} + a_k dS_k + dd_k m_{k−1} + da_k S_k,
 
@@ -45,10 +45,22 @@ EVALUATIONS_PER_CHUNK = 16
 RELAXED_TIMES = 1e3
 
 
-def _interval_coefficients(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
-    """Return e and c (2,) of an interval in which S changes linearly."""
+def _interval_coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
+    """Return e, c and b (3,) of an interval, Q_k = e Q_{k−1} + c S_k − b S_{k−1}, with u = (g, τ).
+
+    Data are the length of the interval, and 1 in a steady oscillation, else 0. S changes linearly, or
+    the interval is a quarter of the period of the oscillation: with ωτ = w the complex modulus of a
+    branch is g iw/(1 + iw), and the part of S that is a quarter period late is −S_{k−1}.
+    """
+    spacing_s, steady = data[0], data[1]
     e, c = relaxation_coefficients(u[1] / spacing_s)
-    return ca.vertcat(e, u[0] * c)
+    w = np.pi / 2 * u[1] / spacing_s
+    in_phase = w**2 / (1 + w**2)
+    return ca.vertcat(
+        (1 - steady) * e,
+        u[0] * ((1 - steady) * c + steady * in_phase),
+        u[0] * ((1 - steady) * c + steady * w / (1 + w**2)),
+    )
 
 
 def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
@@ -58,7 +70,7 @@ def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
     since_s = data[0]
     began = data[1]
     at_once = u[0] * ca.exp(-since_s / u[1])
-    over_interval = _interval_coefficients(u, since_s + began)[1]
+    over_interval = _interval_coefficients(u, ca.vertcat(since_s + began, data[3]))[1]
     return began * at_once + (1 - began) * over_interval
 
 
@@ -66,13 +78,13 @@ def _overstress(before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX) -> c
     """Return m_k from m_{k−1} (`before`) and S_k (`now`), with u = (g, τ).
 
     Data are the time since the previous evaluation, or at the start since the load was applied; 1
-    at the start, else 0; and the time to the next evaluation.
+    at the start, else 0; the time to the next evaluation; and 1 in a steady oscillation, else 0.
     """
-    e, c = ca.vertsplit(_interval_coefficients(u, data[2]))
-    return e * before + (e * _stiffening(u, data) - c) * now
+    e, _, b = ca.vertsplit(_interval_coefficients(u, data[2:]))
+    return e * before + (e * _stiffening(u, data) - b) * now
 
 
-OVERSTRESS = Recursion(_overstress, 1, signal_size=1, constant_count=2, data_size=3)
+OVERSTRESS = Recursion(_overstress, 1, signal_size=1, constant_count=2, data_size=4)
 
 
 def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
@@ -82,10 +94,9 @@ def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
     return ca.vertcat(_stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2])
 
 
-COEFFICIENTS = GeneratedFunction(_coefficients, 2, data_size=3)
-STIFFENING = GeneratedFunction(_stiffening, 2, data_size=3)
-# Coefficients e and c (2,) of an interval by (g, τ); the datum is the length of the interval.
-INTERVAL = GeneratedFunction(_interval_coefficients, 2, data_size=1)
+COEFFICIENTS = GeneratedFunction(_coefficients, 2, data_size=4)
+STIFFENING = GeneratedFunction(_stiffening, 2, data_size=4)
+INTERVAL = GeneratedFunction(_interval_coefficients, 2, data_size=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +109,7 @@ class FadingCoefficients:
         Indices of g and τ in θ.
     u : (2, B, N)
         Values of g and τ.
-    data : (3, B, N)
+    data : (4, B, N)
         Times, see `_overstress`.
     c, d, a : (B, N)
     by : (3, 2, B, N)
@@ -137,7 +148,8 @@ class FadingCoefficients:
         since_s[:, 0] = np.minimum(loaded_s, RELAXED_TIMES * theta[places[1]])
         since_s[:, 1:] = until_next_s[:-1]
         began = np.broadcast_to(np.arange(shape[1]) == 0, shape)
-        data = np.stack([since_s, began, np.broadcast_to(until_next_s, shape)])
+        steady = np.full(shape, float(body.memory.oscillates))
+        data = np.stack([since_s, began, np.broadcast_to(until_next_s, shape), steady])
         u = np.broadcast_to(theta[places][..., None], (2, branches, len(until_next_s)))
         (c, d, a), by = COEFFICIENTS.evaluate_with_jacobian(u, data)
         return cls(places, u, data=data, c=c, d=d, a=a, by=by)
@@ -469,15 +481,16 @@ class MemoryState:
         return MemoryState(self.body, self.theta, stress=stress, overstress=overstress)
 
     def _after_interval(self, interval_s: float) -> tuple[Array, Array]:
-        """Return e Q − c S (all branches,) [Pa] of the overstress Q and the stress S, and the
+        """Return e Q − b S (all branches,) [Pa] of the overstress Q and the stress S, and the
         coefficients c (B,), for an interval [s].
         """
         memory = self.body.memory
         u = self.theta[[(b.share, b.tau) for b in memory.branches]].T
-        e, c = INTERVAL.evaluate(u, np.full((1, u.shape[1]), interval_s))
+        data = np.tile([[interval_s], [float(memory.oscillates)]], u.shape[1])
+        e, c, b = INTERVAL.evaluate(u, data)
         borne = memory.to_branches(self.stress)
         return memory.repeat_over_points(e) * self.overstress - memory.repeat_over_points(
-            c
+            b
         ) * borne, c
 
 

@@ -17,11 +17,12 @@ from scipy.spatial.transform import Rotation
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array, float_converter
 from ..common.declarations import declaration, key
-from ..common.validated_types import Finite, NotNegative, Positive
+from ..common.validated_types import Finite, Flag, NotNegative, Positive, Text
 from ..errors import InputError
 from ..fem.body import Body, Made
 from ..fem.laws.fibres import Fibres
 from ..fem.laws.materials import DampingLaw, Energy, Material, Prony
+from ..fem.laws.time_shift import TimeShift
 from .custom_sensor import Gauge, GraspQuantities, PointQuantities
 from .experiment import Experiment
 from .grasp import Grasp
@@ -106,6 +107,15 @@ class Specimen:
         Angle [°] at which the specimen was cut from a sheet with fibres: from the axis z of the
         sheet, in which the direction of the fibres is stated, to the axis of the first strain,
         positive toward the axis x of the sheet.
+    shift : str
+        Name of the temperature at which the specimen was tested: all relaxation times are 10 to the
+        power of the parameter ``<shift>.log10_shift`` times those of the parameters.
+    temperature_difference_k : float
+        Instead of `shift`: temperature, less that of the parameters. The factor on the relaxation
+        times is that of Williams, Landel & Ferry, with the parameters ``wlf_c1`` and ``wlf_c2_k``.
+    oscillates : bool
+        Whether the strain oscillates steadily and each sample is a quarter of a period after the one
+        before, see `harmonic`.
     length_m, area_m2 : float, optional
         Undeformed length and area of the specimen, if `strain` is the displacement of a test bench
         over the length: the budget then contains the compliance of the bench. None (both) if the
@@ -139,6 +149,9 @@ class Specimen:
     axial_stretch: float = key(Positive, default=1.0)
     transverse_stretch: float | None = key(Positive, default=None)
     cut_angle_deg: float = key(Finite, default=0.0)
+    shift: str = key(Text, default="")
+    temperature_difference_k: float = key(Finite, default=0.0)
+    oscillates: bool = key(Flag, default=False)
     length_m: float | None = key(Positive, default=None)
     area_m2: float | None = key(Positive, default=None)
 
@@ -153,6 +166,12 @@ class Specimen:
         times = np.arange(float(len(self.strain))) if self.t_s is None else self.t_s
         vars(self)["t_s"] = times
         self._require_measurements_of_test()
+        if self.shift and self.temperature_difference_k:
+            raise InputError(
+                f'found shift = "{self.shift}" and temperature_difference_k; expected one of them',
+                None,
+                where="shift",
+            )
         if (self.length_m is None) != (self.area_m2 is None):
             raise InputError(
                 "found one of length_m and area_m2; expected both, or neither for a strain that "
@@ -231,7 +250,14 @@ class Specimen:
 
     @classmethod
     def relaxation(
-        cls, t_s: ArrayLike, modulus_pa: ArrayLike, sigma_pa: float, test: str = "uniaxial"
+        cls,
+        t_s: ArrayLike,
+        modulus_pa: ArrayLike,
+        sigma_pa: float,
+        test: str = "uniaxial",
+        *,
+        shift: str = "",
+        temperature_difference_k: float = 0.0,
     ) -> Specimen:
         """Return the test of a table of the relaxation modulus E(t) or, with "simple-shear", G(t):
         the stress over time at a small strain (`RELAXED_STRAIN`) that is applied at t = 0, over that
@@ -246,6 +272,8 @@ class Specimen:
         sigma_pa : float
             Standard deviation of the noise of the modulus [Pa].
         test : {"uniaxial", "simple-shear"}
+        shift, temperature_difference_k
+            Those of `Specimen`.
 
         Raises
         ------
@@ -255,9 +283,7 @@ class Specimen:
         times = float_array(t_s, "t_s", ((None,),))
         if not len(times) or times[0] <= 0 or (np.diff(times) <= 0).any():
             raise InputError("expected positive times that increase", None, where="t_s")
-        if test not in ("uniaxial", "simple-shear"):
-            fault = f'found "{test}"; expected "uniaxial" for E(t) or "simple-shear" for G(t)'
-            raise InputError(fault, None, where="test")
+        _require_small_strain_test(test)
         modulus = float_array(modulus_pa, "modulus_pa", ((len(times),),), False)
         # A ramp that is short compared with the first time; before it the specimen is at rest.
         ramp_s = 1e-6 * times[0]
@@ -268,6 +294,79 @@ class Specimen:
             sigma_pa=RELAXED_STRAIN * sigma_pa,
             t_s=np.r_[-ramp_s, 0.0, times],
             strain_zero=0.0,
+            shift=shift,
+            temperature_difference_k=temperature_difference_k,
+        )
+
+    @classmethod
+    def harmonic(
+        cls,
+        frequency_hz: ArrayLike,
+        storage_pa: ArrayLike,
+        loss_pa: ArrayLike,
+        relative_sigma: float,
+        test: str = "uniaxial",
+        *,
+        shift: str = "",
+        temperature_difference_k: float = 0.0,
+    ) -> Specimen:
+        """Return a harmonic test (DMA): storage modulus E′ and loss modulus E″ over frequency or,
+        with "simple-shear", G′ and G″.
+
+        A strain of at most `RELAXED_STRAIN` oscillates steadily. Its samples are a quarter of a period
+        apart: at the largest strain, where the stress over the amplitude is E′, and then without
+        strain, where it is −E″. The amplitudes are such that |E*| times the amplitude is the same
+        for all frequencies.
+
+        Parameters
+        ----------
+        frequency_hz : (F,) array
+            Frequencies, positive, in any order.
+        storage_pa, loss_pa : (F,) array
+            Storage and loss modulus [Pa]; NaN where one of them is missing.
+        relative_sigma : float
+            Standard deviation of the noise of both moduli, over |E*| = √(E′² + E″²): the relative
+            error of |E*|, and the error of the phase δ [rad].
+        test : {"uniaxial", "simple-shear"}
+        shift, temperature_difference_k
+            Those of `Specimen`.
+
+        Raises
+        ------
+        InputError
+            If a frequency is not positive, a row has no modulus or a negative one, or for another
+            test.
+        """
+        frequency = float_array(frequency_hz, "frequency_hz", ((None,),))
+        storage = float_array(storage_pa, "storage_pa", ((len(frequency),),), False)
+        loss = float_array(loss_pa, "loss_pa", ((len(frequency),),), False)
+        _require_small_strain_test(test)
+        if not len(frequency) or frequency.min() <= 0:
+            raise InputError("expected positive frequencies", None, where="frequency_hz")
+        size = np.hypot(np.nan_to_num(storage), np.nan_to_num(loss))
+        for name, values in (("storage_pa", storage), ("loss_pa", loss)):
+            if (values < 0).any() or not size.all():
+                row = int(np.flatnonzero((values < 0) | (size == 0))[0]) + 1
+                fault = (
+                    f"found no modulus, or a negative one, in row {row}; expected moduli above 0"
+                )
+                raise InputError(fault, None, where=name)
+        # Beginning with the shortest period, all times have the precision of their period.
+        order = np.argsort(-frequency, kind="stable")
+        quarters_s = np.repeat(0.25 / frequency[order], 2)
+        amplitude = RELAXED_STRAIN * size.min() / size[order]
+        still = np.zeros_like(amplitude)
+        stress = np.column_stack([storage[order], -loss[order]]) * amplitude[:, None]
+        return cls(
+            test,
+            np.r_[0.0, np.column_stack([amplitude, still]).ravel()],
+            np.r_[np.nan, stress.ravel()],
+            sigma_pa=RELAXED_STRAIN * size.min() * relative_sigma,
+            t_s=np.r_[0.0, np.cumsum(quarters_s)],
+            strain_zero=0.0,
+            oscillates=True,
+            shift=shift,
+            temperature_difference_k=temperature_difference_k,
         )
 
     def __repr__(self) -> str:
@@ -311,6 +410,7 @@ class Specimen:
         if cell is None:
             angle = self.cut_angle_deg
             cell = cell_body(self.test, material, prony, fibres=fibres, cut_angle_deg=angle)
+            cell = self.conditioned(cell)
         assert self.t_s is not None
         require_evaluable_law(
             cell, self.find_deformation(), strain=self.strain, second_strain=self.second_strain
@@ -329,6 +429,30 @@ class Specimen:
             validation=validation,
             specimen=self.find_deformation(),
         )
+
+    def conditioned(self, cell: Body) -> Body:
+        """Return the cell of its test as it responds to a steady oscillation and at its temperature.
+
+        Raises
+        ------
+        InputError
+            If it oscillates or has another temperature, but the material has no memory.
+        """
+        shift = None
+        if self.shift or self.temperature_difference_k:
+            shift = TimeShift(self.shift, self.temperature_difference_k)
+        if not (self.oscillates or shift):
+            return cell
+        if not cell.has_memory:
+            raise InputError(
+                "found a harmonic test, or another temperature, of a material without memory; "
+                "expected branches ([[object.prony]], in Python prony=...), whose loss and relaxation "
+                "times they determine",
+                None,
+                where="prony",
+            )
+        parts = (replace(part, oscillates=self.oscillates, shift=shift) for part in cell.parts)
+        return cell.with_parts(tuple(parts))
 
     def _grasps(self, has_fibres: bool) -> list[Grasp]:
         """Return a grasp for each of the four nodes of the cell, in their order: at rest, or with
@@ -471,6 +595,12 @@ class LateralStretch:
         return at.position_m[self.axis, 0] / CELL_SIZE_M
 
 
+def _require_small_strain_test(test: str) -> None:
+    if test not in ("uniaxial", "simple-shear"):
+        fault = f'found "{test}"; expected "uniaxial" for E or "simple-shear" for G'
+        raise InputError(fault, None, where="test")
+
+
 def cell_body(
     test: str,
     material: str | Energy | Material = "neo-hookean",
@@ -503,11 +633,10 @@ def cell_of_other_test(body: Body, test: str) -> Body:
     """Return the cell of another kind of test for the specimen that has the cell `body`."""
     (part,) = body.parts
     cell = cell_body(test, part.material, part.prony, damping=part.damping, made=body.made)
-    if part.axes is None:
-        return cell
     (new,) = cell.parts
-    axes = np.broadcast_to(part.axes[0], (len(new.cells), 3, 3))
-    return cell.with_parts((replace(new, axes=axes),))
+    axes = None if part.axes is None else np.broadcast_to(part.axes[0], (len(new.cells), 3, 3))
+    conditions = replace(new, axes=axes, oscillates=part.oscillates, shift=part.shift)
+    return cell.with_parts((conditions,))
 
 
 def _cut(fibres: Fibres, angle_deg: float) -> Fibres:

@@ -28,6 +28,7 @@ _UNITS = {
     "_1_s": "1/s",
     "_pa": "Pa",
     "_kg": "kg",
+    "_k": "K",
     "_s": "s",
     "_m": "m",
 }
@@ -256,6 +257,27 @@ SHARE = Constant(
 TAU = Constant(
     "tau_s", "τ", meaning="relaxation time", bounds=(1e-4, 1e3), usual=0.3, widest=(1e-7, 1e8)
 )
+# Shift of the relaxation times with the temperature, see `time_shift`; the usual values of Williams,
+# Landel & Ferry are those at the glass transition.
+LOG_SHIFT = Constant(
+    "log10_shift",
+    "log a_T",
+    meaning="logarithm of the relaxation times over those of the reference temperature",
+    bounds=(-30.0, 30.0),
+    scale="linear",
+    typical=1.0,
+    usual=0.0,
+)
+WLF_C1 = Constant(
+    "wlf_c1", "C₁", meaning="factor of Williams, Landel & Ferry", bounds=(0.1, 100.0), usual=17.44
+)
+WLF_C2 = Constant(
+    "wlf_c2_k",
+    "C₂",
+    meaning="temperature of Williams, Landel & Ferry",
+    bounds=(1.0, 1e3),
+    usual=51.6,
+)
 DENSITY = Constant("density_kg_m3", "ρ", meaning="density", bounds=(1.0, 1e5))
 # Total mass, which replaces the densities of all parts; their ratios are kept.
 MASS = Constant("mass_kg", "m", meaning="mass of the whole body", bounds=(1e-6, 1e3))
@@ -342,6 +364,9 @@ KNOWN: Mapping[str, Constant] = {
         *BETA_TERMS,
         SHARE,
         TAU,
+        LOG_SHIFT,
+        WLF_C1,
+        WLF_C2,
         DENSITY,
         MASS,
         FRICTION,

@@ -122,6 +122,11 @@ class MemoryLayout:
         return [0, *np.cumsum(sizes).tolist()]
 
     @property
+    def oscillates(self) -> bool:
+        """Whether the evaluations are those of steady oscillations, at quarters of their periods."""
+        return any(part.oscillates for part in self.parts)
+
+    @property
     def width(self) -> int:
         """Length of the row of a body."""
         return self.starts[-1]

@@ -1,0 +1,119 @@
+"""Harmonic tests (DMA): storage and loss modulus over frequency, also at other temperatures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+
+YOUNG_PA, SHARES, TAU_S = 2e5, np.array([0.5, 2.0]), np.array([10.0, 0.1])
+MEMORY = {"a.share": 0.5, "a.tau_s": 10.0, "b.share": 2.0, "b.tau_s": 0.1}
+UNDAMPED = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+
+
+def complex_modulus_pa(frequency_hz, shift=1.0, long_term_pa=YOUNG_PA):
+    """Storage and loss modulus (F,) of the branches, of relaxation times multiplied by a shift."""
+    w = 2 * np.pi * frequency_hz[:, None] * TAU_S * shift
+    modulus = long_term_pa * (1 + (SHARES * 1j * w / (1 + 1j * w)).sum(axis=1))
+    return modulus.real, modulus.imag
+
+
+def noisy_test(frequency_hz, rng, factor=1.0, shift=""):
+    storage, loss = complex_modulus_pa(frequency_hz, factor)
+    sigma = 0.01 * np.hypot(storage, loss)
+    noise = sigma * rng.normal(size=(2, len(frequency_hz)))
+    return cs.Specimen.harmonic(
+        frequency_hz, storage + noise[0], np.abs(loss + noise[1]), 0.01, shift=shift
+    )
+
+
+@pytest.mark.parametrize(
+    ("test", "long_term"),
+    [
+        ("uniaxial", {"young_pa": YOUNG_PA, "poisson": 0.4}),
+        pytest.param("simple-shear", {"mu_pa": YOUNG_PA, "poisson": 0.4}, marks=pytest.mark.long),
+    ],
+)
+def test_a_steady_oscillation_has_the_complex_modulus_of_the_branches(test, long_term):
+    frequency_hz = np.array([1.0, 0.005, 100.0])
+    storage, loss = complex_modulus_pa(frequency_hz)
+    specimen = cs.Specimen.harmonic(frequency_hz, storage, loss, 0.01, test)
+    experiment = specimen.experiment("neo-hookean", "dma", prony=("a", "b"))
+    seen = cs.simulate(experiment, long_term | MEMORY | UNDAMPED).custom_sensor_values[0][:, 0]
+    np.testing.assert_allclose(seen[1:], specimen.stress_pa[1:], rtol=5e-4)
+
+
+def test_relaxation_times_are_those_of_the_temperature():
+    moduli = complex_modulus_pa(np.ones(1))
+    long_term = {"young_pa": YOUNG_PA, "poisson": 0.4} | MEMORY | UNDAMPED
+    for shift, difference_k, values, factor in (
+        ("warm", 0.0, {"warm.log10_shift": -2.0}, 1e-2),
+        ("", 20.0, {"wlf_c1": 10.0, "wlf_c2_k": 80.0}, 1e-2),
+        ("", 0.0, {}, 1.0),
+    ):
+        specimen = cs.Specimen.harmonic(
+            np.ones(1), *moduli, 0.01, shift=shift, temperature_difference_k=difference_k
+        )
+        body = specimen.experiment(prony=("a", "b")).body
+        theta = dict(zip(body.constants, body.theta_from_values(long_term | values), strict=True))
+        assert theta["a.tau_s"] == pytest.approx(10.0 * factor)
+        assert theta["b.tau_s"] == pytest.approx(0.1 * factor)
+        assert set(values) <= set(body.list_parameter_names())
+
+
+@pytest.mark.long
+def test_tests_at_two_temperatures_determine_branches_and_shift():
+    rng = np.random.default_rng(0)
+    frequency_hz = np.geomspace(1e-3, 1e3, 19)
+    cold = noisy_test(frequency_hz, rng)
+    warm = noisy_test(frequency_hz, rng, 0.01, shift="warm")
+    problem = cs.Problem(
+        [
+            cold.experiment("neo-hookean", "cold", prony=("a", "b")),
+            warm.experiment("neo-hookean", "warm", prony=("a", "b")),
+        ],
+        {
+            "young_pa": cs.Unknown(),
+            "poisson": 0.4999,
+            "a.share": cs.Unknown(),
+            "a.tau_s": cs.Unknown(3.0),
+            "b.share": cs.Unknown(),
+            "b.tau_s": cs.Unknown(0.03),
+            "warm.log10_shift": cs.Unknown(prior=(0.0, 3.0)),
+        },
+    )
+    found = cs.solve(problem)
+    assert found.status.converged
+    assert found.parameters["young_pa"] == pytest.approx(YOUNG_PA, rel=0.01)
+    assert found.parameters["warm.log10_shift"] == pytest.approx(-2.0, abs=0.02)
+    for name, value in MEMORY.items():
+        assert found.parameters[name] == pytest.approx(value, rel=0.03)
+    assert found.history[-1].loss < 4 * len(frequency_hz)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        (([0.0, 1.0], [2.0, 2.0], [1.0, 1.0], 0.01), "positive"),
+        (([1.0, 2.0], [2.0, -2.0], [1.0, 1.0], 0.01), "row 2"),
+        (([1.0, 2.0], [2.0, np.nan], [1.0, np.nan], 0.01), "row 2"),
+    ],
+)
+def test_other_tables_are_refused(arguments, found):
+    with pytest.raises(cs.InputError, match=found):
+        cs.Specimen.harmonic(*arguments)
+    with pytest.raises(cs.InputError, match="planar"):
+        cs.Specimen.harmonic([1.0], [2.0], [1.0], 0.01, "planar")
+
+
+def test_a_material_without_memory_and_a_temperature_stated_twice_are_refused():
+    specimen = cs.Specimen.harmonic([1.0], [2.0], [1.0], 0.01)
+    with pytest.raises(cs.InputError, match="memory"):
+        specimen.experiment()
+    with pytest.raises(cs.InputError, match="expected one of them"):
+        cs.Specimen.harmonic([1.0], [2.0], [1.0], 0.01, shift="a", temperature_difference_k=1.0)
+    body = cs.Specimen.harmonic([1.0], [2.0], [1.0], 0.01, shift="a").experiment(prony=("b",)).body
+    long_term = {"young_pa": 1.0, "poisson": 0.4, "b.share": 1.0, "b.tau_s": 1.0}
+    with pytest.raises(cs.InputError, match=r"a\.log10_shift"):
+        body.theta_from_values(long_term | UNDAMPED)
