@@ -12,7 +12,7 @@ from ..common.array_files import load_arrays
 from ..common.array_types import Array
 from ..common.files import DAMAGE
 from ..errors import InputError
-from .formats.columns import TIME, find_column, name_and_unit
+from .formats.columns import find_time, name_and_unit
 from .formats.text import (
     Row,
     TextTable,
@@ -73,7 +73,7 @@ def read_poses(
         return _from_matrices(t_s, matrices, length_unit=length_unit, row_names=places)
     grid = _with_column_names(read_table(decode(content)))
     lines = [f"line {row.line}" for row in grid.rows]
-    time = find_column(grid, TIME)
+    time = find_time(grid)
     if time is None:
         raise _column_error(grid)
     t_s = times_in_column(grid, *time)

@@ -17,8 +17,10 @@ from .formats.columns import (
     PRESSURE,
     STRAIN,
     TENSION,
+    TIME,
     Quantity,
     QuantityTable,
+    find_time,
     read_columns,
 )
 from .formats.text import (
@@ -218,7 +220,7 @@ def read_custom_sensor(
     ----------
     path : str or Path
     columns : sequence of str
-        Columns of the values; all besides t_s by default.
+        Columns of the values; all besides the times by default.
 
     Raises
     ------
@@ -227,14 +229,17 @@ def read_custom_sensor(
         line is named.
     """
     grid = read_table(decode(read_bytes(path)))
-    names = list(columns) or [name for name in grid.columns if name != "t_s"]
-    for name in ("t_s", *names):
+    time = find_time(grid, [k for k, name in enumerate(grid.columns) if name in columns])
+    time_name = TIME.column if time is None else grid.columns[time[0]]
+    names = list(columns) or [name for name in grid.columns if name != time_name]
+    for name in (time_name, *names):
         if (count := grid.columns.count(name)) != 1:
             there = f"{count} columns are called" if count else "there is no column"
             hint = "" if count else hint_at(name, grid.columns)
             among = ", ".join(grid.columns)
             raise grid.error_at(f"{there} {name!r}; expected one among {among}{hint}")
-    t_s = times_in_column(grid, grid.columns.index("t_s"))
+    assert time is not None  # otherwise there is no such column
+    t_s = times_in_column(grid, *time)
     values = numeric_cells(grid, [grid.columns.index(name) for name in names], blank_allowed=True)
     return without_rounding(t_s), np.asarray(values), names
 

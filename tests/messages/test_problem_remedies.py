@@ -109,22 +109,8 @@ def remedied(folder: Path, message: str) -> Iterator[tuple[str, str, str]]:
         yield "problem.toml", r"(?=file = \"swing_wrench)", f"{key} = {KNOWN[key]}, "
     elif csv and (found := re.search(r"column (.+?) names no unit;.*for example (.+)$", message)):
         yield csv[1], rf"\b{re.escape(found[1])}\b", found[2]
-    elif csv and (found := re.search(r"column (\S+) has the unit ms.*call it (\w+)", message)):
-        rows = (folder / csv[1]).read_text().splitlines()
-        times = [row.split(",", 1) for row in rows[1:]]
-        seconds = [f"{float(t) / 1000:.12g},{rest}" for t, rest in times]
-        yield csv[1], r"(?s).*", "\n".join([rows[0].replace(found[1], found[2]), *seconds])
     elif found := re.search(r"found \[?-?[\d.]+\]?; expected a number of at least 0", message):
         yield "problem.toml", r"friction = -", "friction = "
-
-
-def milliseconds(folder: Path) -> None:
-    """State the times of the markers in milliseconds."""
-    file = folder / "swing_markers.csv"
-    header, *rows = file.read_text().splitlines()
-    times = (row.split(",", 1) for row in rows)
-    late = [f"{1000 * float(t):.12g},{rest}" for t, rest in times]
-    file.write_text("\n".join([header.replace("t_s", "t_ms"), *late]))
 
 
 BOX = "box_m = [[-1, -1, 0.089], [1, 1, 1]]"
@@ -136,7 +122,6 @@ BAR = {
         "[experiment.markers]", "[experiment.markers]\nweights = { lo = 1.0 }"
     ),
     "file of markers": replace_text('"swing_markers.csv"', '"swing_marker.csv"'),
-    "clock in milliseconds": milliseconds,
     "file of poses": replace_text("swing_motion.csv", "swing_motions.csv"),
     "order of quaternions": replace_text(
         '"swing_motion.csv",', '"swing_motion.csv", quaternion = "xyzv",'

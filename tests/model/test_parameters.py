@@ -470,6 +470,13 @@ def test_incompressible_bodies_are_refused(name: str, fields: dict, message: str
         Parameter(name, **{"guess": 0.3, **fields})
 
 
+def test_ratios_of_poisson_that_no_solid_has_are_refused():
+    with pytest.raises(InputError, match=r"poisson: fixed = -1, expected a number >= -0\.99"):
+        Parameter("poisson", -1.0, is_fixed=True)
+    with pytest.raises(InputError, match=r"lower = -3, upper = 0.3, expected -0\.99 <= lower"):
+        Parameter("poisson", 0.1, lower=-3.0, upper=0.3, scale="linear")
+
+
 GIVEN = dict.fromkeys(("gamma_r_s", "gamma_m_1_s"), 0.1)
 SETS = {
     "none": ({}, "the elastic parameters of the body are none; .* expects lambda_pa and mu_pa, or"),

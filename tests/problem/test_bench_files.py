@@ -72,6 +72,13 @@ s;mm;N
 0,1;0,25;2,5
 0,2;0,50;6,0
 """
+OTHER_WORDS = [
+    "Zeit in s;Stauchung in mm;Last in N",
+    "Messzeit [s];Kolbenweg [mm];Druckkraft [N];Stauchung [%];Druckspannung [kPa]",
+    "Versuchszeit (s);Dehnung (mm);Prüflast (N);Sollkraft (N)",
+    "Tiempo (s);Desplazamiento (mm);Fuerza (N);Tensión (MPa)",
+]
+THOUSANDS = "Zeit in ms;Weg in µm;Kraft in mN\n0,0;0,0;0,0\n100,0;250,0;2.500,0\n200,0;500;6.000\n"
 TABS = PLAIN.replace(",", "\t").replace(" (mm)", " / mm").replace(" (s)", " [ms]")
 TABS = TABS.replace("0.1\t", "100\t").replace("0.2\t", "200\t")
 
@@ -96,8 +103,16 @@ def written(tmp_path: Path):
         (UNITS_BELOW, "utf-8"),
         (GERMAN, "cp1252"),
         (TABS, "utf-16"),
+        (THOUSANDS, "utf-8"),
+        (
+            THOUSANDS.replace(",0", "").replace("2.500", "2,500.0").replace("6.000", "6,000"),
+            "utf-8",
+        ),
     ],
-    ids=["plain", "header", "units below", "semicolons from Windows", "tabs in UTF-16"],
+    ids=[
+        *("plain", "header", "units below", "semicolons from Windows", "tabs in UTF-16"),
+        *("thousands with points", "thousands with commas"),
+    ],
 )
 def test_a_machines_columns_are_recognised_with_their_units(written, text, encoding):
     file = written(text, encoding)
@@ -111,8 +126,21 @@ def test_a_machines_columns_are_recognised_with_their_units(written, text, encod
     assert np.isnan(quarter[:, 1:]).all()
 
 
-def test_strain_and_stress_become_displacement_and_force(written):
-    file = written("Strain (%),Stress [MPa]\n0,0\n1,0.02\n2,0.05\n")
+@pytest.mark.parametrize("header", OTHER_WORDS)
+def test_words_of_other_languages_are_understood_by_their_units(written, header):
+    blank = ";9" * (header.count(";") - 2)
+    file = written(f"{header}\n0,0;0,0;0,0{blank}\n0,1;0,25;2,5{blank}\n0,2;0,5;6,0{blank}\n")
+    moved = read_displacement(file)
+    np.testing.assert_allclose(moved.t_s, TIMES)
+    np.testing.assert_allclose(moved.positions_m[:, 2], 1e-3 * np.array(PRESSED_MM))
+    np.testing.assert_allclose(read_wrench(file)[1][:, 2], LOAD_N)
+
+
+@pytest.mark.parametrize(
+    "header", ["Strain (%),Stress [MPa]", "Stauchung in %,Druckspannung in MPa"]
+)
+def test_strain_and_stress_become_displacement_and_force(written, header):
+    file = written(f"{header}\n0,0\n1,0.02\n2,0.05\n")
     moved = read_displacement(file, length_m=0.03, timed=False)
     np.testing.assert_allclose(moved.positions_m[:, 2], [0, 3e-4, 6e-4])
     t_s, values = read_wrench(file, area_m2=1e-4, timed=False)

@@ -15,6 +15,7 @@ from collocation_sysid.recording import (
     write_markers_csv,
     write_poses_csv,
 )
+from collocation_sysid.recording.time_tables import read_custom_sensor
 
 POSES = """t_s,x_m,y_m,z_m,qx,qy,qz,qw
 0.0,0,0,1,0,0,0,1
@@ -126,13 +127,27 @@ def test_markers_may_have_their_unit_in_brackets(file, header):
     ("header", "words"),
     [
         ("t_s,tip_x (in.),tip_y (in.),tip_z (in.)", "the unit in.; expected one of m, cm, mm, in"),
-        ("t (ms),tip_x,tip_y,tip_z", "column t (ms) has the unit ms; expected one of s"),
+        ("t (mm),tip_x,tip_y,tip_z", "column t (mm) has the unit mm; expected one of s, sec, ms"),
+        ("time,tip_x,tip_y,tip_z", "column time names no unit; expected one of s"),
         ("t_s,tip_x (mm),tip_y (m),tip_z (m)", "have different units"),
         ("t_s,tip_x (mm),tip_y,tip_z", "have different units"),
     ],
 )
 def test_units_of_markers_that_are_not_known_are_refused(file, header, words):
     assert words in refusal(read_markers, file(f"{header}\n0.0,1,2,3\n0.1,2,2,3\n"))
+
+
+@pytest.mark.parametrize("name", ["t_ms", "t (ms)", "Time [ms]", "Zeit in ms"])
+def test_times_have_any_unit(file, name):
+    rows = "0,1,2,3\n100,2,2,3\n"
+    wide = read_markers(file(f"{name},tip_x,tip_y,tip_z\n{rows}"))
+    np.testing.assert_allclose(wide.t_s, [0, 0.1])
+    long = read_markers(file(f"marker,{name},x_m,y_m,z_m\ntip,0,1,2,3\ntip,100,2,2,3\n"))
+    np.testing.assert_allclose(long.t_s, [0, 0.1])
+    t_s, values, names = read_custom_sensor(file(f"{name},gap\n0,1\n100,2\n"))
+    np.testing.assert_allclose(t_s, [0, 0.1])
+    assert names == ["gap"]
+    assert values[:, 0].tolist() == [1, 2]
 
 
 def test_units_of_poses_that_are_not_known_are_refused_with_those_that_are(file):

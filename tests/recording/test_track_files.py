@@ -104,6 +104,19 @@ def test_analysis_files_of_sleap_are_read(tmp_path: Path) -> None:
     require_same(read_tracks(tmp_path / "analysis.h5"))
 
 
+@pytest.mark.parametrize("name", ["t_ms", "Time (ms)", "Zeit in ms"])
+def test_times_of_tables_have_any_unit(name: str, tmp_path: Path) -> None:
+    rows = [line.split(",", 1) for line in wide().splitlines()[1:]]
+    later = [f"{1e3 * float(t):g},{rest}" for t, rest in rows]
+    header = wide().splitlines()[0].replace("t_s", name)
+    read = read_tracks(write(tmp_path, "wide.csv", "\n".join([header, *later])))
+    require_same(read, has_times=True)
+    np.testing.assert_allclose(read.t_s, T_S)
+    table = f"{name},point,u,v\n0,t,1,2\n100,t,3,4\n"
+    np.testing.assert_allclose(read_tracks(write(tmp_path, "l.csv", table)).t_s, [0, 0.1])
+    assert read_tracks(write(tmp_path, "f.csv", "frame,t_u,t_v\n0,1,2\n1,3,4\n")).t_s is None
+
+
 def test_archives_of_cotracker_and_tapir_are_read(tmp_path: Path) -> None:
     names = np.array(NAMES)
     np.savez(

@@ -26,9 +26,10 @@ from ...common.validated_types import (
     Positive,
     Text,
 )
-from ...errors import InputError, hint_at, listed
+from ...errors import InputError, hint_at, listed, located
 from ...problem.problem_reading import parse_toml, read_text
 from ...problem.validation_messages import explain_validation_error
+from ...recording.formats.columns import find_time
 from ...recording.formats.text import decode, numeric_cells, read_bytes, read_table, times_in_column
 
 HandAxis = Literal["x", "y", "z", "rx", "ry", "rz"]
@@ -305,32 +306,24 @@ def _with_values_of_file(section: ReferenceSection, task: Path) -> ReferenceSect
     """Return the reference with times and values of its file in place of the file."""
     if section.file is None:
         return section
-    path = task.parent / section.file
-    table = read_table(decode(read_bytes(path)))
-    known = ("t_s", *POSITION_COLUMNS, *VELOCITY_COLUMNS)
-    for column in table.columns:
-        if column not in known:
+    with located(path := task.parent / section.file):
+        table = read_table(decode(read_bytes(path)))
+        time = find_time(table)
+        names = [name for k, name in enumerate(table.columns) if time is None or k != time[0]]
+        known = (*POSITION_COLUMNS, *VELOCITY_COLUMNS)
+        if unknown := [name for name in names if name not in known]:
             raise InputError(
-                f"unknown column {column}{hint_at(column, known)}; expected t_s and some of "
-                f"{', '.join(known[1:])}",
-                path,
+                f"unknown column {unknown[0]}{hint_at(unknown[0], known)}; expected t_s and some of "
+                f"{', '.join(known)}"
             )
-    if "t_s" not in table.columns or len(table.columns) < 2:
-        raise InputError(
-            f"the columns are {', '.join(table.columns)}; expected t_s and some of "
-            f"{', '.join(known[1:])}",
-            path,
-        )
-    place = {name: table.columns.index(name) for name in table.columns}
-    columns = [place[name] for name in place if name != "t_s"]
-    try:
-        t_s = times_in_column(table, place["t_s"])
-        values = numeric_cells(table, columns, blank_allowed=True)
-    except InputError as error:
-        raise error.located(path) from error
-    if len(t_s) > 1 and not (np.diff(t_s) > 0).all():
-        raise InputError("t_s does not increase; expected ascending times", path)
-    by_name = dict(zip((n for n in place if n != "t_s"), values.T, strict=True))
+        if time is None or not names:
+            raise InputError(
+                f"the columns are {', '.join(table.columns)}; expected t_s and some of "
+                f"{', '.join(known)}"
+            )
+        t_s = times_in_column(table, *time)
+        columns = [table.columns.index(name) for name in names]
+        by_name = dict(zip(names, numeric_cells(table, columns, blank_allowed=True).T, strict=True))
     missing = np.full(len(t_s), np.nan)
     update: dict[str, Any] = {"file": None, "t_s": t_s.tolist()}
     for key, names in (("position_m", POSITION_COLUMNS), ("velocity_m_s", VELOCITY_COLUMNS)):

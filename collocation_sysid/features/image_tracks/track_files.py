@@ -2,14 +2,14 @@
 
 | program | file | content |
 |---|---|---|
-| any | .csv, wide | `t_s` or `frame`; `NAME_u`, `NAME_v` and perhaps `NAME_likelihood` of each point |
+| any | .csv, wide | `t_s` (`t_ms`, …) or `frame`; `NAME_u`, `NAME_v`, perhaps `NAME_likelihood` by point |
 | any | .csv, long | `t_s` or `frame`, `point`, `u`, `v` and perhaps `likelihood` |
 | DeepLabCut | .csv, .h5 | rows scorer, (individuals,) bodyparts, coords; frame, then x, y, likelihood |
 | SLEAP | analysis .h5 | `tracks` (tracks, 2, nodes, frames), `node_names`, `point_scores` |
 | CoTracker | .npz | `pred_tracks` (1, T, N, 2), `pred_visibility` (1, T, N) |
 | TAPIR | .npz | `tracks` (N, T, 2), `visibles` (N, T) |
 
-Only tables with a column `t_s`, and archives with `t_s` or `fps`, state times.
+Only tables with a column of times, and archives with `t_s` or `fps`, state times.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...errors import InputError, listed
+from ...recording.formats.columns import find_time
 from ...recording.formats.text import (
     Row,
     TextTable,
@@ -129,15 +130,14 @@ def _times_of(grid: TextTable) -> tuple[Array | None, Array]:
         frames = np.asarray(numeric_cells(grid, [column], blank_allowed=False))[:, 0]
     else:
         frames = np.arange(float(len(grid.rows)))
-    t_s = None
-    if "t_s" in grid.columns:
-        column = grid.columns.index("t_s")
-        is_long = any(name in grid.columns for name in POINT_COLUMNS)
-        if is_long:
-            t_s = np.asarray(numeric_cells(grid, [column], blank_allowed=False))[:, 0]
-        else:
-            t_s = times_in_column(grid, column)
-    return t_s, frames
+    ends = ("_u", "_v", "_likelihood")
+    time = find_time(grid, [k for k, name in enumerate(grid.columns) if name.endswith(ends)])
+    if time is None:
+        return None, frames
+    if any(name in grid.columns for name in POINT_COLUMNS):
+        column, factor = time
+        return factor * numeric_cells(grid, [column], blank_allowed=False)[:, 0], frames
+    return times_in_column(grid, *time), frames
 
 
 def _numbers(grid: TextTable, names: Sequence[str]) -> Array:

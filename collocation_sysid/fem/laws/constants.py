@@ -133,6 +133,7 @@ POISSON = Constant(
     typical=0.1,
     usual=0.3,
     below=0.5,
+    at_least=-0.99,
     widest=(-0.9, 0.4999),
 )
 GAMMA_R = Constant(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,7 +62,7 @@ class Quantity:
         return f"{self.key}_{self.unit}"
 
 
-TIME = Quantity("t", "time", unit="s", words="time zeit prüfzeit temps tiempo tempo")
+TIME = Quantity("t", "time", unit="s", words="time zeit temps tiempo tempo")
 DISPLACEMENTS = tuple(Quantity(axis, "length", unit="m") for axis in "xyz")
 FORCES = tuple(Quantity(f"f{axis}", "force", unit="n") for axis in "xyz")
 TORQUES = tuple(Quantity(f"t{axis}", "torque", unit="nm") for axis in "xyz")
@@ -71,11 +71,20 @@ DISPLACEMENT = Quantity(
     "length",
     unit="m",
     words="displacement extension elongation compression deflection stroke crosshead position travel "
-    "weg standardweg traversenweg verformung déplacement",
+    "weg verformung verschiebung längung längenänderung hub dehnung stauchung déplacement "
+    "allongement desplazamiento spostamento",
 )
-FORCE = Quantity("force", "force", unit="n", words="force load kraft standardkraft")
-STRAIN = Quantity("strain", "ratio", unit="1", words="strain dehnung stauchung déformation")
-STRESS = Quantity("stress", "pressure", unit="pa", words="stress spannung contrainte")
+FORCE = Quantity("force", "force", unit="n", words="force load kraft last fuerza forza")
+STRAIN = Quantity(
+    *("strain", "ratio"),
+    unit="1",
+    words="strain dehnung stauchung déformation deformación deformazione",
+)
+STRESS = Quantity(
+    *("stress", "pressure"),
+    unit="pa",
+    words="stress spannung contrainte esfuerzo tensión sforzo tensione",
+)
 TENSION = Quantity("tension", "force", unit="n", words="tension")
 PRESSURE = Quantity("pressure", "pressure", unit="pa", words="pressure druck pression")
 _STRETCHES = "stretch lambda λ streckung"
@@ -118,17 +127,22 @@ _NAMED = re.compile(
 _PER_AREA = re.compile(r"(?P<name>.+)_(?P<unit>[^\W_]+)_(?P<area>[^\W_]+)")
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
 _DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
+# German compounds end with what they are: Druckspannung, Prüfkraft, Kolbenweg.
+_COMPOUND = re.compile(
+    r"(?P<first>\w+)(?P<last>zeit|weg|kraft|last|spannung|dehnung|stauchung|streckung|druck)"
+)
 # Words in the name of a column that distinguish quantities with the same other words, by key.
 QUALIFIERS = {
     "deformed": _DEFORMED,
     "second": {"second", "zweite"},
-    "lateral": {"lateral", "transverse", "quer", "querdehnung"},
+    "lateral": {"lateral", "transverse", "quer"},
     "difference": {"difference", "differenz", "différence"},
     # Of no quantity: values that are computed from others, of something else, or not measured.
     "other": {
         *("deviatoric", "hydrostatic", "mises", "tresca"),
         *("volumetric", "rate", "energy", "error", "fehler", "deviation", "abweichung", "std"),
         *("uncertainty", "residual", "target", "setpoint", "command", "commanded", "sollwert"),
+        *("soll", "vor"),
         *("amplitude", "range", "modulus", "strength", "limit", "noise"),
     },
 }
@@ -239,7 +253,7 @@ def _find_columns(
         quantity.key: column
         for quantity in (TIME, *sought)
         if quantity.key not in chosen
-        and (column := find_column(grid, quantity, advice=column_advice)) is not None
+        and (column := find_column(grid, quantity, sought, advice=column_advice)) is not None
     }
     return chosen | recognised
 
@@ -275,7 +289,10 @@ def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tup
 
 
 def find_column(
-    grid: TextTable, quantity: Quantity, advice: Callable[[TextTable], str] | None = None
+    grid: TextTable,
+    quantity: Quantity,
+    others: Sequence[Quantity] = (),
+    advice: Callable[[TextTable], str] | None = None,
 ) -> tuple[int, float] | None:
     """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
     name fits. Of several columns with a fitting name, those with another unit are ignored.
@@ -284,6 +301,9 @@ def find_column(
     ----------
     grid : TextTable
     quantity : Quantity
+    others : sequence of Quantity
+        Further quantities that the table may have: a column whose name and unit fit one of them
+        needs no other unit.
     advice : callable, optional
         See `column_advice` of `read_columns`.
 
@@ -306,10 +326,29 @@ def find_column(
             f"the columns {', '.join(names)} could all be {quantity.key}; expected one of them, "
             f"or {remedy}"
         )
-    if units and not fitting:
-        first = next(iter(units))
-        raise _unit_error(grid, grid.columns[first], unit=units[first], quantity=quantity)
-    return fitting[0] if fitting else None
+    if fitting:
+        return fitting[0]
+    explained = {k for other in others for k, _ in _fitting_columns(grid, other)}
+    if (wrong := next((k for k in units if k not in explained), None)) is not None:
+        raise _unit_error(grid, grid.columns[wrong], unit=units[wrong], quantity=quantity)
+    return None
+
+
+def find_time(grid: TextTable, measured: Collection[int] = ()) -> tuple[int, float] | None:
+    """Return index and factor to seconds of the column of times; None without one. A column t_s has
+    precedence.
+
+    The columns `measured` have other quantities, whatever their names.
+
+    Raises
+    ------
+    InputError
+        If several columns have times, or their unit is missing or none of time.
+    """
+    if grid.columns.count(TIME.column) == 1:
+        return grid.columns.index(TIME.column), 1.0
+    names = ["" if k in measured else name for k, name in enumerate(grid.columns)]
+    return find_column(TextTable(names, grid.rows, grid.names_line), TIME)
 
 
 def _fitting_names(grid: TextTable, quantity: Quantity) -> Mapping[int, str | None]:
@@ -433,8 +472,13 @@ def _key_of(name: str) -> str:
 
 
 def _words(name: str) -> set[str]:
-    """Return the words of a name in lower case: its longest sequences of letters."""
-    return set(re.findall(r"[^\W\d_]+", name.lower()))
+    """Return the words of a name in lower case, its longest sequences of letters, and of a compound
+    also its last part and a qualifier that is its first.
+    """
+    words = set(re.findall(r"[^\W\d_]+", name.lower()))
+    compounds = [*filter(None, map(_COMPOUND.fullmatch, words))]
+    qualifiers = set().union(*QUALIFIERS.values())
+    return words | {c["last"] for c in compounds} | {c["first"] for c in compounds} & qualifiers
 
 
 # Errors -------------------------------------------------------------------------------------------

@@ -57,7 +57,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         labels,
         coordinate_columns=[places for _, places in columns.values()],
         chosen=chosen,
-        time=1,
+        time=(1, 1.0),
         unit=length_unit_of_text(unit, "line 1, Length Units"),
         unit_key="Length Units",
         rate_hz=header.number(rate_key),

@@ -18,9 +18,10 @@ import numpy as np
 
 from ...errors import InputError, listed
 from ..sample_times import first_unordered_time
+from .columns import find_time
 from .raw_tracks import LabelChooser, RawTracks, tracks_of_table
 from .text import TextTable, numeric_cells, read_table
-from .units import METRES_PER_UNIT, length_unit_of_spelling, si_factor
+from .units import METRES_PER_UNIT, length_unit_of_spelling
 
 _BRACKETED = re.compile(r"(?P<name>.*?)\s*[(\[](?P<unit>[^()\[\]]+)[)\]]")
 # A column of a marker: the axis behind its name, as in "tip_x", "tip X" or "tip:x".
@@ -29,8 +30,6 @@ _PLACE = re.compile(r"(?P<marker>.+?)[ .:_](?P<axis>[xyz])", re.IGNORECASE)
 _IGNORED = ("Frame", "frame")
 # Number of columns that messages list.
 _LISTED = 8
-# Names of columns of times in other units than seconds.
-_TIME_UNIT = re.compile(r"(?P<name>t|time)_(?P<unit>ms|msec|us|µs|min|minutes)", re.IGNORECASE)
 
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
@@ -43,43 +42,46 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         If columns are missing or unknown, a cell is neither blank nor a number, or time does not
         increase.
     """
-    table, unit = _without_bracketed_units(read_table(text))
-    tracks = (_read_long if "marker" in table.columns else _read_wide)(table, choose)
+    table, unit, to_seconds = _without_units(read_table(text))
+    read = _read_long if "marker" in table.columns else _read_wide
+    tracks = read(table, choose, to_seconds)
     return tracks if unit is None else replace(tracks, unit=unit, unit_key="the columns' names")
 
 
-def _without_bracketed_units(table: TextTable) -> tuple[TextTable, str | None]:
-    """Return the table without units in brackets behind the names of its columns, and the unit of
-    the coordinates; None if there is none.
+def _without_units(table: TextTable) -> tuple[TextTable, str | None, float]:
+    """Return the table with times called t_s and coordinates without units in brackets, the unit of
+    the coordinates, None if there is none, and the factor from the times to seconds.
     """
-    columns = []
+    columns = [*table.columns]
     units: dict[str | None, str] = {}
-    for column in table.columns:
-        parts = _BRACKETED.fullmatch(column) or _TIME_UNIT.fullmatch(column)
+    places = []
+    for k, column in enumerate(table.columns):
+        parts = _BRACKETED.fullmatch(column)
         name, stated = (column, "") if parts is None else (parts["name"], parts["unit"].strip())
-        is_time = name.lower() in ("t", "time", "t_s")
         if place := _PLACE.fullmatch(name):
             name = f"{place['marker']}_{place['axis'].lower()}"
-        is_place = name in ("x", "y", "z") or name[-2:] in ("_x", "_y", "_z")
-        known = ("s", "sec") if is_time else METRES_PER_UNIT
+        if not (name in ("x", "y", "z") or name[-2:] in ("_x", "_y", "_z")):
+            continue
         unit = length_unit_of_spelling(stated)
-        is_known = si_factor(stated, "time") == 1.0 if is_time else unit in known
-        if stated and (is_time or is_place) and not is_known:
+        if stated and unit not in METRES_PER_UNIT:
             raise table.error_at(
-                f"column {column} has the unit {stated}; expected one of {', '.join(known)}: convert "
-                f"its values{', then call it t_s' if is_time else ''}"
+                f"column {column} has the unit {stated}; expected one of "
+                f"{', '.join(METRES_PER_UNIT)}: convert its values"
             )
-        if is_place:
-            units[unit] = column
-        columns.append(name if is_place else "t_s" if is_time and stated else column)
+        units[unit] = column
+        columns[k] = name
+        places.append(k)
     if len(units) > 1:
         raise table.error_at(
             f"the columns {listed(units.values())} have different units; expected the same of all"
         )
-    return TextTable(columns, table.rows), next(iter(units), None)
+    to_seconds = 1.0
+    if "t_s" not in columns and (time := find_time(table, measured=places)) is not None:
+        columns[time[0]], to_seconds = "t_s", time[1]
+    return TextTable(columns, table.rows), next(iter(units), None), to_seconds
 
 
-def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
+def _read_wide(table: TextTable, choose: LabelChooser, to_seconds: float) -> RawTracks:
     """Read a table with three columns for each marker, in metres unless the user states another
     unit; `choose` returns the indices of the markers to read from their labels. Errors as of
     `_wide_labels` and `tracks_of_table`.
@@ -92,7 +94,7 @@ def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
         labels,
         coordinate_columns=places,
         chosen=choose(labels),
-        time=place["t_s"],
+        time=(place["t_s"], to_seconds),
         zeros_are_missing=False,
         default_unit="m",
     )
@@ -132,7 +134,7 @@ def _first_columns(columns: Sequence[str]) -> str:
     return ", ".join(columns[:_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
+def _read_long(table: TextTable, choose: LabelChooser, to_seconds: float) -> RawTracks:
     """Read a table with one row for each marker and time; `choose` returns the indices of the
     markers to read from their labels.
 
@@ -144,7 +146,8 @@ def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
         raise table.error_at("column marker is blank; expected a name", of_row.index(""))
     labels = list(dict.fromkeys(of_row))
     chosen = [labels[k] for k in choose(labels)]
-    row_t_s = numeric_cells(table, [table.columns.index("t_s")], blank_allowed=False)[:, 0]
+    times = numeric_cells(table, [table.columns.index("t_s")], blank_allowed=False)
+    row_t_s = to_seconds * times[:, 0]
     t_s, frame = np.unique(row_t_s, return_inverse=True)
     coordinates = np.full((len(t_s), len(chosen), 3), np.nan)
     for k, label in enumerate(chosen):

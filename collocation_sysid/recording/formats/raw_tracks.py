@@ -69,7 +69,7 @@ def tracks_of_table(
     labels: Sequence[str],
     coordinate_columns: Sequence[Sequence[int]],
     chosen: Sequence[int],
-    time: int | None,
+    time: tuple[int, float] | None,
     **fields: Any,
 ) -> RawTracks:
     """Return the tracks of a table with a row for each frame.
@@ -83,8 +83,8 @@ def tracks_of_table(
         Indices of the columns of x, y and z, by marker.
     chosen : sequence of int
         Indices of the markers to read; cells of others are not read.
-    time : int or None
-        Index of the column of times [s], if there is one.
+    time : (int, float) or None
+        Index of the column of times and factor to seconds, if there is one.
     **fields
         Further fields of `RawTracks`.
 
@@ -99,7 +99,7 @@ def tracks_of_table(
     return RawTracks(
         labels=[labels[k] for k in chosen],
         coordinates=cells.reshape(-1, len(chosen), 3),
-        t_s=None if time is None else times_in_column(table, time),
+        t_s=None if time is None else times_in_column(table, *time),
         **fields,
     )
 
@@ -195,7 +195,7 @@ def tracks_of_frames(
     )
     header.require_count(count_key, len(frames), what="frames")
     places = [range(k, k + 3) for k in range(len(leading), len(table.columns), 3)]
-    time = leading.index("Time") if "Time" in leading else None
+    time = (leading.index("Time"), 1.0) if "Time" in leading else None
     fields |= {"rate_hz": header.number(rate_key), "rate_key": rate_key}
     return tracks_of_table(
         table, labels, coordinate_columns=places, chosen=chosen, time=time, **fields

@@ -36,6 +36,11 @@ _SEPARATOR = re.compile("[,;\t]")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _POINTED = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
+# Marks of thousands: 1.000,5 and 1,000.5, where the decimal sign tells which one it is.
+_THOUSANDS = (
+    (".", re.compile(r"[-+]?\d{1,3}(\.\d{3})+(?P<decimals>,\d+)?")),
+    (",", re.compile(r"[-+]?\d{1,3}(,\d{3})+(?P<decimals>\.\d+)?")),
+)
 _EMPTY = "the file is empty; expected a line of column names, then rows of numbers"
 
 
@@ -140,7 +145,8 @@ def _decoded(content: bytes, encoding: str) -> str | None:
 def separated_rows(text: str, separator: str | None = None) -> list[Row]:
     """Return the rows of separated text; blank rows are skipped.
 
-    Decimal commas become points if the separator is no comma and no number has a point.
+    Decimal commas become points if the separator is no comma and no number has a decimal point.
+    Marks of thousands are removed if a number has a decimal sign, too.
 
     Parameters
     ----------
@@ -167,6 +173,16 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
         raise InputError(f"this is not a CSV text file: {error}") from error
     if not rows:
         raise InputError(_EMPTY)
+    for mark, number in _THOUSANDS:
+        grouped = [
+            (row, k, found)
+            for row in rows
+            for k, cell in enumerate(row.cells)
+            if mark in cell and (found := number.fullmatch(cell))
+        ]
+        if any(found["decimals"] for _, _, found in grouped):
+            for row, k, found in grouped:
+                row.cells[k] = found[0].replace(mark, "")
     if separator != "," and not any(_POINTED.fullmatch(cell) for row in rows for cell in row.cells):
         for row in rows:
             commas = [_DECIMAL_COMMA.fullmatch(cell) for cell in row.cells]

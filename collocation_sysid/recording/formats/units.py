@@ -9,7 +9,8 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 # Factors from units to SI, by dimension. A unit may be written in lower case, as in fz_kn, unless
 # that is another unit.
 UNITS: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "second": 1.0, "ms": 1e-3, "min": 60.0},
+    "time": {"s": 1.0, "sec": 1.0, "seconds": 1.0, "second": 1.0, "ms": 1e-3, "min": 60.0}
+    | {"µs": 1e-6, "us": 1e-6, "ns": 1e-9, "h": 3600.0},
     "length": {**METRES_PER_UNIT, "µm": 1e-6, "um": 1e-6, "nm": 1e-9, '"': 0.0254},
     "force": {
         **{"n": 1.0, "mn": 1e-3, "MN": 1e6, "kn": 1e3, "µn": 1e-6, "un": 1e-6, "nn": 1e-9},
@@ -33,7 +34,7 @@ _WRITTEN = {
 }
 _TORQUES = {"nm": "N m", "nmm": "N mm", "mnm": "mN m"}
 # Second spellings, which messages leave out.
-_UNWRITTEN = ("um", "un", "cmh2o", "seconds", "second")
+_UNWRITTEN = ("um", "un", "us", "cmh2o", "seconds", "second")
 # What people write where a force is meant.
 _MASSES = ("g", "kg", "lb", "lbs")
 
