@@ -1,10 +1,11 @@
 """Mistakes in descriptions and data: table of the reports of `check` and `solve`.
 
 Every mistake is made in a correct problem: in twins of a soft bar with markers (`twins`), also with
-a force sensor, in twins with depth images (`depth_twins`), and in twins with an obstacle
-(`contact_twins`). Correct problems of several seeds stand first: a report there is a false alarm.
+a force sensor, in twins with depth images (`depth_twins`), in twins that ordinary cameras film
+(`filmed_twins`), and in twins with an obstacle (`contact_twins`). Correct problems of several seeds
+stand first: a report there is a false alarm.
 
-    python scripts study_mistakes [--groups tracks wrench depth obstacle] [--only NAME]
+    python scripts study_mistakes [--groups tracks wrench depth video obstacle] [--only NAME]
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ from dataclasses import dataclass
 
 import contact_twins
 import depth_twins
+import filmed_twins
 import numpy as np
 from twins import BODIES, SOFT, sensing_twin, twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
+from wrong_videos import PAIR_FAULTS, PLACE_FAULTS, VIDEO_FAULTS
 
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.features.cameras.feature import depth_image_hypotheses, may_be_images
@@ -124,7 +127,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    groups = ["tracks", "wrench", "depth", "obstacle"]
+    groups = ["tracks", "wrench", "depth", "video", "obstacle"]
     parser.add_argument("--groups", nargs="+", choices=groups, default=groups)
     parser.add_argument("--body", choices=list(BODIES), default="bar")
     parser.add_argument("--samples", type=int, default=40)
@@ -170,6 +173,30 @@ def families(body: str, samples: int) -> list[ProblemFamily]:
             MOVING_FAULTS,
             "young_pa",
             bar_pa,
+        ),
+        ProblemFamily(
+            "video",
+            "video, known places",
+            filmed_twins.filmed_twin,
+            {**VIDEO_FAULTS, **PLACE_FAULTS},
+            "young_pa",
+            filmed_twins.TRUTH["young_pa"],
+        ),
+        ProblemFamily(
+            "video",
+            "video, unknown places",
+            lambda seed: filmed_twins.filmed_twin(seed, are_places_known=False),
+            {f"{name}, places unknown": fault for name, fault in VIDEO_FAULTS.items()},
+            "young_pa",
+            filmed_twins.TRUTH["young_pa"],
+        ),
+        ProblemFamily(
+            "video",
+            "two videos",
+            lambda seed: filmed_twins.filmed_twin(seed, cameras=("front", "top")),
+            PAIR_FAULTS,
+            "young_pa",
+            filmed_twins.TRUTH["young_pa"],
         ),
         ProblemFamily(
             "obstacle", "indentation", contact_twins.poked_twin, POKING_FAULTS, "young_pa", block_pa

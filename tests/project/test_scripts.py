@@ -29,6 +29,7 @@ COMMANDS = (
     "study_methods --starts 1 --methods reduced-space --workers 1",
     "study_mismatch --schemes midpoint --substeps 1",
     "study_mistakes --groups tracks --only wxyz --seeds 1",
+    "study_mistakes --groups video --only turned --seeds 1 --check-only",
     "study_refinement --twins 1",
     "study_shipped --only table1/problem_scheme.toml",
     "study_specimen_coverage --twins 2 --case 0",

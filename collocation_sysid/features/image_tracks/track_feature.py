@@ -1,48 +1,21 @@
-"""Image tracks in checks and runs: likely errors of cameras and of single tracks, and notes.
-
-Before a solve, the tracks are compared with the body carried rigidly by its grasp: with the stated
-description, and with common mistakes corrected. After a fit, single tracks are compared with their
-predictions.
+"""Image tracks in checks and runs: likely errors of cameras (`stated_cameras`) and of single tracks,
+which are compared with their predictions after a fit, and notes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from ...common.array_types import Array
 from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
-from ...recording.camera import Camera
-from ...recording.experiment import Experiment
-from ...recording.placement import LocatedBody
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
 from ..feature import Feature
-from .rays import points_on_surface
+from . import stated_cameras
 from .track_residual import ImageTrackResidual
-from .tracks import ImageTracks, stated_places
 
-# Images in which tracks are compared with the rigid body.
-MOST_IMAGES = 12
-# Distance [pixels] of a point that cannot be projected, and of a ray that meets no part of the body.
-FAR_PX = 1e4
-# Factor by which a correction must decrease the median distance.
-NEARER = 3.0
-# Share of the size of the body in the image below which distances are those of its deformation.
-OF_DEFORMATION = 0.1
-# Distance as a share of that size at which a camera does not show the body, whatever is corrected.
-NOT_SHOWN = 0.5
-# Sizes of images over those of the calibration that are tried.
-SCALES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
-# Frames of cameras in other programs, in columns, and the words for them.
-FRAMES = {
-    "x to the right, y up, z backwards (OpenGL, Blender)": np.diag([1.0, -1.0, -1.0]),
-    "x forward, y to the left, z up (ROS body frame)": np.array(
-        [[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    ),
-}
 # Standard deviations of residuals from which a track is suspicious, and the factor by which an
 # exchange or a step must explain them.
 SUSPICIOUS = 5.0
@@ -54,12 +27,7 @@ FEWEST_BESIDE = 3
 # Ratio of the errors of two poses of a camera below which the second is nearly as good.
 SIMILAR_POSES = 2.0
 
-MESSAGES = {
-    "description/image-tracks": "the points appear {distance_px:.3g} pixels (median) from where the "
-    "body is, which is {size_px:.3g} pixels large in the image: check camera.pose (x to the right, y "
-    "down, z forward, in metres), the calibration and start_s",
-    "description/image-tracks/likely": "the points are not where the body appears ({distance_px:.3g} "
-    "pixels off, median), but {nearer:.2g} times nearer if {mistake}",
+MESSAGES = stated_cameras.MESSAGES | {
     "description/image-track/exchanged": "the tracks {first} and {second} fit each other's places: "
     "their names are exchanged",
     "description/image-track/stuck": "the track {point} hardly moves where the body moves "
@@ -71,154 +39,6 @@ MESSAGES = {
     "others by {others:.2g}: the tracker has lost the point, or it is not on the body; leave it out "
     "with points",
 }
-
-
-# Before a solve -----------------------------------------------------------------------------------
-
-
-def hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield a hypothesis for each camera whose tracks are not where the body appears."""
-    for tracks in experiment.readings:
-        if isinstance(tracks, ImageTracks) and tracks.pixels is not None and tracks.has_known_pose:
-            yield from _camera_hypotheses(experiment, tracks)
-
-
-def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:
-    trial = _Trial(experiment, tracks)
-    pixels = np.asarray(tracks.pixels)
-    stated_px = trial.distance_px(tracks.camera, pixels)
-    size_px = trial.size_px(tracks.camera)
-    if stated_px <= OF_DEFORMATION * size_px:
-        return
-    of = f"'{tracks.name}' of '{experiment.name}'"
-    tried = [
-        (trial.distance_px(camera, other), mistake)
-        for camera, other, mistake in _corrections(tracks.camera, pixels)
-    ]
-    best_px, mistake = min(tried)
-    data = {"distance_px": stated_px, "size_px": size_px}
-    if best_px * NEARER < stated_px:
-        ratio = stated_px / max(best_px, 1.0)
-        data |= {"mistake": mistake, "nearer": ratio}
-        yield Hypothesis("image-tracks/likely", of, data=data, strength=ratio)
-    elif stated_px > NOT_SHOWN * size_px:
-        yield Hypothesis("image-tracks", of, data=data, strength=stated_px / size_px)
-
-
-def _corrections(camera: Camera, pixels: Array) -> Iterator[tuple[Camera, Array, str]]:
-    """Yield camera and pixels with one mistake corrected, and the mistake as a clause."""
-    matrix = camera.require_matrix()
-    width, height = camera.size_px or (2 * matrix[0, 2] + 1, 2 * matrix[1, 2] + 1)
-    yield camera, pixels[..., ::-1], "u and v are exchanged (row, column): exchange the columns"
-    upwards = np.stack([pixels[..., 0], height - 1 - pixels[..., 1]], axis=-1)
-    yield camera, upwards, f"v points upwards: use {height - 1:g} - v"
-    mirrored = np.stack([width - 1 - pixels[..., 0], pixels[..., 1]], axis=-1)
-    yield camera, mirrored, f"u points to the left (a mirrored video): use {width - 1:g} - u"
-    both = np.stack([width - 1 - pixels[..., 0], height - 1 - pixels[..., 1]], axis=-1)
-    yield camera, both, "the video is turned by 180 degrees: turn it, or the pose"
-    for scale in SCALES:
-        other = pixels / scale
-        yield (
-            camera,
-            other,
-            f"the images have {scale:.3g} times the resolution of the calibration: multiply the "
-            "first two rows of the matrix by this",
-        )
-    inverse = np.linalg.inv(camera.pose)
-    yield (
-        replace(camera, pose=inverse),
-        pixels,
-        "the pose is from the world to the camera: invert it",
-    )
-    for words, frame in FRAMES.items():
-        pose = camera.pose.copy()
-        pose[:3, :3] = pose[:3, :3] @ frame
-        yield replace(camera, pose=pose), pixels, f"the pose is that of a frame with {words}"
-    for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres")):
-        pose = camera.pose.copy()
-        pose[:3, 3] *= factor
-        yield (
-            replace(camera, pose=pose),
-            pixels,
-            f"the position of the camera is in {unit}: state it in metres",
-        )
-
-
-class _Trial:
-    """Comparison of the tracks of one camera with the body carried rigidly by its grasp."""
-
-    def __init__(self, experiment: Experiment, tracks: ImageTracks) -> None:
-        times = tracks.sample_times_s
-        first_s, last_s = experiment.t_s[[0, -1]]
-        within = np.flatnonzero((times >= first_s) & (times <= last_s) & tracks.is_seen.any(axis=1))
-        count = min(MOST_IMAGES, len(within))
-        self.samples = within[np.linspace(0, len(within) - 1, count).astype(int)]
-        self.tracks = tracks
-        self.body = experiment.body
-        self.t_s = times[self.samples]
-        self.shapes_m = experiment.rigid_positions(self.t_s)
-        stated = stated_places(experiment)
-        rest = LocatedBody(self.body.nodes_m, self.body)
-        self.weights = {
-            name: rest.weights_at_nearest_point(place) for name, (place, _) in stated.items()
-        }
-
-    def size_px(self, camera: Camera) -> float:
-        """Return the size of the body in the first image [pixels]; `FAR_PX` if it is not there."""
-        rotations, translations = camera.pose_at(self.t_s[:1])
-        own = (self.shapes_m[0] - translations[0]) @ rotations[0]
-        own = own[own[:, 2] > 0]
-        if len(own) < 2:
-            return FAR_PX
-        return float(np.linalg.norm(np.ptp(camera.undistorted_pixels(own), axis=0)))
-
-    def distance_px(self, camera: Camera, pixels: Array) -> float:
-        """Return the median distance of the tracks from the rigid body [pixels]."""
-        rotations, translations = camera.pose_at(self.t_s)
-        seen = self.tracks.is_seen[self.samples]
-        pixels = pixels[self.samples]
-        focal_px = camera.require_matrix()[0, 0]
-        distances = []
-        for k, name in enumerate(self.tracks.names):
-            if not seen[:, k].any():
-                continue
-            missed_px = 0.0
-            if name in self.weights:
-                nodes, weights = self.weights[name]
-            else:
-                first = int(seen[:, k].argmax())
-                ray = _ray(camera, pixels[first, k])
-                if ray is None:
-                    distances.append(np.full(seen[:, k].sum(), FAR_PX))
-                    continue
-                faces, shares, missed = points_on_surface(
-                    translations[[first]],
-                    (rotations[first] @ ray)[None],
-                    self.shapes_m[first],
-                    self.body.mesh.surface,
-                )
-                nodes, weights = self.body.mesh.surface[faces[0]], shares[0]
-                missed_px = focal_px * float(missed[0])
-            points = np.einsum("c,sci->si", weights, self.shapes_m[:, nodes])
-            own = np.einsum("sji,sj->si", rotations, points - translations)
-            off = np.full(len(own), FAR_PX)
-            front = own[:, 2] > 0
-            if front.any():
-                shown = camera.distorted_pixels(own[front])
-                off[front] = np.linalg.norm(shown - pixels[front, k], axis=1)
-            distances.append(np.minimum(off[seen[:, k]] + missed_px, FAR_PX))
-        return float(np.median(np.concatenate(distances)))
-
-
-def _ray(camera: Camera, pixel: Array) -> Array | None:
-    """Return the direction of a pixel in the camera's frame; None where the lens has none."""
-    try:
-        return camera.points_at_unit_depth(pixel[None])[0]
-    except ValueError:
-        return None
-
-
-# After a fit --------------------------------------------------------------------------------------
 
 
 def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
@@ -340,5 +160,8 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
 
 
 IMAGE_TRACKS = Feature(
-    messages=MESSAGES, hypotheses=hypotheses, fit_hypotheses=fit_hypotheses, notes=notes
+    messages=MESSAGES,
+    hypotheses=stated_cameras.hypotheses,
+    fit_hypotheses=fit_hypotheses,
+    notes=notes,
 )

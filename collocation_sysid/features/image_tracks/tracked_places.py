@@ -37,6 +37,8 @@ TURNS_HIDDEN = -0.1
 # Cosine of the angle between two faces up to which a place may move from one to the other: beyond it,
 # the edge is a crease, and places stay in the plane of their face.
 SMOOTH = 0.7
+# Distance of a stated place from the body over its diagonal from which on it is a mistake.
+FAR_OFF = 0.25
 # Iterations that align a camera with the first image.
 ALIGNMENT_EVALUATIONS = 60
 # Share of the visible samples up to which changes are ignored.
@@ -73,11 +75,13 @@ def find_places(
     Raises
     ------
     InputError
-        If the pose of a camera is unknown, and fewer than four points of it have a stated place.
+        If the pose of a camera is unknown, and fewer than four points of it have a stated place; or
+        if a stated place is far from the body.
     """
     cameras = [each for each in experiment.readings if isinstance(each, ImageTracks)]
     rest = LocatedBody(experiment.body.nodes_m, experiment.body)
     stated = {name: place for name, (place, _) in stated_places(experiment).items()}
+    _require_on_body(stated, rest)
     poses, mirrored = {}, {}
     for tracks in cameras:
         poses[tracks.name] = tracks.camera.pose
@@ -89,6 +93,19 @@ def find_places(
     for tracks in cameras:
         _add_places(places, tracks, poses[tracks.name], experiment.body, shape_at)
     return poses, mirrored, places
+
+
+def _require_on_body(places: Mapping[str, Array], rest: LocatedBody) -> None:
+    low_m, high_m = rest.body.nodes_m.min(axis=0), rest.body.nodes_m.max(axis=0)
+    size_m = float(np.linalg.norm(high_m - low_m))
+    for name, place in places.items():
+        away_m = rest.weights_at_point(place)[2]
+        if away_m > FAR_OFF * size_m:
+            raise InputError(
+                f"the place of '{name}' is {away_m:.3g} m from the undeformed body, which extends "
+                f"from {np.round(low_m, 4).tolist()} to {np.round(high_m, 4).tolist()}; expected "
+                "places_m on the undeformed body, in metres"
+            )
 
 
 def _poses_of(
