@@ -25,7 +25,6 @@ from ..program.sweep import Sweep
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
-from ..recording.nuisance import GAUGE
 from .starts.stiffness_scan import Scan
 
 
@@ -336,10 +335,10 @@ class Solution:
             for entry, full, value in zip(nuisance.entries, nuisance.names, values, strict=True):
                 known.append(full)
                 names = {full, entry.label, entry.label.rpartition(" [")[0], entry.row.name}
-                if entry.row.name == GAUGE.name:
+                if entry.row.of in ("gauge", "images"):
                     sensor = readings[entry.number]
                     own = {sensor.unknown_label(each): each for each in sensor.unknowns}
-                    names.add(own[entry.label])
+                    names.add(own.get(entry.label, full))
                 if name in names:
                     estimates[full] = value
         if len(estimates) == 1:

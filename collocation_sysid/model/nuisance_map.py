@@ -258,7 +258,8 @@ class NuisanceMap(RecordingQuantities):
         component : int, optional
             Number of the instance, such as the index of a camera; None for all.
         """
-        return self._indices_where(lambda e: e.row in rows and component in (None, e.number))
+        names = {row.name for row in rows}
+        return self._indices_where(lambda e: e.row.name in names and component in (None, e.number))
 
     def indices_of_labels(self, labels: Iterable[str]) -> Index:
         """Return the indices in φ of the parameters with some labels, in their order."""
@@ -634,6 +635,8 @@ def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, st
     names = experiment.markers.names
     if of == "recording":
         return [(0, "")]
+    if of == "images":  # the measurement itself declares what is unknown about its camera
+        return []
     if of == "marker":
         return enumerate(names)
     if of == "place":

@@ -28,6 +28,7 @@ Component = Literal[
     "load",
     "sensor",
     "camera",
+    "images",
     "gauge",
 ]
 ModelPart = Literal[

@@ -30,6 +30,11 @@ SAMPLES_A_STEP = 2.0
 # Shift of a depth camera in a step of the solver [m]: correspondences stay about the same.
 CAMERA_SHIFT_A_STEP_M = 0.02
 FILM_A_RULER = "film a ruler where the body moves"
+CALIBRATE_A_POSE = "film a calibration board whose pose in the frame of the gripper is known"
+# Frame rates are stated as 30 where they are 29.97, and vary by a percent in videos of phones.
+WIDENING_OF_FRAME_RATES = 100.0
+# Reach of errors of ordinary cameras [σ]: larger steps save a quarter of the iterations.
+IMAGE_REACH = 3.0
 # Scope of parameters that recordings share, as a pattern and in words for messages.
 SCOPE = r"shared( \S+)?"
 SCOPE_TEXT = '"shared", or "shared" followed by the name of a group of recordings'
@@ -104,6 +109,15 @@ def _camera_sharing_key(experiment: Any) -> dict[str, object]:
     """
     places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
     return {"body": id(experiment.body), "pose of its depth cameras": places}
+
+
+def _has_image_cameras(experiment: Any) -> bool:
+    """Return whether ordinary cameras film the body."""
+    return any(each.counts_pixels for each in experiment.readings)
+
+
+def _is_filmed_motion(experiment: Any) -> bool:
+    return _is_motion(experiment) and _has_image_cameras(experiment)
 
 
 def _is_motion(experiment: Any) -> bool:
@@ -634,6 +648,152 @@ DEPTH_EDGE = Deviation(
     sentence="silhouettes end {size} inside the body's outline",
     description="distance by which silhouettes in the images of each depth camera end inside the "
     "outline of the body, in pixels",
+)
+
+# Errors of ordinary cameras. A camera states its own prior deviations (`CameraImages`); these rows
+# count for those that it does not state. Rows that are "tested" only have no place in the budget by
+# default, because a camera that states zero is exact.
+IMAGE_TURN = Deviation(
+    "image_turn_rad",
+    "rad",
+    sigma=None,
+    key="image_pose",
+    of="images",
+    axes="x y z",
+    changes=(),
+    applies=_has_image_cameras,
+    reach=IMAGE_REACH,
+    by="length",
+    label="turn, {axis}, of {which}",
+    sentence="rotation of a camera of images: {size}",
+    remedy=CALIBRATE_A_POSE,
+    description="rotation of each ordinary camera about its axes",
+)
+IMAGE_SHIFT = Deviation(
+    "image_shift_m",
+    "m",
+    sigma=None,
+    key="image_pose",
+    of="images",
+    axes="x y z",
+    changes=(),
+    applies=_has_image_cameras,
+    reach=IMAGE_REACH,
+    by="length",
+    label="shift, {axis}, of {which}",
+    sentence="translation of a camera of images: {size}",
+    remedy=CALIBRATE_A_POSE,
+    description="translation of each ordinary camera along its axes",
+)
+IMAGE_FOCAL = Deviation(
+    "image_focal",
+    "1",
+    sigma=None,
+    key="image_focal",
+    of="images",
+    changes=(),
+    applies=_has_image_cameras,
+    reach=IMAGE_REACH,
+    tested=5e-3,
+    widening=WIDENING,
+    assumed="the focal lengths of the cameras are those of the calibration",
+    remedy="calibrate the camera with the focus and zoom of the recording",
+    by="worst",
+    label="error of the focal length of {which}",
+    sentence="error of a focal length: {signed}",
+    description="relative error of both focal lengths of each ordinary camera",
+)
+IMAGE_CENTRE = Deviation(
+    "image_centre_px",
+    "px",
+    sigma=None,
+    key="image_centre",
+    of="images",
+    axes="u v",
+    changes=(),
+    applies=_has_image_cameras,
+    reach=IMAGE_REACH,
+    tested=2.0,
+    widening=WIDENING,
+    assumed="the principal points of the cameras are those of the calibration",
+    remedy="calibrate the camera with images of the same size and crop as the video",
+    by="length",
+    label="error of the principal point, {axis}, of {which}",
+    sentence="error of a principal point: {size}",
+    description="error of the principal point of each ordinary camera",
+)
+IMAGE_TIME = Deviation(
+    "image_time_s",
+    "s",
+    sigma=None,
+    key="image_time",
+    of="images",
+    changes=(),
+    applies=_is_filmed_motion,
+    reach=IMAGE_REACH,
+    tested=5e-3,
+    widening=WIDENING,
+    assumed="the clocks of cameras and gripper agree",
+    remedy="state clock_sigma_s, so that the delay is estimated, or trigger both by one signal",
+    by="worst",
+    label="delay of {which}",
+    sentence="delay of images: {signed}",
+    description="delay of the images of each ordinary camera by the clock of the grasps",
+)
+IMAGE_CLOCK_RATE = Deviation(
+    "image_clock_rate",
+    "1",
+    sigma=None,
+    key="image_clock_rate",
+    of="images",
+    changes=(),
+    applies=_is_filmed_motion,
+    reach=IMAGE_REACH,
+    considered=1e-4,
+    widening=WIDENING_OF_FRAME_RATES,
+    assumed="the stated frame rates of the cameras are right",
+    remedy="use the times of the images in the video, or film a clock",
+    by="worst",
+    label="error of the frame rate of {which}",
+    sentence="error of a frame rate: {signed}",
+    description="relative error of the time between the images of each ordinary camera",
+)
+IMAGE_LINE_DELAY = Deviation(
+    "image_line_delay_s",
+    "s",
+    sigma=None,
+    key="image_line_delay",
+    of="images",
+    changes=(),
+    applies=_is_filmed_motion,
+    reach=IMAGE_REACH,
+    considered=1e-5,
+    widening=WIDENING,
+    assumed="the rows of an image are exposed as stated (line_delay_s)",
+    remedy="state line_delay_s: the exposure of one row after the other by a rolling shutter takes 10 "
+    "to 30 microseconds per row of a phone",
+    by="worst",
+    label="error of the line delay of {which}",
+    sentence="error of a line delay: {signed}",
+    description="error of the time from one row of an image to the next, of each ordinary camera",
+)
+IMAGE_DRIFT = Deviation(
+    "image_drift_px",
+    "px",
+    sigma=None,
+    key="image_drift",
+    of="images",
+    changes=(),
+    applies=_is_filmed_motion,
+    reach=UNLIMITED_REACH,
+    considered=0.2,
+    widening=WIDENING,
+    assumed="trackers follow their points without drift",
+    remedy="compare each image with the first one in the tracker, or use tags, which do not drift",
+    by="worst",
+    label="drift of {which}",
+    sentence="drift of a track: up to {size}",
+    description="drift of each track: standard deviation of a random walk after one second",
 )
 
 # In the order of φ; neighbours of one component stand together.

@@ -21,23 +21,20 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ...program.association import Association
 from ...program.correspondences import Correspondences
-from ...program.custom_sensor_residual import CorrespondingSensorResidual, is_within
+from ...program.custom_sensor_residual import is_within
 from ...program.measurement_model import CorrespondenceModel
-from ...program.measurement_residual import GROUP, ResidualExpression, RowStencil, lagrange_weights
+from ...program.measurement_residual import GROUP, ResidualExpression, RowStencil
 from ...program.observables import PointPositions
-from ...recording.experiment import Experiment
-from ...recording.nuisance import cayley_rotation
+from .camera_images import POSE_UNKNOWNS, CameraImagesResidual
 from .tracked_places import TrackedPlaces
-from .tracks import POSE_UNKNOWNS, WALK_TERMS, ImageTracks, place_labels
+from .tracks import WALK_TERMS, ImageTracks, place_labels
 
 # Threshold of Huber's loss in standard deviations, if the problem states none.
 HUBER = 3.0
-# Depth at which points near or behind the camera are projected in trial motions [m].
-LEAST_DEPTH_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class ImageTrackResidual(CorrespondingSensorResidual):
+class ImageTrackResidual(CameraImagesResidual):
     """Residual of the tracks of one camera; its entities are the points, its observable their
     positions.
     """
@@ -45,7 +42,6 @@ class ImageTrackResidual(CorrespondingSensorResidual):
     sensor: ImageTracks
     observable: PointPositions
     correspondences: TrackedPlaces
-    experiment: Experiment
 
     sigma_key = "sigma_px"
     is_compiled = True
@@ -54,26 +50,15 @@ class ImageTrackResidual(CorrespondingSensorResidual):
     def _stencil(self) -> RowStencil:
         """Stencil of all images and points.
 
-        Its data are the distances of the neighbouring times from the image [s], the time since the
-        first image over that of the last one, and the duration [s], the row of the point in the
-        image, and the pose of the camera: R by rows, then the translation [m].
+        Its data are those of the camera, see `camera_data`, and the row of the point in the image.
         """
         times = self._times
         count = self.observable.vector_count
         samples = len(times)
         places = times[:, None] * count + np.arange(count)[:, None]
-        since_s = self.t_s - self.t_s[0]
-        duration_s = max(float(since_s[-1]), 1e-12)
         rows = np.nan_to_num(self.measured[..., 1])
-        common = np.column_stack(
-            [
-                self.observable_s[times] - self.t_s[:, None],
-                since_s / duration_s,
-                np.full(samples, duration_s),
-                self.correspondences.rotations.reshape(samples, 9),
-                self.correspondences.translations,
-            ]
-        )
+        found = self.correspondences
+        common = self.camera_data(found.rotations, found.translations)
         data = np.broadcast_to(common.T[..., None], (common.shape[1], samples, count))
         return RowStencil(places, np.concatenate([data, rows[None]]))
 
@@ -90,33 +75,13 @@ class ImageTrackResidual(CorrespondingSensorResidual):
             Data of the sample, see `_stencil`.
         """
         count = values.shape[1]
-        offsets, share, duration, rotation, translation, row = ca.vertsplit(
-            data, np.cumsum([0, count, 1, 1, 9, 3, 1]).tolist()
-        )
-        tracks = self.sensor
+        *camera, row = ca.vertsplit(data, np.cumsum([0, values.shape[1], 1, 1, 9, 3, 1]).tolist())
         own = phi * self.nuisance.scales[self.own_parameters[0]][:, None]
-        names = tracks.camera_unknowns(self.is_static)
-        unknown = dict(zip(names, ca.vertsplit(own[: len(names)]), strict=True)) if names else {}
-        drift = own[len(names) :]
-
-        def known(*which: str) -> ca.SX:
-            return ca.vertcat(*(unknown.get(name, ca.SX(0)) for name in which))
-
-        line_s = tracks.line_delay_s + known("line_delay_error_s")
-        late = known("delay_s") + known("clock_rate") * share * duration + line_s * row
-        weights = lagrange_weights(late, ca.vertsplit(offsets))
-        # Stored by rows, so that this is the transpose: from the world to the camera.
-        to_camera = ca.reshape(rotation, 3, 3)
-        point = to_camera @ (values @ ca.vertcat(*weights) - translation)
-        if any(name.startswith("turn") for name in names):
-            point = cayley_rotation(known("turn_x_rad", "turn_y_rad", "turn_z_rad")) @ point
-        point = point + known("shift_x_m", "shift_y_m", "shift_z_m")
-        point = ca.vertcat(point[:2], ca.fmax(point[2], LEAST_DEPTH_M))
-        pixel = tracks.camera.pixel_expression(
-            point, known("focal_error"), known("centre_u_px", "centre_v_px")
-        )
+        count = len(self.sensor.camera_unknowns(self.experiment))
+        pixel = self.projected(self.known_errors(own[:count]), values, camera, row)
+        drift = own[count:]
         if drift.numel():
-            pixel = pixel + self._walk(drift, share, duration)
+            pixel = pixel + self._walk(drift, *camera[1:3])
         return ca.vertcat(pixel, 0)
 
     @staticmethod
@@ -211,16 +176,17 @@ class ImageTracksModel(CorrespondenceModel):
     def _pose_parameters(self) -> Index:
         """Indices in φ of the errors of the pose that are estimated, rotation first."""
         tracks = self.measurement
-        names = [name for name in POSE_UNKNOWNS if name in tracks.unknowns]
+        unknowns = tracks.camera_unknowns(self.grid.experiment)
+        names = [name for name in POSE_UNKNOWNS if name in unknowns]
         return self.grid.nuisance.indices_of_labels(map(tracks.unknown_label, names))
 
     @cached_property
     def _own_parameters(self) -> Index:
         """Indices in φ (N, f) on which the pixels of each point depend besides its place."""
         tracks, nuisance = self.measurement, self.grid.nuisance
-        static = self.grid.experiment.is_static
-        labels = [tracks.unknown_label(name) for name in tracks.camera_unknowns(static)]
-        drifts = tracks.drift_sigma_px and not static
+        experiment = self.grid.experiment
+        labels = [tracks.unknown_label(name) for name in tracks.camera_unknowns(experiment)]
+        drifts = tracks.drift_px(experiment) > 0
         return np.array(
             [
                 nuisance.indices_of_labels([*labels, *(tracks.drift_labels(p) if drifts else ())])

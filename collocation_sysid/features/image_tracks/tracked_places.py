@@ -23,8 +23,9 @@ from ...program.correspondences import Correspondences
 from ...program.markers.marker_association import MarkerAssociation
 from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
+from .camera_images import POSE_UNKNOWNS
 from .rays import FEWEST_POINTS, is_occluded, points_on_surface, poses_from_points
-from .tracks import POSE_UNKNOWNS, ImageTracks, stated_places
+from .tracks import ImageTracks, stated_places
 
 # Sine of the angle by which a ray may miss the body if the pose of the camera is exact, and in
 # standard deviations of the pose.
@@ -252,7 +253,8 @@ class TrackedPlaces(Correspondences):
             start_pose=np.zeros(len(pose_parameters)),
             mirror_ratio=mirrored.get(tracks.name, np.inf),
         )
-        return correspondences.with_visibility(shapes)._aligned(shapes)
+        unknowns = tracks.camera_unknowns(experiment)
+        return correspondences.with_visibility(shapes)._aligned(shapes, unknowns)
 
     @property
     def measured(self) -> ImageTracks:
@@ -350,7 +352,7 @@ class TrackedPlaces(Correspondences):
 
     # Alignment --------------------------------------------------------------------------------
 
-    def _aligned(self, shapes_m: Array) -> TrackedPlaces:
+    def _aligned(self, shapes_m: Array, unknowns: Mapping[str, float]) -> TrackedPlaces:
         """Return the correspondences with the errors of the pose that fit the first image best,
         weighted by their priors; of a pose that is off by many pixels, every residual would be
         beyond the threshold of Huber's loss.
@@ -365,8 +367,8 @@ class TrackedPlaces(Correspondences):
         at_m = np.einsum("pc,pci->pi", weights[points], shapes_m[sample][nodes[points]])
         own_m = (at_m - self.translations[sample]) @ self.rotations[sample]
         pixels = np.asarray(tracks.pixels)[sample, points]
-        names = [name for name in POSE_UNKNOWNS if name in tracks.unknowns]
-        scales = np.array([tracks.unknowns[name] for name in names])
+        names = [name for name in POSE_UNKNOWNS if name in unknowns]
+        scales = np.array([unknowns[name] for name in names])
         places = [POSE_UNKNOWNS.index(name) for name in names]
 
         def differences(pose: Array) -> Array:

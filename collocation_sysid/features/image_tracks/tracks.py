@@ -11,38 +11,20 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, root_mean
-from ...common.checked_arrays import float_array, read_only_floats, unconverted, unconverted_or_none
+from ...common.checked_arrays import float_array, read_only_floats, unconverted_or_none
 from ...common.declarations import declaration, identity, key
 from ...common.validated_types import NotNegative, Positive
 from ...errors import InputError
-from ...recording.camera import Camera
-from ...recording.custom_sensor import CustomSensor
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
-from ...recording.nuisance import DEGREE, GAUGE, SURFACE_PLACE, UNLIMITED_REACH
-from ...recording.sample_times import first_unordered_time
+from ...recording.nuisance import IMAGE_DRIFT, IMAGE_REACH, SURFACE_PLACE
+from .camera_images import CameraImages
+from .camera_images import PoseSigma as PoseSigma
 
 # Directions in which a place may move on the surface.
 DIRECTIONS = ("first", "second")
 # Terms of the series of a random walk: three contain 93 % of its variance.
 WALK_TERMS = 3
-# Texts and units of what is uncertain about a camera, by the names of the unknowns.
-UNKNOWN_TEXTS = {
-    **{f"turn_{axis}_rad": (f"turn, {axis},", "rad") for axis in "xyz"},
-    **{f"shift_{axis}_m": (f"shift, {axis},", "m") for axis in "xyz"},
-    "focal_error": ("error of the focal length", "1"),
-    "centre_u_px": ("error of the principal point, u,", "px"),
-    "centre_v_px": ("error of the principal point, v,", "px"),
-    "delay_s": ("delay", "s"),
-    "clock_rate": ("error of the frame rate", "1"),
-    "line_delay_error_s": ("error of the line delay", "s"),
-}
-POSE_UNKNOWNS = tuple(UNKNOWN_TEXTS)[:6]
-OF_TIME = ("delay_s", "clock_rate", "line_delay_error_s")
-# A term of the drift of a track; predictions are linear in it.
-TRACK_DRIFT = Deviation(
-    "track_drift", "", sigma=None, of="gauge", changes=(), reach=UNLIMITED_REACH
-)
 # Places of another camera that a check compares: words, axis of the camera about which it is turned
 # around the body, and angle [degrees].
 VIEWS = (
@@ -52,34 +34,12 @@ VIEWS = (
 )
 # Cosine between the normal of a face and the view, above which it is tracked.
 FACING = 0.3
-# An unknown of a camera with a stated pose and known places: steps of three standard deviations save
-# a quarter of the iterations. With unknown places they take more time.
-STATED_CAMERA = Deviation("reading", "", sigma=None, of="gauge", changes=(), reach=3.0)
-# Prior of the pose of a camera that is found from the body at rest [rad, m]: it is not a statement.
-UNKNOWN_TURN_RAD = 20 * DEGREE
-UNKNOWN_SHIFT_M = 0.2
+# Reach of errors of a camera without a stated pose and known places [σ]: larger steps take more time.
+CAREFUL_REACH = 1.0
 
 
 @declaration
-class PoseSigma:
-    """Uncertainty of the stated pose of a camera; zero for an exact one.
-
-    Parameters
-    ----------
-    turn_deg : float
-        Standard deviation of its rotation about each of its axes [degrees].
-    shift_m : float
-        Standard deviation of its position along each of its axes [m].
-    """
-
-    description_name: ClassVar[str] = "pose_sigma"
-
-    turn_deg: float = key(NotNegative, default=1.0)
-    shift_m: float = key(NotNegative, default=5e-3)
-
-
-@declaration
-class ImageTracks(CustomSensor):
+class ImageTracks(CameraImages):
     """Pixels of points of the body in the images of one camera, as trackers of videos write them.
 
     A point lies on the surface of the body. Where its place is unknown, it is found from the ray of
@@ -87,12 +47,11 @@ class ImageTracks(CustomSensor):
 
     Parameters
     ----------
-    name : str
-        Name of the camera, in messages, error bars and files.
-    camera : Camera
-        Camera with a matrix.
-    t_s : (S,) array
-        Times of the images, ascending, at any rate.
+    name, camera, t_s, has_known_pose, pose_sigma, focal_sigma, centre_sigma_px, clock_sigma_s
+        See `CameraImages`. A pose that is not known is found from the known places of at least four
+        points with the body at rest, and then estimated.
+    clock_rate_sigma, line_delay_s, line_delay_sigma_s
+        See `CameraImages`.
     pixels : (S, N, 2) array, or None
         Pixels u (to the right) and v (downwards); NaN where missing. None before they are simulated.
     names : sequence of str
@@ -104,22 +63,6 @@ class ImageTracks(CustomSensor):
         Standard deviation of the noise of each pixel coordinate.
     place_sigma_m : float
         Standard deviation of the known places along the surface; zero for exact ones.
-    has_known_pose : bool
-        Whether the pose of the camera is known. If not, it is found from the known places of at
-        least four points with the body at rest, and then estimated.
-    pose_sigma : PoseSigma
-        Uncertainty of the pose.
-    focal_sigma : float
-        Standard deviation of the relative error of both focal lengths; zero for exact ones.
-    centre_sigma_px : float
-        Standard deviation of each coordinate of the principal point [pixels].
-    clock_sigma_s : float
-        Standard deviation of the delay of the images by the clock of the grasps [s].
-    clock_rate_sigma : float
-        Standard deviation of the relative error of the frame rate.
-    line_delay_s, line_delay_sigma_s : float
-        Time from one row of the image to the next one of a rolling shutter, and its standard
-        deviation [s]. The time of an image is that of its first row.
     drift_sigma_px : float
         Drift of the tracker: standard deviation of a random walk of each track after one second
         [pixels].
@@ -131,32 +74,18 @@ class ImageTracks(CustomSensor):
         nothing is measured.
     """
 
-    description_name: ClassVar[str] = "camera"
     measurement_text: ClassVar[str] = "image tracks"
     other_text: ClassVar[str] = "image tracks"
     noise_key: ClassVar[str] = "sigma_px of image_tracks"
     sigma_text: ClassVar[str] = "its sigma_px"
     precedence: ClassVar[int] = 2
-    counts_pixels: ClassVar[bool] = True
-    unit = "px"
 
-    name: str
-    camera: Camera
-    t_s: Array = key(converter=unconverted)
     pixels: Array | None = key(converter=unconverted_or_none)
     names: Sequence[str] = key(converter=identity)
     places_m: Array | None = key(converter=unconverted_or_none, default=None)
     sigma_px: float = key(Positive, default=1.0)
     place_sigma_m: float = key(NotNegative, default=1e-3)
-    has_known_pose: bool = key(default=True)
-    pose_sigma: PoseSigma = key(default=PoseSigma())
-    focal_sigma: float = key(NotNegative, default=5e-3)
-    centre_sigma_px: float = key(NotNegative, default=2.0)
-    clock_sigma_s: float = key(NotNegative, default=5e-3)
-    clock_rate_sigma: float = key(NotNegative, default=0.0)
-    line_delay_s: float = key(NotNegative, default=0.0)
-    line_delay_sigma_s: float = key(NotNegative, default=0.0)
-    drift_sigma_px: float = key(NotNegative, default=0.0)
+    drift_sigma_px: float = key(NotNegative, default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         """Check the tracks, and complete what every custom sensor has, in place."""
@@ -165,15 +94,7 @@ class ImageTracks(CustomSensor):
         count = len(names)
         if not names or len(set(names)) < count:
             raise InputError(f"names of {where} are {list(names)}; expected different names")
-        if self.camera.matrix is None:
-            raise InputError(
-                f"the camera of {where} has no matrix; expected that of its calibration"
-            )
-        times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
-        if not len(times):
-            raise InputError(f"t_s of {where} is empty; expected at least one time")
-        if fault := first_unordered_time(times):
-            raise InputError(f"{fault[1]} in t_s of {where}", where=f"row {fault[0] + 1}")
+        times = self._checked_times(where)
         shape = (len(times), count, 2)
         pixels = None
         if self.pixels is not None:
@@ -193,7 +114,7 @@ class ImageTracks(CustomSensor):
             sigma=self.sigma_px,
             points_m=places[np.isfinite(places).all(axis=1)],
             columns=tuple(f"{name}_{axis}" for name in names for axis in "uv"),
-            unknowns=self._camera_unknowns(),
+            unknowns=self._stated_unknowns(),
             _value_count=2 * count,
         )
 
@@ -261,35 +182,6 @@ class ImageTracks(CustomSensor):
 
     # Nuisance parameters ----------------------------------------------------------------------
 
-    def _camera_unknowns(self) -> dict[str, float]:
-        """Return the prior standard deviations of what is uncertain about the camera, by name; what
-        is exact is left out.
-        """
-        pose = self.pose_sigma
-        turn, shift = np.deg2rad(pose.turn_deg), pose.shift_m
-        if not self.has_known_pose:
-            turn, shift = UNKNOWN_TURN_RAD, UNKNOWN_SHIFT_M
-        sigmas = {f"turn_{axis}_rad": turn for axis in "xyz"}
-        sigmas |= {f"shift_{axis}_m": shift for axis in "xyz"}
-        sigmas |= {
-            "focal_error": self.focal_sigma,
-            "centre_u_px": self.centre_sigma_px,
-            "centre_v_px": self.centre_sigma_px,
-            "delay_s": self.clock_sigma_s,
-            "clock_rate": self.clock_rate_sigma,
-            "line_delay_error_s": self.line_delay_sigma_s,
-        }
-        return {name: float(sigma) for name, sigma in sigmas.items() if sigma}
-
-    def camera_unknowns(self, is_static: bool) -> list[str]:
-        """Return the names of `unknowns`, without those of times if the experiment is static."""
-        return [name for name in self.unknowns if not (is_static and name in OF_TIME)]
-
-    def unknown_label(self, name: str) -> str:
-        """Return the label of an unknown of the camera, with its unit."""
-        text, unit = UNKNOWN_TEXTS[name]
-        return f"{text} of {self.name} [{unit}]"
-
     def place_sigmas_m(self, experiment: Experiment) -> Array:
         """Return the prior standard deviation (N,) of each place along the surface [m]: the stated
         one, and the diagonal of the body where the place is unknown; zero for exact places.
@@ -302,13 +194,11 @@ class ImageTracks(CustomSensor):
         """Yield row, label and prior standard deviation of each unknown: of the camera, of the
         drift of the tracks, and of the places, which cameras share by the names of the points.
         """
-        for name in self.camera_unknowns(experiment.is_static):
-            is_stated = self.has_known_pose and self.is_place_known.all()
-            row = STATED_CAMERA if is_stated else GAUGE
-            yield row, self.unknown_label(name), self.unknowns[name]
-        if self.drift_sigma_px and not experiment.is_static:
+        is_stated = self.has_known_pose and self.is_place_known.all()
+        yield from self.camera_rows(experiment, IMAGE_REACH if is_stated else CAREFUL_REACH)
+        if drift_px := self.drift_px(experiment):
             for label in (each for point in self.names for each in self.drift_labels(point)):
-                yield TRACK_DRIFT, label, self.drift_sigma_px
+                yield IMAGE_DRIFT, label, drift_px
         for point, sigma in zip(self.names, self.place_sigmas_m(experiment), strict=True):
             if sigma:
                 for label in place_labels(point):
@@ -353,6 +243,14 @@ class ImageTracks(CustomSensor):
                 place_sigma_m=float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
             )
             yield f"another such camera {words}", seen
+
+    def drift_px(self, experiment: Experiment) -> float:
+        """Return the prior standard deviation of the drift of a track after one second [pixels], as
+        stated, else that of the experiment's `Nuisance`; zero if it is not estimated.
+        """
+        if not IMAGE_DRIFT.applies(experiment):
+            return 0.0
+        return self.drift_sigma_px or experiment.nuisance.sigma(IMAGE_DRIFT) or 0.0
 
     def drift_labels(self, point: str) -> list[str]:
         """Return the labels of the terms of the drift of a track, u first."""

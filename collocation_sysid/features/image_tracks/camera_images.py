@@ -1,0 +1,250 @@
+"""What measurements in the images of an ordinary camera have in common: the camera and its errors.
+
+A camera states how uncertain it is. What it does not state is estimated if the recording's `Nuisance`
+does so, and otherwise considered in the budget and tested, see the rows `IMAGE_…` of
+`recording.nuisance`. Measurements of one experiment whose cameras have the same name share the errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+
+from ...common.array_types import Array
+from ...common.checked_arrays import read_only_floats, unconverted
+from ...common.declarations import declaration, key
+from ...common.validated_types import NotNegative
+from ...errors import InputError
+from ...program.custom_sensor_residual import CorrespondingSensorResidual
+from ...program.measurement_residual import lagrange_weights
+from ...recording.camera import Camera
+from ...recording.custom_sensor import CustomSensor
+from ...recording.deviation import Deviation
+from ...recording.experiment import Experiment
+from ...recording.nuisance import (
+    DEGREE,
+    IMAGE_CENTRE,
+    IMAGE_CLOCK_RATE,
+    IMAGE_FOCAL,
+    IMAGE_LINE_DELAY,
+    IMAGE_SHIFT,
+    IMAGE_TIME,
+    IMAGE_TURN,
+    cayley_rotation,
+)
+from ...recording.sample_times import first_unordered_time
+
+# Row and axis of each error of a camera, by the name of its unknown.
+CAMERA_UNKNOWNS: dict[str, tuple[Deviation, str]] = {
+    **{f"turn_{axis}_rad": (IMAGE_TURN, axis) for axis in "xyz"},
+    **{f"shift_{axis}_m": (IMAGE_SHIFT, axis) for axis in "xyz"},
+    "focal_error": (IMAGE_FOCAL, ""),
+    "centre_u_px": (IMAGE_CENTRE, "u"),
+    "centre_v_px": (IMAGE_CENTRE, "v"),
+    "delay_s": (IMAGE_TIME, ""),
+    "clock_rate": (IMAGE_CLOCK_RATE, ""),
+    "line_delay_error_s": (IMAGE_LINE_DELAY, ""),
+}
+POSE_UNKNOWNS = tuple(CAMERA_UNKNOWNS)[:6]
+# Prior of the pose of a camera that is found from the body at rest [rad, m]: it is not a statement.
+UNKNOWN_TURN_RAD = 20 * DEGREE
+UNKNOWN_SHIFT_M = 0.2
+# Depth at which points near or behind the camera are projected in trial motions [m].
+LEAST_DEPTH_M = 1e-3
+
+
+@declaration
+class PoseSigma:
+    """Uncertainty of the stated pose of a camera; zero for an exact one.
+
+    Parameters
+    ----------
+    turn_deg : float
+        Standard deviation of its rotation about each of its axes [degrees].
+    shift_m : float
+        Standard deviation of its position along each of its axes [m].
+    """
+
+    description_name: ClassVar[str] = "pose_sigma"
+
+    turn_deg: float = key(NotNegative, default=1.0)
+    shift_m: float = key(NotNegative, default=5e-3)
+
+
+@declaration
+class CameraImages(CustomSensor):
+    """Images of one camera, of which something is measured: base class of `ImageTracks` and
+    `Outlines`. Standard deviations of zero are not estimated.
+
+    Parameters
+    ----------
+    name : str
+        Name of the camera, in messages, error bars and files.
+    camera : Camera
+        Camera with a matrix.
+    t_s : (S,) array
+        Times of the images, ascending, at any rate.
+    has_known_pose : bool
+        Whether the pose of the camera is known.
+    pose_sigma : PoseSigma
+        Uncertainty of the pose.
+    focal_sigma : float
+        Standard deviation of the relative error of both focal lengths.
+    centre_sigma_px : float
+        Standard deviation of each coordinate of the principal point [pixels].
+    clock_sigma_s : float
+        Standard deviation of the delay of the images by the clock of the grasps [s].
+    clock_rate_sigma : float
+        Standard deviation of the relative error of the frame rate.
+    line_delay_s, line_delay_sigma_s : float
+        Time from one row of the image to the next one of a rolling shutter, and its standard
+        deviation [s]. The time of an image is that of its first row.
+    """
+
+    description_name: ClassVar[str] = "camera"
+    counts_pixels: ClassVar[bool] = True
+    unit = "px"
+
+    name: str
+    camera: Camera
+    t_s: Array = key(converter=unconverted)
+    has_known_pose: bool = key(default=True, kw_only=True)
+    pose_sigma: PoseSigma = key(default=PoseSigma(), kw_only=True)
+    focal_sigma: float = key(NotNegative, default=5e-3, kw_only=True)
+    centre_sigma_px: float = key(NotNegative, default=2.0, kw_only=True)
+    clock_sigma_s: float = key(NotNegative, default=5e-3, kw_only=True)
+    clock_rate_sigma: float = key(NotNegative, default=0.0, kw_only=True)
+    line_delay_s: float = key(NotNegative, default=0.0, kw_only=True)
+    line_delay_sigma_s: float = key(NotNegative, default=0.0, kw_only=True)
+
+    def _checked_times(self, where: str) -> Array:
+        """Return the times of the images; an `InputError` if there are none, they do not increase,
+        or the camera has no matrix.
+        """
+        if self.camera.matrix is None:
+            raise InputError(
+                f"the camera of {where} has no matrix; expected that of its calibration"
+            )
+        times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
+        if not len(times):
+            raise InputError(f"t_s of {where} is empty; expected at least one time")
+        if fault := first_unordered_time(times):
+            raise InputError(f"{fault[1]} in t_s of {where}", where=f"row {fault[0] + 1}")
+        return times
+
+    def _stated_unknowns(self) -> dict[str, float]:
+        """Return the stated standard deviations of the errors of the camera, by name; without those
+        that are zero.
+        """
+        pose = self.pose_sigma
+        turn, shift = float(np.deg2rad(pose.turn_deg)), pose.shift_m
+        if not self.has_known_pose:
+            turn, shift = UNKNOWN_TURN_RAD, UNKNOWN_SHIFT_M
+        sigmas = [
+            *[turn] * 3,
+            *[shift] * 3,
+            self.focal_sigma,
+            *[self.centre_sigma_px] * 2,
+            self.clock_sigma_s,
+            self.clock_rate_sigma,
+            self.line_delay_sigma_s,
+        ]
+        return {k: float(s) for k, s in zip(CAMERA_UNKNOWNS, sigmas, strict=True) if s}
+
+    def camera_unknowns(self, experiment: Experiment) -> dict[str, float]:
+        """Return the prior standard deviations of the errors of the camera that are estimated, by
+        name: as stated, else those of the experiment's `Nuisance`.
+        """
+        sigmas = {
+            name: self.unknowns.get(name) or experiment.nuisance.sigma(row)
+            for name, (row, _) in CAMERA_UNKNOWNS.items()
+            if row.applies(experiment)
+        }
+        return {name: float(sigma) for name, sigma in sigmas.items() if sigma}
+
+    def unknown_label(self, name: str) -> str:
+        """Return the label of an unknown of the camera, with its unit."""
+        row, axis = CAMERA_UNKNOWNS[name]
+        return f"{row.label.format(which=self.name, axis=axis)} [{row.unit}]"
+
+    def camera_rows(
+        self, experiment: Experiment, reach: float
+    ) -> Iterator[tuple[Deviation, str, float]]:
+        """Yield row, label and prior standard deviation of each error of the camera that is
+        estimated, with another reach of the row.
+        """
+        for name, sigma in self.camera_unknowns(experiment).items():
+            yield replace(CAMERA_UNKNOWNS[name][0], reach=reach), self.unknown_label(name), sigma
+
+
+@dataclass(frozen=True, eq=False)
+class CameraImagesResidual(CorrespondingSensorResidual):
+    """Residual of points in the images of one camera."""
+
+    sensor: CameraImages
+    experiment: Experiment
+
+    def camera_data(self, rotations: Array, translations: Array) -> Array:
+        """Return the data (S, k + 14) of the images for `projected`: distances of the k
+        neighbouring times from the image [s], the time since the first image over that of the last
+        one, and the duration [s], the rotation (S, 3, 3) of the camera by rows, its translation [m].
+        """
+        since_s = self.t_s - self.t_s[0]
+        duration_s = max(float(since_s[-1]), 1e-12)
+        return np.column_stack(
+            [
+                self.observable_s[self._times] - self.t_s[:, None],
+                since_s / duration_s,
+                np.full(len(since_s), duration_s),
+                rotations.reshape(-1, 9),
+                translations,
+            ]
+        )
+
+    def known_errors(self, own: ca.SX) -> Callable[..., ca.SX]:
+        """Return a function from names of unknowns of the camera to their values; `own` are those
+        that are estimated.
+        """
+        names = self.sensor.camera_unknowns(self.experiment)
+        values = dict(zip(names, ca.vertsplit(own), strict=True)) if names else {}
+
+        def known(*names: str) -> ca.SX:
+            return ca.vertcat(*(values.get(name, ca.SX(0)) for name in names))
+
+        return known
+
+    def projected(
+        self, known: Callable[..., ca.SX], values: ca.SX, data: Sequence[ca.SX], row: ca.SX
+    ) -> ca.SX:
+        """Return the pixel (2,) of a point.
+
+        Parameters
+        ----------
+        known : callable
+            See `known_errors`.
+        values : (3, times) SX
+            Positions of the point at the neighbouring grid times [m].
+        data : sequence of SX
+            Parts of `camera_data`: distances, share, duration, rotation, translation.
+        row : SX
+            Row of the image in which the point appears.
+        """
+        offsets, share, duration, rotation, translation = data
+        line_s = self.sensor.line_delay_s + known("line_delay_error_s")
+        late = known("delay_s") + known("clock_rate") * share * duration + line_s * row
+        weights = lagrange_weights(late, ca.vertsplit(offsets))
+        # Stored by rows, so that this is the transpose: from the world to the camera.
+        to_camera = ca.reshape(rotation, 3, 3)
+        point = to_camera @ (values @ ca.vertcat(*weights) - translation)
+        turn = known(*POSE_UNKNOWNS[:3])
+        if not turn.is_zero():
+            point = cayley_rotation(turn) @ point
+        point = point + known(*POSE_UNKNOWNS[3:])
+        point = ca.vertcat(point[:2], ca.fmax(point[2], LEAST_DEPTH_M))
+        return self.sensor.camera.pixel_expression(
+            point, known("focal_error"), known("centre_u_px", "centre_v_px")
+        )

@@ -1,0 +1,202 @@
+"""Errors of ordinary cameras in three modes: estimated, considered in the budget, tested."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from kit.filmed import (
+    DISTORTION,
+    MATRIX,
+    NAMES,
+    NOISE_PX,
+    T_S,
+    filming,
+    motion_m,
+    projected,
+    swung,
+    tracks_of,
+    unknown_young,
+)
+from scipy.interpolate import CubicSpline
+
+import collocation_sysid as cs
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.methods.solution import Solution
+from collocation_sysid.statistics.budget.consider_analysis import (
+    changes_of_assumptions,
+    changes_of_nuisances,
+)
+from collocation_sysid.statistics.budget.systematic_effects import Assumptions
+from collocation_sysid.statistics.budget.uncertainty_budget import estimate_changes
+from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
+from collocation_sysid.statistics.probes.relaxed_assumptions import SolvedFit, probed_changes
+from collocation_sysid.statistics.probes.routine_probes import probed_deviations, routine_probes
+from collocation_sysid.statistics.uncertainty import AUTO
+
+EXACT: dict[str, Any] = {
+    "pose_sigma": cs.PoseSigma(turn_deg=0.0, shift_m=0.0),
+    "focal_sigma": 0.0,
+    "centre_sigma_px": 0.0,
+    "clock_sigma_s": 0.0,
+    "place_sigma_m": 0.0,
+}
+SINCE_S = T_S - T_S[0]
+
+
+def seen_at(times_s: np.ndarray) -> np.ndarray:
+    """Pixels of the true motion at other times, the same for all points or of each point."""
+    pixels = CubicSpline(T_S, projected(filming("front"), motion_m()))
+    if times_s.ndim == 1:
+        return pixels(times_s)
+    return np.stack([pixels(times_s[:, k])[:, k] for k in range(len(NAMES))], axis=1)
+
+
+def drifting(size: float) -> np.ndarray:
+    """Pixels of which one track drifts: the first term of the series of a random walk."""
+    pixels = seen_at(T_S)
+    angle = np.pi / 2
+    duration_s = SINCE_S[-1]
+    walk = np.sqrt(2 * duration_s) / angle * np.sin(angle * SINCE_S / duration_s)
+    pixels[:, NAMES.index("middle_front"), 1] += size * walk
+    return pixels
+
+
+def zoomed(size: float) -> np.ndarray:
+    matrix = np.array(MATRIX)
+    matrix[:2, :2] *= 1 + size
+    camera = cs.Camera(matrix, DISTORTION, filming("front").pose)
+    return projected(camera, motion_m())
+
+
+# What a camera sees that is off by a size; this size, and the name of the value.
+SEEN: dict[str, tuple[Callable[[float], np.ndarray], float, str]] = {
+    "image_focal": (zoomed, 4e-3, "image_focal"),
+    "image_centre_px": (
+        lambda size: seen_at(T_S) + np.array([size, 0.0]),
+        1.5,
+        "error of the principal point, u, of front",
+    ),
+    "image_time_s": (lambda size: seen_at(T_S + size), 3e-3, "image_time_s"),
+    "image_clock_rate": (lambda size: seen_at(T_S + size * SINCE_S), 5e-3, "image_clock_rate"),
+    "image_line_delay_s": (
+        lambda size: seen_at(T_S[:, None] + size * seen_at(T_S)[..., 1]),
+        1e-5,
+        "image_line_delay_s",
+    ),
+    "image_drift_px": (drifting, 1.0, "drift of middle_front in front, v1"),
+}
+
+
+def problem(pixels: np.ndarray, seed: int | None = None, **sigmas: float) -> cs.Problem:
+    """The recording of a camera that is described as exact, except for what is estimated."""
+    if seed is not None:
+        pixels = pixels + NOISE_PX * np.random.default_rng(seed).normal(size=pixels.shape)
+    tracks = replace(tracks_of(**EXACT), pixels=pixels)
+    experiment = swung([tracks], nuisance=cs.Nuisance.none(**sigmas))
+    return cs.Problem([experiment], unknown_young(1.4e5), huber=1e9)
+
+
+def solved(described: cs.Problem) -> Solution:
+    return cs.solve(described, ReducedSpace(tolerance=1e-9))
+
+
+@cache
+def faultless() -> Solution:
+    return solved(problem(seen_at(T_S)))
+
+
+def probed(solution: Solution) -> SolvedFit:
+    """A solution with the columns of all routine probes."""
+    collocation, z = solution.collocation, solution.z
+    deviations = probed_deviations(dict.fromkeys(Assumptions().collect_deviations()))
+    of_images = {name: s if name in SEEN else None for name, s in deviations.items()}
+    changes = changes_of_assumptions(collocation, z, of_images)
+    fit = linearise_fit(collocation, z)
+    at = SolvedFit(
+        collocation,
+        z,
+        fit,
+        AUTO,
+        {},
+        {},
+        of_images,
+        probed_changes(collocation, z, of_images, changes),
+    )
+    known = at.uncertainty_of_refit(fit, at.read_parameters())
+    return replace(at, statistical={**known.estimates, **known.derived})
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SEEN)
+def test_an_error_of_a_camera_is_estimated(name: str) -> None:
+    film, size, label = SEEN[name]
+    solution = solved(problem(film(size), **{name: 3 * size}))
+    assert abs(solution.nuisance(label) / size - 1) < 0.1
+    assert abs(solution.parameters["young_pa"] / 1.5e5 - 1) < 2e-3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SEEN)
+def test_a_considered_error_of_a_camera_moves_the_estimate_as_such_a_camera(name: str) -> None:
+    film, size, _ = SEEN[name]
+    first = faultless()
+    changes = changes_of_nuisances(first.collocation, first.z, {name: size})
+    told = -estimate_changes(linearise_fit(first.collocation, first.z), changes.blocks)[0]
+    own = [k for k, each in enumerate(changes.names) if each == name]
+    number = 3 * 2 * NAMES.index("middle_front") + 3 if name == "image_drift_px" else 0
+    moved = solved(problem(film(size))).q[0] - first.q[0]
+    assert moved == pytest.approx(told[own[number]], rel=0.1, abs=2e-5)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SEEN)
+def test_an_error_of_a_camera_is_tested_by_one_linear_step(name: str) -> None:
+    film, size, _ = SEEN[name]
+    at = probed(solved(problem(film(3 * size), seed=1)))
+    probes = {probe.name: probe for probe in routine_probes(at)}
+    assert set(probes) == set(SEEN)
+    probe = probes[name]
+    assert probe.sentences
+    assert probe.size == pytest.approx(3 * size, abs=4 * (probe.size_error or 0.0), rel=0.15)
+
+
+@pytest.mark.long
+def test_faultless_tracks_have_no_significant_error_of_the_camera() -> None:
+    at = probed(faultless())
+    rng = np.random.default_rng(3)
+    for _ in range(12):
+        noisy = [
+            replace(b, residual=rng.normal(size=b.residual.shape) * b.is_measured, misfit=None)
+            for b in at.fit.blocks
+        ]
+        fit = replace(at.fit, blocks=tuple(noisy))
+        fit = fit.after_step(gauss_newton_step(fit))
+        known = at.uncertainty_of_refit(fit, at.read_parameters())
+        here = replace(at, fit=fit, statistical={**known.estimates, **known.derived})
+        assert not any(probe.sentences for probe in routine_probes(here))
+
+
+def test_what_a_camera_states_is_not_considered_again() -> None:
+    stated = tracks_of(drift_sigma_px=0.5, clock_rate_sigma=1e-3)
+    collocation = cs.Problem([swung([stated])], unknown_young()).collocation()
+    names = {each.row.name for each in collocation.transcriptions[0].nuisance.entries}
+    assert {"image_drift_px", "image_clock_rate", "image_focal"} <= names
+    assert "image_line_delay_s" not in names
+
+
+def test_a_problem_may_state_a_prior_for_all_cameras() -> None:
+    both = [tracks_of("front"), tracks_of("top")]
+    experiment = swung(both, nuisance=cs.Nuisance.none(image_line_delay_s=2e-5))
+    entries = (
+        cs.Problem([experiment], unknown_young()).collocation().transcriptions[0].nuisance.entries
+    )
+    own = [each for each in entries if each.row.name == "image_line_delay_s"]
+    assert [each.label for each in own] == [
+        f"error of the line delay of {name} [s]" for name in ("front", "top")
+    ]
+    assert {each.sigma for each in own} == {2e-5}
