@@ -92,7 +92,7 @@ SEEN: dict[str, tuple[Callable[[float], np.ndarray], float, str]] = {
 }
 
 
-def problem(pixels: np.ndarray, seed: int | None = None, **sigmas: float) -> cs.Problem:
+def problem(pixels: np.ndarray, seed: int | None = None, **sigmas: Any) -> cs.Problem:
     """The recording of a camera that is described as exact, except for what is estimated."""
     if seed is not None:
         pixels = pixels + NOISE_PX * np.random.default_rng(seed).normal(size=pixels.shape)
@@ -135,7 +135,8 @@ def probed(solution: Solution) -> SolvedFit:
 @pytest.mark.parametrize("name", SEEN)
 def test_an_error_of_a_camera_is_estimated(name: str) -> None:
     film, size, label = SEEN[name]
-    solution = solved(problem(film(size), **{name: 3 * size}))
+    prior: dict[str, Any] = {name: 3 * size}
+    solution = solved(problem(film(size), **prior))
     assert abs(solution.nuisance(label) / size - 1) < 0.1
     assert abs(solution.parameters["young_pa"] / 1.5e5 - 1) < 2e-3
 
