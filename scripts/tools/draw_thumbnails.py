@@ -1,7 +1,8 @@
 """Draw the thumbnails of the gallery: one large deformed body of each script.
 
 Scripts are run up to their first simulation, so that nothing is solved. Scripts with measured data
-simulate a recording of their problem file, for which the data must have been fetched.
+simulate a recording of their problem file, for which the data must have been fetched. Scripts of
+published material tests are run as a whole, and their figure is the thumbnail.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -46,6 +48,9 @@ MEASURED = {
 # Script without a mesh: a cube with the measured equibiaxial stretches is drawn.
 WITHOUT_MESH = "3_rubber_tests"
 EQUIBIAXIAL_STRETCH = 1.6
+# Scripts whose own figure is the thumbnail, at this resolution [1/inch].
+FIGURES = ("measured_brain", "measured_silicone")
+FIGURE_DPI = 100
 
 
 class _FirstSimulation(Exception):
@@ -66,7 +71,8 @@ def main() -> None:
         if chosen and script.stem not in chosen:
             continue
         figure = thumbnail(script)
-        figure.savefig(PICTURES / f"{script.stem}.png", dpi=RESOLUTION_DPI)
+        resolution_dpi = FIGURE_DPI if script.stem in FIGURES else RESOLUTION_DPI
+        figure.savefig(PICTURES / f"{script.stem}.png", dpi=resolution_dpi)
         print(PICTURES / f"{script.stem}.png")
 
 
@@ -74,6 +80,10 @@ def thumbnail(script: Path) -> Figure:
     """Return the thumbnail of a script of the gallery."""
     if script.stem == WITHOUT_MESH:
         return stretched_cube()
+    if script.stem in FIGURES:
+        with patch.object(plt, "show"):
+            runpy.run_path(str(script))
+        return plt.gcf()
     if script.stem in MEASURED:
         file, index, overrides = MEASURED[script.stem]
         problem = cs.Problem.read(ROOT / "problems" / file, overrides)

@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 import matplotlib.pyplot as plt
 import pytest
+from kit.published_curves import FOLDER, write_curves
 
 GALLERY = Path(__file__).parents[2] / "docs" / "gallery"
 SCRIPTS = sorted(GALLERY.glob("*/[0-9]_*.py"))
@@ -30,6 +31,19 @@ def test_the_gallery_opens_with_the_first_identification_and_its_picture():
     ],
 )
 def test_a_script_of_the_gallery_runs_and_draws_a_picture(script, tmp_path, monkeypatch):
+    run_and_draw(script, tmp_path, monkeypatch)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(FOLDER is None, reason="the curves are not present")
+@pytest.mark.parametrize("name", ["measured_brain", "measured_silicone"])
+def test_a_script_with_published_curves_runs_and_draws_a_picture(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLLOCATION_SYSID_DATA", str(tmp_path))
+    write_curves(tmp_path / "hyperelastic_curves" / "data.h5")
+    run_and_draw(GALLERY / "2_own_data" / f"{name}.py", tmp_path, monkeypatch)
+
+
+def run_and_draw(script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
     drawn = []
