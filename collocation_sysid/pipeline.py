@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from .common.array_types import Array
 from .common.checked_calls import checked
@@ -169,8 +170,8 @@ def run(
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and estimate uncertainties.
 
-    Once there is an answer, Ctrl-C only ends the steps that follow: `Run.omitted_checks` states
-    which results are missing.
+    Once there is an answer, Ctrl-C only ends the steps that follow, as a step does that cannot be
+    computed: `Run.omitted_checks` states which results are missing.
 
     Parameters
     ----------
@@ -249,13 +250,15 @@ def run(
             if problem.uncertainty.numerical and answer.uncertainty is not None:
                 answer = refine(answer, report_progress=say, watch=watch)
             return timed(answer)
-        except (KeyboardInterrupt, TimeLimitReached) as end:
+        except (KeyboardInterrupt, TimeLimitReached, SimulationError, LinAlgError) as end:
             unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
             rollouts = unsimulated | dict(answer.rollouts)
             if isinstance(end, TimeLimitReached):
                 is_late = answer.solution.status is Status.TIME_LIMIT
                 why = answer.solution.message if is_late else f"at the limit of {limit_s:g} s,"
                 missing = f"{why} {missing}"
+            elif not isinstance(end, KeyboardInterrupt):  # a check must not lose the fit
+                missing = f"a check failed ({end}): {missing}"
             return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from kit.problems import hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.fem.laws.constants import KNOWN, constant_named
+from collocation_sysid.methods.solution import Status
 from collocation_sysid.methods.starts.stiffness_scan import ScanState
 from collocation_sysid.model.parameters import (
     Parameter,
@@ -17,6 +20,7 @@ from collocation_sysid.model.parameters import (
     with_widest_bounds,
 )
 from collocation_sysid.runs.second_start import start_beyond_bounds
+from collocation_sysid.runs.solving import continued_beyond_bounds
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import Concern
 
@@ -47,6 +51,24 @@ def test_a_stated_bound_is_kept():
     solution = metal_wire(upper=5e8)
     assert solution.parameters["young_pa"] == pytest.approx(5e8)
     assert start_beyond_bounds(solution) is None
+
+
+def test_a_search_beyond_a_bound_that_does_not_converge_is_made_and_reported_once():
+    at_bound = replace(metal_wire(upper=1e9), notes=())
+    parameters = at_bound.collocation.parameters
+    free = parameters.map_components(lambda item: replace(item, stated_bounds=(False, False)))
+    at_bound = replace(at_bound, collocation=at_bound.collocation.with_parameters(free))
+    searches = []
+
+    def diverging(collocation, watch, start):
+        searches.append(collocation.parameters.guesses["young_pa"])
+        better = replace(at_bound.history[-1], loss=0.5 * at_bound.history[-1].loss)
+        return replace(at_bound, status=Status.STALLED, history=(better,))
+
+    kept = continued_beyond_bounds(diverging, at_bound, None)
+    assert len(searches) == 1
+    assert len(kept.notes) == 1
+    assert "did not converge" in kept.notes[0]
 
 
 def test_the_ratio_of_an_auxetic_foam_is_found_below_the_default_bound():

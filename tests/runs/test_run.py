@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from kit.problem_files import TRUTH, run_command, settings, write_problem
 
-from collocation_sysid import Problem, run
+import collocation_sysid as cs
+from collocation_sysid import Problem, pipeline, run
 from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import read_markers, write_markers_csv
@@ -228,3 +229,19 @@ def test_undetermined_parameters_have_no_interval(tmp_path):
     assert poisson["reason"]
     said = [sentence for sentence in found["uncertainty"]["verdicts"] if "poisson" in sentence]
     assert any("not identifiable" in s or "ended at its lower bound" in s for s in said)
+
+
+def test_a_check_that_cannot_be_computed_keeps_the_fit(monkeypatch):
+    strain = np.linspace(0.01, 0.2, 10)
+    pull = cs.Specimen("uniaxial", strain, 2e4 * strain, 10.0)
+    fixed = {"poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    unknown = {"young_pa": cs.Unknown()}
+
+    def singular(*_, **__):
+        raise cs.SimulationError("no equilibrium", 0.0)
+
+    monkeypatch.setattr(pipeline, "profile_likelihoods", singular)
+    answer = run(Problem([pull.experiment("linear")], unknown | fixed))
+    assert answer.solution.status.converged
+    assert "a check failed (no equilibrium" in answer.omitted_checks
+    assert answer.result.trust.verdict == "doubtful"

@@ -226,6 +226,18 @@ def test_the_other_test_of_a_material_with_memory_has_its_memory_and_times():
         assert added.body.parts[0].prony == experiments[0].body.parts[0].prony
 
 
+def test_a_test_that_the_law_cannot_be_evaluated_in_is_not_proposed():
+    """Equibiaxial tension to a stretch of 7.6 makes a sheet 58 times thinner."""
+    strain = np.linspace(0.1, 6.6, 12)
+    pull = cs.Specimen("uniaxial", strain, 1e5 * strain, 1e4)
+    constants = {"mu_1_pa": cs.Unknown(4e5), "alpha_1": cs.Unknown(1.5), "kappa_pa": 1e9}
+    collocation = cs.Problem([pull.experiment("ogden-1")], constants).collocation()
+    variables, _ = initial_variables(collocation)
+    proposed = [what for what, _ in added_measurements(collocation, variables)]
+    assert proposed
+    assert not any("equibiaxial" in what for what in proposed)
+
+
 # Of a body with a mesh ----------------------------------------------------------------------------
 
 

@@ -379,7 +379,8 @@ class NewtonSolver:
                 value = residual(trial)
             following = self.step(iterate.factor, value)
             length = float(np.linalg.norm(step))
-            rate = float(np.linalg.norm(following)) / max(length, 1e-300)
+            with np.errstate(over="ignore"):  # an infinite rate ends the chords as well
+                rate = float(np.linalg.norm(following)) / max(length, 1e-300)
             # Rounding ends the contraction of the smallest steps.
             is_rounding = self._is_last(following, OLD_FACTOR_SHARE)
             if not (rate <= SLOWEST_CHORD_RATE or is_rounding):
