@@ -13,6 +13,7 @@ from ..common.display import Table
 from ..common.files import require_possible, write_text_file
 from ..common.serialisation import as_json as json_text
 from ..common.serialisation import content
+from ..common.validated_types import AtLeastOne, Count
 from ..errors import InputError
 from .command_options import (
     AllowCode,
@@ -81,6 +82,7 @@ def refine(
     "export runs/swing --to body.inp",
     "export runs/swing --to mujoco",
     "export runs/swing --to calculix --out deck --verify",
+    "export runs/swing --to usd --out bodies --samples 100",
 )
 def export(
     *,
@@ -97,6 +99,15 @@ def export(
         option("Folder for a format, instead of export-FORMAT in the run folder.", "DIR"),
     ] = None,
     experiment: OneExperiment = None,
+    samples: Annotated[
+        AtLeastOne | None,
+        option(
+            "Write this number of bodies, with constants drawn from their combined distribution, into "
+            "sample_001, sample_002, … of a folder, and samples.csv with their constants.",
+            "N",
+        ),
+    ] = None,
+    seed: Annotated[Count, option("Seed of the draws of --samples.", "N")] = 0,
     verify: Annotated[
         bool, option("Simulate the exported body in the target, and compare the results.")
     ] = False,
@@ -122,7 +133,9 @@ def export(
         IdentifiedBody,
         comparison_table,
         parse_destination,
+        read_draws,
         verify_export,
+        write_draws,
         write_export,
     )
     from ..extras.export.rerun_recording import TARGET as RECORDING
@@ -130,6 +143,13 @@ def export(
 
     destination = parse_destination(to, MAIN_FILES, run_folder=run.run_folder, out=out)
     name = destination.format_name
+    if samples is not None and (verify or name == RECORDING or not destination.is_folder):
+        raise InputError(
+            f"found --samples with {'--verify' if verify else f'--to {to}'}; expected a format of "
+            "bodies, such as mujoco or usd, and a folder as --out",
+            None,
+            where="--samples",
+        )
     if name == RECORDING:
         if verify:
             raise InputError(
@@ -149,7 +169,11 @@ def export(
         body = IdentifiedBody.read(run.run_folder, experiment, allow_code=allow_code)
         progress.say(f"writing the body for {target.name}")
         with destination.export_folder() as folder:
-            exported = write_export(body, name, folder=folder)
+            if samples is None:
+                exported = write_export(body, name, folder=folder)
+            else:
+                draws = read_draws(run.run_folder, samples, seed, allow_code)
+                exported = write_draws(body, draws, name, folder)
             destination.place_files(folder, target.main_file)
             if verify:
                 progress.say(f"comparing with predictions of {target.name}")

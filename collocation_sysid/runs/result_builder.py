@@ -174,9 +174,10 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
     if known is None:
         return None
     reported = [k for k, name in enumerate(known.names) if name in known.estimates]
-    combined = None
+    combined = drawn = None
     if answer.systematic_effects is not None:
         combined = answer.covariance()[np.ix_(reported, reported)]
+        drawn = answer.draw_covariance
     return copy_fields(
         UncertaintyResult,
         known,
@@ -185,6 +186,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
         covariance=known.covariance[np.ix_(reported, reported)],
         quantiles=known.quantiles[reported],
         combined_covariance=combined,
+        draw_covariance=drawn,
         noise_factors=known.level.factors,
         autocorrelation=known.dependence.lag1,
         verdicts=tuple(identifiability_sentences(known, answer.combinations)),

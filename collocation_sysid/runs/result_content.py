@@ -324,6 +324,9 @@ class UncertaintyResult:
     combined_covariance : (k, k) array or None
         Covariance due to noise, discretisation and systematic effects, whose 95 % intervals have
         half widths of 1.96 standard deviations; None if systematic effects were not evaluated.
+    draw_covariance : (n, n) array or None
+        Covariance in SI units of draws of all n estimated parameters, also of those at a bound; None
+        if systematic effects were not evaluated.
     verdicts : tuple of str
         Sentences on what the data determine.
     combinations : tuple of Combination
@@ -350,6 +353,7 @@ class UncertaintyResult:
     recordings: Mapping[str, RecordingsAgreement] | None
     profiles: Mapping[str, ProfileResult]
     combined_covariance: Array | None = optional()  # noqa: RUF009, it returns a field
+    draw_covariance: Array | None = optional()  # noqa: RUF009, it returns a field
     combinations: tuple[Combination, ...] = ()
     directions: tuple[Direction, ...] = ()
 

@@ -463,14 +463,10 @@ class SolvedProblem:
         pandas = _optional_package("pandas", "a data frame")
         if self.uncertainty is None or self.systematic_effects is None:
             raise InputError("the run has no error bars, and therefore no samples")
-        # Wide, not NaN, where a parameter is not determined.
-        complete = self._complete_covariance
-        factors = self._collect_relative_deviations() / np.sqrt(np.diag(complete))
-        factors = np.nan_to_num(factors, nan=1.0) / self._relative_by_value()
         draws = draw_samples(
             self.solution.collocation,
             self.parameters,
-            complete * np.outer(factors, factors),
+            self.draw_covariance,
             self.combinations,
             count,
             seed,
@@ -479,6 +475,16 @@ class SolvedProblem:
         frame.index.name = "sample"
         frame.attrs["units"] = {name: unit_of(name) for name in frame.columns}
         return frame
+
+    @property
+    def draw_covariance(self) -> Array:
+        """Covariance (k, k) of the draws of `samples` in SI units, of all estimated parameters: wide,
+        not NaN, where one is not determined. The run must have error bars.
+        """
+        complete = self._complete_covariance
+        factors = self._collect_relative_deviations() / np.sqrt(np.diag(complete))
+        factors = np.nan_to_num(factors, nan=1.0) / self._relative_by_value()
+        return complete * np.outer(factors, factors)
 
     def predicted(self) -> dict[str, Any]:
         """Return the predictions of the fit as labelled arrays.

@@ -133,6 +133,16 @@ def test_an_ensemble_has_an_export_for_each_draw(run_folder, tmp_path):
     run = cs.run(cs.Problem.read(run_folder.parent / "problem.toml"), "reduced-space")
     assert run.uncertainty is not None
     samples = run.samples(3, seed=1)
+    # The command draws from the run folder what Python draws from the run.
+    run.save(run_folder.parent / "again", pictures=False)
+    for target, files in (("mujoco", "body.xml"), ("usd", "body.usda")):
+        folder = tmp_path / f"{target}_of_command"
+        options = ("--to", target, "--out", folder, "--samples", 3, "--seed", 1)
+        assert run_command("export", run_folder.parent / "again", *options).code == 0
+        table = np.genfromtxt(folder / "samples.csv", delimiter=",", names=True)
+        for name in samples:
+            np.testing.assert_allclose(table[name], samples[name], rtol=1e-12)
+        assert (folder / "sample_003" / files).is_file()
     for target, files in (("mujoco", "body.xml"), ("usd", "body.usda")):
         folder = tmp_path / target
         write_ensemble(run, target, folder, 3, seed=1)
@@ -163,6 +173,13 @@ def test_an_ensemble_has_an_export_for_each_draw(run_folder, tmp_path):
         tips_m.append(data.flexvert_xpos.copy())
     assert np.isfinite(tips_m).all()
     assert np.abs(tips_m[1] - tips_m[0]).max() > 0  # the bodies differ
+
+
+def test_samples_need_a_folder_of_bodies(run_folder, tmp_path):
+    for options in (["--to", tmp_path / "body.xml"], ["--to", "mujoco", "--verify"]):
+        refused = run_command("export", run_folder, *options, "--samples", 2)
+        assert refused.code == 2
+        assert "--samples" in refused.err
 
 
 # What files hold

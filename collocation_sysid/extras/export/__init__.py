@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ...common.array_types import Array
 from ...common.display import Table
 from ...common.serialisation import as_json
 from ...errors import InputError, hint_at
@@ -23,8 +24,8 @@ from ...result.run_writers import replaced_folder
 from ...runs.solved_problem import SolvedProblem
 from . import calculix, mujoco, newton, rerun_recording, usd
 from .export_destination import ExportDestination, parse_destination
-from .export_target import ExportedFiles, ExportTarget, PredictionComparison
-from .identified import IdentifiedBody
+from .export_target import ExportedFiles, ExportTarget, PredictionComparison, values_as_text
+from .identified import IdentifiedBody, read_draws
 
 IDENTIFIED_FILE = "identified.json"
 SAMPLES_FILE = "samples.csv"
@@ -115,14 +116,30 @@ def write_ensemble(
     InputError
         As `write_export` and `SolvedProblem.samples`.
     """
-    samples = run.samples(count, seed)
-    body = IdentifiedBody.from_run(run, experiment)
+    samples = run.samples(count, seed).to_dict("list")
+    return write_draws(IdentifiedBody.from_run(run, experiment), samples, target_name, folder)
+
+
+def write_draws(
+    body: IdentifiedBody,
+    draws: Mapping[str, Sequence[float] | Array],
+    target_name: str,
+    folder: str | Path,
+) -> ExportedFiles:
+    """Write a body for a target with each of some draws (count,) of its parameters and moduli, by
+    name; see `write_ensemble`.
+    """
     exported = target_named(target_name).export(body)  # refused before anything is written
-    digits = max(3, len(str(count)))
+    rows = [dict(zip(draws, row, strict=True)) for row in zip(*draws.values(), strict=True)]
+    own = {*body.parameters, *body.body.list_field_coefficient_names()}
+    names = [name for name in draws if name in own]  # without derived moduli
+    digits = max(3, len(str(len(rows))))
     with replaced_folder(folder, marker_file=SAMPLES_FILE, content_word="ensemble") as place:
-        samples.to_csv(place / SAMPLES_FILE, index_label="sample")
-        for k, values in enumerate(samples.to_dict("records"), start=1):
-            draw = body.with_values({name: values[name] for name in run.parameters})
+        lines = [",".join(("sample", *draws))]
+        lines += [f"{k},{values_as_text([*row.values()], ',')}" for k, row in enumerate(rows)]
+        (place / SAMPLES_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        for k, row in enumerate(rows, start=1):
+            draw = body.with_values({name: float(row[name]) for name in names})
             exported = write_export(draw, target_name, place / f"sample_{k:0{digits}d}")
     return exported
 
@@ -202,8 +219,10 @@ __all__ = [
     "PredictionComparison",
     "comparison_table",
     "parse_destination",
+    "read_draws",
     "target_named",
     "verify_export",
+    "write_draws",
     "write_ensemble",
     "write_export",
 ]

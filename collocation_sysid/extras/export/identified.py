@@ -21,9 +21,11 @@ from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
 from ...fem.laws.ogden import is_power_law, term_numbers
 from ...problem import Problem
+from ...program.collocation import Collocation
 from ...recording import Experiment, Markers, Obstacle
 from ...recording.obstacle_solids import solid_key
 from ...result.replay import MotionRecord, damaged_run_refused, read_arrays
+from ...runs.ensemble import draw_samples
 from ...runs.forward_simulation import ForwardSimulation
 from ...runs.result_builder import build_result
 from ...runs.result_content import ReportedEstimate, Result
@@ -182,24 +184,7 @@ class IdentifiedBody:
             mesh made under gravity; or if only obstacles support the body.
         """
         folder = Path(run)
-        result = Result.read(folder)
-        answer = WarmStart.from_result(result, folder)
-        home = result.problem_folder(
-            folder,
-            "which export needs: in Python, export the run itself, "
-            'write_export(IdentifiedBody.from_run(run), "mujoco", "deck"), see docs/howto/simulators.md',
-        )
-        with damaged_run_refused(folder):
-            _warnings(result)
-        problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
-        problem = problem.with_lengths(
-            {n: each.shapes.length_m for n, each in result.fields.items()}
-        )
-        if problem.parameters.free:
-            problem = answer.apply_to_problem(problem)  # which may state no guess itself
-        with located(folder):
-            _require_stress_free(problem)
-        collocation = problem.collocation()
+        result, answer, problem, collocation = _read_run(folder, allow_code)
         names = [transcription.experiment.name for transcription in collocation.transcriptions]
         if experiment is not None and experiment not in names:
             raise InputError(_not_fitted(experiment, names), folder)
@@ -469,6 +454,59 @@ class IdentifiedBody:
             ],
             "node_loads_n": self.node_loads_n,
         }
+
+
+def _read_run(folder: Path, allow_code: bool) -> tuple[Result, WarmStart, Problem, Collocation]:
+    """Return the result of a run folder, its estimates, and its problem and program at these."""
+    result = Result.read(folder)
+    answer = WarmStart.from_result(result, folder)
+    home = result.problem_folder(
+        folder,
+        "which export needs: in Python, export the run itself, "
+        'write_export(IdentifiedBody.from_run(run), "mujoco", "deck"), see docs/howto/simulators.md',
+    )
+    with damaged_run_refused(folder):
+        _warnings(result)
+    problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
+    problem = problem.with_lengths({n: each.shapes.length_m for n, each in result.fields.items()})
+    if problem.parameters.free:
+        problem = answer.apply_to_problem(problem)  # which may state no guess itself
+    with located(folder):
+        _require_stress_free(problem)
+    collocation = problem.collocation()
+    return result, answer, problem, collocation
+
+
+def read_draws(
+    run: str | Path, count: int, seed: int = 0, allow_code: bool = False
+) -> dict[str, Array]:
+    """Return draws (count,) of all parameters and derived moduli of a run folder by name, those of
+    `SolvedProblem.samples`.
+
+    Raises
+    ------
+    InputError
+        As `IdentifiedBody.read`; for a run without error bars, or whose search went on beyond the
+        bounds of its problem; or if hardly any draw is admissible.
+    """
+    folder = Path(run)
+    result, _, _, collocation = _read_run(folder, allow_code)
+    known = result.uncertainty
+    covariance = None if known is None else known.draw_covariance
+    free = collocation.parameters.free
+    if known is None or covariance is None:
+        raise InputError("the run has no error bars, and therefore no samples", folder)
+    with damaged_run_refused(folder):
+        values = {item.name: result.parameters[item.name].value for item in free}
+    if np.shape(covariance) != (len(free), len(free)) or any(
+        not item.lower <= values[item.name] <= item.upper for item in free
+    ):
+        raise InputError(
+            "an estimate of the run is beyond the bounds of its problem file; expected bounds that "
+            "contain it (state lower and upper, and solve again), or in Python write_ensemble(run, …)",
+            folder,
+        )
+    return draw_samples(collocation, values, covariance, known.combinations, count, seed)
 
 
 def _not_fitted(experiment: str, names: Sequence[str]) -> str:
