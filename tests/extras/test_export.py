@@ -36,6 +36,7 @@ from collocation_sysid.extras.export.export_target import equilibria
 from collocation_sysid.extras.export.identified import without_obstacles
 from collocation_sysid.extras.export.obstacle_shapes import Facets, faceted_obstacles
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.laws.fibres import Fibres
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.problem import Problem
@@ -705,6 +706,76 @@ def test_calculix_sags_alike_with_the_same_energy(material, tmp_path):
     (sag,) = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
     assert sag.ours > 0.05 * BAR_M[0]  # not small
     assert abs(sag.compute_relative_difference()) < 1e-4
+
+
+YEOH = {"c10_pa": 1e4, "c20_pa": 0.0, "c30_pa": 0.0, "kappa_pa": 1e6}
+
+
+def reinforced_bar(fibres: Fibres, constants: dict[str, float]) -> IdentifiedBody:
+    """A bar with fibres; its isotropic material has the energy of CalculiX's."""
+    bar = held_bar("yeoh", YEOH, "tet10")  # linear elements would lock
+    body = Body(bar.body.mesh, "yeoh", 900.0, "tet10", fibres=fibres)
+    theta = body.theta_from_values({**YEOH, **OTHERS, **constants})
+    return replace(bar, body=body, theta=theta, experiment=replace(bar.experiment, body=body))
+
+
+def test_calculix_gets_fibres_in_their_axes(tmp_path):
+    fibres = Fibres(direction=[1, 1, 0], normal=[0, 0, 1], families=2, law="exponential")
+    constants = {"fibre_pa": 8e4, "fibre_exponent": 0.5, "fibre_angle_rad": 0.3}
+    folder = exported(reinforced_bar(fibres, constants), "calculix", tmp_path)
+    deck = (folder / "body.inp").read_text()
+    values = card_values(folder, "*USER MATERIAL,CONSTANTS=10")
+    own = [2e4, 0.5]
+    sine = np.sin(0.3)
+    np.testing.assert_allclose(values, [1e4, 2e-6, 0, -sine, *own, 0, sine, *own], rtol=1e-10)
+    axes = np.array(card_values(folder, "*ORIENTATION,NAME=F0_0")).reshape(2, 3)
+    local = np.vstack([axes, np.cross(*axes)])  # rows X, Y and Z of the deck
+    along = [np.array([0, a, np.sqrt(1 - a * a)]) @ local for a in (-sine, sine)]
+    turned = np.pi / 4 + np.array([0.3, -0.3])
+    expected = np.column_stack([np.cos(turned), np.sin(turned), 0 * turned])
+    np.testing.assert_allclose(np.abs(np.sum(along * expected, axis=1)), 1.0, rtol=1e-9)
+    assert deck.count("*SOLID SECTION") == 1
+
+
+@pytest.mark.parametrize(
+    ("target", "fibres", "constants", "found"),
+    [
+        ("mujoco", Fibres(direction=[1, 0, 0]), {}, "fibres are not exported"),
+        ("newton", Fibres(direction=[1, 0, 0]), {}, "fibres are not exported"),
+        ("usd", Fibres(direction=[1, 0, 0]), {}, "fibres are not exported"),
+        (
+            "calculix",
+            Fibres(direction=[1, 0, 0], dispersed=True),
+            {"fibre_dispersion": 0.1},
+            "scatter",
+        ),
+        ("calculix", Fibres(direction=[1, 0, 0], tension_only=False), {}, "no compression"),
+    ],
+)
+def test_fibres_that_a_target_does_not_have_are_named(target, fibres, constants, found, tmp_path):
+    body = reinforced_bar(fibres, {"fibre_pa": 8e4, **constants})
+    limits = write_export(body, target, tmp_path / "out").limitations
+    assert any(found in limit for limit in limits)
+
+
+@needs_ccx
+@pytest.mark.parametrize(
+    ("fibres", "constants"),
+    [
+        (Fibres(direction=[1, 0, 0]), {}),
+        (
+            Fibres(direction=[1, 0.5, 0], normal=[0, 0, 1], families=2, law="exponential"),
+            {"fibre_exponent": 0.5, "fibre_angle_rad": 0.3},
+        ),
+        (Fibres(axis=(1, 0, 0), axis_point_m=(0.0, 0.01, -0.02)), {}),
+    ],
+    ids=["parallel", "two families", "hoops"],
+)
+def test_calculix_bends_alike_with_fibres(fibres, constants, tmp_path):
+    body = reinforced_bar(fibres, {"fibre_pa": 8e4, **constants})
+    (sag,) = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
+    assert sag.ours > 0.2 * BAR_M[0]
+    assert abs(sag.compute_relative_difference()) < 0.01
 
 
 @needs_ccx

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import runpy
 import tomllib
 from dataclasses import replace
 
+import casadi as ca
 import get_pneumatic_arm as arm
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ import study_pneumatic_arm as study
 
 from collocation_sysid import Problem, solve
 from collocation_sysid.errors import SimulationError
+from collocation_sysid.fem.laws.fibres import FibreLaw, reinforced
+from collocation_sysid.fem.laws.materials import MATERIALS
 from collocation_sysid.fem.meshes.mesh import TetMesh
 
 FILE = arm.FOLDER / "problem.toml"
@@ -38,6 +42,16 @@ def test_the_shipped_mesh_and_fibres_are_those_of_the_script():
     stated = tomllib.loads(FILE.read_text())["parameters"]
     angles = [stated[f"ring_{k}.fibre_angle_rad"]["fixed"] for k in range(1, 8)]
     np.testing.assert_allclose(angles, arm.fibre_angles(shape), atol=1e-4)
+
+
+def test_the_energy_of_the_wall_is_that_of_quadratic_fibres():
+    function = runpy.run_path(str(arm.FOLDER / "reinforced.py"))["reinforced"]
+    fibres = FibreLaw(is_turned=True, tension_only=False)
+    other = reinforced(MATERIALS["neo-hookean"], fibres).energy
+    F = ca.SX(ca.DM(np.array([[1.1, 0.05, -0.02], [0.03, 0.9, 0.04], [-0.01, 0.06, 1.02]])))
+    constants = {"lambda_pa": 8e5, "mu_pa": 9e4, "fibre_pa": 8.5e5, "fibre_angle_rad": 2.0704}
+    energies = [float(ca.DM(ca.evalf(law(F, **constants)))) for law in (function, other)]
+    assert energies[0] == pytest.approx(energies[1], rel=1e-12)
 
 
 def test_the_mesh_fills_half_of_the_arm_without_its_chambers():

@@ -16,6 +16,9 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...errors import InputError
+from ...fem.laws.constants import FIBRE_ANGLE, FIBRE_EXPONENT, FIBRE_STIFFNESS
+from ...fem.laws.fibres import FibreLaw, ReinforcedMaterial
+from ...fem.regions import BodyPart
 from .export_target import (
     ExportedFiles,
     PredictionComparison,
@@ -35,7 +38,12 @@ TETRAHEDRON_SIDES = (0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)
 # Constant D_i that removes a term of U = Σ (J − 1)^2i / D_i: zero would mean a very stiff term.
 ABSENT_TERM = 1e20
 CAPABILITIES = TargetCapabilities(
-    {}, other_materials="", mass_damping="", node_forces="", has_quadratic_elements=True
+    {},
+    other_materials="",
+    mass_damping="",
+    node_forces="",
+    has_quadratic_elements=True,
+    has_fibres=True,
 )
 # Coefficients C_i of the series of Arruda and Boyce.
 _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
@@ -43,6 +51,10 @@ _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 MOST_TERMS = 3
 # Largest number of values on a line of a card, by the manual of CalculiX.
 VALUES_PER_LINE = 8
+DISPERSED = (
+    "fibres that scatter are not exported: the exported part is softer along them than the "
+    "identified one"
+)
 FOAM_LIMITATION = (
     "CalculiX 2.20 finds no equilibrium of a HYPERFOAM of one term, or of two with a negative "
     "exponent; the card is that of Abaqus, too"
@@ -62,12 +74,22 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     ).limitations(body)
     linear = all(region.material == "linear" for region in body.regions)
     materials = ""
-    for k, region in enumerate(body.regions):
+    for k, (region, part) in enumerate(zip(body.regions, body.body.parts, strict=True)):
         card, limitation = _material_card(region, linear)
+        name = f"M{k}"
+        sections = f"*SOLID SECTION,ELSET=E{k},MATERIAL={name}\n"
+        if isinstance(part.material, ReinforcedMaterial):
+            fibres = part.material.energy.fibres
+            if fibres.is_dispersed:
+                limitation = f"{limitation}; {DISPERSED}".removeprefix("; ")
+            else:
+                name = f"ELASTIC_FIBER{k}"
+                card, limitation = _fibre_card(region, fibres)
+                sections = _fibre_sections(body, part, k, name)
         limits += [f"{region.name}: {limitation}"] if limitation else []
         materials += (
-            f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{_format_values(region.density_kg_m3)}\n"
-            f"*SOLID SECTION,ELSET=E{k},MATERIAL=M{k}\n"
+            f"*MATERIAL,NAME={name}\n{card}*DENSITY\n{_format_values(region.density_kg_m3)}\n"
+            f"{sections}"
         )
     limits.append("damping is not exported: an equilibrium has none")
     if body.is_quadratic:
@@ -228,6 +250,54 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
         f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)²: the same λ and μ "
         "at small strain, but stresses differ in second order of the strain"
     )
+
+
+def _fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
+    """Return the card of CalculiX's own law of fibres in the axes of `_fibre_sections`, and a
+    sentence on what it does not express.
+
+    Its energy is that of Holzapfel, Gasser & Ogden (2000), k₁/(2 k₂) (exp(k₂ (Ī₄ − 1)²) − 1) of each
+    family for Ī₄ > 1, beside the neo-Hookean one; with k₂ = 0 it is quadratic.
+    """
+    c = region.constants
+    sine = np.sin(c.get(FIBRE_ANGLE.name, 0.0))
+    own = (c[FIBRE_STIFFNESS.name] / 4, c.get(FIBRE_EXPONENT.name, 0.0))
+    values = [region.mu_pa / 2, 2 / region.kappa_pa]
+    for side in (1, -1)[: fibres.families]:
+        values += [0.0, -side * sine, *own]
+    lines = (values[k : k + VALUES_PER_LINE] for k in range(0, len(values), VALUES_PER_LINE))
+    card = "".join(f"{_format_values(*line)}\n" for line in lines)
+    limitation = (
+        f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)², and fibres resist "
+        "their stretch without the change of volume"
+    )
+    if not fibres.tension_only:
+        limitation += "; they carry no compression, while the identified ones do"
+    return f"*USER MATERIAL,CONSTANTS={len(values)}\n{card}", limitation
+
+
+def _fibre_sections(body: IdentifiedBody, part: BodyPart, number: int, name: str) -> str:
+    """Return an orientation, an element set and a section for each direction of the fibres of a
+    part: local axes are the normal of the fibres, across them, and against them.
+    """
+    assert part.axes is not None
+    here = body.nodes_m - body.nodes_m.mean(axis=0)
+    undeformed = body.body.nodes_m - body.body.nodes_m.mean(axis=0)
+    turn = np.linalg.lstsq(undeformed, here)[0].T  # of the body as its grasp holds it
+    axes = np.round(np.einsum("ij,kjl->kil", turn, part.axes), 12)
+    different, of_cell = np.unique(axes.reshape(-1, 9), axis=0, return_inverse=True)
+    cards = ""
+    for k, own in enumerate(different.reshape(-1, 3, 3)):
+        cells = part.cells[of_cell.ravel() == k] + 1
+        label = f"F{number}_{k}"
+        cards += (
+            f"*ORIENTATION,NAME={label},SYSTEM=RECTANGULAR\n"
+            f"{_format_values(*own[:, 2], *own[:, 1])}\n"
+            f"*ELSET,ELSET={label}\n"
+            + "".join(f"{cell}\n" for cell in cells)
+            + f"*SOLID SECTION,ELSET={label},MATERIAL={name},ORIENTATION={label}\n"
+        )
+    return cards
 
 
 def _power_law_card(region: IdentifiedRegion, volume: float) -> str:

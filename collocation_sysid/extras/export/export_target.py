@@ -124,6 +124,8 @@ class TargetCapabilities:
         (which are split otherwise).
     node_forces, point_masses : str
         Sentences for forces and for point masses on nodes; empty if the simulator has them.
+    has_fibres : bool
+        Whether it has fibres beside a material.
     has_rounded_edges, has_face_selection : bool
         Whether obstacles may have rounded edges, and be limited to some faces of the body.
     """
@@ -138,6 +140,7 @@ class TargetCapabilities:
     node_forces: str = "forces on nodes are not exported"
     point_masses: str = ""
     has_quadratic_elements: bool = False
+    has_fibres: bool = False
     has_rounded_edges: bool = True
     has_face_selection: bool = True
 
@@ -154,7 +157,7 @@ class TargetCapabilities:
             damped = bool(region.gamma_r_s)
             templates = [
                 *[VISCOELASTICITY] * bool(region.branches),
-                *[FIBRES] * ("fibre_pa" in region.constants),
+                *[FIBRES] * ("fibre_pa" in region.constants and not self.has_fibres),
                 *[self.other_materials] * (region.material not in self.materials),
                 *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),
