@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .extras.planning.task import Task
     from .extras.studies.model_comparison import ModelComparison, compare_models
     from .features.image_tracks.tracks import ImageTracks, PoseSigma
+    from .features.outlines.outlines import Outlines
     from .fem.body import Body
     from .fem.laws.constants import Constant
     from .fem.laws.fibres import Fibres
@@ -130,6 +131,7 @@ __all__ = [
     "Nuisance",
     "NuisanceRow",
     "Obstacle",
+    "Outlines",
     "Parameter",
     "Parameters",
     "Penalty",

@@ -13,6 +13,7 @@ recording belong into the packages `program`, `model` and `recording`.
 - `cameras`: likely errors in the description of depth cameras (`poses`), their images (`images`) and
   times (`times`).
 - `image_tracks`: tracks of points in the images of ordinary cameras, with all their parts.
+- `outlines`: masks of the body in images of ordinary cameras, with all their parts.
 - `specimens`: material tests without a mesh.
 - `contact`: obstacles (`obstacles`), and bodies in parts or inside obstacles (`placement`).
 """

@@ -7,10 +7,11 @@ from .cameras.feature import CAMERAS
 from .contact.feature import CONTACT
 from .feature import Feature
 from .image_tracks.track_feature import IMAGE_TRACKS
+from .outlines.outline_feature import OUTLINES
 from .specimens.feature import SPECIMENS
 from .wrenches.feature import WRENCH
 
-FEATURES: tuple[Feature, ...] = (WRENCH, CONTACT, CAMERAS, IMAGE_TRACKS, SPECIMENS)
+FEATURES: tuple[Feature, ...] = (WRENCH, CONTACT, CAMERAS, IMAGE_TRACKS, OUTLINES, SPECIMENS)
 for _feature in FEATURES:
     declare_topics(_feature.topics)
     declare_messages(_feature.messages)

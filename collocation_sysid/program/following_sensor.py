@@ -115,6 +115,16 @@ class FollowingSensorResidual(CorrespondingSensorResidual):
         return followed.numbers(followed.predict_motion(motion.observed, phi))
 
 
+def all_nodes(body: Body, rows: int) -> PointPositions:
+    """Return all nodes of a body as an observable at the first `rows` grid times."""
+    count = len(body.nodes_m)
+    nodes = Placement(
+        np.arange(count)[:, None], np.ones((count, 1)), distance_m=np.zeros(count), node_count=count
+    )
+    association = MarkerAssociation.from_exact_places(body, nodes, points_m=body.nodes_m)
+    return PointPositions(np.arange(rows), association, np.full((count, 3), -1))
+
+
 class FollowingSensorModel(CorrespondenceModel):
     """Custom sensor whose points on the body follow the estimates."""
 
@@ -122,17 +132,7 @@ class FollowingSensorModel(CorrespondenceModel):
 
     @cached_property
     def _observable(self) -> PointPositions:
-        body = self.grid.experiment.body
-        count = len(body.nodes_m)
-        nodes = Placement(
-            np.arange(count)[:, None],
-            np.ones((count, 1)),
-            distance_m=np.zeros(count),
-            node_count=count,
-        )
-        association = MarkerAssociation.from_exact_places(body, nodes, points_m=body.nodes_m)
-        rows = np.arange(len(self.grid.t_s))
-        return PointPositions(rows, association, coordinate_parameters=np.full((count, 3), -1))
+        return all_nodes(self.grid.experiment.body, len(self.grid.t_s))
 
     @cached_property
     def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:

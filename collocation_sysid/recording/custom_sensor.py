@@ -98,6 +98,8 @@ class CustomSensor(Measurement):
     measurement_text: ClassVar[str] = "readings"
     other_text: ClassVar[str] = "sensor readings"
     noise_key: ClassVar[str] = "sigma of the readings"
+    # Ending of the files that a simulation writes.
+    suffix: ClassVar[str] = ".csv"
 
     name: str
     t_s: Array
@@ -205,6 +207,12 @@ class CustomSensor(Measurement):
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with other samples (S, m) at the times `t_s` (S,) [s]."""
         return replace(self, t_s=t_s, values=values)
+
+    def simulated_text(self, experiment: Any, positions_m: Array) -> str | None:
+        """Return the content of the file that a simulation with the motion (T, n, 3) [m] of an
+        experiment writes; None for a table of the simulated numbers.
+        """
+        return None
 
     # Its unknowns -----------------------------------------------------------------------------
 

@@ -284,6 +284,10 @@ def _write_tables(
     for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         key = f"reading_{gauge.name}"
+        text = gauge.simulated_text(experiment, trajectory.positions_m)
+        if text is not None:
+            files[key].write_text(text, encoding="utf-8")
+            continue
         write_gauge_csv(files[key], gauge.sample_times_s, names=gauge.columns, values=read + noise)
 
 
@@ -368,8 +372,10 @@ def _table_names(
         bench = [table_name(section, table) for table in tables]
     else:
         keys += [_numbered_key("wrench", k) for k in range(len(experiment.wrenches))]
-    keys += [f"reading_{gauge.name}" for gauge in experiment.readings]
-    return {key: f"{experiment.name}_{key}.csv" for key in keys} | {name: name for name in bench}
+    names = {key: f"{experiment.name}_{key}.csv" for key in keys}
+    for gauge in experiment.readings:
+        names[f"reading_{gauge.name}"] = f"{experiment.name}_reading_{gauge.name}{gauge.suffix}"
+    return names | {name: name for name in bench}
 
 
 def _numbered_key(kind: str, index: int) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.features.image_tracks.rays import (
+    is_behind,
     is_occluded,
     points_on_surface,
     poses_from_points,
@@ -225,6 +227,37 @@ def test_hidden_points_are_not_compared() -> None:
         False,
         False,
     ]
+
+
+def test_points_behind_an_obstacle_are_not_compared() -> None:
+    # A ball between the camera and the middle of the bar, and a wall behind the bar.
+    eye, middle = np.array(EYES_M["front"]), np.array(PLACES_M["middle_front"])
+    ball = cs.Obstacle(shape=cs.Sphere(0.004, 0.6 * middle + 0.4 * eye), name="ball")
+    wall = cs.Obstacle(shape=cs.Plane([0.0, -1.0, 0.0], [0.0, 0.1, 0.0]), name="wall")
+    tracks = tracks_of("front", **EXACT)
+    compared = {}
+    for name, obstacles in (("free", [wall]), ("hidden", [wall, ball])):
+        experiment = swung([tracks])
+        experiment = replace(experiment, grasps=[*experiment.grasps, *obstacles])
+        program = cs.Problem([experiment], parameters=unknown_young()).collocation()
+        (residual,) = program.transcriptions[0].residuals_of(ImageTrackResidual)
+        compared[name] = dict(zip(NAMES, residual.is_compared[0, :, 0].tolist(), strict=True))
+    assert compared["free"]["middle_front"]
+    assert not compared["hidden"]["middle_front"]
+    others = [name for name in NAMES if name != "middle_front"]
+    assert [compared["hidden"][n] for n in others] == [compared["free"][n] for n in others]
+
+
+def test_a_solid_hides_what_is_behind_it_and_not_what_touches_it() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.21], [0.0, 0.0, 0.8]])
+    eyes = np.tile([0.0, 0.0, 2.0], (4, 1))
+
+    def ball(points_m: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points_m - [0.0, 0.0, 0.5], axis=1) - 0.1
+
+    assert is_behind(points, eyes, ball, 0.01).tolist() == [True, False, True, False]
+    floor = np.array([[0.0, 0.0, -1e-4]])
+    assert not is_behind(floor, eyes[:1], lambda points_m: points_m[:, 2], 0.01).any()
 
 
 def test_points_off_the_body_are_excluded() -> None:

@@ -2,7 +2,7 @@
 
 A camera states how uncertain it is. What it does not state is estimated if the recording's `Nuisance`
 does so, and otherwise considered in the budget and tested, see the rows `IMAGE_…` of
-`recording.nuisance`. Measurements of one experiment whose cameras have the same name share the errors.
+`recording.nuisance`. Measurements of one experiment with the same `camera_name` share the errors.
 """
 
 from __future__ import annotations
@@ -166,10 +166,15 @@ class CameraImages(CustomSensor):
         }
         return {name: float(sigma) for name, sigma in sigmas.items() if sigma}
 
+    @property
+    def camera_name(self) -> str:
+        """Name of the camera, which measurements in its images share with its errors."""
+        return self.name
+
     def unknown_label(self, name: str) -> str:
         """Return the label of an unknown of the camera, with its unit."""
         row, axis = CAMERA_UNKNOWNS[name]
-        return f"{row.label.format(which=self.name, axis=axis)} [{row.unit}]"
+        return f"{row.label.format(which=self.camera_name, axis=axis)} [{row.unit}]"
 
     def camera_rows(
         self, experiment: Experiment, reach: float

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -13,6 +15,9 @@ from ...common.array_types import Array, Index
 EDGE_TOLERANCE = 1e-9
 # Most pairs of a ray and a triangle at a time, for the memory.
 MOST_PAIRS = 2_000_000
+# Steps towards a camera within which a solid is met, and the least one over the length of the way.
+MOST_STEPS = 1000
+LEAST_STEP = 1e-3
 # Fewest points that determine the pose of a camera.
 FEWEST_POINTS = 4
 # Difference of rotations [rad] below which two poses are the same.
@@ -105,6 +110,30 @@ def is_occluded(
         is_hit, distance, _ = ray_hits(points_m[part], to_eye, triangles)
         is_between = (distance < 1) & (distance * length[:, None] > margin_m)
         hidden[part] = (is_hit & is_between).any(axis=1)
+    return hidden
+
+
+def is_behind(
+    points_m: Array, eyes_m: Array, distance: Callable[[Array], Array], margin_m: float
+) -> NDArray[np.bool_]:
+    """Return which points (P, 3) a solid hides from eyes (P, 3).
+
+    The signed distance of the solid, as a function of points (P, 3), is as long as the next step from
+    the point to the eye may be (sphere tracing). The first step is `margin_m`, so that a solid that
+    touches the point does not hide it; steps are at least a share of the length, `LEAST_STEP`.
+    """
+    way = eyes_m - points_m
+    length = np.linalg.norm(way, axis=1)
+    way /= length[:, None]
+    along = np.full(len(points_m), margin_m)
+    hidden = np.zeros(len(points_m), dtype=bool)
+    for _ in range(MOST_STEPS):
+        left = np.flatnonzero(~hidden & (along < length))
+        if not len(left):
+            break
+        gap = distance(points_m[left] + along[left, None] * way[left])
+        hidden[left[gap < 0]] = True
+        along[left] += np.maximum(gap, LEAST_STEP * length[left])
     return hidden
 
 

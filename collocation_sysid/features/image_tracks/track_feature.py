@@ -145,7 +145,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
             left.append(f"{', '.join(absent)} (their rays do not meet the body)")
         hidden = tracks.is_seen & places.is_placed & ~places.is_visible
         if hidden.any():
-            left.append(f"{hidden.sum()} samples of points that the body hides")
+            left.append(f"{hidden.sum()} samples of points that the body or an obstacle hides")
         yield (
             f"experiment '{experiment.name}': {known.sum()} samples of {known.any(axis=0).sum()} "
             f"points of '{tracks.name}' deviate by {rms:.3g} pixels (RMS of a coordinate); left out: "

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -22,9 +23,10 @@ from ...fem.body import Body
 from ...program.correspondences import Correspondences
 from ...program.markers.marker_association import MarkerAssociation
 from ...recording.experiment import Experiment
+from ...recording.obstacle import Obstacle
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from .camera_images import POSE_UNKNOWNS
-from .rays import FEWEST_POINTS, is_occluded, points_on_surface, poses_from_points
+from .rays import FEWEST_POINTS, is_behind, is_occluded, points_on_surface, poses_from_points
 from .tracks import ImageTracks, stated_places
 
 # Sine of the angle by which a ray may miss the body if the pose of the camera is exact, and in
@@ -209,6 +211,8 @@ class TrackedPlaces(Correspondences):
         Their values with which the first image fits best, in prior standard deviations.
     mirror_ratio : float
         Of a pose that was found: the error of the second best pose over that of the best one.
+    obstacles : sequence of Obstacle
+        Obstacles, which may hide points.
     """
 
     tracks: ImageTracks
@@ -221,6 +225,7 @@ class TrackedPlaces(Correspondences):
     pose_parameters: Index
     mirror_ratio: float = np.inf
     start_pose: Array = field(default_factory=lambda: np.zeros(0))
+    obstacles: Sequence[Obstacle] = ()
 
     @classmethod
     def from_shapes(
@@ -252,6 +257,7 @@ class TrackedPlaces(Correspondences):
             pose_parameters=pose_parameters,
             start_pose=np.zeros(len(pose_parameters)),
             mirror_ratio=mirrored.get(tracks.name, np.inf),
+            obstacles=experiment.obstacles,
         )
         unknowns = tracks.camera_unknowns(experiment)
         return correspondences.with_visibility(shapes)._aligned(shapes, unknowns)
@@ -317,8 +323,8 @@ class TrackedPlaces(Correspondences):
         """Return the correspondences with the points that are visible in the first s shapes (s, n,
         3) [m]; self if hardly any sample changes, so that the loss does not jump for ever.
 
-        A point is hidden if its face looks away from the camera, or another part of the body is in
-        front of it; not by obstacles.
+        A point is hidden if its face looks away from the camera, or if another part of the body or
+        an obstacle is in front of it.
         """
         count = len(shapes_m)
         if not count:
@@ -341,6 +347,9 @@ class TrackedPlaces(Correspondences):
             eyes = np.tile(self.translations[k], (len(candidates), 1))
             triangles = shapes_m[k][surface]
             hidden = is_occluded(points[k, candidates], eyes, triangles, margin_m)
+            for obstacle in self.obstacles:
+                distance = obstacle_distance(obstacle, body, shapes_m[k])
+                hidden |= is_behind(points[k, candidates], eyes, distance, margin_m)
             visible[k, candidates[hidden]] = False
         if np.sum(visible != before) <= SETTLED * np.sum(before & self.tracks.is_seen[:count]):
             return self
@@ -436,6 +445,18 @@ class TrackedPlaces(Correspondences):
         if not has_left:
             return association
         return replace(association, centre_places_m=centres, axes=axes, cells=cells)
+
+
+def obstacle_distance(obstacle: Obstacle, body: Body, nodes_m: Array) -> Callable[[Array], Array]:
+    """Return the signed distance (P,) [m] from an obstacle, as a function of points (P, 3) [m]; its
+    frame is where its nodes are among `nodes_m` (n, 3) [m].
+    """
+    origin, *ends = nodes_m[obstacle.nodes]
+    size_m = body.frame_nodes_m[1, 0] - body.frame_nodes_m[0, 0]
+    axes = (np.array(ends) - origin).T / size_m
+    point = ca.SX.sym("point", 3)
+    gap = ca.Function("gap", [point], [obstacle.shape.signed_distance(point)])
+    return lambda points_m: gap(((points_m - origin) @ axes + body.frame_nodes_m[0]).T).full()[0]
 
 
 def surface_association(body: Body, places_m: Array, sigmas_m: Array) -> MarkerAssociation:

@@ -57,6 +57,38 @@ class ImageCameraSection(Section, of=Camera):
     pose: PoseMatrix | Literal["file", "unknown"]
     poses: Text | None = None
 
+    def read(self, folder: RecordingFolder, where: str) -> Camera:
+        """Return the camera of the table, completed by the calibration file."""
+        arguments: dict[str, Any] = {}
+        if self.file is not None:
+            file = existing_file(folder.path, self.file, key=f"{where}.file")
+            with located(where=f"{where}.file"):
+                read = read_calibration(file, self.name)
+            names = ("matrix", "distortion", "model", "size_px", "pose")
+            arguments = {name: getattr(read, name) for name in names}
+            if arguments["pose"] is not None:
+                arguments["pose"][:3, 3] *= METRES_PER_UNIT[self.length_unit]
+        stated = self.model_fields_set & {"matrix", "distortion", "model", "size_px"}
+        arguments |= {name: getattr(self, name) for name in stated}
+        if arguments.get("matrix") is None:
+            raise InputError(
+                "missing; expected the matrix of the camera, or a calibration file",
+                where=f"{where}.matrix",
+            )
+        if self.pose == "file" and arguments.get("pose") is None:
+            raise InputError(
+                f'found "file", but {self.file or "no file"} states no pose; expected the pose '
+                'as a matrix, or "unknown"',
+                where=f"{where}.pose",
+            )
+        if self.pose != "file":
+            arguments["pose"] = None if self.pose == "unknown" else self.pose
+        if self.poses is not None:
+            poses = existing_file(folder.path, self.poses, key=f"{where}.poses")
+            arguments["poses"] = read_poses(poses)
+        with located(where=where):
+            return Camera(**arguments)
+
 
 class PoseSigmaSection(Section, of=PoseSigma):  # noqa: D101 (that of the class)
     pass
@@ -121,7 +153,7 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
             If a file is missing or unusable, the calibration is for images of another size, a point
             is not in the file, or nothing is within the times.
         """
-        camera = self._camera(folder, f"{where}.camera")
+        camera = self.camera.read(folder, f"{where}.camera")
         arguments: dict[str, Any] = {
             "name": self.name,
             "has_known_pose": self.camera.pose != "unknown",
@@ -204,39 +236,6 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
                 where=f"{where}.frame_rate_hz",
             )
         return content, self.start_s + content.frames / self.frame_rate_hz
-
-    def _camera(self, folder: RecordingFolder, where: str) -> Camera:
-        """Return the camera of the table, completed by the calibration file."""
-        section = self.camera
-        arguments: dict[str, Any] = {}
-        if section.file is not None:
-            file = existing_file(folder.path, section.file, key=f"{where}.file")
-            with located(where=f"{where}.file"):
-                read = read_calibration(file, section.name)
-            names = ("matrix", "distortion", "model", "size_px", "pose")
-            arguments = {name: getattr(read, name) for name in names}
-            if arguments["pose"] is not None:
-                arguments["pose"][:3, 3] *= METRES_PER_UNIT[section.length_unit]
-        stated = section.model_fields_set & {"matrix", "distortion", "model", "size_px"}
-        arguments |= {name: getattr(section, name) for name in stated}
-        if arguments.get("matrix") is None:
-            raise InputError(
-                "missing; expected the matrix of the camera, or a calibration file",
-                where=f"{where}.matrix",
-            )
-        if section.pose == "file" and arguments.get("pose") is None:
-            raise InputError(
-                f'found "file", but {section.file or "no file"} states no pose; expected the pose '
-                'as a matrix, or "unknown"',
-                where=f"{where}.pose",
-            )
-        if section.pose != "file":
-            arguments["pose"] = None if section.pose == "unknown" else section.pose
-        if section.poses is not None:
-            poses = existing_file(folder.path, section.poses, key=f"{where}.poses")
-            arguments["poses"] = read_poses(poses)
-        with located(where=where):
-            return Camera(**arguments)
 
     def _require_size(self, camera: Camera, pixels: Array, where: str) -> None:
         """Raise an `InputError` if the images do not have the size of the calibration."""

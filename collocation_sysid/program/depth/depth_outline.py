@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from scipy.spatial import KDTree
 
 from ...common.array_types import Array, Index
 from ...fem.body import Body
+from ...recording.camera import Camera
 from ...recording.depth_camera import DepthCamera
 from .depth_camera_model import DepthCameraModel
 from .visible_surface import VisibleSurface
@@ -123,9 +125,16 @@ class Outline:
         edges = []
         for sample, shape_m in enumerate(shapes_m):
             image_m = camera.depth.images_m[sample] if len(camera.depth.images_m) else None
+            eye_m = camera.eye_m(phi, sample)
             points = None
-            if image_m is not None:
-                points = _outline_points(camera, surface, shape_m=shape_m, phi=phi, sample=sample)
+            if image_m is not None and eye_m is not None:
+                view = OutlineView(
+                    camera.depth.camera,
+                    eye_m,
+                    partial(camera.to_camera_m, phi, sample=sample),
+                    camera.depth.spacing_m,
+                )
+                points = outline_points(view, surface, shape_m)
             if image_m is None or points is None:
                 edges.append(_no_edges(corners))
                 continue
@@ -167,8 +176,29 @@ class _NearestEdges(NamedTuple):
     exists: NDArray[np.bool_]
 
 
+class OutlineView(NamedTuple):
+    """View of a camera at one image.
+
+    Attributes
+    ----------
+    camera : Camera
+        Camera with a matrix.
+    eye_m : (3,) array
+        Its position in the world [m].
+    to_camera_m : callable
+        Points (P, 3) of the world in the frame of the camera [m].
+    spacing_m : float
+        Distance of the points of an outline [m].
+    """
+
+    camera: Camera
+    eye_m: Array
+    to_camera_m: Callable[[Array], Array]
+    spacing_m: float
+
+
 @dataclass(frozen=True, eq=False)
-class _OutlinePoints:
+class OutlinePoints:
     """Points (P) where the body ends in the view of a camera.
 
     Attributes
@@ -237,20 +267,18 @@ def no_depth_is_empty(
     return bool(background < LEAST_BACKGROUND_SHARE * np.count_nonzero(np.isnan(image_m)))
 
 
-def _outline_points(
-    camera_in: DepthCameraModel, surface: VisibleSurface, shape_m: Array, *, phi: Array, sample: int
-) -> _OutlinePoints | None:
-    """Return the points where a shape (n, 3) [m] ends in the view of a camera, at φ and the image
-    with index `sample`; None if there are none, for a point cloud, or if the body is partly behind
-    the camera.
+def outline_points(
+    view: OutlineView, surface: VisibleSurface, shape_m: Array
+) -> OutlinePoints | None:
+    """Return the points where a shape (n, 3) [m] of the surface ends in a view; None if there are
+    none, or if the body is partly behind the camera.
 
     They lie `spacing_m` apart on edges between a flat triangle that faces the camera and one that
     does not, and are not in front of or behind another part of the body.
     """
-    eye_m = camera_in.eye_m(phi, sample)
-    camera = camera_in.depth.camera
-    own_m = camera_in.to_camera_m(phi, shape_m, sample=sample)
-    if eye_m is None or (own_m[:, 2] <= 0).any():
+    camera, eye_m, to_camera_m, spacing_m = view
+    own_m = to_camera_m(shape_m)
+    if (own_m[:, 2] <= 0).any():
         return None
     facing = surface.is_facing(shape_m, eye_m)
     ends, faces_of_edges = surface.edges
@@ -267,7 +295,7 @@ def _outline_points(
     front_triangle = front_triangle[outline_edges]
     corners = surface.plane_triangles[front_triangle]
     lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
-    counts = np.maximum(1, np.ceil(lengths_m / camera_in.depth.spacing_m).astype(int))
+    counts = np.maximum(1, np.ceil(lengths_m / spacing_m).astype(int))
     edge = np.repeat(np.arange(len(outline_edges)), counts)
     number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (number + 0.5) / counts[edge]
@@ -285,11 +313,11 @@ def _outline_points(
         / np.maximum(length_px, 1e-9)[:, None]
     )
     centres = pixels[corners[edge]].mean(axis=1)
-    at_m = camera_in.to_camera_m(phi, points_m, sample=sample)
+    at_m = to_camera_m(points_m)
     places_px = camera.distorted_pixels(at_m)
     inwards = np.sum(normals * (places_px - centres), axis=1) < 0
     outwards = np.where(inwards[:, None], -normals, normals)
-    separate = _first_of_each_cube(points_m, camera_in.depth.spacing_m)
+    separate = _first_of_each_cube(points_m, spacing_m)
     separate = separate[length_px[separate] > 1e-6]
     is_covered = _covered(
         places_px[separate] + OUTSIDE_PX * outwards[separate],
@@ -298,7 +326,7 @@ def _outline_points(
     selected = separate[~is_covered]
     if not len(selected):
         return None
-    return _OutlinePoints(
+    return OutlinePoints(
         faces=faces[selected],
         weights=weights[selected],
         depth_m=at_m[selected, 2],
@@ -340,7 +368,7 @@ def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
 
 def _edges(
     camera_in: DepthCameraModel,
-    points: _OutlinePoints,
+    points: OutlinePoints,
     image_m: Array,
     *,
     phi: Array,
@@ -359,7 +387,47 @@ def _edges(
             image_m, pixels, depth_m=points.depth_m, gate_m=gate_m, is_missing_empty=empty
         )
 
-    offsets = np.arange(-SEARCH_PX, SEARCH_PX + STEP_PX / 2, STEP_PX)
+    def is_nothing() -> NDArray[np.bool_]:
+        return (image_m > points.depth_m.max() + gate_m) | (np.isnan(image_m) & empty)
+
+    edges, outwards, is_compared = image_edges(points, shown_at, is_nothing)
+    return {
+        "faces": points.faces,
+        "weights": points.weights,
+        "is_compared": is_compared,
+        **_planes(
+            camera_in,
+            camera,
+            edges=edges,
+            outwards=outwards,
+            depth_m=points.depth_m,
+            phi=phi,
+            sample=sample,
+        ),
+    }
+
+
+def image_edges(
+    points: OutlinePoints,
+    shown_at: Callable[[Array], NDArray[np.int64]],
+    is_nothing: Callable[[], NDArray[np.bool_]],
+    search_px: float = SEARCH_PX,
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the edges (P, 2) in an image that belong to points of an outline, their normals (P, 2)
+    away from the body, and whether there is an edge (P,) [pixels].
+
+    Parameters
+    ----------
+    points : OutlinePoints
+    shown_at : callable
+        Classes (…, P) of pixels (…, P, 2) beside the points.
+    is_nothing : callable
+        Mask (rows, columns) of the pixels that show nothing, called where the body reaches into
+        these.
+    search_px : float
+        Distance to either side of the outline within which the edge is searched.
+    """
+    offsets = np.arange(-search_px, search_px + STEP_PX / 2, STEP_PX)
     middle = _nearest_ends(points, offsets, along_px=0.0, shown_at=shown_at)
     has_edge = np.isfinite(middle)
     on_lines = np.array(
@@ -383,29 +451,15 @@ def _edges(
     edges = points.pixels + mean_offsets[:, None] * outwards
     is_beyond = ~has_edge & (shown_at(points.pixels) == EMPTY)
     if is_beyond.any():
-        is_nothing = (image_m > points.depth_m.max() + gate_m) | (np.isnan(image_m) & empty)
-        nearest_edges = _nearest_edges(is_nothing, points.pixels[is_beyond])
+        nearest_edges = _nearest_edges(is_nothing(), points.pixels[is_beyond])
         edges[is_beyond] = nearest_edges.edges
         outwards[is_beyond] = nearest_edges.outwards
         is_beyond[is_beyond] = nearest_edges.exists
-    return {
-        "faces": points.faces,
-        "weights": points.weights,
-        "is_compared": has_edge | is_beyond,
-        **_planes(
-            camera_in,
-            camera,
-            edges=edges,
-            outwards=outwards,
-            depth_m=points.depth_m,
-            phi=phi,
-            sample=sample,
-        ),
-    }
+    return edges, outwards, has_edge | is_beyond
 
 
 def _nearest_ends(
-    points: _OutlinePoints,
+    points: OutlinePoints,
     offsets: Array,
     *,
     along_px: float,

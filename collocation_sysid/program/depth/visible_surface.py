@@ -62,13 +62,13 @@ class VisibleSurface:
     is_selected: NDArray[np.bool_]
 
     @classmethod
-    def from_body(cls, body: Body, depth: Depth) -> VisibleSurface:
+    def from_body(cls, body: Body, depth: Depth | None = None) -> VisibleSurface:
         """Build the surface of a body, with the faces that a depth camera may see according to the
-        problem; all of them if it does not state any.
+        problem; all of them if it does not state any, and without a depth camera.
         """
         triangles = body.mesh.surface
         chosen = np.ones(len(triangles), dtype=bool)
-        if depth.faces is not None:
+        if depth is not None and depth.faces is not None:
             chosen[:] = False
             chosen[depth.faces.resolve_faces(body.mesh)] = True
         nodes, faces = np.unique(body.nodes.nodes_of_faces(triangles), return_inverse=True)

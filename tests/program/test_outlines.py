@@ -1,0 +1,266 @@
+"""Outlines of the body in masks of ordinary cameras."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from kit.filmed import T_S, filming, swung, tracks_of, unknown_young
+from kit.problem_files import run_command
+from kit.silhouettes import (
+    SIZE_PX,
+    TRUTH,
+    bar,
+    camera,
+    hanging,
+    hanging_m,
+    outlines_of,
+    photograph,
+    rasterised,
+)
+from PIL import Image
+
+import collocation_sysid as cs
+from collocation_sysid.features.outlines.masks import decoded, encoded, read_masks
+from collocation_sysid.features.outlines.outline_feature import hypotheses
+from collocation_sysid.features.outlines.outline_residual import OutlinesResidual
+from collocation_sysid.features.outlines.outlines import mask_of
+from collocation_sysid.methods.solution import Solution
+from collocation_sysid.program.observables import ObservableDerivatives
+from collocation_sysid.statistics.uncertainty import uncertainty_at
+
+
+def residual_of(experiment: cs.Experiment) -> OutlinesResidual:
+    program = cs.Problem([experiment], parameters=unknown_young()).collocation()
+    return program.transcriptions[0].residuals_of(OutlinesResidual)[-1]
+
+
+def solved(outlines: cs.Outlines, guess_pa: float) -> Solution:
+    parameters = {**TRUTH, "young_pa": cs.Unknown(guess_pa)}
+    return cs.solve(cs.Problem([hanging([outlines])], parameters=parameters))
+
+
+def test_the_distance_is_that_of_a_shifted_outline() -> None:
+    residual = residual_of(hanging([outlines_of()]))
+    x, phi = hanging_m().reshape(1, -1), np.zeros(residual.nuisance.size)
+    for shift in ([0.0, 0.0], [0.0, 3.0]):
+        mask = np.roll(photograph(), np.array(shift, dtype=int)[::-1], axis=(0, 1))
+        residual = residual_of(hanging([outlines_of(mask)]))
+        pairs = residual.reassociated(x, phi)
+        here = residual_of_pairs(residual, pairs)
+        off = here.predict(here.observable.evaluate_positions(x, phi), phi)[0, :, 0]
+        used = pairs.is_compared[0]
+        expected = -pairs.outwards[0] @ shift
+        assert used.sum() > 50
+        assert np.sqrt(np.mean((off - expected)[used] ** 2)) < 0.3
+
+
+def residual_of_pairs(residual: OutlinesResidual, pairs: Any) -> OutlinesResidual:
+    from dataclasses import replace
+
+    from collocation_sysid.features.outlines.outline_residual import compared
+
+    return replace(
+        residual, correspondences=pairs, is_compared=compared(pairs, residual.observable_s)
+    )
+
+
+FREE: dict[str, Any] = {"clock_rate_sigma": 1e-3, "line_delay_s": 2e-5, "line_delay_sigma_s": 5e-6}
+
+
+def test_derivatives_agree_with_differences() -> None:
+    mask = rasterised(hanging_m(), camera())
+    film = cs.Outlines("front", camera(), T_S[:3] + 0.004, [mask] * 3, **FREE)
+    residual = residual_of(swung([film]))
+    rng = np.random.default_rng(3)
+    x = np.tile(hanging_m().ravel(), (len(T_S), 1)) + 1e-3 * rng.normal(size=(len(T_S), 1))
+    phi = 0.01 * rng.normal(size=residual.nuisance.size)
+    residual = residual_of_pairs(residual, residual.reassociated(x, phi))
+    direction = 1e-3 * rng.normal(size=x.shape)
+
+    def at(step: float, step_phi: np.ndarray) -> np.ndarray:
+        values = residual.observable.evaluate_positions(x + step * direction, phi + step_phi)
+        return residual.residuals(values, phi + step_phi)
+
+    still, step = np.zeros_like(phi), 1e-5
+    points = residual.observable
+    by_x = (points.operator(phi) @ direction.T).T[..., None]
+    slopes: ObservableDerivatives = points.derivatives_from(
+        x, points.shape_functions(phi), np.array([0]), by_x
+    )
+    found, by = residual.linearise(points.evaluate_positions(x, phi), slopes, phi, 1 + len(phi))
+    np.testing.assert_allclose(found, at(0.0, still), atol=1e-10)
+    differences = (at(step, still) - at(-step, still)) / (2 * step)
+    np.testing.assert_allclose(by[..., 0], differences, rtol=1e-5, atol=1e-5)
+    assert np.abs(differences).max() > 0.1
+    for k in range(len(phi)):
+        unit = np.where(np.arange(len(phi)) == k, step, 0.0)
+        differences = (at(0.0, unit) - at(0.0, -unit)) / (2 * step)
+        np.testing.assert_allclose(by[..., 1 + k], differences, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("guess_pa", [1.2e5, 1.2e6])
+def test_the_modulus_of_a_hanging_bar_follows_from_one_photograph(guess_pa: float) -> None:
+    solution = solved(outlines_of(), guess_pa)
+    estimate = uncertainty_at(solution.collocation, solution.z).estimates["young_pa"]
+    low, high = estimate.statistical95 or (0.0, np.inf)
+    assert low < TRUTH["young_pa"] < high
+    assert (high - low) / 2 < 0.1 * TRUTH["young_pa"]
+    assert abs(estimate.value / TRUTH["young_pa"] - 1) < 0.05
+
+
+@pytest.mark.long
+def test_masks_that_are_too_large_all_around_are_estimated() -> None:
+    from scipy.ndimage import binary_dilation
+
+    cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool)
+    wide = binary_dilation(photograph(), cross, iterations=2)
+    solution = solved(outlines_of(wide), 3e5)
+    assert solution.nuisance("edge_px") == pytest.approx(-2.0, abs=0.3)
+    assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
+
+
+def test_tracks_and_outlines_of_one_camera_share_its_errors() -> None:
+    mask = rasterised(bar().nodes_m, filming("front", size_px=SIZE_PX))
+    view = filming("front", size_px=SIZE_PX)
+    film = cs.Outlines("masks", view, [0.1, 0.2, 0.3], [mask] * 3, same_camera_as="front")
+    one = cs.Problem([swung([tracks_of("front")])], unknown_young()).collocation()
+    both = cs.Problem([swung([tracks_of("front"), film])], unknown_young()).collocation()
+    sizes = [each.transcriptions[0].nuisance.size for each in (one, both)]
+    assert sizes[1] - sizes[0] == 1  # the edge
+
+
+def test_own_masks_are_those_of_another_program() -> None:
+    mask = mask_of(outlines_of(), hanging(), hanging_m(), 0.0)
+    assert np.sum(mask != photograph()) < 0.005 * photograph().sum()
+
+
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (np.zeros(SIZE_PX[::-1], dtype=bool), "mask 1 of the outlines 'front' is empty"),
+        (np.ones(SIZE_PX[::-1], dtype=bool), "contains the whole image"),
+        (
+            np.zeros((10, 20), dtype=bool),
+            "has 20 x 10 pixels, but the calibration is for 640 x 480",
+        ),
+        (~photograph(), "seems to be inverted"),
+        (np.zeros((2, 3, 4)), "expected .rows, columns. of bool"),
+    ],
+)
+def test_impossible_masks_are_refused(mask: np.ndarray, message: str) -> None:
+    with pytest.raises(cs.InputError, match=message):
+        outlines_of(mask)
+
+
+def test_a_mask_of_something_else_is_named() -> None:
+    other = np.roll(photograph(), 200, axis=0)
+    assert [h.data["common"] < 0.05 for h in hypotheses(hanging([outlines_of(other)]))] == [True]
+    assert [*hypotheses(hanging([outlines_of()]))] == []
+
+
+def test_outlines_can_be_pickled_and_shortened() -> None:
+    film = cs.Outlines("front", camera(), [0.0, 0.1], [photograph()] * 2)
+    half = pickle.loads(pickle.dumps(film)).without_later_values(0.05)
+    assert [mask is None for mask in half.all_masks] == [False, True]
+
+
+# Files ------------------------------------------------------------------------------------------
+
+
+def test_run_lengths_are_those_of_coco() -> None:
+    mask = np.zeros((3, 4), dtype=bool)
+    mask[1:, 1] = mask[0, 2] = True
+    assert encoded(mask) == {"size": [3, 4], "counts": [4, 3, 5]}
+    np.testing.assert_array_equal(decoded(encoded(mask)), mask)
+    np.testing.assert_array_equal(decoded(encoded(photograph())), photograph())
+    # The text of pycocotools for the counts [4, 3, 5], and for [100, 7, 3] (of 10 x 11 pixels).
+    np.testing.assert_array_equal(decoded({"size": [3, 4], "counts": "435"}), mask)
+    long = decoded({"size": [10, 11], "counts": "T373"}).T.ravel()
+    assert np.flatnonzero(long).tolist() == [*range(100, 107)]
+
+
+PROBLEM = """
+[object]
+mesh = "bar.vtu"
+density_kg_m3 = 1070.0
+[parameters]
+young_pa = { guess = 8e5 }
+poisson = 0.45
+gamma_r_s = 1e-3
+gamma_m_1_s = 0.1
+[[experiment]]
+name = "hung"
+kind = "static"
+[experiment.grasp]
+nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
+[[experiment.outlines]]
+name = "front"
+file = "FILE"
+[experiment.outlines.camera]
+matrix = MATRIX
+distortion = DISTORTION
+size_px = [640, 480]
+pose = POSE
+"""
+
+
+def folder_with(folder: Path, file: str) -> Path:
+    text = PROBLEM.replace("FILE", file).replace("POSE", str(camera().pose.tolist()))
+    text = text.replace("MATRIX", str(np.asarray(camera().matrix).tolist()))
+    text = text.replace("DISTORTION", str(camera().distortion.tolist()))
+    bar().mesh.write(folder / "bar.vtu")
+    (folder / "problem.toml").write_text(text)
+    return folder / "problem.toml"
+
+
+def test_masks_of_a_problem_file_are_read_in_all_formats(tmp_path: Path) -> None:
+    image = Image.fromarray(np.where(photograph(), 255, 0).astype(np.uint8))
+    image.save(tmp_path / "front.png")
+    (tmp_path / "front.json").write_text(json.dumps([{"segmentation": encoded(photograph())}]))
+    (tmp_path / "front").mkdir()
+    image.save(tmp_path / "front" / "0001.png")
+    for file in ("front.png", "front.json", "front"):
+        problem = cs.Problem.read(folder_with(tmp_path, file))
+        (film,) = problem.experiments[0].readings
+        assert isinstance(film, cs.Outlines)
+        np.testing.assert_array_equal(film.all_masks[0], photograph())
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "cannot be read"),
+        ('{"size": [2, 2], "counts": [1, 2]}', "the counts have 3 pixels for 2 x 2"),
+        ('{"mask": 1}', "found no run lengths"),
+        ("[]", "0 masks|no mask|empty"),
+    ],
+)
+def test_files_that_are_no_masks_are_refused(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "front.json").write_text(content)
+    with pytest.raises(cs.InputError, match=message):
+        cs.Problem.read(folder_with(tmp_path, "front.json"))
+
+
+def test_a_photograph_is_no_mask(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    Image.fromarray(rng.integers(0, 255, (48, 64), dtype=np.uint8)).save(tmp_path / "front.png")
+    with pytest.raises(cs.InputError, match="found a photograph"):
+        read_masks(tmp_path / "front.png")
+
+
+@pytest.mark.long
+def test_a_simulation_writes_masks_that_are_identified(tmp_path: Path) -> None:
+    file = folder_with(tmp_path, "hung_reading_front.json")
+    simulated = run_command("simulate", str(file), "--out", str(tmp_path), "--set", "young_pa=4e5")
+    assert simulated.code == 0, simulated.err
+    assert (tmp_path / "hung_reading_front.json").exists()
+    run = cs.run(cs.Problem.read(file))
+    low, high = run.interval("young_pa")
+    assert low < 4e5 < high
+    assert any("points of the outline in 1 masks of 'front'" in each for each in run.result.notes)
