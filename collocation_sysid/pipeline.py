@@ -15,10 +15,10 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from .common.array_types import Array
-from .common.checked_calls import checked
 from .common.display import plain_text
 from .common.step_counting import StepUnit, counted_phase
 from .common.time_limit import TimeLimitReached, time_limit
+from .common.validated_classes import validated
 from .errors import InputError, SimulationError
 from .features.specimens.notes import one_kind_notes
 from .features.specimens.offsets import stress_offset_notes
@@ -157,7 +157,7 @@ class Run(SolvedProblem):
         return write_run(self, folder, frames=frames, pictures=pictures)
 
 
-@checked
+@validated
 def run(
     problem: Problem | str | Path,
     method: str | Method | None = None,

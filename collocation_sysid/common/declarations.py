@@ -12,15 +12,15 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
+from functools import wraps
 from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_origin
 
 import numpy as np
 from pydantic import PlainValidator, ValidatorFunctionWrapHandler, WrapValidator
 
 from ..errors import InputError
-from .checked_calls import form_of, refused
-from .validated_classes import validate_arguments
-from .validated_types import Finite, faulty_entry
+from .validated_classes import form_of, refused, validate_arguments
+from .validated_types import Finite
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -111,33 +111,39 @@ def declaration(kind: type[T]) -> type[T]:
         On construction of an instance, if a value does not have the form of its field.
     """
     made: Any = dataclass(frozen=True, eq=False)(kind)
-    # The fields of a base have their accepted type already; the signature shows the stated one.
-    made.__init__.__annotations__ |= {
-        name: stated
-        for base in reversed(made.__mro__)
-        for name, stated in inspect.get_annotations(base).items()
-        if name in made.__init__.__annotations__
-    }
-    names = vars(sys.modules[kind.__module__])
-    for each in fields(made):
-        if isinstance(each.type, str):  # a field of a base class has its accepted type already
-            each.type = _accepted_type(each, names)
-    validate_arguments(made, _refusal)
-    return made
+    assign = made.__init__
+
+    @wraps(assign)
+    def construct(self: Any, *arguments: Any, **by_name: Any) -> None:
+        try:
+            assign(self, *arguments, **by_name)
+        except InputError as error:
+            raise error.located(where=getattr(self, "description", None)) from error.__cause__
+
+    made.__init__ = construct
+    return validate_arguments(made, lambda: _forms(made), _refusal)
 
 
-def _accepted_type(field: Field[Any], names: Mapping[str, Any]) -> Any:
-    """Return the annotation from which pydantic makes the validator of a field, see `key`.
+def _forms(kind: type) -> dict[str, Any]:
+    """Return the forms of all fields of a declaration, whose annotations are texts in the modules of
+    the classes that state them.
+    """
+    owners = {n: base for base in reversed(kind.__mro__) for n in inspect.get_annotations(base)}
+    modules = {name: vars(sys.modules[owner.__module__]) for name, owner in owners.items()}
+    return {each.name: _form(each, modules[each.name]) for each in fields(kind)}
+
+
+def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
+    """Return the form of a field, see `key`; None if all values are accepted.
 
     The default value is accepted, although a problem file may not state it, and so is None for a
     field whose annotation or default is None. A field without form and converter has the form of its
-    annotation, see `checked_calls.form_of`, in which `names` of the module may occur; numbers are
-    then finite, unless the default is not. The converter ``tuple[X, ...]`` stands for that form of
-    its annotation; type checkers then accept all iterables.
+    annotation, see `validated_classes.form_of`, in which `names` of the module may occur; numbers
+    are then finite, unless the default is not. The converter ``tuple[X, ...]`` stands for that form
+    of its annotation; type checkers then accept all iterables.
     """
     is_optional = field.default is None or str(field.type).endswith("| None")
-    converter = field.metadata.get("converter")
-    if converter is not None and get_origin(converter) is not tuple:
+    if (converter := _converter(field)) is not None:
         return Annotated[
             Any,
             PlainValidator(
@@ -151,7 +157,7 @@ def _accepted_type(field: Field[Any], names: Mapping[str, Any]) -> Any:
         if is_number and np.isfinite(cast(Any, field.default) or 0.0):
             form = Finite
     if form is None:
-        return Any
+        return None
 
     def unless_default(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
         """Return a possible None and the default value unchanged, other values validated."""
@@ -163,30 +169,28 @@ def _accepted_type(field: Field[Any], names: Mapping[str, Any]) -> Any:
     return Annotated[form, WrapValidator(unless_default)]
 
 
-def _refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
-    """Return the error of a converter or of ``__post_init__``; or an `InputError` that names the
-    object and the invalid field. See `validated_classes.Refusal` for the arguments.
-    """
-    field = fault["loc"] and type(instance).__dataclass_fields__[fault["loc"][0]]
-    converter = field and field.metadata.get("converter")
-    if not field or (converter is not None and get_origin(converter) is not tuple):
-        error = fault["ctx"]["error"]
+def _converter(field: Field[Any]) -> Callable[[Any], Any] | None:
+    """Return the function that converts the values of a field."""
+    converter = field.metadata.get("converter")
+    return None if get_origin(converter) is tuple else converter
+
+
+def _refusal(
+    arguments: Mapping[str, Any], name: str, part: str, found: Any, faults: Any
+) -> Exception:
+    """Return the error of a converter, or one that names the object and the invalid field."""
+    instance = arguments["self"]
+    vars(instance).update({n: value for n, value in arguments.items() if n != "self"})
+    if _converter(type(instance).__dataclass_fields__[name]):
+        error = faults[0]["ctx"]["error"]
     else:
-        error = _form_refusal(instance, fault)
+        called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
+        word = getattr(instance, "description_name", called)
+        whose = f"the {word} {instance.name!r}" if hasattr(instance, "name") else f"a {word}"
+        of = "" if hasattr(instance, "description") else f" of {whose}"
+        error = refused(f"{name}{part}{of} is", found, faults)
     where = getattr(instance, "description", None)
-    if where is None or not isinstance(error, InputError):
-        return error
-    return error.located(where=where).with_traceback(error.__traceback__)
-
-
-def _form_refusal(instance: Any, fault: Mapping[str, Any]) -> InputError:
-    """Return the error for a value that does not have the form of its field."""
-    called = re.sub("(?<!^)(?=[A-Z])", " ", type(instance).__name__).lower()
-    word = getattr(instance, "description_name", called)
-    what, value = faulty_entry(instance, fault)
-    whose = f"the {word} {instance.name!r}" if hasattr(instance, "name") else f"a {word}"
-    of = what if hasattr(instance, "description") else f"{what} of {whose}"
-    return refused(of, value, [fault])
+    return error.located(where=where) if where and isinstance(error, InputError) else error
 
 
 def keys_of(kind: type) -> Iterator[tuple[str, Key]]:

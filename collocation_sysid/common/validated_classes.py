@@ -1,152 +1,264 @@
-"""Declaration of classes whose values are validated: `validated`.
+"""Validation of the arguments of public functions and of constructors: `validated`.
 
-A validated class is a frozen dataclass with one annotation for each field, from which pydantic
-makes the validator of the class, the JSON schema, and the validators of classes that contain it. A
-value is validated once, where the instance is made: in Python, or from the table of a file.
+Each argument is validated by itself, in the order of the signature, against a form: a type for
+pydantic. `form_of` makes the form of a plain annotation; the fields of a `declaration` have forms of
+their own.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
-from functools import cache, wraps
+import sys
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import cache, reduce, wraps
+from operator import or_
 from types import MappingProxyType
-from typing import Any, TypeVar, dataclass_transform, overload
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
-from pydantic_core import ArgsKwargs
+import numpy as np
+from pydantic import BeforeValidator, ConfigDict, InstanceOf, Strict, TypeAdapter, ValidationError
 
 from ..errors import InputError
 from .field_descriptions import attributes
-from .validated_types import expectation, faulty_entry
+from .validated_types import Flag, Number, StrictInteger, expectation
 
-T = TypeVar("T")
-
-# Function that returns the error for invalid arguments of a constructor: of the instance with these
-# arguments, and of the first entry of pydantic's `ValidationError.errors()`. Its location begins
-# with the name of a field; it is empty for an error of `__post_init__`, which the entry contains.
-Refusal = Callable[[Any, Mapping[str, Any]], Exception]
+C = TypeVar("C", bound=Callable[..., Any])
+# Error about an invalid value: from all arguments, the name of the invalid one, the place in it
+# (".key" of a table, "[index]" of a list, or ""), the value there, and the faults, which are entries
+# of pydantic's `ValidationError.errors()`, one for each form that would be accepted.
+Refusal = Callable[[Mapping[str, Any], str, str, Any, Sequence[Mapping[str, Any]]], Exception]
 _CONFIGURATION = ConfigDict(extra="forbid", arbitrary_types_allowed=True, validate_default=True)
+_PLAIN = {float: Number, int: StrictInteger, bool: Flag, str: Annotated[str, Strict()]}
 
 
 @overload
-def validated(kind: type[T], /) -> type[T]: ...
+def validated(called: C, /) -> C: ...
 @overload
-def validated(*, kw_only: bool = False) -> Callable[[type[T]], type[T]]: ...
+def validated(*, kw_only: bool = False) -> Callable[[C], C]: ...
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
-def validated(
-    kind: type[T] | None = None, /, *, kw_only: bool = False
-) -> type[T] | Callable[[type[T]], type[T]]:
-    """Return the class as a frozen dataclass with validated fields, or without a class the
-    decorator that does so.
+def validated(called: Any = None, /, *, kw_only: bool = False) -> Any:
+    """Return a function or class whose arguments are validated against their annotations; without
+    arguments other than `kw_only`, the decorator that does so.
 
-    On construction, in Python or from a table of a file, every value is validated against the
-    annotation of its field, and replaced by the validated value. Then the class's own
-    ``__post_init__`` is called, which raises an `InputError` for values that exclude each other.
-    Unknown names are refused. The section "Attributes" of the docstring describes the fields in the
-    JSON schema.
+    A class without constructor becomes a frozen dataclass of options: values, also the defaults, are
+    replaced by the validated ones, the section "Attributes" of the docstring describes the fields in
+    the JSON schema, tables of a file can be validated as the class, and errors are located at the
+    name of the field. A function, or a class that has a constructor, accepts its defaults as they
+    are, and values whose annotation has no form (see `form_of`), such as arrays.
 
     Parameters
     ----------
-    kind : type, optional
-        Class with annotated fields.
+    called : callable
+        Function, dataclass, or class with annotated fields.
     kw_only : bool
-        Whether all fields are keyword arguments.
+        Whether all fields of options are keyword arguments.
 
     Raises
     ------
     InputError
-        On construction in Python, if a value does not have the type of its field; its location is
-        the name of the field.
+        In a call, for the first argument that does not have its form.
     """
+    if called is None:
+        return lambda kind: _options(kind, kw_only)
+    if isinstance(called, type) and "__init__" not in vars(called):
+        return _options(called, kw_only)
 
-    def declared(kind: type[T]) -> type[T]:
-        """Return the class as a frozen dataclass with validated fields."""
-        made: Any = dataclass(frozen=True, kw_only=kw_only)(kind)
-        _describe_fields(made)
-        validate_arguments(made, _key_refusal)
-        return made
+    def forms() -> dict[str, Any]:
+        names = vars(sys.modules[called.__module__])
+        function = called.__init__ if isinstance(called, type) else called
+        stated = inspect.get_annotations(inspect.unwrap(function))
+        return {name: form_of(annotation, names) for name, annotation in stated.items()}
 
-    return declared if kind is None else declared(kind)
+    def refusal(arguments: Any, name: str, part: str, found: Any, faults: Any) -> InputError:
+        own = arguments.get("name")
+        who = f"{title} {own!r}" if own and isinstance(own, str) else title
+        return refused(f"{who}: {name}{part} is", found, faults)
+
+    title = _title(called)
+    return validate_arguments(called, forms, refusal, accepts_defaults=True)
 
 
-def _describe_fields(kind: Any) -> None:
-    """Add the descriptions of the fields of a dataclass to their metadata, in place, from which
-    pydantic takes them.
-    """
-    descriptions = attributes(kind)
-    for each in fields(kind):
-        if each.name in descriptions:
+def _options(kind: Any, kw_only: bool) -> Any:
+    made: Any = dataclass(frozen=True, kw_only=kw_only)(kind)
+    made.__pydantic_config__ = _CONFIGURATION
+    descriptions = attributes(made)
+    for each in fields(made):
+        if each.name in descriptions:  # pydantic takes it from the metadata
             _, text = descriptions[each.name]
             each.metadata = MappingProxyType({**each.metadata, "description": text})
 
+    def refusal(_: Any, name: str, part: str, found: Any, faults: Any) -> InputError:
+        where = name + part.partition("[")[0]
+        if faults[0]["type"] == "value_error":
+            return InputError(str(faults[0]["ctx"]["error"]), where=where)
+        return InputError(f"found {found!r}; {expectation(faults, found)}", where=where)
 
-def validate_arguments(kind: Any, refusal: Refusal) -> None:
-    """Replace the constructor of a dataclass, in place, by one that validates the arguments.
+    return validate_arguments(made, lambda: get_type_hints(made, include_extras=True), refusal)
 
-    Each argument is validated against the `type` of its field, then ``__post_init__`` is called.
+
+def validate_arguments(
+    called: Any, forms: Callable[[], Mapping[str, Any]], refusal: Refusal, accepts_defaults=False
+) -> Any:
+    """Return a function, or a dataclass with a constructor, that validates its arguments.
 
     Parameters
     ----------
-    kind : type
-        Dataclass.
-    refusal : callable
-        Function that returns the error for an invalid argument or an error of ``__post_init__``,
-        see `Refusal`.
+    called : callable
+        Function or dataclass; the constructor of a dataclass is replaced.
+    forms : callable
+        Function that returns the forms of the arguments by name in the first call; arguments without
+        a form, or with None, are not validated.
+    refusal : Refusal
+        Error about an invalid argument.
+    accepts_defaults : bool
+        Whether values that are the default of their argument are passed as they are.
     """
-    assign = kind.__init__
+    is_class = isinstance(called, type)
+    function: Any = called.__init__ if is_class else called
+    signature = inspect.signature(function)
+    stated_fields = fields(called) if is_dataclass(called) else ()
+    made = {each.name for each in stated_fields if each.default_factory is not MISSING}
 
-    @wraps(assign)
-    def construct(self: Any, *arguments: Any, **by_name: Any) -> None:
-        """Validate the arguments, assign them, and call ``__post_init__``."""
+    @cache
+    def validators() -> list[tuple[str, Any, Any]]:
+        """Return name, default and validator of each argument that has a form."""
+        stated = {n: f for n, f in forms().items() if n in signature.parameters and f is not None}
+        return [(n, signature.parameters[n].default, _validator(f)) for n, f in stated.items()]
+
+    @wraps(function)
+    def call(*arguments: Any, **by_name: Any) -> Any:
         try:
-            _validator(kind).validate_python(ArgsKwargs(arguments, by_name), self_instance=self)
-            return
-        except ValidationError as error:
-            fault = error.errors(include_url=False)[0]
-        # Outside of the handler, so that the error is shown alone.
-        bound = _bind_arguments(kind, arguments, by_name)
-        vars(self).update(bound | vars(self))
-        if fault["loc"] and isinstance(fault["loc"][0], int):
-            names = [*bound][fault["loc"][0]], *fault["loc"][1:]
-            fault["loc"] = names
-        raise refusal(self, fault)
+            bound = signature.bind(*arguments, **by_name)
+        except TypeError as error:
+            raise TypeError(f"{_title(called)}: {error}{_other_constructors(called)}") from None
+        stated = bound.arguments
+        for name, default, validator in validators():
+            value = stated.get(name, default)
+            if (accepts_defaults and value is default) or (name in made and name not in stated):
+                continue
+            try:
+                stated[name] = validator.validate_python(value)
+                continue
+            except ValidationError as error:
+                faults = error.errors(include_url=False)
+            # Outside of the handler, so that the error is shown alone.
+            raise refusal(stated, name, *_part_at_fault(value, faults[0]), faults)
+        return function(*bound.args, **bound.kwargs)
 
-    kind.__pydantic_config__ = _CONFIGURATION
-    kind.__init__ = construct
+    if is_class:
+        called.__init__ = call
+    return called if is_class else call
 
 
-def _bind_arguments(
-    kind: Any, arguments: tuple[Any, ...], by_name: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return the arguments of the constructor of a class by the names of its fields."""
-    try:
-        return inspect.signature(kind).bind(*arguments, **by_name).arguments
-    except TypeError as error:
-        message = str(error)
+def _title(called: Any) -> str:
+    return called.__qualname__.removesuffix(".__init__")
+
+
+def _other_constructors(called: Any) -> str:
     others = [
-        f"{kind.__name__}.{name}"
-        for name in dir(kind)
-        if name.startswith("from_") and isinstance(inspect.getattr_static(kind, name), classmethod)
+        f"{called.__name__}.{name}"
+        for name in dir(called)
+        if name.startswith("from_")
+        and isinstance(inspect.getattr_static(called, name), classmethod)
     ]
-    hint = f"; other constructors: {', '.join(others)}" if others else ""
-    raise TypeError(f"{kind.__name__}: {message}{hint}")
+    return f"; other constructors: {', '.join(others)}" if others else ""
+
+
+def form_of(annotation: Any, names: Mapping[str, Any]) -> Any:
+    """Return the form, for pydantic, of values with an annotation; None if all values are accepted.
+
+    Numbers are finite or infinite, classes accept their instances, and sequences a single object
+    in place of a list of one. Protocols, arrays and names that are known only to type checkers have
+    no form, nor has a union that contains one of these.
+
+    Parameters
+    ----------
+    annotation : str or type
+        If it is a text, it is evaluated.
+    names : mapping
+        Names that may occur in the text.
+    """
+    if isinstance(annotation, str):
+        try:
+            annotation = eval(annotation, dict(names))
+        except (NameError, TypeError):
+            return None
+    if isinstance(annotation, TypeVar):
+        return form_of(annotation.__bound__, names)
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if annotation is None or annotation is types.NoneType or origin in (Annotated, Literal):
+        return annotation
+    if origin in (Union, types.UnionType):
+        forms = [form_of(part, names) for part in parts if part is not types.NoneType]
+        if any(form is None for form in forms):
+            return None
+        return reduce(or_, forms + [None] * (len(forms) < len(parts)))
+    if origin is Callable:
+        return annotation
+    if origin in (tuple, Sequence):
+        entries = [part if part is ... else form_of(part, names) for part in parts]
+        if any(entry is None for entry in entries):
+            return None
+        entries += [...] * (origin is Sequence)
+        return Annotated[tuple[*entries], BeforeValidator(_listed)]
+    if not isinstance(annotation, type) or origin or getattr(annotation, "_is_protocol", False):
+        return None
+    return _PLAIN.get(annotation, InstanceOf[annotation])
+
+
+def _listed(value: Any) -> Any:
+    """Return a single object as a list of one, and other containers than tables as a tuple."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        return (value,)
+    is_list = not isinstance(value, Mapping | bytes) and np.ndim(cast(Any, value)) == 1
+    return tuple(value) if is_list else value
+
+
+def validate_as(annotation: Any, value: Any, name: str) -> Any:
+    """Return a value as validated against an annotation that has a form, see `form_of`; raise an
+    `InputError` about `name` if it is refused.
+    """
+    try:
+        return _validator(form_of(annotation, {})).validate_python(value)
+    except ValidationError as error:
+        faults = error.errors(include_url=False)
+    part, found = _part_at_fault(value, faults[0])
+    raise refused(f"{name}{part} is", found, faults)
 
 
 @cache
-def _validator(kind: type) -> Any:
-    """Return pydantic's validator of a class, cached."""
-    return TypeAdapter(kind).validator
+def _validator(form: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(form)
 
 
-def _key_refusal(instance: Any, fault: Mapping[str, Any]) -> Exception:
-    """Return the error of ``__post_init__``; or an `InputError` whose location is the name of the
-    invalid field, and of the entry if the value is a table. See `Refusal` for the arguments.
-    """
-    if not fault["loc"]:
-        return fault["ctx"]["error"]
-    where, value = faulty_entry(instance, fault)
-    if fault["type"] == "value_error":
-        return InputError(str(fault["ctx"]["error"]), None, where=where)
-    return InputError(f"found {value!r}; {expectation([fault], value)}", None, where=where)
+def _part_at_fault(value: Any, fault: Mapping[str, Any]) -> tuple[str, Any]:
+    """Return the place in a value that is at fault, see `Refusal`, and what was found there."""
+    part = ""
+    for each in fault["loc"]:
+        if isinstance(each, int) and np.ndim(cast(Any, value)):
+            part += f"[{each}]"
+        elif isinstance(value, Mapping) and each in value:
+            part += f".{each}"
+            value = value[each]
+    return part, fault["input"]
+
+
+def refused(what: str, found: Any, faults: Sequence[Mapping[str, Any]]) -> InputError:
+    """Return the error about a value: "what found; expected …", see `Refusal` for the arguments."""
+    shown = f"{found:g}" if isinstance(found, float) else repr(found)
+    shown = shown if len(shown) < 80 else f"a {type(found).__name__}"
+    return InputError(f"{what} {shown}; {expectation(faults, found)}")

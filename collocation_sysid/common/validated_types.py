@@ -109,24 +109,3 @@ def expectation(faults: Sequence[Mapping[str, Any]], found: Any) -> str:
     words = [word for text in literals for word in re.findall("'(.*?)'", text)]
     forms = " or ".join(dict.fromkeys(expected(fault) for fault in faults))
     return f"expected {forms}{hint_at(str(found), words)}"
-
-
-def faulty_entry(instance: Any, fault: Mapping[str, Any]) -> tuple[str, Any]:
-    """Return the name and the value of the field that is at fault, or of its entry if the value is
-    a table.
-
-    Parameters
-    ----------
-    instance : object
-        Instance with the values that were validated as attributes.
-    fault : mapping
-        One entry of pydantic's `ValidationError.errors()`, whose location begins with the name of a
-        field; names of entries follow it after dots.
-    """
-    name, *entries = fault["loc"]
-    value = getattr(instance, name)
-    for part in entries:
-        if isinstance(value, Mapping) and part in value:
-            name = f"{name}.{part}"
-            value = value[part]
-    return name, value

@@ -28,7 +28,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
-from ..common.checked_calls import checked
+from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .air import placed_unit_drag
@@ -208,7 +208,7 @@ class Body(Discretisation):
         cannot evaluate, or `UnderGravity` with a memory or a field.
     """
 
-    @checked
+    @validated
     def __init__(
         self,
         mesh: TetMesh,

@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..common.array_types import Array, Index
-from ..common.checked_calls import checked
 from ..common.files import reason
+from ..common.validated_classes import validated
 from ..common.validated_types import Count, Text
 from ..errors import InputError, hint_at
 from .force_points import ForcePoints
@@ -74,7 +74,7 @@ CONTEXT_SIZE = CONTEXT_OFFSETS[-1]
 TRIANGLE_M = (0.1, 0.2, 0.3, 0.2, 0.2, 0.3, 0.1, 0.3, 0.3)
 
 
-@checked
+@validated
 @dataclass(frozen=True, eq=False)
 class NodeForce:
     """Force on every node of a body, on every face of its surface, or on some of them.

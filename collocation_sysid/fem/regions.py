@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
-from ..common.checked_calls import checked
+from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Text
 from ..errors import InputError, hint_at
 from .laws.constants import CONTRAST, DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, TAU, Constant
@@ -40,7 +40,7 @@ from .spatial_field import TWO_PHASE, Field, FieldModes
 from .two_phase import TwoPhaseModes
 
 
-@checked
+@validated
 @dataclass(frozen=True, eq=False)
 class Region:
     """Part of a body with properties that differ from the rest.

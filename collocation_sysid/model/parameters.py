@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array
-from ..common.checked_calls import checked, validate_as
+from ..common.validated_classes import validate_as, validated
 from ..common.validated_types import Boundless, Finite, Positive, Text
 from ..errors import InputError, hint_at
 from ..fem.body import Body
@@ -44,7 +44,7 @@ from ..fem.laws.moduli import ENGINEERING, engineering_constants
 from .generated_functions import GeneratedFunction
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Unknown:
     """Parameter to estimate, as stated by the user; omitted values follow from its constant.
@@ -78,7 +78,7 @@ class Unknown:
 PARAMETER_KEYS = (*(field.name for field in fields(Unknown)), "fixed", "tied_to", "ratio")
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Tied:
     """Parameter that is a fixed multiple of another parameter.
@@ -95,7 +95,7 @@ class Tied:
     ratio: Finite = 1.0
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Parameter:
     """Complete definition of a scalar parameter of a problem, or of one component of a vector.
@@ -429,7 +429,7 @@ class FieldCoefficients:
     components: tuple[Parameter, ...]
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Parameters:
     """All parameters of a problem.

@@ -40,7 +40,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..common.array_types import Array, Index
-from ..common.checked_calls import checked
+from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Substeps
 from ..errors import InputError
 from ..model.parameters import Parameters
@@ -112,7 +112,7 @@ class Violation:
         )
 
 
-@checked
+@validated
 @dataclass(frozen=True, eq=False)
 class Collocation:
     """Values and derivatives of the collocation program of one or several experiments.

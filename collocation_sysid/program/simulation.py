@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array
-from ..common.checked_calls import checked
+from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, SimulationError
 from ..fem.laws.constants import with_undamped
@@ -160,7 +160,7 @@ def require_steps(experiment: Experiment, step_s: float) -> None:
         )
 
 
-@checked
+@validated
 def simulate(
     experiment: Experiment,
     parameters: Parameters | Mapping[str, float] | Sequence[float] | Array,
@@ -442,7 +442,7 @@ def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experi
     return _with_values(experiment, CustomSensor, values)
 
 
-@checked
+@validated
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
     """Return the experiment with other marker tracks (T, M, 3) [m] at its samples; raise InputError
     for another shape.

@@ -16,8 +16,8 @@ from pydantic import Field
 
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array, read_only_floats, unconverted
-from ..common.checked_calls import checked
 from ..common.declarations import declaration, key
+from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from ..fem.meshes.selection import Selection
@@ -379,7 +379,7 @@ def points_from_image(image_m: Array, camera: Camera) -> Array:
 _ImageSize = Annotated[AtLeastOne, Field(le=20_000)]
 
 
-@checked
+@validated
 def depth_image(camera: Camera, shape: tuple[_ImageSize, _ImageSize], triangles_m: Array) -> Array:
     """Render a depth image [m] of opaque triangles, both sides of which are visible.
 

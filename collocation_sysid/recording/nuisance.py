@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from ..common.checked_calls import validate_as
 from ..common.field_descriptions import FieldOfRow, sentence, with_fields
+from ..common.validated_classes import validate_as
 from ..common.validated_types import Finite
 from ..errors import InputError, listed
 from .deviation import WIDENING, Deviation, RecordingQuantities

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
 from ..common.checked_arrays import point_text, read_only_floats, read_only_nodes
-from ..common.checked_calls import checked
+from ..common.validated_classes import validated
 from ..errors import InputError
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def require_body(body: Body) -> Body:
     return body
 
 
-@checked
+@validated
 def place_markers(
     points_m: ArrayLike,
     node_positions_m: ArrayLike,

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from ..common.checked_calls import checked
 from ..common.step_counting import search_activity
+from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne
 from ..errors import InputError
 from ..fem.meshes.refinement import refine_body
@@ -62,7 +62,7 @@ def finer_mesh(problem: Problem) -> Problem:
 REFINEMENTS = {"step": finer_step, "mesh": finer_mesh}
 
 
-@checked
+@validated
 def refine(
     run: A,
     levels: AtLeastOne = 2,

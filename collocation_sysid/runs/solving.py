@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from ..common.array_types import Array
-from ..common.checked_calls import checked
 from ..common.step_counting import search_activity
 from ..common.time_limit import TimeLimitReached, time_limit
+from ..common.validated_classes import validated
 from ..errors import InputError
 from ..features.measurements import lost_samples
 from ..features.registry import FEATURES
@@ -80,7 +80,7 @@ START_S = 40.0
 MOST_REREADINGS = 5
 
 
-@checked
+@validated
 def solve(
     problem: Problem | str | Path,
     method: str | Method | None = None,

@@ -50,6 +50,7 @@ def test_wrong_values_are_refused_or_clear():
         (lambda: cs.Ball((0, 0, 0), 1j), "Ball: radius_m is 1j; expected a number"),  # pyright: ignore[reportArgumentType]
         (lambda: cs.Parameter("mu_pa", True), "Parameter 'mu_pa': guess is True"),
         (lambda: cs.Experiment(cube(), T_S, 5), "grasps is 5; expected a Grasp"),  # pyright: ignore[reportArgumentType]
+        (lambda: cs.Experiment(cube(), T_S, [5]), "grasps[0] is 5; expected a Grasp"),  # pyright: ignore[reportArgumentType]
         (lambda: cs.Experiment(5, T_S, []), "the body is a int; expected a Body"),  # pyright: ignore[reportArgumentType]
         (lambda: cs.Markers(T_S, TRACKS_M * 1j, 1e-3), "complex numbers"),
         (lambda: cs.Markers(T_S, TRACKS_M, 1e-300), "at least 1e-12 m"),

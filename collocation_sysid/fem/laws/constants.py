@@ -14,7 +14,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from ...common.checked_calls import checked
+from ...common.validated_classes import validated
 from ...common.validated_types import Finite, Positive, Text
 from ...errors import InputError
 
@@ -34,7 +34,7 @@ _UNITS = {
 }
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Constant:
     """Definition of one constant of the model.

@@ -31,8 +31,8 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
-from ...common.checked_calls import checked
 from ...common.files import reason
+from ...common.validated_classes import validated
 from ...common.validated_types import Text
 from ...errors import InputError, hint_at
 from ..chain_rule import ChainRule
@@ -48,7 +48,7 @@ Energy = Callable[..., ca.SX]
 REST_TOLERANCE = 1e-9
 
 
-@checked
+@validated
 @dataclass(frozen=True, eq=False)
 class Material:
     """Strain-energy density with its constants.
@@ -370,7 +370,7 @@ Stress = Callable[..., tuple[ca.SX, ca.SX]]
 TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
 
 
-@checked
+@validated
 @dataclass(frozen=True, eq=False)
 class DampingLaw:
     """Damping law: a potential, or a stress.
@@ -512,7 +512,7 @@ def as_damping(damping: str | DampingLaw) -> DampingLaw:
     return _look_up("damping", damping, table=DAMPINGS)
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Prony:
     """Branch of the memory: a spring of `share` times the stiffness in series with a dashpot.

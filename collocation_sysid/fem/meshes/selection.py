@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ...common.checked_calls import checked
+from ...common.validated_classes import validated
 from ...common.validated_types import Positive, Text
 from ...errors import InputError, hint_at, require_among
 from .mesh import ElementNodes, TetMesh
@@ -98,7 +98,7 @@ class Box(_PositionSelection):
         return f"the box from ({low}) to ({high}) m"
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Ball(_PositionSelection):
     """Selection of a ball, including its surface.
@@ -142,7 +142,7 @@ class Ball(_PositionSelection):
         return f"the ball of radius {self.radius_m:g} m about ({center}) m"
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Face(_PositionSelection):
     """Selection of the nodes on an end or a plane side of the body, without stating a length.
@@ -293,7 +293,7 @@ class Indices:
         return _select_faces(chosen, mesh, what="the list of indices")
 
 
-@checked
+@validated
 @dataclass(frozen=True)
 class Named:
     """Selection by a point array of the mesh, or for cells a cell array, of booleans or 0 and 1.

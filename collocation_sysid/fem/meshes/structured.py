@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ...common.checked_arrays import float_array
-from ...common.checked_calls import checked
+from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError
 from .mesh import TetMesh
@@ -183,7 +183,7 @@ def box_mesh(
     return TetMesh(points, orient_elements(points, tetrahedra)[0], is_generated=True)
 
 
-@checked
+@validated
 def cylinder_mesh(
     radius_m: Positive, height_m: Positive, rings: _Part, layers: _Part, sectors: _Part = 6
 ) -> TetMesh:
