@@ -356,3 +356,40 @@ def test_a_file_of_a_cut_specimen_equals_the_specimen_in_python(tmp_path):
     )
     found = cs.solve(cs.Problem.read(tmp_path / "problem.toml")).parameters
     assert found["fibre_pa"] == pytest.approx(FIBRE_PA, rel=1e-3)
+
+
+@pytest.mark.long
+def test_a_pressurised_half_reinforced_bar_determines_matrix_and_fibres():
+    size_m, divisions = (0.03, 0.03, 0.07), (3, 3, 7)
+    block = cs.box_mesh(size_m, divisions)
+    middle = np.abs(block.centres_m - np.array(size_m) / 2) < [0.005, 0.005, 0.025]
+    mesh = type(block)(block.points_m, block.tetrahedra[~middle.all(axis=1)])
+    inside = np.abs(mesh.points_m - np.array(size_m) / 2) < [0.006, 0.006, 0.026]
+    chamber = mesh.surface[inside.all(axis=1)[mesh.surface].all(axis=1)]
+    wall = cs.Region("wall", mesh.centres_m[:, 0] < 0.01, fibres=Fibres(direction=[0, 0, 1]))
+    body = cs.Body(mesh, density_kg_m3=1070.0, regions=[wall], rest_shape="stress_free")
+    t_s = np.arange(5.0)
+    held = cs.Grasp(np.flatnonzero(mesh.points_m[:, 2] > 0.0699), cs.PoseSequence.fixed())
+    tip_m = mesh.points_m[mesh.points_m[:, 2] < 1e-9][:4]
+    markers = cs.Markers(t_s, np.zeros((5, len(tip_m), 3)), 5e-5, places_m=tip_m)
+    bent = cs.Experiment(
+        body,
+        t_s,
+        [held],
+        markers,
+        pressures=[cs.Pressure(chamber, np.linspace(0.0, 4e4, 5), t_s)],
+        nuisance=cs.Nuisance.none(),
+        air_density_kg_m3="none",
+        kind="static",
+    )
+    truth = {"young_pa": 1e5, "poisson": 0.4, "fibre_pa": 4e5, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    exact_m = cs.simulate(bent, truth).markers_m
+    bend_m, stretch_m = np.abs(exact_m[-1] - exact_m[0]).mean(axis=0)[[0, 2]]
+    assert bend_m > 5 * stretch_m  # the wall with fibres does not become longer
+    noise_m = 5e-5 * np.random.default_rng(0).normal(size=exact_m.shape)
+    seen = cs.with_markers(bent, exact_m + noise_m)
+    unknown = {"young_pa": cs.Unknown(7e4), "fibre_pa": cs.Unknown(1e5)}
+    found = cs.solve(cs.Problem([seen], truth | unknown))
+    assert found.status.converged
+    assert found.parameters["young_pa"] == pytest.approx(1e5, rel=0.02)
+    assert found.parameters["fibre_pa"] == pytest.approx(4e5, rel=0.1)
