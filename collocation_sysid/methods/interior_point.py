@@ -264,17 +264,12 @@ class InteriorPoint(MethodOptions):
 
         The callbacks that they contain are new, and are added to `functions`.
         """
-        settings: dict[str, Any] = {
-            "ipopt.linear_solver": self.linear_solver,
-            "ipopt.tol": self.tolerance,
-            "ipopt.max_iter": self.max_iterations,
-            "ipopt.print_level": 0,
-            "ipopt.sb": "yes",
-            "ipopt.option_file_name": "",  # IPOPT reads ipopt.opt of the working folder otherwise
+        settings = nlpsol.ipopt_settings(
+            functions, self.linear_solver, self.tolerance, self.max_iterations
+        )
+        settings |= {
             "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
             "ipopt.constr_mult_init_max": 0.0,  # the warm-up needs no multipliers
-            "jac_g": functions.function("jac_g", "g", "jac_g"),
-            "grad_f": functions.function("grad_f", "f", "grad_f"),
         }
         if is_warm:
             settings |= {

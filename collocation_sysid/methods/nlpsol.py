@@ -33,6 +33,7 @@ Settings = Callable[[NlpFunctions], Mapping[str, Any]]
 GRACE_S = 2.0
 # Interval at which that is checked [s].
 LOOK_EVERY_S = 0.05
+# Settings of every solver.
 _COMMON = {
     "print_time": False,
     "error_on_fail": False,
@@ -107,8 +108,8 @@ def solve(
         start = recorder.initial_variables(start)
         functions = NlpFunctions(program, hessian, errors=errors)
         monitor = IterationMonitor(recorder, program, errors=errors)
-        options = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
-        solver = _create_solver(plugin, functions, settings=options)
+        options = {"iteration_callback": monitor, **settings(functions)}
+        solver = create_solver(plugin, functions, settings=options)
     initial_variables = convert_variables(start, collocation, target=program)
     result = _run(
         solver,
@@ -159,14 +160,39 @@ def solve(
     )
 
 
-def _create_solver(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
-    """Return CasADi's solver of a program."""
+def ipopt_settings(
+    functions: NlpFunctions, linear_solver: str, tolerance: float, max_iterations: int
+) -> dict[str, Any]:
+    """Return settings of IPOPT without output and with exact first derivatives, whose callbacks are
+    added to `functions`.
+    """
+    return {
+        "ipopt.linear_solver": linear_solver,
+        "ipopt.tol": tolerance,
+        "ipopt.max_iter": max_iterations,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.option_file_name": "",  # IPOPT reads ipopt.opt of the working folder otherwise
+        "jac_g": functions.function("jac_g", "g", "jac_g"),
+        "grad_f": functions.function("grad_f", "f", "grad_f"),
+    }
+
+
+def create_solver(plugin: str, functions: NlpFunctions, settings: Mapping[str, Any]) -> ca.Function:
+    """Return CasADi's solver of a program.
+
+    Raises
+    ------
+    InputError
+        If the solver does not know a setting.
+    """
     z = ca.MX.sym("z", functions.collocation.variable_count)
     value, rows = functions.nlp(z, ca.MX(0, 1))
     output = io.StringIO()
     try:
         with redirect_stdout(output):  # where IPOPT says which setting it refuses
-            return ca.nlpsol("solver", plugin, {"x": z, "f": value, "g": rows}, settings)
+            program = {"x": z, "f": value, "g": rows}
+            return ca.nlpsol("solver", plugin, program, {**_COMMON, **settings})
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).strip().splitlines()]
         unknown = [line for line in lines if "Unknown option" in line]

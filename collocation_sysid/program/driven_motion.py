@@ -1,7 +1,8 @@
-"""Motion of one experiment as a function of the prescribed positions of its grasped dofs.
+"""Motion of one experiment as a function of what drives it: the prescribed positions of its grasped
+dofs, and the amplitudes of its tendons and pressures.
 
-Methods that choose the motion of a grasp, instead of reading it from a recording, need the motion
-of the body and its derivatives by the prescribed positions. The parameters q are fixed.
+Methods that choose these, instead of reading them from a recording, need the motion of the body and
+its derivatives by their controls. The parameters q are fixed.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from ..common.array_types import Array, Index
 from ..errors import SimulationError
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.grasp_constraint import PrescribedDisplacements
+from ..model.inputs import Inputs
 from ..model.parameters import Parameters
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
@@ -33,7 +35,8 @@ MOST_CORRECTIONS = 4
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Prescribed positions that drive a motion, with their derivatives by controls.
+    """Prescribed positions, and amplitudes of tendons and pressures, that drive a motion, with their
+    derivatives by controls.
 
     Attributes
     ----------
@@ -41,15 +44,22 @@ class Drive:
         Prescribed positions of the grasped dofs at the grid times [m].
     by_control : (N, g, c) array
         Their derivatives by the c controls; empty, c = 0, where none are needed.
+    amplitudes : (N, a) array, optional
+        Amplitudes of the energies of all tendons, then pressures, at the evaluations of the forces;
+        those of the experiment by default.
+    amplitudes_by_control : (N, a, c) array, optional
+        Their derivatives by the controls; zero by default.
     """
 
     goals_m: Array
     by_control: Array
+    amplitudes: Array | None = None
+    amplitudes_by_control: Array | None = None
 
     @property
     def without_controls(self) -> Drive:
-        """The same positions without derivatives."""
-        return Drive(self.goals_m, self.by_control[..., :0])
+        """The same drive without derivatives."""
+        return Drive(self.goals_m, self.by_control[..., :0], self.amplitudes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +137,26 @@ class DrivenMotion:
         """Prescribed positions (N, g) of the grasped dofs as the experiment states them [m]."""
         return self._stated.prescribed.positions_m
 
+    @property
+    def _amplitude_columns(self) -> slice:
+        """Columns of the amplitudes among the inputs u: after the constants, because the experiment
+        has no deviations.
+        """
+        first = len(self.transcription.body.constants)
+        return slice(first, first + len(self.transcription.experiment.actuators))
+
+    @property
+    def stated_amplitudes(self) -> Array:
+        """Amplitudes (N, a) of tendons and pressures at the evaluations, as the experiment states
+        them.
+        """
+        return self._stated.inputs.evaluate_at(self._stated.p)[0][:, self._amplitude_columns]
+
+    @property
+    def evaluated_s(self) -> Array:
+        """Times (N,) of the evaluations of the forces [s]."""
+        return self.transcription.dynamics.evaluated_s
+
     @cached_property
     def _sweep(self) -> Sweep:
         return Sweep(self.transcription)
@@ -137,14 +167,25 @@ class DrivenMotion:
         """
         stated = self._stated
         u, _ = stated.inputs.evaluate_at(stated.p)
-        # The inputs do not depend on the controls.
-        by_control = np.broadcast_to(0.0, (*u.shape, drive.by_control.shape[2]))
+        controls = drive.by_control.shape[2]
+        by_control = np.broadcast_to(0.0, (*u.shape, controls))
+        dynamics = stated.dynamics
+        if drive.amplitudes is not None:
+            u = np.array(u)
+            u[:, self._amplitude_columns] = drive.amplitudes
+            dynamics = dynamics.with_inputs(u)
+        if drive.amplitudes_by_control is not None:
+            by_control = np.zeros(by_control.shape)
+            by_control[:, self._amplitude_columns] = drive.amplitudes_by_control
         goals = np.full((len(self.t_s), self.transcription.dof_count), np.nan)
         goals[:, self.dofs] = drive.goals_m
         return replace(
             stated,
+            # Linear in the controls: without second derivatives.
+            inputs=Inputs((), controls, len(self.t_s)),
+            nq=0,
             input_derivatives=by_control,
-            dynamics=replace(stated.dynamics, prescribed_m=goals),
+            dynamics=replace(dynamics, prescribed_m=goals),
             prescribed=PrescribedDisplacements(self.dofs, drive.goals_m, by_phi=drive.by_control),
         )
 

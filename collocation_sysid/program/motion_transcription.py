@@ -515,16 +515,18 @@ class MotionTranscription:
         Returns
         -------
         ((constraints,) array, (constraints, m) array)
-            Scaled constraints c, and ∂c/∂(q, φ) by the m parameters of `dynamic_parameters`.
+            Scaled constraints c, and ∂c/∂p by the m parameters p of the equations: those of
+            `dynamic_parameters`, or the controls of a `Drive`.
         """
         dynamics = equations.dynamics
+        count = equations.input_derivatives.shape[2]
         self.motion_rows.fill(
             values,
             forces,
             dynamics=dynamics,
             has_variable_mass=equations.mass_depends_on_parameters,
         )
-        by_p = np.zeros((self.grid_times, self.dof_count, len(self.dynamic_parameters)))
+        by_p = np.zeros((self.grid_times, self.dof_count, count))
         rows = slice(dynamics.first_row, None)
         by_p[rows] = equations.force_derivatives(rows, forces.by_theta)
         by_p = dynamics.combine(dynamics.tables.w, dynamics.zero_prescribed_forces(by_p))
@@ -535,14 +537,14 @@ class MotionTranscription:
         dynamics.zero_prescribed_forces(by_p)
         by_p[:, self.prescribed_dofs] = 0
         if equations.prescribed.depends_on_phi:
-            by_p[:, equations.prescribed.dofs, self.nq :] -= (
+            by_p[:, equations.prescribed.dofs, equations.nq :] -= (
                 equations.prescribed.by_phi / self.length_m
             )
         by_p = by_p[dynamics.first_row :, self.constrained_dofs]
         rows = self._scaled_constraints(
             x, dynamics.assemble_residual(x, forces.force), equations=equations
         )
-        return rows, by_p.reshape(self.constraint_count, len(self.dynamic_parameters))
+        return rows, by_p.reshape(self.constraint_count, count)
 
     def lagrangian_weights(
         self, multipliers: Array, reaction_weights: Array | float = 0.0
@@ -733,22 +735,7 @@ class MotionTranscription:
         """
         dynamics = equations.dynamics
         band = self.hessian
-        curvature = self._curvature(
-            x, equations, weights=weights.forces, lifted_histories=lifted_histories
-        )
-        band.fill(
-            values,
-            curvature.position_position,
-            b=curvature.position_velocity,
-            threads=self.body.threads,
-        )
-        if curvature.velocity_velocity.size:
-            rates = curvature.velocity_velocity
-            self._rate_hessian.fill(values, rates, b=rates, threads=self.body.threads)
-        skew = full_skew_values(self.experiment.sparsity, curvature.position_velocity_skew)
-        if skew.size:
-            self._skew_hessian.fill(values, skew, b=skew, threads=self.body.threads)
-        by_x, twice = equations.weighted_second_derivatives(x, curvature, row_weights=weights.rows)
+        by_x, twice = self.motion_hessian_values(x, equations, weights, values, lifted_histories)
         of_q = self.length_m * by_x[..., : self.nq]
         values[band.top_positions] = of_q.reshape(band.top_positions.shape)
         by_phi = np.diag(2 * loss_weight * self.nuisance_indices.is_first)  # the prior
@@ -765,6 +752,37 @@ class MotionTranscription:
         of_pairs = by_phi[np.triu_indices(len(by_phi))]
         further = [twice[: self.nq, self.nq :].ravel(), of_states, of_pairs]
         return twice[: self.nq, : self.nq], further
+
+    def motion_hessian_values(
+        self,
+        x: Array,
+        equations: EquationsAtParameters,
+        weights: RowWeights,
+        values: Array,
+        lifted_histories: Sequence[WeightedHistory] = (),
+    ) -> tuple[Array, Array]:
+        """Write the second derivatives by x to `values`, in the order of `hessian` without its rows
+        of q, and return those by (x, p), (N, 3n, m) [1/m], and by p, (m, m), for the parameters p of
+        the equations; arguments as of `constraint_hessian_values`.
+
+        Those through prescribed positions are not included.
+        """
+        curvature = self._curvature(
+            x, equations, weights=weights.forces, lifted_histories=lifted_histories
+        )
+        self.hessian.fill(
+            values,
+            curvature.position_position,
+            b=curvature.position_velocity,
+            threads=self.body.threads,
+        )
+        if curvature.velocity_velocity.size:
+            rates = curvature.velocity_velocity
+            self._rate_hessian.fill(values, rates, b=rates, threads=self.body.threads)
+        skew = full_skew_values(self.experiment.sparsity, curvature.position_velocity_skew)
+        if skew.size:
+            self._skew_hessian.fill(values, skew, b=skew, threads=self.body.threads)
+        return equations.weighted_second_derivatives(x, curvature, row_weights=weights.rows)
 
     def _curvature(
         self,

@@ -18,8 +18,12 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.design.hand_limits import Limits
-from collocation_sysid.extras.planning import reduced_solver
-from collocation_sysid.extras.planning.full_program import FullProgram, solve_full
+from collocation_sysid.extras.planning import durations, reduced_solver
+from collocation_sysid.extras.planning.full_program import (
+    FullProgram,
+    iteration_monitor,
+    solve_full,
+)
 from collocation_sysid.extras.planning.motion_plan import MotionPlan, plan_motion
 from collocation_sysid.extras.planning.plan_folder import command_times_s, plan_json, plan_summary
 from collocation_sysid.extras.planning.planned_body import PlannedBody
@@ -522,10 +526,13 @@ def test_derivatives_of_the_full_program_are_its_differences():
         {"point": "tip", "t_s": [0.2], "velocity_m_s": [(0.1, 0.0, 0.0)]},
     ])  # fmt: skip
     planned = PlannedProgram.from_task(PlannedBody.read(hung_bar()), wanted, NARROW, within_reach)
-    full = FullProgram(planned)
+    c = 0.05 * np.random.default_rng(0).normal(size=planned.space.size)
+    require_exact_derivatives(FullProgram(planned), c, planned.simulate(c))
+
+
+def require_exact_derivatives(full: FullProgram, c: np.ndarray, x: np.ndarray) -> None:
+    """Compare derivatives near a simulated motion with differences."""
     rng = np.random.default_rng(0)
-    c = 0.05 * rng.normal(size=planned.space.size)
-    x = planned.simulate(c)
     w = full.pack(c, x)
     motion = full.constraint_values(w)[: full.motion_count]
     assert np.abs(motion).max() < 1e-9  # a simulation satisfies the equations of motion
@@ -570,6 +577,205 @@ def test_both_solvers_find_the_same_motion(free):
     error = np.abs(full.multipliers - reduced.multipliers).max()
     # Neighbouring limits that bind together share their multipliers, which are less accurate.
     assert error < 0.05 * reduced.multipliers.max()
+
+
+# Tensions and pressures ---------------------------------------------------------------------------
+
+
+@cache
+def actuated_bar() -> cs.Problem:
+    """The bar with a cable along one side, and a pressure on its free surface that lags."""
+    (hung,) = hung_bar().experiments
+    body = hung.body
+    surface = body.mesh.surface
+    outside = surface[(body.nodes_m[surface][:, :, 2] < 0.119).any(axis=1)]
+    z = np.linspace(0.12, 0.0, 5)
+    cable = cs.Tendon(np.column_stack([0 * z, 0 * z + 0.01, z]), 0.0, name="cable", loss_n=0.05)
+    chamber = {"name": "chamber", "lag_s": 0.03, "factor": 1.1, "loss_pa": 50.0}
+    pressure = cs.Pressure(outside, [-200.0, -200.0], [0.0, 0.2], **chamber)
+    changed = replace(hung, tendons=[cable], pressures=[pressure])
+    return cs.Problem([changed], {n: cs.Unknown(v) for n, v in TRUTH.items()}, substeps=1)
+
+
+SHORT = {"duration_s": 0.3, "sample_s": 0.03}
+TIP = {"tip": np.array([0.01, 0.01, 0.0])}
+CABLE = {"tendon": [{"name": "cable", "tension_n": (0.0, 1.0), "rate_n_s": 20.0}]}
+CHAMBER = {"pressure": [{"name": "chamber", "pressure_pa": (-4e3, 1e3), "rate_pa_s": 4e4}]}
+
+
+def actuated(**changes) -> PlannedProgram:
+    return PlannedProgram.from_task(PlannedBody.read(actuated_bar()), task(**changes), LIMITS)
+
+
+def test_derivatives_by_tensions_and_pressures_are_differences():
+    planned = actuated(**SHORT, **CABLE, **CHAMBER, hand={"intervals": 7, "free": ["x", "ry"]},
+                       reference=[{"point": "tip", "hold": True}])  # fmt: skip
+    rng = np.random.default_rng(0)
+    c = 0.05 * np.abs(rng.normal(size=planned.space.size))
+    x = planned.simulate(c)
+    way, h = rng.normal(size=len(c)), 1e-4
+    found = planned.driven.respond(planned.drive(c), x) @ way
+    differences = (planned.simulate(c + h * way) - planned.simulate(c - h * way)) / (2 * h)
+    assert np.abs(found - differences).max() < 1e-5 * np.abs(differences).max()
+    require_exact_derivatives(FullProgram(planned), c, x)
+
+
+def test_a_tendon_alone_moves_the_tip_as_a_twin_does():
+    """The tip of a body whose tendon follows a known tension is the reference."""
+    problem = actuated_bar()
+    body = PlannedBody.read(problem)
+    t_s = 0.02 * np.arange(31)
+    share = np.clip(t_s / 0.4, 0, 1)
+    known_n = 0.05 + 0.5 * share**3 * (10 - 15 * share + 6 * share**2)
+    twin = body.experiment(None, t_s, TIP, {"cable": (t_s, known_n)})
+    wanted_m = cs.simulate(twin, TRUTH, "midpoint", substeps=1).markers_m[:, 0]
+    assert np.ptp(wanted_m[:, 0]) > 0.005
+    planned = plan_motion(
+        problem,
+        task(
+            duration_s=0.4,
+            reference=[
+                {"point": "tip", "t_s": t_s[:21].tolist(),
+                 "position_m": [tuple(each) for each in wanted_m[:21].tolist()], "sigma_m": 1e-5}
+            ],
+            end={"at_rest": False},
+            hand={"intervals": 16, "free": []},
+            tendon=[CABLE["tendon"][0] | {"jerk_weight": 1e-6}],
+        ),
+        LIMITS,
+    )  # fmt: skip
+    at_s = planned.t_s
+    assert planned.commands(at_s)["cable"] == pytest.approx(known_n[: len(at_s)], abs=0.01)
+    assert planned.tracking_error(planned.program.references[0]).largest_m < 2e-4
+    assert np.abs(planned.motion.derivatives(at_s).value).max() == 0.0
+    assert "cable: 0.05 to 0.5" in "\n".join(map(str, plan_summary(planned, Path("out"))))
+
+
+@cache
+def suction_plan() -> MotionPlan:
+    """The tip is lowered by a pressure alone, which may change slowly and begins at its limit."""
+    return plan_motion(
+        actuated_bar(),
+        task(
+            **SHORT,
+            reference=[
+                {"point": "tip", "t_s": [0.3], "position_m": [(np.nan, np.nan, -0.006)],
+                 "relative": True, "sigma_m": 3e-5}
+            ],
+            end={"at_rest": False},
+            hand={"intervals": 7, "free": []},
+            pressure=[CHAMBER["pressure"][0] | {"rate_pa_s": 2e4, "pressure_pa": (-4e3, -200.0),
+                                                "jerk_weight": 10.0}],
+        ),
+        LIMITS,
+        tolerances=TIGHT,
+    )  # fmt: skip
+
+
+def test_a_pressure_with_a_lag_is_planned_within_its_limits():
+    plan = suction_plan()
+    t_s = np.linspace(0.0, plan.t_s[-1], 1000)
+    command = plan.commands(t_s)["chamber"]
+    assert -4e3 <= command.min() < -2e3
+    assert command.max() == -200.0
+    assert np.abs(np.gradient(command, t_s)).max() <= 2e4
+    (limit,) = [each for each in plan.binding_limits if each.name == "rate_pa_s of chamber"]
+    assert limit.spans_s
+    # The simulation with the lag of the recording follows the prediction without.
+    assert plan.time_step_error_m < 2e-4
+    assert plan.tracking_error(plan.program.references[0]).largest_m < 1e-3
+
+
+def test_both_solvers_find_the_same_pressure():
+    plan = suction_plan()
+    assert plan.answer.status == "converged"
+    early = solve_reduced(plan.program, tolerances=replace(TIGHT, iterations=1))
+    full = solve_full(plan.program, early)
+    assert full.status == "converged"
+    assert np.abs(full.c - plan.answer.c).max() < 1e-6
+    assert np.abs(full.x - plan.answer.x).max() < 1e-6 * np.ptp(plan.answer.x)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tendon": [CABLE["tendon"][0] | {"name": "cabel"}]}, "no tendon 'cabel'.*cable"),
+        ({"tendon": [CABLE["tendon"][0] | {"name": "chamber"}]}, "no tendon 'chamber'"),
+        ({"pressure": [CHAMBER["pressure"][0] | {"pressure_pa": (0.0, 1e3)}]},
+         r"pressure_pa: found \[0, 1000\], but it is -200 Pa before the motion"),
+    ],
+)  # fmt: skip
+def test_tables_of_signals_that_do_not_fit_the_recording_are_explained(changes, message):
+    with pytest.raises(InputError, match=message):
+        actuated(**changes)
+
+
+def test_tendons_and_pressures_keep_their_values_before_the_motion():
+    (recorded,) = actuated_bar().experiments
+    changing = replace(
+        recorded,
+        tendons=[replace(recorded.tendons[0], tension_n=[0.4, 0.9], t_s=[0.0, 0.2])],
+        pressures=[replace(recorded.pressures[0], pressure_pa=[-200.0, 900.0])],
+    )
+    body = replace(PlannedBody.read(actuated_bar()), template=changing)
+    standing = body.experiment(None, 0.02 * np.arange(50), TIP)
+    assert standing.tendons[0].energy_amplitude_at(np.array([0.9])) == pytest.approx(0.35)
+    assert standing.pressures[0].energy_amplitude_at(np.array([0.9])) == pytest.approx(270.0)
+
+
+# Reliability --------------------------------------------------------------------------------------
+
+
+def test_the_monitor_of_ipopt_never_asks_it_to_stop():
+    seen = []
+    full = FullProgram(program())
+    monitor = iteration_monitor(full, lambda *each: seen.append(each), 3, [])
+    arguments = [np.full(monitor.size1_in(k), 2.0) for k in range(monitor.n_in())]
+    stop = np.array([7.0])
+    assert monitor.eval_buffer([memoryview(each) for each in arguments], [memoryview(stop)]) == 0
+    assert stop[0] == 0.0
+    assert seen == [(3, 2.0)]
+
+
+@pytest.mark.parametrize("error", [InputError("too long"), np.linalg.LinAlgError("unsolved")])
+def test_a_failed_search_for_a_duration_keeps_the_plan(monkeypatch, error):
+    original = PlannedProgram.from_task
+
+    def from_task(body, wanted, *arguments):
+        if wanted.duration_s != 0.4:
+            raise error
+        return original(body, wanted, *arguments)
+
+    monkeypatch.setattr(PlannedProgram, "from_task", from_task)
+    plan = plan_motion(hung_bar(), task(**REACH, largest_error_m=1e-5), SLOW)
+    assert plan.exceeds_error
+    assert plan.sufficient_duration_s is None
+
+
+def test_an_unsolved_program_of_the_hand_is_a_duration_that_does_not_suffice(monkeypatch):
+    def unsolved(_):
+        raise np.linalg.LinAlgError("the conic program was not solved")
+
+    monkeypatch.setattr(durations, "smoothest_motion", unsolved)
+    assert durations.shortest_of_hand(program()) is None
+
+
+def test_obstacles_stay_at_their_pose_at_the_first_sample_also_in_an_execution():
+    t_s = 5.0 + 0.02 * np.arange(11)
+    shift_m = np.outer(t_s - 5.0, [1.0, 0.0, 0.0])
+    moving = cs.PoseSequence(t_s, shift_m, quaternions_xyzw=np.tile([0, 0, 0, 1.0], (11, 1)))
+    (hung,) = hung_bar().experiments
+    late = replace(
+        hung,
+        t_s=t_s,
+        markers=replace(hung.markers, t_s=t_s),
+        grasps=[cs.Grasp(hung.grasps[0].nodes, cs.PoseSequence.fixed()),
+                cs.Obstacle(poses=moving, shape=cs.Sphere(0.02, (0.2, 0.0, 0.0)), name="ball")],
+    )  # fmt: skip
+    body = PlannedBody.read(cs.Problem([late], hung_bar().parameters, substeps=1))
+    for times in (t_s, t_s - 5.0):
+        _, places = body.experiment(None, times, TIP).grasps[1].poses.at(times)
+        assert places == pytest.approx(np.zeros((11, 3)), abs=1e-12)
 
 
 # Uncertainty --------------------------------------------------------------------------------------
@@ -727,6 +933,7 @@ rotation_deg = 60.0
 angular_speed_deg_s = 360.0
 angular_acceleration_deg_s2 = 3000.0
 """
+SIGNAL = 'intervals = 8\n[[tendon]]\nname = "cable"\ntension_n = [0, 5]\nrate_n_s = 10.0\n'
 MISTAKES = {
     "duration_s = 0.8": [
         ("", "duration_s: missing"),
@@ -759,9 +966,27 @@ MISTAKES = {
         ('free = ["x", "w"]', "free"),
         ('free = ["x", "x"]', "names a coordinate twice"),
         ('free = ["x"]\nend_m = [0.0, 0.1, 0.0]', "end_m moves y, which is not free"),
+        ("free = []", "hand.free: found \\[\\]; expected coordinates that may move"),
+        ('joint_limits = "reach.py"', "joint_limits"),
         ("end_m = [inf, nan, 0.0]", "end_m has an infinite component; expected a number or nan"),
     ],
 }
+
+
+MISTAKES["intervals = 8"] += [
+    (SIGNAL.replace(line, instead), message)
+    for line, instead, message in (
+        ("rate_n_s = 10.0", "", "rate_n_s: missing"),
+        ("rate_n_s = 10.0", "rate_n_s = 0", "rate_n_s: found 0.*expected a number above 0"),
+        ("rate_n_s = 10.0", "rate_pa_s = 9.0", "unknown key.*rate_n_s"),
+        ("[0, 5]", "[5, 0]", r"tension_n is \[5, 0\]; expected the lowest value"),
+        ("[0, 5]", "[-1, 5]", "tension_n"),
+        ("[0, 5]", "5", "tension_n"),
+        ("rate_n_s", "end_n = 7.0\nrate_n_s", "end_n = 7 is outside tension_n"),
+        ('name = "cable"', "", "name: missing"),
+        ("rate_n_s = 10.0", f"rate_n_s = 10.0\n{SIGNAL[13:]}", "two tables have the name 'cable'"),
+    )
+]
 
 
 @pytest.mark.parametrize(
@@ -939,3 +1164,67 @@ def test_the_content_of_plan_json_is_that_of_the_plan():
     assert content["references"][0]["point"] == "tip"
     assert content["limits"]["speed_m_s"]["share_used"] == bar_plan().shares["speed_m_s"]
     assert content["status"] == "converged"
+
+
+# Joint limits of a file ---------------------------------------------------------------------------
+
+REACH_FILE = "def within_reach(position_m, rotation):\n    return position_m[0] - 0.02\n"
+
+
+def with_joint_limits(folder: Path, text: str) -> Task:
+    (folder / "reach.py").write_text(text)
+    lines = GOOD.replace('"low"', '"tip"').replace("0.02, 0.0, nan", "0.05, 0.0, nan")
+    code = '{ file = "reach.py", function = "within_reach" }'
+    (folder / "task.toml").write_text(f"{lines}joint_limits = {code}\n")
+    return Task.read(folder / "task.toml")
+
+
+def test_limits_of_joints_may_be_in_a_python_file_that_runs_if_allowed(tmp_path: Path):
+    wanted = with_joint_limits(tmp_path, REACH_FILE)
+    with pytest.raises(InputError, match=r"hand\.joint_limits: .*--allow-code"):
+        plan_motion(hung_bar(), wanted, LIMITS)
+    plan = plan_motion(hung_bar(), wanted, LIMITS, allow_code=True)
+    x = plan.motion.derivatives(np.linspace(0, 0.8, 200)).value[:, 0]
+    assert x.max() + PlannedBody.read(hung_bar()).hand_m[0] <= 0.02 + 1e-5
+    assert "joint_limits" in {each.name for each in plan.binding_limits}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("within_reach = 3\n", "no function 'within_reach'"),
+        ("raise ValueError('broken')\n", "raised an error when it was run: ValueError: broken"),
+        ("def within_reach(p, r):\n    return p[7]\n", "hand.joint_limits: the function failed"),
+        ("def within_reach(p, r):\n    return -1.0\n", "does not depend on the pose"),
+    ],
+)
+def test_mistakes_in_functions_of_joint_limits_are_explained(tmp_path: Path, text, message):
+    wanted = with_joint_limits(tmp_path, text)
+    with pytest.raises(InputError, match=message):
+        plan_motion(hung_bar(), wanted, LIMITS, allow_code=True)
+
+
+# Kinds of tasks -----------------------------------------------------------------------------------
+
+
+def test_a_point_is_thrown_with_a_position_and_a_velocity_at_one_time():
+    thrown = {"point": "tip", "t_s": [0.4], "interpolation": "none", "relative": True,
+              "position_m": [(0.04, np.nan, 0.0)], "velocity_m_s": [(0.5, np.nan, 0.0)],
+              "sigma_m": 1e-3, "sigma_m_s": 1e-2}  # fmt: skip
+    plan = plan_motion(hung_bar(), task(reference=[thrown], hand={"intervals": 12}), LIMITS)
+    place = plan.points_m["tip"]
+    at = int(np.argmin(np.abs(plan.t_s - 0.4)))
+    assert place[at, [0, 2]] - place[0, [0, 2]] == pytest.approx([0.04, 0.0], abs=1e-3)
+    velocity = (place[at + 1] - place[at - 1]) / (plan.t_s[at + 1] - plan.t_s[at - 1])
+    assert velocity[[0, 2]] == pytest.approx([0.5, 0.0], abs=0.02)
+    assert plan.residual_vibration_m < 5e-4
+
+
+def test_a_point_is_held_still_while_the_hand_moves():
+    wanted = task(
+        reference=[{"point": "tip", "hold": True}],
+        hand={"free": ["x", "z", "ry"], "end_m": (0.03, 0.0, np.nan), "intervals": 12},
+    )
+    plan = plan_motion(hung_bar(), wanted, LIMITS)
+    assert plan.motion.derivatives(plan.t_s).value[-1, 0] == pytest.approx(0.03)
+    assert plan.tracking_error(plan.program.references[0]).largest_m < 3e-3

@@ -432,7 +432,7 @@ def end():
 def deaf(**_):
     threading.Thread(target=end).start()
     time.sleep(600)
-nlpsol._create_solver = lambda *_, **__: deaf
+nlpsol.create_solver = lambda *_, **__: deaf
 nlpsol.GRACE_S = 0.2 if {times} == 1 else 600
 cli.main()
 """

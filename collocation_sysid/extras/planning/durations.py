@@ -7,28 +7,16 @@ longer duration is not worse.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from .planned_program import PlannedProgram
-from .reduced_solver import HandLimitsExcludeTask, PlanAnswer, smoothest_motion
+from .reduced_solver import HandLimitsExcludeTask, smoothest_motion
 
 # Relative accuracy of a shortest duration, and the largest factor from the stated duration.
 ACCURACY, LARGEST_FACTOR = 0.02, 16.0
 T = TypeVar("T")
-
-
-class Trial(NamedTuple):
-    """A plan of one duration."""
-
-    program: PlannedProgram
-    answer: PlanAnswer
-
-    @property
-    def largest_error_m(self) -> float:
-        """Largest distance of a point from its reference, or of a node from rest [m]."""
-        return self.program.largest_error_m(self.answer.x)
 
 
 def shortest(
@@ -78,7 +66,7 @@ def shortest_of_hand(program: PlannedProgram) -> float | None:
     def attempt(duration_s: float) -> bool | None:
         try:
             smoothest_motion(program.with_duration(duration_s))
-        except HandLimitsExcludeTask:
+        except (HandLimitsExcludeTask, np.linalg.LinAlgError):
             return None
         return True
 

@@ -16,10 +16,12 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
 from ...errors import InputError
 from ...methods.callbacks import NlpFunctions, TimedFunction
+from ...methods.nlpsol import create_solver, ipopt_settings
 from .planned_program import PlannedProgram
 from .reduced_solver import PlanAnswer, Watch
 
@@ -50,28 +52,22 @@ class FullProgram:
     def __init__(self, program: PlannedProgram) -> None:
         self.program = program
         self.driven = program.driven
-        self.collocation = program.driven.collocation
-        if self.collocation.has_eliminated_histories or program.body_limits is not None:
+        if self.driven.collocation.has_eliminated_histories or program.body_limits is not None:
             raise InputError(
                 "interior-point supports neither memory of a body or force, nor limits of [avoid]; "
                 "expected reduced-space",
                 None,
                 where="--solver",
             )
-        transcription = self.driven.transcription
-        self.length_m = transcription.length_m
-        self.position_count = transcription.variable_count
+        self.transcription = self.driven.transcription
+        self.length_m = self.transcription.length_m
+        self.position_count = self.transcription.variable_count
         self.variable_count = self.position_count + program.space.size
-        self.motion_count = self.collocation.constraint_count
+        self.motion_count = self.transcription.constraint_count
         limits = program.hand_limits
         self.limit_count = len(limits.names)
         self.vector_count = len(limits.t_s) * len(limits.at_time.vector_names)
         self.constraint_count = self.motion_count + self.limit_count
-        per_time = transcription.constraints_per_time
-        place = np.searchsorted(transcription.constrained_dofs, self.driven.dofs)
-        times = np.arange(transcription.constraint_times)
-        self._grasp_times = slice(transcription.dynamics.first_row, None)
-        self._grasp_rows: Index = (times[:, None] * per_time + place).ravel()
 
     # Variables ------------------------------------------------------------------------------------
 
@@ -83,10 +79,6 @@ class FullProgram:
         """Return the unknowns c (c,) and the motion x (N, 3n) [m] of variables."""
         x = self.length_m * w[: self.position_count]
         return w[self.position_count :], x.reshape(len(self.program.grid_since_s), -1)
-
-    def _point(self, w: Array) -> Array:
-        """Return the variables of the collocation program, with the parameters of the plan."""
-        return np.concatenate([self.driven.q, w[: self.position_count]])
 
     # Objective ------------------------------------------------------------------------------------
 
@@ -106,24 +98,26 @@ class FullProgram:
 
     def constraint_values(self, w: Array) -> Array:
         """Return the constraints (constraints,)."""
-        c, _ = self.unpack(w)
-        rows = self.collocation.constraint_values(self._point(w))
-        rows[self._grasp_rows] -= self._shift(c)
+        c, x = self.unpack(w)
+        equations = self.driven.equations(self.program.drive(c).without_controls)
+        rows = self.transcription.constraint_values(x, equations)
         return np.concatenate([rows, self._limits(c)[0]])
 
     def constraints_and_jacobian(self, w: Array, out: Array | None = None) -> tuple[Array, Array]:
         """Return the constraints, and the values of their Jacobian in the order of
         `jacobian_structure`, written to `out` if given.
         """
-        c, _ = self.unpack(w)
-        rows, values = self.collocation.constraints_and_jacobian(self._point(w))
-        rows[self._grasp_rows] -= self._shift(c)
-        limits, by_c = self._limits(c)
-        drive = self.program.drive(c).by_control[self._grasp_times]
-        of_grasps = drive.reshape(len(self._grasp_rows), -1) / -self.length_m
-        columns = np.concatenate([of_grasps, by_c]).T.ravel()
+        c, x = self.unpack(w)
+        equations = self.driven.equations(self.program.drive(c))
+        forces = equations.dynamics.linearise(x, self.transcription.linearisation_buffer)
+        of_x = np.zeros(self.transcription.motion_rows.structure.nnz)
+        rows, of_motion = self.transcription.constraints_and_jacobian(
+            x, equations, forces=forces, values=of_x
+        )
+        limits, of_limits = self._limits(c)
+        by_c = np.concatenate([of_motion, of_limits]).T[self._depends_on_c]
         result = np.empty(len(self.jacobian_structure[1])) if out is None else out
-        result[:] = np.concatenate([values[self._first_entry :], columns])
+        result[:] = np.concatenate([of_x, by_c])
         return np.concatenate([rows, limits]), result
 
     def jacobian(self, w: Array) -> sp.csc_array:
@@ -136,29 +130,22 @@ class FullProgram:
     @cached_property
     def jacobian_structure(self) -> tuple[Index, Index]:
         """Column pointers and row indices of the Jacobian."""
-        indptr, indices = self.collocation.jacobian_structure
-        size = self.program.space.size
-        first = self._first_entry
-        in_column = np.concatenate(
-            [self._grasp_rows, self.motion_count + np.arange(self.limit_count)]
-        )
-        of_x = indptr[self.collocation.nq :] - first
-        ends = of_x[-1] + len(in_column) * np.arange(1, size + 1)
-        return np.concatenate([of_x, ends]), np.concatenate(
-            [indices[first:], np.tile(in_column, size)]
+        of_x = self.transcription.motion_rows.structure
+        ends = of_x.nnz + np.cumsum(self._depends_on_c.sum(axis=1))
+        return (
+            np.concatenate([of_x.indptr, ends]),
+            np.concatenate([of_x.indices, np.nonzero(self._depends_on_c)[1]]),
         )
 
-    @property
-    def _first_entry(self) -> int:
-        """Number of entries of the columns of q, which come first in the collocation program."""
-        return int(self.collocation.jacobian_structure[0][self.collocation.nq])
-
-    def _shift(self, c: Array) -> Array:
-        """Return the scaled displacement of the prescribed positions from those of the standing
-        hand, of each constraint of the grasps.
+    @cached_property
+    def _depends_on_c(self) -> NDArray[np.bool_]:
+        """Whether each constraint depends on each unknown, (c, constraints): prescribed positions on
+        those of the hand, equations of motion on those of the signals, limits on all.
         """
-        moved = self.program.drive(c).goals_m - self.driven.stated_goals_m
-        return moved[self._grasp_times].ravel() / self.length_m
+        moves_hand = self.program.space.moves_hand[:, None]
+        of_motion = moves_hand == self.transcription.is_grasp_constraint
+        of_limits = np.ones((len(moves_hand), self.limit_count), dtype=bool)
+        return np.concatenate([of_motion, of_limits], axis=1)
 
     def _limits(self, c: Array) -> tuple[Array, Array]:
         """Return the limits of the hand as smooth constraints, and their derivatives (k, c)."""
@@ -172,23 +159,25 @@ class FullProgram:
     @cached_property
     def hessian_structure(self) -> tuple[Index, Index]:
         """Column pointers and row indices of the upper triangle of the Lagrangian's Hessian."""
-        upper = np.arange(1, self.program.space.size + 1)
         of_x = self._keys % self.position_count
         counts = np.bincount(self._keys // self.position_count, minlength=self.position_count)
-        of_c = [self.position_count + np.arange(count) for count in upper]
-        indptr = np.concatenate([[0], np.cumsum(np.concatenate([counts, upper]))])
+        of_c = [
+            np.arange(0 if is_coupled else self.position_count, self.position_count + number)
+            for number, is_coupled in enumerate(~self.program.space.moves_hand, 1)
+        ]
+        indptr = np.cumsum([0, *counts, *map(len, of_c)])
         return indptr, np.concatenate([of_x, *of_c])
 
     @cached_property
     def _motion_entries(self) -> tuple[Index, Index]:
-        """Entries of the collocation program's Hessian in rows and columns of x, and the key of
-        each: column · position_count + row.
+        """Entries of the transcription's Hessian in rows of x, and the key of each: column ·
+        position_count + row.
         """
-        indptr, rows = self.collocation.hessian_structure
-        columns = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
-        nq = self.collocation.nq
-        chosen = np.flatnonzero((rows >= nq) & (columns >= nq))
-        return chosen, (columns[chosen] - nq) * self.position_count + rows[chosen] - nq
+        structure, nq = self.transcription.hessian, self.transcription.nq
+        columns = np.repeat(np.arange(self.position_count), np.diff(structure.indptr))
+        chosen = np.flatnonzero(structure.indices >= nq)
+        rows = structure.indices[chosen] - nq
+        return chosen, columns[chosen] * self.position_count + rows
 
     @cached_property
     def _objective_entries(self) -> tuple[Index, Array]:
@@ -203,35 +192,54 @@ class FullProgram:
         """Keys of all entries by x, ascending."""
         return np.unique(np.concatenate([self._motion_entries[1], self._objective_entries[0]]))
 
+    @cached_property
+    def _places(self) -> tuple[Index, Index]:
+        """Places of the entries of the motion, and of the objective, among all entries by x."""
+        return (
+            np.searchsorted(self._keys, self._motion_entries[1]),
+            np.searchsorted(self._keys, self._objective_entries[0]),
+        )
+
     def hessian_values(self, w: Array, weight: float, multipliers: Array, out: Array) -> None:
         """Write the upper triangle of the Hessian of weight · objective + multipliers · constraints
         to `out`, in the order of `hessian_structure`.
         """
-        c, _ = self.unpack(w)
+        c, x = self.unpack(w)
         of_motion = multipliers[: self.motion_count]
+        values = np.zeros(self.transcription.hessian.nnz)
+        by_x, by_c = self.transcription.motion_hessian_values(
+            x,
+            self.driven.equations(self.program.drive(c)),
+            self.transcription.lagrangian_weights(of_motion),
+            values,
+        )
         of_x = np.zeros(len(self._keys))
-        chosen, keys = self._motion_entries
-        values = self.collocation.hessian_values(self._point(w), 0.0, multipliers=of_motion)
-        np.add.at(of_x, np.searchsorted(self._keys, keys), values[chosen])
-        keys, values = self._objective_entries
-        np.add.at(of_x, np.searchsorted(self._keys, keys), weight * values)
+        places_of_motion, places_of_objective = self._places
+        of_x[places_of_motion] += values[self._motion_entries[0]]
+        of_x[places_of_objective] += weight * self._objective_entries[1]
         by_jerk, _ = self.program.effort
-        of_c = 2 * weight * by_jerk.T @ by_jerk
+        of_c = by_c + 2 * weight * by_jerk.T @ by_jerk
         of_c += self._grasp_hessian(c, of_motion) + self._limit_hessian(
             c, multipliers[self.motion_count :]
         )
-        rows, columns = np.tril_indices(len(c))  # the upper triangle, column by column
-        out[:] = np.concatenate([of_x, of_c[rows, columns]])
+        mixed = self.length_m * by_x.reshape(self.position_count, -1)
+        columns = [
+            np.concatenate([mixed[:0 if moves_hand else None, k], of_c[: k + 1, k]])
+            for k, moves_hand in enumerate(self.program.space.moves_hand)
+        ]  # fmt: skip
+        out[:] = np.concatenate([of_x, *columns])
 
     def _grasp_hessian(self, c: Array, multipliers: Array) -> Array:
         """Return Σ multipliers · ∂²constraint/∂c² (c, c) of the prescribed positions."""
-        program = self.program
+        program, transcription = self.program, self.transcription
         matrix, constant = program.coordinates_at_grid
-        weights = np.zeros((len(constant), len(self.driven.dofs)))
-        by_time = multipliers[self._grasp_rows].reshape(-1, len(self.driven.dofs))
-        weights[self._grasp_times] = by_time / -self.length_m
-        planned = weights[:, program.planned_columns].reshape(len(constant), -1, 3)
-        curvature = program.frame.weighted_hessian(matrix @ c + constant, planned)
+        weights = np.zeros((len(constant), transcription.dof_count))
+        by_time = multipliers.reshape(transcription.constraint_times, -1) / -self.length_m
+        weights[transcription.dynamics.first_row :, transcription.constrained_dofs] = by_time
+        planned = weights[:, self.driven.dofs[program.planned_columns]]
+        curvature = program.frame.weighted_hessian(
+            matrix @ c + constant, planned.reshape(len(constant), -1, 3)
+        )
         return np.einsum("tic,tij,tjd->cd", matrix, curvature, matrix, optimize=True)
 
     def _limit_hessian(self, c: Array, multipliers: Array) -> Array:
@@ -241,29 +249,28 @@ class FullProgram:
         of_rows = multipliers[self.vector_count :].reshape(len(limits.t_s), -1)
         states = limits.matrix @ c + limits.constant
         stacked = np.concatenate([states, of_vectors, of_rows], axis=1).T
-        values = self._limit_curvature(stacked).full().reshape(18, len(limits.t_s), 18)
+        size = states.shape[1]
+        values = self._limit_curvature(stacked).full().reshape(size, len(limits.t_s), size)
         curvature = values.transpose(1, 0, 2)
         return np.einsum("tic,tij,tjd->cd", limits.matrix, curvature, limits.matrix, optimize=True)
 
     @cached_property
     def _limit_curvature(self) -> ca.Function:
-        """Second derivatives (18, 18) of the weighted limits by the state of the hand, at all times."""
+        """Second derivatives of the weighted limits by coordinates and their derivatives, at all
+        times.
+        """
         at_time = self.program.hand_limits.at_time
-        counts = len(at_time.vector_names), len(at_time.row_names)
-        data = ca.SX.sym("data", 18 + sum(counts))
-        state, of_vectors, of_rows = ca.vertsplit(data, [0, 18, 18 + counts[0], data.numel()])
-        squares = ca.sum1(ca.reshape(at_time.vectors(state), 3, -1) ** 2).T
+        sizes = at_time.vectors.numel_in(0), len(at_time.vector_names), len(at_time.row_names)
+        data = ca.SX.sym("data", sum(sizes))
+        state, of_vectors, of_rows = ca.vertsplit(data, [0, *np.cumsum(sizes).tolist()])
+        squares = ca.sum1(ca.reshape(at_time.vectors(state), 3, sizes[1]) ** 2).T
         total = ca.dot(of_vectors, squares) + ca.dot(of_rows, at_time.rows(state))
         hessian = ca.densify(ca.hessian(total, state)[0])
         return ca.Function("limits", [data], [hessian]).map(len(self.program.hand_limits.t_s))
 
 
 def solve_full(
-    program: PlannedProgram,
-    start: PlanAnswer,
-    tolerance: float = TOLERANCE,
-    iterations: int = MOST_ITERATIONS,
-    watch: Watch | None = None,
+    program: PlannedProgram, start: PlanAnswer, watch: Watch | None = None
 ) -> PlanAnswer:
     """Solve a plan by IPOPT; Ctrl-C, and a search without an answer, keep the initial plan.
 
@@ -273,10 +280,6 @@ def solve_full(
         The problem.
     start : PlanAnswer
         Initial plan.
-    tolerance : float
-        IPOPT's tolerance of the scaled optimality conditions.
-    iterations : int
-        Largest number of iterations.
     watch : callable, optional
         Called with the number of each iterate and its objective.
 
@@ -288,38 +291,18 @@ def solve_full(
     full = FullProgram(program)
     errors: list[BaseException] = []
     functions = NlpFunctions(cast(Any, full), full.hessian_values, errors)
-    w = ca.MX.sym("w", full.variable_count)
-    value, rows = functions.nlp(w, ca.MX(0, 1))
-    seen = itertools.count(len(start.history))
-
-    def report(outputs: list[Array], _: object) -> None:
-        if watch is not None:
-            watch(next(seen), float(outputs[1][0]))
-
-    # Variables, objective, constraints, and the multipliers of bounds, constraints and parameters.
-    sizes = [full.variable_count, 1, full.constraint_count, full.variable_count]
-    outputs = [ca.Sparsity.dense(size) for size in (*sizes, full.constraint_count, 0)]
-    monitor = TimedFunction("monitor", outputs, [ca.Sparsity.dense(1)], report, errors)
-    options = {
+    monitor = iteration_monitor(full, watch, len(start.history), errors)
+    settings = {
+        **ipopt_settings(functions, "mumps", TOLERANCE, MOST_ITERATIONS),
         "iteration_callback": monitor,
-        "print_time": False,
-        "error_on_fail": False,
-        "show_eval_warnings": False,
-        "no_nlp_grad": True,
-        "jac_g": functions.function("jac_g", "g", "jac_g"),
-        "grad_f": functions.function("grad_f", "f", "grad_f"),
         "hess_lag": functions.function("hess_lag", "triu_hess"),
-        "ipopt.linear_solver": "mumps",
-        "ipopt.tol": tolerance,
-        "ipopt.max_iter": iterations,
-        "ipopt.print_level": 0,
-        "ipopt.sb": "yes",
-        "ipopt.option_file_name": "",  # IPOPT reads ipopt.opt of the working folder otherwise
+        # The gradient at the initial point may be large: IPOPT would scale the jerk away.
+        "ipopt.nlp_scaling_method": "none",
         "ipopt.mu_init": INITIAL_BARRIER,
         "ipopt.bound_push": INITIAL_DISTANCE,
         "ipopt.bound_frac": INITIAL_DISTANCE,
     }
-    solver = ca.nlpsol("plan", "ipopt", {"x": w, "f": value, "g": rows}, options)
+    solver = create_solver("ipopt", functions, settings)
     lower = np.zeros(full.constraint_count)
     lower[full.motion_count :] = -np.inf
     try:
@@ -340,3 +323,23 @@ def solve_full(
     multipliers[full.vector_count :] /= 2
     history = [float(value) for value in solver.stats()["iterations"]["obj"]]
     return PlanAnswer(c, x, multipliers, "converged", [*start.history, *history])
+
+
+def iteration_monitor(
+    full: FullProgram, watch: Watch | None, first: int, errors: list[BaseException]
+) -> TimedFunction:
+    """Return CasADi's callback of each iteration, which calls `watch` with numbers from `first` on
+    and never asks the solver to stop.
+    """
+    seen = itertools.count(first)
+
+    def report(arguments: list[Array], stops: list[Array | None]) -> None:
+        if watch is not None:
+            watch(next(seen), float(arguments[1][0]))
+        if stops[0] is not None:
+            stops[0][0] = 0.0
+
+    # Variables, objective, constraints, and the multipliers of bounds, constraints and parameters.
+    sizes = [full.variable_count, 1, full.constraint_count, full.variable_count]
+    inputs = [ca.Sparsity.dense(size) for size in (*sizes, full.constraint_count, 0)]
+    return TimedFunction("monitor", inputs, [ca.Sparsity.dense(1)], report, errors)

@@ -18,12 +18,13 @@ import numpy as np
 from ...common.array_types import Array
 from ...errors import InputError, SimulationError
 from ...problem import Problem
+from ...problem.code_loader import CodeLoader
 from ...program.simulation import Trajectory, simulate
 from ...recording import Experiment, Markers, PoseSequence
 from ...runs.solved_problem import SolvedProblem
 from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.hand_limits import REACHED, Limits
-from .durations import Trial, shortest, shortest_of_hand
+from .durations import shortest, shortest_of_hand
 from .full_program import solve_full
 from .planned_body import PlannedBody
 from .planned_program import POSES_PER_SAMPLE, PlannedProgram
@@ -34,6 +35,7 @@ from .reduced_solver import (
     Watch,
     solve_reduced,
 )
+from .signals import Commands
 from .spline_motion import PoseLimit, SplineMotion
 from .task import Reference, Task
 
@@ -143,8 +145,18 @@ class MotionPlan:
             poses.t_s - start_s, poses.positions_m, quaternions_xyzw=poses.quaternions_xyzw
         )
 
+    def commands(self, t_s: Array) -> dict[str, Array]:
+        """Return the planned tensions [N] and pressures [Pa] (T,), before their lag, at any times
+        since the start [s], by name.
+        """
+        return self.program.commands(self.answer.c, np.asarray(t_s))
+
     def execution(
-        self, t_s: Array, tracks_m: Array, poses: PoseSequence | None = None
+        self,
+        t_s: Array,
+        tracks_m: Array,
+        poses: PoseSequence | None = None,
+        commands: Commands | None = None,
     ) -> Experiment:
         """Return the recording of an execution, to be compared with the prediction (a problem with
         fixed parameters) or to be identified from beside the first recording.
@@ -158,6 +170,9 @@ class MotionPlan:
         poses : PoseSequence, optional
             Measured poses over the times since the start, in the format of the problem; those of
             the plan by default.
+        commands : mapping, optional
+            Times since the start and measured tensions or pressures, by name; those of the plan by
+            default.
         """
         body = self.program.body
         markers = body.template.markers
@@ -165,7 +180,10 @@ class MotionPlan:
         times = np.asarray(t_s, dtype=np.float64)
         moved = replace((poses or self.poses(times)).after(held), first_motion=held)
         places = body.marker_places_m
-        experiment = body.experiment(moved, times, places)
+        if commands is None:
+            fine_s = np.linspace(times[0], times[-1], POSES_PER_SAMPLE * (len(times) - 1) + 1)
+            commands = {name: (fine_s, values) for name, values in self.commands(fine_s).items()}
+        experiment = body.experiment(moved, times, places, commands)
         seen = Markers(
             times, tracks_m, markers.sigma_m, markers.names, np.array([*places.values()])
         )
@@ -406,7 +424,7 @@ def plan_motion(
     pose_limits : callable, optional
         ``pose_limits(position_m, rotation) -> margins``: expressions in CasADi operations that must
         not be positive, of the position (3,) and the rotation matrix (3, 3) of the hand in the
-        frame of the poses, such as limits of joints.
+        frame of the poses, such as limits of joints; by default those of the task.
     solver : {"reduced-space", "interior-point"}
         Gauss–Newton steps in the space of the hand's unknowns, or IPOPT after these, with the
         positions of all nodes as variables.
@@ -433,6 +451,10 @@ def plan_motion(
         task = Task.read(task)
     if not isinstance(limits, Limits):
         limits = Limits.read(limits)
+    if task.hand.joint_limits is not None and pose_limits is None:
+        code = task.hand.joint_limits
+        loader = CodeLoader(Path(), is_allowed=allow_code)
+        _, pose_limits = loader.function(code.file, code.function, "hand.joint_limits.file")
     if robust and (body.covariance is None or solver != "reduced-space"):
         raise InputError(
             "a robust plan needs a run with uncertainties, and the solver reduced-space",
@@ -441,7 +463,7 @@ def plan_motion(
         )
     began_s = time.perf_counter()
 
-    def solve(duration_s: float) -> Trial:
+    def solve(duration_s: float) -> tuple[PlannedProgram, PlanAnswer]:
         """Return the plan of the task with a duration."""
         say(f"searching for a motion of {duration_s:.3g} s")
         of_duration = task if duration_s == task.duration_s else task.stretched(duration_s)
@@ -453,39 +475,45 @@ def plan_motion(
         if solver == "interior-point" and answer.status != "interrupted":
             say("improving the motion by IPOPT")
             answer = solve_full(program, answer, watch=watch)
-        return Trial(program, answer)
+        return program, answer
 
-    def attempt(duration_s: float) -> Trial | None:
-        """Return the plan with a duration; None if its error is too large."""
+    def suffices(program: PlannedProgram, answer: PlanAnswer) -> bool:
+        return task.largest_error_m is None or (
+            program.largest_error_m(answer.x) <= task.largest_error_m
+        )
+
+    def attempt(duration_s: float) -> tuple[PlannedProgram, PlanAnswer] | None:
+        """Return the plan with a duration; None if its error is too large, or there is none: the
+        plan of another duration must not be lost.
+        """
         try:
             found = solve(duration_s)
-        except (HandLimitsExcludeTask, SimulationError):
+        except (HandLimitsExcludeTask, SimulationError, InputError, np.linalg.LinAlgError):
             return None
-        if found.answer.status == "interrupted":
+        if found[1].status == "interrupted":
             raise KeyboardInterrupt
-        return found if found.largest_error_m <= accepted_m else None
+        return found if suffices(*found) else None
 
-    accepted_m = np.inf if task.largest_error_m is None else task.largest_error_m
     sufficient_s = None
     try:
-        trial = solve(task.duration_s)
+        program, answer = solve(task.duration_s)
     except HandLimitsExcludeTask as error:
         program = PlannedProgram.from_task(body, task, limits, pose_limits)
         raise InputError(_contradiction(program), None, where="hand") from error
     except np.linalg.LinAlgError as error:
         raise InputError(f"{error}; state wider limits", None, where="hand") from error
-    suffices = trial.largest_error_m <= accepted_m
-    if trial.answer.status != "interrupted" and (task.shortest or not suffices):
+    is_enough = suffices(program, answer)
+    if answer.status != "interrupted" and (task.shortest or not is_enough):
         with suppress(KeyboardInterrupt):  # the plan of the stated duration remains
-            found = shortest(attempt, task.duration_s, trial if suffices else None)
+            first = (program, answer) if is_enough else None
+            found = shortest(attempt, task.duration_s, first)
             if found is not None and task.shortest:
-                trial = found[1]
+                program, answer = found[1]
             elif found is not None:
                 sufficient_s = found[0]
     seconds = time.perf_counter() - began_s
     say("simulating the plan with fine time steps")
-    fine = _finely_simulated(trial.program, trial.answer.c)
-    return MotionPlan(trial.program, trial.answer, fine, seconds, sufficient_s)
+    return MotionPlan(program, answer, _finely_simulated(program, answer.c), seconds, sufficient_s)
 
 
 def _finely_simulated(program: PlannedProgram, c: Array) -> Trajectory:
@@ -495,7 +523,11 @@ def _finely_simulated(program: PlannedProgram, c: Array) -> Trajectory:
     markers = program.experiment.markers
     places_m = markers.predict_positions(program.experiment.body.nodes_m)
     points = dict(zip(markers.names, places_m, strict=True))
-    experiment = program.body.experiment(program.poses(c, fine_s), program.experiment.t_s, points)
+    t_s = program.experiment.t_s
+    commands = {
+        name: (t_s[0] + fine_s, values) for name, values in program.commands(c, fine_s).items()
+    }
+    experiment = program.body.experiment(program.poses(c, fine_s), t_s, points, commands)
     problem = program.body.problem
     values = problem.parameters.values(program.body.q)
     substeps = FINER * program.driven.transcription.substeps

@@ -1,4 +1,6 @@
-"""Folder of a plan: poses for the robot, prediction, pictures and plan.json."""
+"""Folder of a plan: poses for the robot, tensions and pressures, prediction, pictures and
+plan.json.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...common.display import Line, Shown, Table
+from ...common.files import safe_name
 from ...common.serialisation import as_json
 from ...fem.laws.constants import symbol_of
 from ...recording import write_markers_csv, write_poses_csv
@@ -45,14 +48,15 @@ def write_plan(
     """Write the folder of a plan atomically, and return its path.
 
     It contains poses.csv (poses in the format of the problem), hand.csv (the hand with velocity and
-    acceleration), predicted_points.csv, pictures, plan.json and, with `with_film`, motion.gif.
+    acceleration), command_<name>.csv of each planned tendon and pressure, predicted_points.csv,
+    pictures, plan.json and, with `with_film`, motion.gif.
 
     Parameters
     ----------
     folder : str or Path
         Folder, which may contain an earlier plan; that is replaced.
     rate_hz : float, optional
-        Rate of poses.csv and hand.csv; four times that of the samples by default.
+        Rate of poses, hand and commands; four times that of the samples by default.
     with_film : bool
         Whether to render the motion as a film.
     with_mcap : bool
@@ -71,6 +75,9 @@ def write_plan(
         t_s = command_times_s(plan, rate_hz)
         write_poses_csv(place / POSES_FILE, plan.poses(t_s))
         write_columns_csv(place / HAND_FILE, hand_columns(plan, t_s))
+        for each, values in zip(plan.program.signals, plan.commands(t_s).values(), strict=True):
+            column = {"t_s": t_s, each.section.range_key: values}
+            write_columns_csv(place / command_file(each.name), column)
         if with_mcap:
             write_trajectory_mcap(plan, place / TRAJECTORY_FILE, t_s)
         if plan.points_m:
@@ -98,6 +105,11 @@ def command_times_s(plan: MotionPlan, rate_hz: float | None = None) -> Array:
     last_s = plan.t_s[-1]
     rate = float(4 / plan.t_s[1]) if rate_hz is None else rate_hz
     return np.arange(int(np.ceil(last_s * rate - 1e-9)) + 1) / rate
+
+
+def command_file(name: str) -> str:
+    """Return the name of the file with the planned tension or pressure of an actuator."""
+    return f"command_{safe_name(name)}.csv"
 
 
 def hand_columns(plan: MotionPlan, t_s: Array) -> dict[str, Array]:
@@ -135,6 +147,8 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
     """Return the content of plan.json, in types that JSON has."""
     program = plan.program
     limiting = plan.limiting_constant
+    times_s = command_times_s(plan)
+    commands = plan.commands(times_s)
     return {
         "schema": SCHEMA,
         "experiment": program.body.template.name,
@@ -169,6 +183,16 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
         "largest_error_m": plan.largest_error_m,
         "accepted_error_m": program.task.largest_error_m,
         "sufficient_duration_s": plan.sufficient_duration_s,
+        "signals": [
+            {
+                "name": each.name,
+                "unit": each.unit,
+                "lowest": float(values.min()),
+                "highest": float(values.max()),
+                "largest_rate": float(np.abs(np.gradient(values, times_s)).max()),
+            }
+            for each, values in zip(program.signals, commands.values(), strict=True)
+        ],
         "hand": {
             "intervals": program.space.intervals,
             "coefficients": plan.motion.coefficients,
@@ -183,6 +207,11 @@ def _limit_lines(plan: MotionPlan) -> list[Shown]:
     task = plan.program.task
     if task.shortest:
         lines.append(f"shortest duration: {task.duration_s:.3g} s")
+    for each, values in zip(plan.program.signals, plan.commands(plan.t_s).values(), strict=True):
+        lines.append(
+            f"{each.name}: {values.min():.4g} to {values.max():.4g} {each.unit} "
+            f"(limits {each.lowest:.4g} to {each.highest:.4g} {each.unit})"
+        )
     if plan.exceeds_error:
         enough_s = plan.sufficient_duration_s
         longer = (

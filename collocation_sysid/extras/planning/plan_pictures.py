@@ -20,13 +20,33 @@ from .motion_plan import MotionPlan
 
 @own_settings()
 def plan_figures(plan: MotionPlan) -> dict[str, Figure]:
-    """Return the figures of a plan by file name without suffix: "hand", and "tracking" if it has
-    references of positions.
+    """Return the figures of a plan by file name without suffix: "hand" if it may move, "tracking" if
+    the plan has references of positions, and "commands" if it has tensions or pressures.
     """
-    figures = {"hand": motion_picture_of(plan.motion, plan.program.limits)}
+    figures = {}
+    if plan.program.space.moves_hand.any():
+        figures["hand"] = motion_picture_of(plan.motion, plan.program.limits)
+    if plan.program.signals:
+        figures["commands"] = commands_picture(plan)
     if any(np.isfinite(each.position_m).any() for each in plan.program.references):
         figures["tracking"] = tracking_picture(plan)
     return figures
+
+
+def commands_picture(plan: MotionPlan) -> Figure:
+    """Return a figure with a panel for each planned tension or pressure, with its limits, dashed."""
+    signals = plan.program.signals
+    figure = new_figure(PAGE_MM, 15 + 40 * len(signals))
+    panels = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    t_s = np.linspace(0.0, plan.t_s[-1], 400)
+    for panel, each, values in zip(panels, signals, plan.commands(t_s).values(), strict=True):
+        panel.plot(t_s, values, color=COLOUR_CYCLE[0], lw=LINE_PT)
+        for limit in (each.lowest, each.highest):
+            panel.axhline(limit, color="black", lw=0.6, ls="--")
+        panel.axvline(plan.program.task.duration_s, color="black", lw=0.6, ls=":")
+        style_axes(panel, "", xlabel="", ylabel=f"{each.name} [{each.unit}]")
+    panels[-1].set_xlabel("time [s]")
+    return figure
 
 
 def tracking_picture(plan: MotionPlan) -> Figure:

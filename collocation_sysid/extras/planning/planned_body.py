@@ -19,6 +19,7 @@ from ...runs.result_builder import build_result
 from ...runs.result_content import Result
 from ...runs.solved_problem import SolvedProblem
 from ...runs.warm_start import WarmStart
+from .signals import Commands, commanded
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,12 +185,17 @@ class PlannedBody:
         return np.asarray(self.template.body.nodes_m[grasp.nodes].mean(axis=0), dtype=np.float64)
 
     def experiment(
-        self, poses: PoseSequence | None, t_s: Array, points: dict[str, Array]
+        self,
+        poses: PoseSequence | None,
+        t_s: Array,
+        points: dict[str, Array],
+        commands: Commands | None = None,
     ) -> Experiment:
         """Return the experiment of a plan: the recording with other poses of the planned grasp and
         other times, from equilibrium, with points in place of the measurements.
 
-        Other grasps and obstacles stay where they are at the first sample.
+        Other grasps and obstacles stay where they are at the first sample of the recording, and
+        tendons and pressures keep their values.
 
         Parameters
         ----------
@@ -199,14 +205,18 @@ class PlannedBody:
             Times, from the first sample of the recording on.
         points : dict of name to (3,) array
             Places of the points on the undeformed body [m].
+        commands : mapping, optional
+            Times and tensions [N] or pressures [Pa] of planned tendons and pressures, by name.
         """
         template = self.template
         grasps = []
         for number, grasp in enumerate(template.grasps):
             is_planned = number == self.grasp_number and poses is not None
-            moved = poses if is_planned else _standing(grasp.poses, t_s)
+            moved = poses if is_planned else _standing(grasp.poses, template.t_s)
             grasps.append(replace(grasp, poses=moved, wrench=None))
         changes: dict[str, Any] = {
+            "tendons": commanded(template.tendons, template.t_s[0], commands or {}),
+            "pressures": commanded(template.pressures, template.t_s[0], commands or {}),
             "start_positions_m": None,
             "start_velocities_m_s": None,
             "start_velocity_m_s": None,

@@ -1,19 +1,21 @@
 """Optimal-control problem of a plan: residuals, effort of the hand, and limits.
 
-With the unknowns c of the hand's spline, the motion x(c) of the body, the references y* at the
-samples and the mass M of the body, the plan minimises
+With the unknowns c of the splines of the hand and of tensions and pressures, the motion x(c) of the
+body, the references y* at the samples and the mass M of the body, the plan minimises
 
     Σ_k mean_t ‖(S_k x − y*_k)/σ_k‖² + mean_t Σ_i (m_i/M) ‖v_i/(ω₁ σ_rest)‖² + w mean ‖jerk/j₀‖²
 
-subject to limits of the hand g(c) ≤ 0. All residuals are linear in the positions x at the grid times
-(velocities are differences), so that they are one sparse matrix. The second term is the mean kinetic
-energy in the window after the motion, in units of that of a vibration with the amplitude σ_rest at
-the lowest natural frequency ω₁. The unit j₀ of the jerk is ten times the largest acceleration over
-the duration.
+subject to limits g(c) ≤ 0 of the hand and the signals. All residuals are linear in the positions x
+at the grid times (velocities are differences), so that they are one sparse matrix. The second term
+is the mean kinetic energy in the window after the motion, in units of that of a vibration with the
+amplitude σ_rest at the lowest natural frequency ω₁. The unit j₀ of the jerk is ten times the largest
+acceleration over the duration; for tensions and pressures it is the largest third derivative of the
+smoothest change over the whole range.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, cast
@@ -33,7 +35,8 @@ from ...recording import Experiment, PoseSequence
 from ..design.hand_limits import HandBounds, Limits
 from .body_limits import BodyLimits
 from .planned_body import PlannedBody
-from .spline_motion import LIMIT_POINTS, HandFrame, HandLimits, PoseLimit, SplineSpace
+from .signals import Signal, task_signals
+from .spline_motion import HAND, LIMIT_POINTS, HandFrame, HandLimits, PoseLimit, SplineSpace
 from .task import AXES, Reference, Task, point_names, point_places, sampled_references
 
 # Fewest and largest numbers of samples of a plan.
@@ -43,6 +46,9 @@ FEWEST_AT_REST = 4
 # Jerk in units of the limit of the acceleration over the duration: that of a motion which changes
 # between the limits in a tenth of its duration.
 JERK_UNIT = 10.0
+# Largest third derivative of the change with the least jerk, in units of the change over the cube of
+# its duration.
+SIGNAL_JERK_UNIT = 60.0
 # Least variance in a direction of the parameters that scenarios vary, over the largest.
 SMALLEST_VARIANCE = 1e-8
 # Poses per sample that the simulation of a plan interpolates.
@@ -91,7 +97,7 @@ class LinearisedLimits(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LimitsOverTime:
-    """Limits of a hand at all times at which they hold, as functions of the unknowns.
+    """Limits of a hand and of signals at all times at which they hold, as functions of the unknowns.
 
     Attributes
     ----------
@@ -99,8 +105,8 @@ class LimitsOverTime:
         Limits at one time.
     t_s : (T,) array
         Times since the start [s].
-    matrix, constant : (T, 18, c) and (T, 18) arrays
-        Coordinates and their two derivatives as an affine function of the unknowns.
+    matrix, constant : (T, 3k, c) and (T, 3k) arrays
+        The k coordinates and their two derivatives as an affine function of the unknowns.
     """
 
     at_time: HandLimits
@@ -123,7 +129,7 @@ class LimitsOverTime:
         parts = []
         for function in self._slopes:
             values, slopes = (each.full() for each in function(states))
-            by_state = slopes.reshape(len(values), len(self.t_s), 18).transpose(1, 0, 2)
+            by_state = slopes.reshape(len(values), len(self.t_s), len(states)).transpose(1, 0, 2)
             parts += [values.T.ravel(), (by_state @ self.matrix).reshape(-1, len(c))]
         vectors, vector_slopes, rows, row_slopes = parts
         return LinearisedLimits(
@@ -133,7 +139,7 @@ class LimitsOverTime:
     @cached_property
     def _slopes(self) -> tuple[ca.Function, ca.Function]:
         """Vectors and rows with their slopes, at all times."""
-        state = ca.SX.sym("state", 18)
+        state = ca.SX.sym("state", self.matrix.shape[1])
         functions = []
         for each in (self.at_time.vectors, self.at_time.rows):
             values = each(state)
@@ -172,13 +178,15 @@ class PlannedProgram:
     driven : DrivenMotion
         Motion of the body as a function of the hand's.
     space : SplineSpace
-        Motions of the hand.
+        Motions of the hand, and signals.
     start : (3n,) array
         Equilibrium before the motion [m].
     references : list of Reference
         References at the samples.
     lowest_hz : float
         Lowest natural frequency of the body about the equilibrium; NaN if there is none.
+    signals : tuple of Signal
+        Tensions and pressures that the plan chooses.
     pose_limits : callable or None
         Limits of the joints, see `HandLimits`.
     """
@@ -192,16 +200,12 @@ class PlannedProgram:
     start: Array
     references: list[Reference]
     lowest_hz: float
+    signals: tuple[Signal, ...]
     pose_limits: PoseLimit | None = None
 
     @classmethod
     def from_task(
-        cls,
-        body: PlannedBody,
-        task: Task,
-        limits: Limits,
-        pose_limits: PoseLimit | None = None,
-        substeps: int | None = None,
+        cls, body: PlannedBody, task: Task, limits: Limits, pose_limits: PoseLimit | None = None
     ) -> PlannedProgram:
         """Build the problem.
 
@@ -233,10 +237,11 @@ class PlannedProgram:
         rotation, translation = body.start_pose
         hand_m = rotation @ body.hand_m + translation
         bounds = limits.bounds_from(hand_m)
-        space = _space(task, bounds)
+        signals = task_signals(task, template)
+        space = _space(task, bounds, signals)
         names, places = point_names(task), point_places(task, body.marker_places_m)
         points = dict(zip(names, places, strict=True)) or _farthest_node(body)
-        substeps = substeps or body.problem.choose_first_substeps()
+        substeps = body.problem.choose_first_substeps()
 
         def standing(samples: int) -> tuple[Experiment, DrivenMotion]:
             """Return the experiment with `samples` samples in which the hand stands."""
@@ -261,16 +266,15 @@ class PlannedProgram:
         index = {name: k for k, name in enumerate(points)}
         first = started[[index[name] for name in names]] if names else np.zeros((0, 3))
         references = sampled_references(task, since_s, places, first)
-        return cls(
-            body, task, limits, experiment, driven, space, start, references, lowest_hz, pose_limits
-        )
+        hand = experiment, driven, space, start, references, lowest_hz, signals
+        return cls(body, task, limits, *hand, pose_limits)
 
     def with_duration(self, duration_s: float) -> PlannedProgram:
         """Return the program with another duration [s] of the hand's motion, for the limits of the
         hand alone: samples and references are those of this program.
         """
         task = self.task.stretched(duration_s)
-        return replace(self, task=task, space=_space(task, self.bounds))
+        return replace(self, task=task, space=_space(task, self.bounds, self.signals))
 
     def scenarios(self) -> tuple[PlannedProgram, ...]:
         """Return programs whose parameters are at 2k points around those of this program, so that
@@ -291,7 +295,10 @@ class PlannedProgram:
         for step in np.concatenate([steps.T, -steps.T]):
             driven = replace(self.driven, q=self.driven.q + step)
             start = equilibrium(self.experiment, driven.theta, start=self.start)
-            found.append(replace(self, driven=driven, start=start))
+            other = replace(self, driven=driven, start=start)
+            # The hand and the residuals are the same.
+            vars(other).update({name: getattr(self, name) for name in SHARED})
+            found.append(other)
         return tuple(found)
 
     # The hand -------------------------------------------------------------------------------------
@@ -317,7 +324,22 @@ class PlannedProgram:
     @cached_property
     def coordinates_at_grid(self) -> tuple[Array, Array]:
         """Matrix (N, 6, c) and constant (N, 6) of the hand's coordinates at the grid times."""
-        return self.space.affine(self.grid_since_s)
+        matrix, constant = self.space.affine(self.grid_since_s)
+        return matrix[:, :HAND], constant[:, :HAND]
+
+    @cached_property
+    def _amplitudes(self) -> tuple[Array, Array]:
+        """Amplitudes of all tendons and pressures at the evaluations as an affine function of the
+        unknowns: matrix (N, a, c) and constant (N, a).
+        """
+        by_unknown, given = self.space.affine(self.driven.evaluated_s - self.driven.t_s[0])
+        constant = np.array(self.driven.stated_amplitudes)
+        matrix = np.zeros((*constant.shape, self.space.size))
+        for k, signal in enumerate(self.signals, HAND):
+            matrix[:, signal.number] = signal.slope * by_unknown[:, k]
+            value = given[:, k] + signal.initial - signal.offset
+            constant[:, signal.number] = signal.slope * value
+        return matrix, constant
 
     @cached_property
     def planned_columns(self) -> Index:
@@ -334,11 +356,26 @@ class PlannedProgram:
         by_control = np.zeros((*goals.shape, len(c)))
         goals[:, self.planned_columns] = positions.reshape(rows, -1)
         by_control[:, self.planned_columns] = slopes.reshape(rows, -1, 6) @ matrix
-        return Drive(goals, by_control)
+        if not self.signals:
+            return Drive(goals, by_control)
+        matrix, constant = self._amplitudes
+        return Drive(goals, by_control, matrix @ c + constant, matrix)
 
     def coordinates(self, c: Array, t_s: Array) -> Array:
         """Return the coordinates (T, 6) of the hand at times since the start."""
         return self.space.motion(c).derivatives(t_s).value
+
+    def commands(self, c: Array, t_s: Array) -> dict[str, Array]:
+        """Return the commands (T,) of tendons and pressures [N, Pa] at times since the start, by
+        name, within their limits.
+        """
+        values, rates, _ = self.space.signals(c).derivatives(t_s)
+        return {
+            each.name: np.clip(
+                each.command(values[:, k], rates[:, k]), each.lowest, each.highest
+            )
+            for k, each in enumerate(self.signals)
+        }  # fmt: skip
 
     def poses(self, c: Array, t_s: Array) -> PoseSequence:
         """Return the poses of the grasped body at times (T,) since the start [s], as grasps have
@@ -363,8 +400,10 @@ class PlannedProgram:
 
     @cached_property
     def hand_limits(self) -> LimitsOverTime:
-        """Limits of the hand."""
-        at_time = HandLimits.from_bounds(self.bounds, self.frame, self.space.free, self.pose_limits)
+        """Limits of the hand and of the signals."""
+        at_time = HandLimits.from_bounds(
+            self.bounds, self.frame, self.space.free, self.pose_limits, self.signals
+        )
         return LimitsOverTime.in_space(at_time, self.space)
 
     # The residuals --------------------------------------------------------------------------------
@@ -391,12 +430,18 @@ class PlannedProgram:
 
     @cached_property
     def effort(self) -> tuple[Array, Array]:
-        """Matrix (k, c) and constant (k,) of the weighted jerk of the hand, an affine residual."""
+        """Matrix (k, c) and constant (k,) of the weighted jerk of the hand and of the signals, an
+        affine residual.
+        """
         matrix, constant = self.space.jerk()
-        limits = self.limits
+        limits, duration_s = self.limits, self.space.duration_s
         growth = np.radians(limits.angular_acceleration_deg_s2)
-        unit = np.repeat([limits.acceleration_m_s2, growth], 3) * JERK_UNIT / self.space.duration_s
-        weight = np.sqrt(self.task.hand.jerk_weight / len(matrix)) / unit
+        unit = np.repeat([limits.acceleration_m_s2, growth], 3) * JERK_UNIT / duration_s
+        spans = np.array([each.span for each in self.signals])
+        unit = np.concatenate([unit, SIGNAL_JERK_UNIT * spans / duration_s**3])
+        weights = [self.task.hand.jerk_weight] * HAND
+        weights += [each.section.jerk_weight for each in self.signals]
+        weight = np.sqrt(np.array(weights) / len(matrix)) / unit
         scaled = matrix * weight[:, None]
         return scaled.reshape(-1, self.space.size), (constant * weight).ravel()
 
@@ -507,9 +552,25 @@ class PlannedProgram:
         """Return the objective at unknowns c and motion x (N, 3n)."""
         return sum(self.objective_parts(c, x).values())
 
-    def simulate(self, c: Array, near: Array | None = None) -> Array:
-        """Return the motion (N, 3n) [m] at the unknowns c, see `DrivenMotion.simulate`."""
-        return self.driven.simulate(self.drive(c), start=self.start, near=near)
+    def simulate(self, c: Array, near: Array | None = None, drive: Drive | None = None) -> Array:
+        """Return the motion (N, 3n) [m] at the unknowns c, see `DrivenMotion.simulate`; `drive` is
+        that of c, where it is known.
+        """
+        return self.driven.simulate(drive or self.drive(c), start=self.start, near=near)
+
+
+# What programs with other constants have in common with the original, see `scenarios`.
+SHARED = (
+    "bounds",
+    "frame",
+    "coordinates_at_grid",
+    "planned_columns",
+    "_amplitudes",
+    "hand_limits",
+    "residual_rows",
+    "residuals",
+    "effort",
+)
 
 
 def _selection(rows: Index, count: int, weights: Array) -> sp.csr_array:
@@ -541,10 +602,12 @@ def _farthest_node(body: PlannedBody) -> dict[str, Array]:
     return {"farthest node": nodes_m[farthest]}
 
 
-def _space(task: Task, bounds: HandBounds) -> SplineSpace:
-    """Return the space of the hand's motions; an `InputError` if the end is beyond the workspace."""
+def _space(task: Task, bounds: HandBounds, signals: Sequence[Signal]) -> SplineSpace:
+    """Return the space of the hand's motions and of the signals; an `InputError` if the end is
+    beyond the workspace.
+    """
     hand = task.hand
-    free = np.array([AXES.index(axis) for axis in hand.free])
+    free = np.array([AXES.index(axis) for axis in hand.free], dtype=np.int64)
     end = np.full(6, np.nan)
     if hand.end_m is not None:
         end[:3] = hand.end_m
@@ -569,7 +632,13 @@ def _space(task: Task, bounds: HandBounds) -> SplineSpace:
     end[np.setdiff1d(np.arange(6), free)] = 0.0
     reach = bounds.compute_reach()
     units = np.repeat(np.minimum(reach.value, reach.second * task.duration_s**2 / 4), 3)
-    return SplineSpace(task.duration_s, hand.intervals, np.sort(free), end, units)
+    return SplineSpace(
+        task.duration_s,
+        hand.intervals,
+        np.concatenate([np.sort(free), HAND + np.arange(len(signals))]),
+        np.concatenate([end, [each.end for each in signals]]),
+        np.concatenate([units, [each.span for each in signals]]),
+    )
 
 
 def _lowest_frequency_hz(driven: DrivenMotion, start: Array) -> float:

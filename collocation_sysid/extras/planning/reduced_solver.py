@@ -231,7 +231,8 @@ def solve_reduced(
     limits = tolerances or ReducedTolerances()
     c = smoothest_motion(program) if start is None else start
     programs = scenarios or (program,)
-    motions = [each.simulate(c) for each in programs]
+    drive = program.drive(c)
+    motions = [each.simulate(c, drive=drive) for each in programs]
     matrix, target = program.residuals
     by_jerk, jerk = program.effort
     value = _mean_objective(programs, c, motions)
@@ -243,7 +244,6 @@ def solve_reduced(
         while len(answer.history) <= limits.iterations:
             if watch is not None:
                 watch(len(answer.history) - 1, value)
-            drive = program.drive(c)
             slopes = [p.driven.respond(drive, x) for p, x in zip(programs, motions, strict=True)]
             share = 1 / np.sqrt(len(programs))
             rows = np.vstack([*(share * (matrix @ s.reshape(-1, len(c))) for s in slopes), by_jerk])
@@ -272,14 +272,16 @@ def solve_reduced(
                     answer.status = "converged" if damping < 1e-3 and allowed else "stalled"
                     if damping < 1e-3:
                         return answer
-                moved, decrease = motions, -np.inf
+                moved, decrease, excess = motions, -np.inf, violation
                 if program.hand_limits.shares(trial).max() <= LARGEST_SHARE:
                     with suppress(SimulationError):
+                        drive = program.drive(trial)
                         moved = [
-                            p.simulate(trial, near=x + by_c @ step)
+                            p.simulate(trial, near=x + by_c @ step, drive=drive)
                             for p, x, by_c in zip(programs, motions, slopes, strict=True)
                         ]
-                        if _violation(program, moved) <= max(violation, LARGEST_SHARE - 1):
+                        excess = _violation(program, moved)
+                        if excess <= max(violation, LARGEST_SHARE - 1):
                             decrease = value - _mean_objective(programs, trial, moved)
                 # While a limit of the body is exceeded, the violation decreases instead.
                 if decrease > (1e-4 * predicted if allowed else -np.inf):
@@ -292,8 +294,7 @@ def solve_reduced(
             damping = damping / 5 if decrease > 0.5 * predicted else damping
             damping = 0.0 if damping < 1e-6 else damping
             failures = 0
-            c, motions, value = trial, moved, value - decrease
-            violation = _violation(program, motions)
+            c, motions, value, violation = trial, moved, value - decrease, excess
             answer.c, answer.x, answer.multipliers = c, motions[0], trial_multipliers
             answer.history.append(value)
             past = answer.history[-4:]

@@ -1,30 +1,37 @@
-"""Motion of a hand as cubic B-splines of its six coordinates, from rest to rest.
+"""Motion of a hand and signals of actuators as cubic B-splines of their coordinates, from rest to
+rest.
 
-The coordinates are a shift d(t) and a rotation vector r(t) relative to the initial pose, so that the
-hand is at p₀ + d(t) with the orientation exp(r(t)) R₀. Velocity and acceleration are zero at both
-ends, because the first three and the last three coefficients of a clamped cubic spline are equal
-there; after the end the hand stays.
+The first six coordinates are a shift d(t) and a rotation vector r(t) relative to the initial pose, so
+that the hand is at p₀ + d(t) with the orientation exp(r(t)) R₀; the others are those of `Signal`s.
+First and second derivatives are zero at both ends, because the first three and the last three
+coefficients of a clamped cubic spline are equal there; after the end all coordinates stay.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from ...common.array_types import Array, Index
+from ...common.files import reason
+from ...errors import InputError
 from ..design.hand_limits import WITHIN, HandBounds
 from ..design.hand_motion import TimeDerivatives
+from .signals import Signal
 
 # Expression (k,), which must not be positive, of the position (3,) and the rotation (3, 3).
 PoseLimit = Callable[[ca.SX, ca.SX], Any]
 
 DEGREE = 3
+# Coordinates of the hand, which come first.
+HAND = 6
 # Points of an interval of the spline at which limits hold; its knots are among them, where the
 # acceleration has its peaks.
 LIMIT_POINTS = 6
@@ -38,7 +45,7 @@ SMALL_SQUARE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class SplineSpace:
-    """Cubic splines of the six coordinates of a hand that begin and end at rest.
+    """Cubic splines of k coordinates, the first six those of a hand, that begin and end at rest.
 
     The unknowns are scaled coefficients, those of the free coordinates, time by time: first the
     inner coefficients, and last the value at the end unless it is given.
@@ -49,13 +56,13 @@ class SplineSpace:
         Duration of the motion [s].
     intervals : int
         Number of intervals of the spline.
-    free : (k,) array of int
+    free : array of int
         Indices of the coordinates that may move.
-    end : (6,) array
-        Given values at the end [m, rad]; NaN where the value is free. Coordinates that are not free
-        have zero.
-    units : (6,) array
-        Units of the coefficients [m, rad].
+    end : (k,) array
+        Given values at the end; NaN where the value is free. Coordinates that are not free have
+        zero.
+    units : (k,) array
+        Units of the coefficients.
     """
 
     duration_s: float
@@ -78,7 +85,7 @@ class SplineSpace:
 
     @cached_property
     def _map(self) -> Array:
-        """Matrix (intervals + 3, 6, c) from unknowns to coefficients, without those given."""
+        """Matrix (intervals + 3, k, c) from unknowns to coefficients, without those given."""
         count = self.intervals + DEGREE
         columns = []
         for row in range(EQUAL, count - EQUAL + 1):
@@ -86,15 +93,20 @@ class SplineSpace:
             for axis in self.free:
                 if row == count - EQUAL and np.isfinite(self.end[axis]):
                     continue
-                column = np.zeros((count, 6))
+                column = np.zeros((count, len(self.end)))
                 column[rows, axis] = self.units[axis]
                 columns.append(column)
         return np.stack(columns, axis=2)
 
     @cached_property
+    def moves_hand(self) -> NDArray[np.bool_]:
+        """Whether each unknown (c,) belongs to the hand, and not to a signal."""
+        return self._map[:, :HAND].any(axis=(0, 1))
+
+    @cached_property
     def _given(self) -> Array:
-        """Coefficients (intervals + 3, 6) of the motion with zero unknowns."""
-        given = np.zeros((self.intervals + DEGREE, 6))
+        """Coefficients (intervals + 3, k) of the motion with zero unknowns."""
+        given = np.zeros((self.intervals + DEGREE, len(self.end)))
         given[-EQUAL:] = np.nan_to_num(self.end)
         return given
 
@@ -112,18 +124,22 @@ class SplineSpace:
 
     def affine(self, t_s: Array, order: int = 0) -> tuple[Array, Array]:
         """Return the coordinates, or their derivatives of an order, as an affine function of the
-        unknowns: matrix (T, 6, c) and constant (T, 6).
+        unknowns: matrix (T, k, c) and constant (T, k).
         """
         basis = self.basis(t_s, order)
         return np.tensordot(basis, self._map, axes=1), basis @ self._given
 
     def motion(self, unknowns: Array) -> SplineMotion:
-        """Return the motion of unknowns (c,)."""
-        return SplineMotion(self, self._given + self._map @ unknowns)
+        """Return the motion of the hand at unknowns (c,)."""
+        return SplineMotion(self, (self._given + self._map @ unknowns)[:, :HAND])
+
+    def signals(self, unknowns: Array) -> SplineMotion:
+        """Return the coordinates of the signals at unknowns (c,)."""
+        return SplineMotion(self, (self._given + self._map @ unknowns)[:, HAND:])
 
     def jerk(self) -> tuple[Array, Array]:
         """Return the jerk in each interval as an affine function of the unknowns: matrix
-        (intervals, 6, c) and constant (intervals, 6) [m/s³, rad/s³].
+        (intervals, k, c) and constant (intervals, k) [m/s³, rad/s³, N/s³, Pa/s³].
         """
         middles = (np.arange(self.intervals) + 0.5) * self.duration_s / self.intervals
         return self.affine(middles, 3)
@@ -131,12 +147,12 @@ class SplineSpace:
 
 @dataclass(frozen=True, eq=False)
 class SplineMotion:
-    """Motion of a hand.
+    """Motion of a hand, or signals, over time.
 
     Attributes
     ----------
-    coefficients : (intervals + 3, 6) array
-        Coefficients of shift [m] and rotation vector [rad].
+    coefficients : (intervals + 3, k) array
+        Coefficients of shift [m] and rotation vector [rad], or of the signals [N, Pa].
     """
 
     space: SplineSpace
@@ -153,7 +169,7 @@ class SplineMotion:
         return np.linspace(0.0, self.duration_s, CHECK_POINTS * self.space.intervals + 1)
 
     def derivatives(self, t_s: Array) -> TimeDerivatives:
-        """Return the coordinates (T, 6) and their first and second derivatives at times since the
+        """Return the coordinates (T, k) and their first and second derivatives at times since the
         start [s].
         """
         value, first, second = (
@@ -237,14 +253,20 @@ def _turns(vectors: Array) -> tuple[Array, Array]:
     """Return the rotation matrices (T, 3, 3) of rotation vectors (T, 3), and their derivatives
     (T, 3, 3, 3) by these.
     """
-    turn = ca.SX.sym("turn", 3)
-    rows = ca.vec(rotation_expression(turn).T)
-    function = ca.Function("turns", [turn], [rows, ca.densify(ca.jacobian(rows, turn))])
-    values, slopes = (each.full() for each in function.map(len(vectors))(vectors.T))
+    values, slopes = (each.full() for each in _turn_function().map(len(vectors))(vectors.T))
     by_turn = slopes.reshape(3, 3, len(vectors), 3).transpose(2, 0, 1, 3)
     return values.T.reshape(-1, 3, 3), by_turn
 
 
+@cache
+def _turn_function() -> ca.Function:
+    """Return the rows (9,) of exp(r) and their derivatives (9, 3) by r."""
+    turn = ca.SX.sym("turn", 3)
+    rows = ca.vec(rotation_expression(turn).T)
+    return ca.Function("turns", [turn], [rows, ca.densify(ca.jacobian(rows, turn))])
+
+
+@cache
 def _turn_curvature() -> ca.Function:
     """Return the second derivatives (3, 3) of tr(exp(r) Mᵀ) by r, of r (3,) and M (9,)."""
     data = ca.SX.sym("data", 12)
@@ -253,9 +275,33 @@ def _turn_curvature() -> ca.Function:
     return ca.Function("turn_curvature", [data], [ca.hessian(trace, turn)[0]])
 
 
+def _joint_limits(function: PoseLimit, position_m: ca.SX, rotation: ca.SX) -> ca.SX:
+    """Return the expressions (k,) of a user's function."""
+    where = "hand.joint_limits"
+    try:
+        values = function(position_m, rotation)
+        rows = ca.vec(ca.vertcat(*values) if isinstance(values, (list, tuple)) else ca.SX(values))
+    except Exception as error:
+        raise InputError(
+            f"the function failed: {reason(error)}; expected expressions of position_m (3,) and "
+            "rotation (3, 3) in CasADi operations",
+            None,
+            where=where,
+        ) from error
+    if not all(ca.symvar(rows[k]) for k in range(rows.numel())) or not rows.numel():
+        raise InputError(
+            "a value of the function does not depend on the pose; expected expressions of position_m "
+            "and rotation",
+            None,
+            where=where,
+        )
+    return rows
+
+
 @dataclass(frozen=True)
 class HandLimits:
-    """Limits of a hand at one time, of its coordinates and their two derivatives (18,).
+    """Limits of a hand and of signals at one time, of the k coordinates and their two derivatives
+    (3 k,).
 
     Attributes
     ----------
@@ -276,7 +322,12 @@ class HandLimits:
 
     @classmethod
     def from_bounds(
-        cls, bounds: HandBounds, frame: HandFrame, free: Index, pose_limits: PoseLimit | None = None
+        cls,
+        bounds: HandBounds,
+        frame: HandFrame,
+        free: Index,
+        pose_limits: PoseLimit | None = None,
+        signals: Sequence[Signal] = (),
     ) -> HandLimits:
         """Build from the limits of the robot; those of coordinates that cannot move are left out.
 
@@ -290,9 +341,12 @@ class HandLimits:
             Coordinates that may move.
         pose_limits : callable, optional
             Further limits, of position (3,) [m] and rotation (3, 3) of the hand.
+        signals : sequence of Signal
+            The signals, whose coordinates follow those of the hand.
         """
-        state = ca.SX.sym("state", 18)
-        value, first, second = state[:6], state[6:12], state[12:]
+        size = HAND + len(signals)
+        state = ca.SX.sym("state", 3 * size)
+        value, first, second = ca.vertsplit(state, size)
         limits = bounds.limits
         rows: list[tuple[str, Any]] = []
         for axis in range(3):
@@ -307,7 +361,7 @@ class HandLimits:
                 ("acceleration_m_s2", second[:3], limits.acceleration_m_s2),
             ]
         if turns:
-            turn, rate, growth = value[3:], first[3:], second[3:]
+            turn, rate, growth = value[3:HAND], first[3:HAND], second[3:HAND]
             _, a, b = _factors(ca.sumsqr(turn))
             across = ca.cross(turn, rate)
             spin = rate + a * across + b * ca.cross(turn, across)
@@ -322,13 +376,16 @@ class HandLimits:
                 for name, each in angular.items()
             ]
         if pose_limits is not None:
-            rotation = rotation_expression(value[3:]) @ ca.DM(frame.rotation)
-            extra = ca.vertcat(pose_limits(value[:3] + ca.DM(frame.position_m), rotation))
+            rotation = rotation_expression(value[3:HAND]) @ ca.DM(frame.rotation)
+            extra = _joint_limits(pose_limits, value[:3] + ca.DM(frame.position_m), rotation)
             rows += [("joint_limits", extra[k]) for k in range(extra.numel())]
+        for k, signal in enumerate(signals, HAND):
+            rows += signal.limit_rows(value[k], first[k], second[k])
         scaled = [each / (WITHIN * most) for _, each, most in vectors]
+        nothing = ca.SX(0, 1)
         return cls(
-            ca.Function("vectors", [state], [ca.vertcat(*scaled)]),
+            ca.Function("vectors", [state], [ca.vertcat(nothing, *scaled)]),
             tuple(name for name, _, _ in vectors),
-            ca.Function("rows", [state], [ca.vertcat(*(each for _, each in rows))]),
+            ca.Function("rows", [state], [ca.vertcat(nothing, *(each for _, each in rows))]),
             tuple(name for name, _ in rows),
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -28,6 +28,7 @@ from ...common.validated_types import (
 )
 from ...errors import InputError, hint_at, listed, located
 from ...problem.problem_reading import parse_toml, read_text
+from ...problem.schema import CodeSection
 from ...problem.validation_messages import explain_validation_error
 from ...recording.formats.columns import find_time
 from ...recording.formats.text import decode, numeric_cells, read_bytes, read_table, times_in_column
@@ -150,7 +151,8 @@ class HandSection(Section):
     ----------
     free
         Coordinates that may move: x, y, z of the middle of the grasped nodes (the default), and rx,
-        ry, rz of the rotation vector, relative to the initial pose in world axes.
+        ry, rz of the rotation vector, relative to the initial pose in world axes; none, [], beside
+        a tendon or pressure.
     intervals
         Number of equal time intervals of the cubic spline of each coordinate.
     end_m
@@ -160,15 +162,17 @@ class HandSection(Section):
     jerk_weight
         Weight of the mean square jerk of the hand, in units of ten times the limit of the
         acceleration over the duration.
+    joint_limits
+        Python function of position (3,) [m] and rotation (3, 3) of the hand, in CasADi operations,
+        that returns expressions which must not be positive.
     """
 
-    free: Annotated[list[HandAxis], Field(min_length=1)] = Field(
-        default_factory=lambda: [*AXES[:3]]
-    )
+    free: list[HandAxis] = Field(default_factory=lambda: [*AXES[:3]])
     intervals: Annotated[AtLeastOne, Field(ge=6, le=200)] = 16
     end_m: Row | None = None
     end_rotation_deg: Row | None = None
     jerk_weight: Positive = 1e-3
+    joint_limits: CodeSection | None = None
 
     @model_validator(mode="after")
     def _require_consistent(self) -> HandSection:
@@ -184,6 +188,93 @@ class HandSection(Section):
                         f"{key} moves {axis}, which is not free; expected {axis} in free, or 0"
                     )
         return self
+
+
+class SignalSection(Section):
+    """A tension or pressure that the plan chooses."""
+
+    name: Text
+    jerk_weight: Positive = 1e-3
+    range_key: ClassVar[str]
+    rate_key: ClassVar[str]
+    end_key: ClassVar[str]
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Lowest and highest value [N, Pa]."""
+        return getattr(self, self.range_key)
+
+    @property
+    def rate(self) -> float:
+        """Largest rate of change [N/s, Pa/s]."""
+        return getattr(self, self.rate_key)
+
+    @property
+    def end(self) -> float | None:
+        """Given value at the end [N, Pa]."""
+        return getattr(self, self.end_key)
+
+    @model_validator(mode="after")
+    def _require_range(self) -> SignalSection:
+        low, high = self.range
+        if not low < high:
+            raise ValueError(
+                f"{self.range_key} is [{low:g}, {high:g}]; expected the lowest value, and a higher one"
+            )
+        if self.end is not None and not low <= self.end <= high:
+            raise ValueError(
+                f"{self.end_key} = {self.end:g} is outside {self.range_key}; expected a value from "
+                f"{low:g} to {high:g}"
+            )
+        return self
+
+
+class TendonSection(SignalSection):
+    """Tension of a tendon that the plan chooses.
+
+    Attributes
+    ----------
+    name
+        Name of the tendon of the recording.
+    tension_n
+        Lowest and highest tension.
+    rate_n_s
+        Largest rate at which the tension changes.
+    end_n
+        Tension at the end of the motion; free by default.
+    jerk_weight
+        Weight of the mean square third derivative of the tension, in units of 60 times the range over
+        the cube of the duration: of the smoothest change over the whole range.
+    """
+
+    tension_n: tuple[NotNegative, NotNegative]
+    rate_n_s: Positive
+    end_n: NotNegative | None = None
+    range_key, rate_key, end_key = "tension_n", "rate_n_s", "end_n"
+
+
+class PressureSection(SignalSection):
+    """Pressure that the plan chooses, before a lag of the recording.
+
+    Attributes
+    ----------
+    name
+        Name of the pressure of the recording.
+    pressure_pa
+        Lowest and highest pressure; negative for suction.
+    rate_pa_s
+        Largest rate at which the pressure changes.
+    end_pa
+        Pressure at the end of the motion; free by default.
+    jerk_weight
+        Weight of the mean square third derivative of the pressure, in units of 60 times the range
+        over the cube of the duration: of the smoothest change over the whole range.
+    """
+
+    pressure_pa: tuple[Finite, Finite]
+    rate_pa_s: Positive
+    end_pa: Finite | None = None
+    range_key, rate_key, end_key = "pressure_pa", "rate_pa_s", "end_pa"
 
 
 class AvoidSection(Section):
@@ -222,6 +313,9 @@ class Task(Section):
         State of the body at the end.
     hand
         Motion of the hand.
+    tendon, pressure
+        [[tendon]] and [[pressure]] tables: tensions and pressures that the plan chooses; the others
+        keep their values before the motion.
     avoid
         Limits of the body.
     """
@@ -233,11 +327,36 @@ class Task(Section):
     reference: list[ReferenceSection] = Field(default_factory=list)
     end: EndSection = Field(default_factory=EndSection)
     hand: HandSection = Field(default_factory=HandSection)
+    tendon: list[TendonSection] = Field(default_factory=list)
+    pressure: list[PressureSection] = Field(default_factory=list)
     avoid: AvoidSection = Field(default_factory=AvoidSection)
+
+    @property
+    def signals(self) -> list[tuple[str, int, SignalSection]]:
+        """Kind, number from one, and table of each tension and pressure that the plan chooses."""
+        return [
+            (kind, number, each)
+            for kind, tables in (("tendon", self.tendon), ("pressure", self.pressure))
+            for number, each in enumerate(tables, 1)
+        ]
 
     @model_validator(mode="after")
     def _require_purpose(self) -> Task:
         hand = self.hand
+        signals = [each for _, _, each in self.signals]
+        if not hand.free and not signals:
+            raise InputError(
+                "found []; expected coordinates that may move, or a [[tendon]] or [[pressure]] table",
+                None,
+                where="hand.free",
+            )
+        names = [each.name for each in signals]
+        if twice := [name for k, name in enumerate(names) if name in names[:k]]:
+            raise InputError(
+                f"two tables have the name {twice[0]!r}; expected one for each tendon or pressure",
+                None,
+                where="tendon" if self.tendon else "pressure",
+            )
         if self.shortest and self.largest_error_m is None:
             raise InputError(
                 "the shortest duration needs the error that is acceptable; expected "
@@ -245,7 +364,8 @@ class Task(Section):
                 None,
                 where="shortest",
             )
-        if not self.reference and hand.end_m is None and hand.end_rotation_deg is None:
+        ends = [hand.end_m, hand.end_rotation_deg, *(each.end for each in signals)]
+        if not self.reference and all(end is None for end in ends):
             raise InputError(
                 "nothing to do; expected a [[reference]] table, or end_m in [hand]",
                 None,
@@ -283,7 +403,7 @@ class Task(Section):
 
     @classmethod
     def read(cls, path: str | Path) -> Task:
-        """Read task.toml and the files of its references.
+        """Read task.toml and the files of its references; the file of `joint_limits` is not run.
 
         Raises
         ------
@@ -297,9 +417,14 @@ class Task(Section):
             task = cls.model_validate(content)
         except ValidationError as error:
             raise explain_validation_error(error, content, path=file, root=cls) from error
-        return task.model_copy(
-            update={"reference": [_with_values_of_file(each, file) for each in task.reference]}
-        )
+        update: dict[str, Any] = {
+            "reference": [_with_values_of_file(each, file) for each in task.reference]
+        }
+        if task.hand.joint_limits is not None:
+            code = task.hand.joint_limits
+            absolute = code.model_copy(update={"file": str(file.resolve().parent / code.file)})
+            update["hand"] = task.hand.model_copy(update={"joint_limits": absolute})
+        return task.model_copy(update=update)
 
 
 def _with_values_of_file(section: ReferenceSection, task: Path) -> ReferenceSection:
