@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from kit.problem_files import TRUTH as TRUTH_OF_FILES
 from kit.problem_files import run_command, write_problem
 from scipy.linalg import eigh, expm
 from scipy.signal import lsim
@@ -25,13 +26,19 @@ from collocation_sysid.extras.planning.full_program import (
     solve_full,
 )
 from collocation_sysid.extras.planning.motion_plan import MotionPlan, plan_motion
-from collocation_sysid.extras.planning.plan_folder import command_times_s, plan_json, plan_summary
+from collocation_sysid.extras.planning.plan_folder import (
+    command_times_s,
+    plan_json,
+    plan_summary,
+    write_plan,
+)
 from collocation_sysid.extras.planning.planned_body import PlannedBody
 from collocation_sysid.extras.planning.planned_program import PlannedProgram
 from collocation_sysid.extras.planning.reduced_solver import ReducedTolerances, solve_reduced
 from collocation_sysid.extras.planning.spline_motion import rotation_expression
 from collocation_sysid.extras.planning.task import AvoidSection, Task, sampled_references
 from collocation_sysid.extras.planning.trajectory_log import write_trajectory_mcap
+from collocation_sysid.recording import read_markers, write_markers_csv
 from collocation_sysid.recording.pose_files import read_poses
 
 LIMITS = Limits.model_validate(
@@ -1228,3 +1235,38 @@ def test_a_point_is_held_still_while_the_hand_moves():
     plan = plan_motion(hung_bar(), wanted, LIMITS)
     assert plan.motion.derivatives(plan.t_s).value[-1, 0] == pytest.approx(0.03)
     assert plan.tracking_error(plan.program.references[0]).largest_m < 3e-3
+
+
+@pytest.mark.long
+def test_the_folder_of_a_plan_checks_its_execution_and_identifies_from_it(tmp_path: Path):
+    problem = write_problem(tmp_path, {"swing": 10})
+    (tmp_path / "task.toml").write_text(GOOD)
+    plan = plan_motion(problem, tmp_path / "task.toml", LIMITS)
+    folder = write_plan(plan, tmp_path / "plan", with_film=False)
+    recorded = folder / "predicted_markers.csv"
+    planned = read_markers(recorded)
+    noise = np.random.default_rng(0).normal(scale=1e-3, size=planned.positions_m.shape)
+    guesses = plan.program.body.problem.parameters.values(plan.program.body.q)
+
+    def record(**changes: float) -> None:
+        """The markers of an execution by a body with other constants."""
+        seen = cs.simulate(
+            cs.Problem.read(folder / "check.toml", simulation=True).experiments[0],
+            guesses | changes, "midpoint", substeps=4,
+        )  # fmt: skip
+        write_markers_csv(recorded, planned.t_s, planned.names, seen.markers_m + noise)
+
+    def solved(file: str, out: str) -> dict:
+        outcome = run_command("solve", str(folder / file), "--out", str(tmp_path / out))
+        assert outcome.code in (0, 1), outcome.err
+        return json.loads((tmp_path / out / "result.json").read_text())
+
+    record()
+    good = solved("check.toml", "good")
+    assert good["trust"]["verdict"] == "good"
+    record(mu_pa=120.0)
+    assert solved("check.toml", "other")["trust"]["verdict"] != "good"
+    # The first recording of write_problem has other constants than its guesses.
+    record(**TRUTH_OF_FILES)
+    again = solved("identify.toml", "again")
+    assert again["parameters"]["mu_pa"]["value"] == pytest.approx(300.0, rel=0.05)

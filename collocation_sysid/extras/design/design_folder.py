@@ -198,7 +198,7 @@ def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     problem_table.pop("experiment_defaults", None)
     old_folder = origin.path.resolve().parent
     for key in ("object", "experiment"):
-        problem_table[key] = _relative_to(problem_table[key], old_folder, new=folder)
+        problem_table[key] = relative_to(problem_table[key], old_folder, new=folder)
     tables = problem_table["experiment"]
     names = [each.get("name") for each in tables]
     new = deepcopy(tables[names.index(recording.template.name)])
@@ -243,17 +243,17 @@ def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
     return table
 
 
-def _relative_to(value: Any, old: Path, new: Path) -> Any:
+def relative_to(value: Any, old: Path, new: Path) -> Any:
     """Return nested content of a problem with file names relative to the folder `new` instead of
     `old`, in new lists and dictionaries; whether the files exist does not matter.
     """
     if isinstance(value, list):
-        return [_relative_to(each, old, new=new) for each in value]
+        return [relative_to(each, old, new=new) for each in value]
     if not isinstance(value, dict):
         return value
     return {
         key: Path(os.path.relpath(old / each, new)).as_posix()
         if key in OF_FILES and isinstance(each, str)
-        else (each if key == "columns" else _relative_to(each, old, new=new))
+        else (each if key == "columns" else relative_to(each, old, new=new))
         for key, each in value.items()
     }

@@ -12,7 +12,6 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...common.display import Line, Shown, Table
-from ...common.files import safe_name
 from ...common.serialisation import as_json
 from ...fem.laws.constants import symbol_of
 from ...recording import write_markers_csv, write_poses_csv
@@ -22,12 +21,12 @@ from ...result.pictures.album import save_pictures
 from ...result.replay import MotionRecord
 from ...result.run_writers import replaced_folder
 from ..design.hand_motion import angular_motion
+from .execution_problems import POSES_FILE, execution_problems, problem_text, write_commands
 from .motion_plan import MotionPlan
 from .plan_pictures import plan_figures
 from .trajectory_log import write_trajectory_mcap
 
 PLAN_FILE = "plan.json"
-POSES_FILE = "poses.csv"
 HAND_FILE = "hand.csv"
 PREDICTION_FILE = "predicted_points.csv"
 FILM_FILE = "motion.gif"
@@ -49,7 +48,8 @@ def write_plan(
 
     It contains poses.csv (poses in the format of the problem), hand.csv (the hand with velocity and
     acceleration), command_<name>.csv of each planned tendon and pressure, predicted_points.csv,
-    pictures, plan.json and, with `with_film`, motion.gif.
+    pictures, plan.json, with `with_film` motion.gif, and, if the problem was read from a file,
+    check.toml and identify.toml for a recorded execution.
 
     Parameters
     ----------
@@ -75,9 +75,9 @@ def write_plan(
         t_s = command_times_s(plan, rate_hz)
         write_poses_csv(place / POSES_FILE, plan.poses(t_s))
         write_columns_csv(place / HAND_FILE, hand_columns(plan, t_s))
-        for each, values in zip(plan.program.signals, plan.commands(t_s).values(), strict=True):
-            column = {"t_s": t_s, each.section.range_key: values}
-            write_columns_csv(place / command_file(each.name), column)
+        write_commands(plan, place, t_s)
+        for name, content in execution_problems(plan, place, target.resolve()).items():
+            (place / name).write_text(problem_text(name, content), encoding="utf-8")
         if with_mcap:
             write_trajectory_mcap(plan, place / TRAJECTORY_FILE, t_s)
         if plan.points_m:
@@ -105,11 +105,6 @@ def command_times_s(plan: MotionPlan, rate_hz: float | None = None) -> Array:
     last_s = plan.t_s[-1]
     rate = float(4 / plan.t_s[1]) if rate_hz is None else rate_hz
     return np.arange(int(np.ceil(last_s * rate - 1e-9)) + 1) / rate
-
-
-def command_file(name: str) -> str:
-    """Return the name of the file with the planned tension or pressure of an actuator."""
-    return f"command_{safe_name(name)}.csv"
 
 
 def hand_columns(plan: MotionPlan, t_s: Array) -> dict[str, Array]:

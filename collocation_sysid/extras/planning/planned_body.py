@@ -47,6 +47,8 @@ class PlannedBody:
         Reasons not to rely on the constants without care.
     run : Path or None
         Run folder; None for a problem or a run in memory.
+    home : Path or None
+        Folder to which names of files in the problem are relative; None for a problem of Python.
     """
 
     problem: Problem
@@ -58,6 +60,7 @@ class PlannedBody:
     description_std_m: float = 0.0
     warnings: tuple[str, ...] = ()
     run: Path | None = None
+    home: Path | None = None
 
     def __post_init__(self) -> None:
         with located(self.problem.path, f"experiment '{self.template.name}'"):
@@ -107,7 +110,8 @@ class PlannedBody:
         )
         template = _select(problem, problem.experiments, experiment)
         places = _stated_places(template)
-        return cls(problem, template, problem.parameters.guess_q, None, None, places)
+        guess = problem.parameters.guess_q
+        return cls(problem, template, guess, None, None, places, home=_home(problem))
 
     @classmethod
     def _from_solved(cls, run: SolvedProblem, experiment: str | None) -> PlannedBody:
@@ -128,6 +132,7 @@ class PlannedBody:
             places,
             _description_std_m(result),
             warnings=_warnings(result),
+            home=_home(run.problem),
         )
 
     @classmethod
@@ -162,6 +167,7 @@ class PlannedBody:
             _description_std_m(result),
             warnings=warnings,
             run=folder,
+            home=home,
         )
 
     @property
@@ -296,6 +302,10 @@ def _standing(poses: PoseSequence, t_s: Array) -> PoseSequence:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotations[0], translations[0]
     return PoseSequence.from_matrices(t_s[:1], matrix[None])
+
+
+def _home(problem: Problem) -> Path | None:
+    return None if problem.path is None else problem.path.parent
 
 
 def _stated_places(experiment: Experiment) -> dict[str, Array]:
