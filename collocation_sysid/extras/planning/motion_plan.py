@@ -42,6 +42,8 @@ from .task import Reference, Task
 Solver = Literal["reduced-space", "interior-point"]
 # Share of a limit, tightened by its margin, from which it binds.
 BINDING = 1 - 1e-4
+# Sources of the band beside those of a budget.
+DESCRIPTION, UNKNOWN = "description", "all sources"
 # Time steps of the simulation that checks a plan, for each of the plan's.
 FINER = 4
 
@@ -65,6 +67,24 @@ class TrackingError:
     largest_m: float
     band_m: float | None
     expected_rms_m: float | None
+
+
+class BandContribution(NamedTuple):
+    """Contribution to the band of a plan.
+
+    Attributes
+    ----------
+    constant : str or None
+        Name of the constant; None for errors of the description.
+    source : str
+        Source of its uncertainty in the budget of the run.
+    share : float
+        Share of the variance of the tracked coordinates.
+    """
+
+    constant: str | None
+    source: str
+    share: float
 
 
 class BindingLimit(NamedTuple):
@@ -287,23 +307,48 @@ class MotionPlan:
         )
 
     @cached_property
+    def band_contributions(self) -> tuple[BandContribution, ...]:
+        """Contributions to the variance of the tracked coordinates, the largest first: of the own
+        uncertainty of each constant, by the sources of its budget, and of errors of the
+        description; empty if the uncertainty of the constants is not known.
+        """
+        contributions = self.contributions_m
+        if contributions is None:
+            return ()
+        body = self.program.body
+        names = [item.name for item in body.problem.parameters.free]
+        of_constants, of_description = np.zeros(len(names)), 0.0
+        for reference in self.program.references:
+            counted = np.isfinite(reference.position_m)
+            squares = contributions[reference.name][counted] ** 2 / reference.sigma_m**2
+            of_constants += squares.sum(axis=0) * np.diag(self.covariance)
+            of_description += len(squares) * (body.description_std_m / reference.sigma_m) ** 2
+        total = of_constants.sum() + of_description
+        if not total:
+            return ()
+        found = [BandContribution(None, DESCRIPTION, of_description / total)]
+        for name, variance in zip(names, of_constants, strict=True):
+            sources = body.budget.get(name) or {UNKNOWN: 1.0}
+            whole = sum(sources.values())
+            found += [
+                BandContribution(name, source, float(variance * share / (whole * total)))
+                for source, share in sources.items()
+            ]
+        return tuple(sorted((each for each in found if each.share), key=lambda each: -each.share))
+
+    @property
     def limiting_constant(self) -> tuple[str, float] | None:
         """Name of the constant whose own uncertainty contributes most to the variance of the
         tracked coordinates, and its share of the sum of these contributions; None if unknown.
         """
-        contributions = self.contributions_m
-        names = [item.name for item in self.program.body.problem.parameters.free]
-        if contributions is None or not names:
+        shares: dict[str, float] = {}
+        for each in self.band_contributions:
+            if each.constant is not None:
+                shares[each.constant] = shares.get(each.constant, 0.0) + each.share
+        if not shares:
             return None
-        variances = np.zeros(len(names))
-        for reference in self.program.references:
-            counted = np.isfinite(reference.position_m)
-            squares = contributions[reference.name][counted] ** 2 / reference.sigma_m**2
-            variances += squares.sum(axis=0) * np.diag(self.covariance)
-        if not variances.any():
-            return None
-        first = int(variances.argmax())
-        return names[first], float(variances[first] / variances.sum())
+        first = max(shares, key=lambda name: shares[name])
+        return first, shares[first] / sum(shares.values())
 
     def tracking_error(self, reference: Reference) -> TrackingError:
         """Return the predicted deviation of a point from its reference."""

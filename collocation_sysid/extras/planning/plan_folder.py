@@ -20,9 +20,10 @@ from ...result.animation import film
 from ...result.pictures.album import save_pictures
 from ...result.replay import MotionRecord
 from ...result.run_writers import replaced_folder
+from ...statistics.remedies import remedy_for
 from ..design.hand_motion import angular_motion
 from .execution_problems import POSES_FILE, execution_problems, problem_text, write_commands
-from .motion_plan import MotionPlan
+from .motion_plan import UNKNOWN, BandContribution, MotionPlan
 from .plan_pictures import plan_figures
 from .trajectory_log import write_trajectory_mcap
 
@@ -168,6 +169,7 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
         "limiting_constant": None
         if limiting is None
         else {"name": limiting[0], "share": limiting[1]},
+        "band_contributions": [each._asdict() for each in plan.band_contributions],
         "limits": {
             name: {"limit": getattr(program.limits, name), "share_used": float(share)}
             for name, share in plan.shares.items()
@@ -244,6 +246,20 @@ def _limit_lines(plan: MotionPlan) -> list[Shown]:
     return lines
 
 
+def _improvement(largest: BandContribution) -> str:
+    """Return the line about the largest contribution to the band, and what reduces it."""
+    percent = f"{100 * largest.share:.0f} % of the band's variance"
+    if largest.constant is None:
+        return (
+            f"{percent} are errors of the description: a finer mesh or another law may reduce them"
+        )
+    of_constant = f"the uncertainty of {symbol_of(largest.constant)}"
+    if largest.source == UNKNOWN:
+        return f"{percent} are {of_constant}"
+    remedy = remedy_for(largest.source)
+    return f"{percent} are {of_constant} by {largest.source}; to reduce it, {remedy}"
+
+
 def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
     """Return a plan on one screen."""
     notes: list[Shown] = [Line(f"warning: {text}", "check") for text in plan.program.body.warnings]
@@ -275,6 +291,8 @@ def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
             f"the uncertainty of {symbol_of(limiting[0])} contributes most to the band "
             f"({100 * limiting[1]:.0f} % of the constants' variance)"
         )
+    if plan.band_contributions:
+        shown.append(_improvement(plan.band_contributions[0]))
     if plan.half_width_after_recording_m is not None:
         shown.append(
             "if this motion is recorded with the same markers, and identified from too, the band "

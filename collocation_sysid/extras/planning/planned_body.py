@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,8 @@ class PlannedBody:
     description_std_m : float
         Standard deviation of a coordinate of a point by errors of the description [m]: by how much
         the residuals of the markers in the fit exceed their noise.
+    budget : mapping of name to mapping of source to float
+        Shares of the sources in the variance of each constant; empty if they are not known.
     warnings : tuple of str
         Reasons not to rely on the constants without care.
     run : Path or None
@@ -58,6 +61,7 @@ class PlannedBody:
     statistical_covariance: Array | None
     marker_places_m: dict[str, Array]
     description_std_m: float = 0.0
+    budget: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     run: Path | None = None
     home: Path | None = None
@@ -131,6 +135,7 @@ class PlannedBody:
             *_covariances(result, problem),
             places,
             _description_std_m(result),
+            result.budget,
             warnings=_warnings(result),
             home=_home(run.problem),
         )
@@ -165,6 +170,7 @@ class PlannedBody:
             *covariances,
             places,
             _description_std_m(result),
+            result.budget,
             warnings=warnings,
             run=folder,
             home=home,
