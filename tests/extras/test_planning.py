@@ -1282,9 +1282,7 @@ def test_the_folder_of_a_plan_checks_its_execution_and_identifies_from_it(tmp_pa
     good = solved("check.toml", "good")
     assert good["trust"]["verdict"] == "good", good["trust"]
     record(mu_pa=120.0)
-    other = solved("check.toml", "other")
-    assert other["trust"]["verdict"] != "good"
-    assert other["fit"]["rms_m"] > 1.5 * good["fit"]["rms_m"]
+    assert solved("check.toml", "other")["trust"]["verdict"] != "good"
     # The first recording of write_problem has other constants than its guesses.
     record(**TRUTH_OF_FILES)
     again = solved("identify.toml", "again")
