@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,33 @@ def test_analysis_files_of_sleap_are_read(tmp_path: Path) -> None:
         file["track_names"] = np.array(["bar"], dtype="S")
         file["point_scores"] = SCORES.T[None]
     require_same(read_tracks(tmp_path / "analysis.h5"))
+
+
+@pytest.mark.parametrize("version", [1.0, 1.3])
+def test_labels_of_sleap_are_read(version: float, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    nodes = [{"name": "unused"}, *({"name": name} for name in reversed(NAMES))]
+    count = len(NAMES)
+    order = [{"id": count - k} for k in range(count)]
+    shift = 0.5 if version < 1.1 else 0.0
+    point = [("x", "f8"), ("y", "f8"), ("visible", "?"), ("complete", "?"), ("score", "f8")]
+    points = [
+        (*(xy + shift), True, False, score)
+        for row, scores in zip(PIXELS, SCORES, strict=True)
+        for xy, score in zip(row, scores, strict=True)
+    ]
+    kinds = ["instance_id", "instance_type", "frame_id", "track", "point_id_start", "point_id_end"]
+    instances = [(k, 1, k, -1, count * k, count * (k + 1)) for k in range(len(PIXELS))]
+    heads = ["frame_id", "video", "frame_idx", "instance_id_start", "instance_id_end"]
+    frames = [(k, 0, k, k, k + 1) for k in range(len(PIXELS))]
+    with h5py.File(tmp_path / "bar.slp", "w") as file:
+        file.create_group("metadata").attrs["format_id"] = version
+        stated = {"nodes": nodes, "skeletons": [{"nodes": order}]}
+        file["metadata"].attrs["json"] = np.bytes_(json.dumps(stated))
+        file["pred_points"] = np.array(points, dtype=point)
+        file["instances"] = np.array(instances, dtype=[(name, "i8") for name in kinds])
+        file["frames"] = np.array(frames, dtype=[(name, "i8") for name in heads])
+    require_same(read_tracks(tmp_path / "bar.slp"))
 
 
 @pytest.mark.parametrize("name", ["t_ms", "Time (ms)", "Zeit in ms"])

@@ -153,6 +153,12 @@ def test_points_near_the_grasp_move_as_it_does(mistake: str) -> None:
     assert words in found.message
 
 
+def test_places_on_sides_that_the_camera_does_not_see_are_named() -> None:
+    behind = np.array([(x, 0.03, 0.01) for x in np.linspace(0.02, 0.1, len(PLACES_M))])
+    (found,) = hypotheses(swung([tracks_of(places_m=behind)]))
+    assert "7 of 7 points with places_m are on sides" in found.message
+
+
 def test_places_far_from_the_body_are_refused() -> None:
     tracks = tracks_of(places_m=1e3 * np.array(list(PLACES_M.values())))
     with pytest.raises(cs.InputError, match=r"the place of 'tip_front' is 11.* expected places_m"):

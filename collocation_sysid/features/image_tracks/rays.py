@@ -24,6 +24,15 @@ FEWEST_POINTS = 4
 SAME_TURN_RAD = 1e-3
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross products (..., 3) of vectors (..., 3); for few vectors several times faster
+    than that of NumPy.
+    """
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
 def ray_hits(
     origins: Array, directions: Array, triangles: Array
 ) -> tuple[NDArray[np.bool_], Array, Array]:
@@ -43,13 +52,13 @@ def ray_hits(
     """
     first = triangles[:, 0]
     ab, ac = triangles[:, 1] - first, triangles[:, 2] - first
-    across = np.cross(directions[:, None], ac)
+    across = cross(directions[:, None], ac)
     determinant = np.einsum("pfi,fi->pf", across, ab)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1 / determinant
         away = origins[:, None] - first
         in_b = np.einsum("pfi,pfi->pf", away, across) * inverse
-        other = np.cross(away, ab)
+        other = cross(away, ab)
         in_c = np.einsum("pi,pfi->pf", directions, other) * inverse
         distance = np.einsum("fi,pfi->pf", ac, other) * inverse
         least = np.minimum(np.minimum(in_b, in_c), 1 - in_b - in_c)
@@ -84,7 +93,7 @@ def points_on_surface(
     for k in np.flatnonzero(~is_hit.any(axis=1)):
         direction = directions[k] / np.linalg.norm(directions[k])
         away = triangles.reshape(-1, 3) - origins[k]
-        sines = np.linalg.norm(np.cross(away, direction), axis=1) / np.linalg.norm(away, axis=1)
+        sines = np.linalg.norm(cross(away, direction), axis=1) / np.linalg.norm(away, axis=1)
         sines[away @ direction <= 0] = 1.0
         nearest = int(sines.argmin())
         faces[k], corner = divmod(nearest, 3)

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from ...common.array_types import Array, Index
 from ...recording.camera import Camera
 from ...recording.experiment import Experiment
-from ...recording.placement import LocatedBody
+from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
 from .rays import points_on_surface
 from .tracks import ImageTracks, stated_places
@@ -27,6 +27,10 @@ MOST_IMAGES = 6
 MOST_IN_MOTION = 60
 # Distance [pixels] of a point that cannot be projected, and of a ray that meets no part of the body.
 FAR_PX = 1e4
+# Share of the points with known places that may be on sides of the body that are not seen, with a
+# cosine between normal and view below the second number throughout.
+HIDDEN = 0.5
+TURNED_AWAY = -0.2
 # Factor by which a correction must decrease the median distance.
 NEARER = 3.0
 # Share of the size of the body in the image below which distances are those of its deformation.
@@ -74,6 +78,8 @@ MESSAGES = {
     "down, z forward, in metres), the calibration, places_m and start_s",
     "description/image-tracks/likely": "the points are not where the body appears ({distance_px:.3g} "
     "pixels off, median), but {nearer:.2g} times nearer if {mistake}",
+    "description/image-tracks/hidden": "{hidden} of {count} points with places_m are on sides of the "
+    "body that the camera does not see: check the axes of places_m and camera.pose",
     "description/image-tracks/motion": "near the grasp the points do not move as the grasp does "
     "(deviation {unlike:.2g} of its motion), but {nearer:.2g} times more alike if {mistake}",
 }
@@ -130,6 +136,12 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
             strength = stated_px / min(size_px, FAR_PX)
             yield Hypothesis("image-tracks", of, data=data, strength=strength)
             return
+    hidden = trial.hidden_count()
+    if hidden > HIDDEN * len(trial.known):
+        data = {"hidden": hidden, "count": len(trial.known)}
+        strength = hidden / (HIDDEN * len(trial.known))
+        yield Hypothesis("image-tracks/hidden", of, data=data, strength=strength)
+        return
     unlike = trial.unlike(stated)
     if experiment.is_static or not unlike > UNLIKE:
         return
@@ -277,6 +289,27 @@ class _Trial:
                 off = np.where(np.isfinite(off), np.minimum(off, FAR_PX), FAR_PX)
             distances.append(off[seen[:, k]])
         return float(np.median(np.concatenate(distances)))
+
+    def hidden_count(self) -> int:
+        """Return how many points with known places are on faces that look away from the camera in
+        all compared images.
+        """
+        surface = self.body.mesh.surface
+        corners = self.body.nodes_m[surface]
+        t_s = self.tracks.sample_times_s[self.samples]
+        eyes_m = self.tracks.camera.pose_at(t_s)[1]
+        count = 0
+        for nodes, weights in self.known.values():
+            place = weights @ self.body.nodes_m[nodes]
+            away = np.linalg.norm(nearest_points_of_triangles(place, corners) - place, axis=1)
+            # All faces at an edge or corner.
+            faces = np.flatnonzero(away <= away.min() + 1e-6 * self.length_m)
+            at = self._carried_m[:, surface[faces]]
+            normals = np.cross(at[:, :, 1] - at[:, :, 0], at[:, :, 2] - at[:, :, 0])
+            to_eye = eyes_m[:, None] - at.mean(axis=2)
+            scale = np.linalg.norm(normals, axis=2) * np.linalg.norm(to_eye, axis=2)
+            count += bool((np.sum(normals * to_eye, axis=2) < TURNED_AWAY * scale).all())
+        return count
 
     # Motion -----------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@
 | any | .csv, long | `t_s` or `frame`, `point`, `u`, `v` and perhaps `likelihood` |
 | DeepLabCut | .csv, .h5 | rows scorer, (individuals,) bodyparts, coords; frame, then x, y, likelihood |
 | SLEAP | analysis .h5 | `tracks` (tracks, 2, nodes, frames), `node_names`, `point_scores` |
+| SLEAP | .slp | `frames`, `instances`, `points`, `pred_points`, and names in `metadata` |
 | CoTracker | .npz | `pred_tracks` (1, T, N, 2), `pred_visibility` (1, T, N) |
 | TAPIR | .npz | `tracks` (N, T, 2), `visibles` (N, T) |
 
@@ -15,6 +16,7 @@ Only tables with a column of times, and archives with `t_s` or `fps`, state time
 from __future__ import annotations
 
 import io
+import json
 import pickle
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -49,6 +51,9 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 BY_TIME = ("pred_tracks",)
 VISIBILITY = ("pred_visibility", "visibility", "pred_vis", "vis")
 BY_POINT_VISIBILITY = ("visibles", "visible", "pred_occ", "occluded")
+# Version of the labels of SLEAP from which the centre of the first pixel is (0, 0).
+CENTRED_PIXELS = 1.1
+POINTS = ("points", "pred_points")
 EXPECTED = "a table with NAME_u and NAME_v, or a file of DeepLabCut, SLEAP, CoTracker or TAPIR"
 
 
@@ -302,12 +307,14 @@ def _read_hdf5(file: Path) -> TrackFile:
     with h5py.File(file) as content:
         if "tracks" in content and "node_names" in content:
             return _sleap_tracks(content)
+        if {"frames", "instances", "metadata"} <= set(content):
+            return _sleap_labels(content)
         for name, group in content.items():
             if isinstance(group, h5py.Group) and "table" in group:
                 return _deeplabcut_hdf5(name, group)
         raise InputError(
             f"found the groups {listed(content)}; expected those of DeepLabCut (in table format) or "
-            "of an analysis file of SLEAP"
+            "of SLEAP (.slp, or an analysis file)"
         )
 
 
@@ -328,6 +335,61 @@ def _sleap_tracks(content: Any) -> TrackFile:
         if scores.shape == (len(tracks), len(nodes), tracks.shape[3]):
             likelihood = scores.transpose(2, 0, 1).reshape(len(pixels), -1)
     return TrackFile(tuple(names), pixels, likelihood, None, np.arange(float(len(pixels))))
+
+
+def _sleap_labels(content: Any) -> TrackFile:
+    """Return the points of a file of labels of one video; points that a person placed have the
+    likelihood one, and precede predicted ones.
+    """
+    try:
+        stated = json.loads(_text(content["metadata"].attrs["json"]))
+        nodes = [each["name"] for each in stated["nodes"]]
+        order = [each["id"] for each in stated["skeletons"][0]["nodes"]]
+        frames, instances = content["frames"][()], content["instances"][()]
+        # Points that a person placed, and predicted ones, by the type of an instance.
+        points_of: list[Any] = [content[name][()] if name in content else () for name in POINTS]
+        # Until version 1.1 the centre of the first pixel was (0.5, 0.5).
+        version = float(content["metadata"].attrs.get("format_id", 1.0))
+        videos = np.unique(frames["video"])
+        numbers = frames["frame_idx"]
+        of_track = instances["track"]
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise InputError(
+            f"this file of labels cannot be read ({error}); expected the .slp of SLEAP, or its "
+            "analysis file"
+        ) from error
+    if len(videos) != 1:
+        raise InputError(
+            f"found labels of {len(videos)} videos; expected one: export each video as an analysis "
+            "file of SLEAP"
+        )
+    tracks = sorted(set(of_track.tolist()))
+    first, last = int(numbers.min()), int(numbers.max())
+    shape = (last - first + 1, len(tracks), len(order))
+    pixels, likelihood = np.full((*shape, 2), np.nan), np.zeros(shape)
+    offset = 0.5 if version < CENTRED_PIXELS else 0.0
+    for frame in frames:
+        rows = instances[frame["instance_id_start"] : frame["instance_id_end"]]
+        for row in sorted(rows, key=lambda each: -each["instance_type"]):
+            is_predicted = bool(row["instance_type"])
+            points = points_of[is_predicted][row["point_id_start"] : row["point_id_end"]]
+            at = int(frame["frame_idx"]) - first, tracks.index(int(row["track"]))
+            is_visible = points["visible"].astype(bool)
+            xy = np.column_stack([points["x"], points["y"]]) - offset
+            pixels[at] = np.where(is_visible[:, None], xy, np.nan)
+            likelihood[at] = points["score"] if is_predicted else 1.0
+    parts = [nodes[k] for k in order]
+    names = parts
+    if len(tracks) > 1:
+        names = [f"track_{k + 1}_{part}" for k in range(len(tracks)) for part in parts]
+    flat = len(pixels), -1
+    return TrackFile(
+        tuple(names),
+        pixels.reshape(*flat, 2),
+        likelihood.reshape(flat),
+        None,
+        np.arange(first, last + 1.0),
+    )
 
 
 def _text(value: Any) -> str:

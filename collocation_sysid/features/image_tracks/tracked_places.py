@@ -26,7 +26,14 @@ from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from .camera_images import POSE_UNKNOWNS
-from .rays import FEWEST_POINTS, is_behind, is_occluded, points_on_surface, poses_from_points
+from .rays import (
+    FEWEST_POINTS,
+    cross,
+    is_behind,
+    is_occluded,
+    points_on_surface,
+    poses_from_points,
+)
 from .tracks import ImageTracks, stated_places
 
 # Sine of the angle by which a ray may miss the body if the pose of the camera is exact, and in
@@ -304,13 +311,13 @@ class TrackedPlaces(Correspondences):
         body = self.association.body
         corners = body.nodes_m[body.mesh.surface]
         ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        normals = np.cross(ab, ac)
+        normals = cross(ab, ac)
         squares = np.einsum("fi,fi->f", normals, normals)
         faces, shares = [], []
         for place in self.association.centre_places_m:
             away = place - corners[:, 0]
-            in_c = np.einsum("fi,fi->f", np.cross(ab, away), normals) / squares
-            in_b = np.einsum("fi,fi->f", np.cross(away, ac), normals) / squares
+            in_c = np.einsum("fi,fi->f", cross(ab, away), normals) / squares
+            in_b = np.einsum("fi,fi->f", cross(away, ac), normals) / squares
             off = np.einsum("fi,fi->f", away, normals) / np.sqrt(squares)
             least = np.minimum(np.minimum(in_b, in_c), 1 - in_b - in_c)
             face = int(np.argmin(np.abs(off) / np.sqrt(np.sqrt(squares)) - np.minimum(least, 0.0)))
@@ -334,7 +341,7 @@ class TrackedPlaces(Correspondences):
         faces, shares = self._faces
         corners = shapes_m[:, surface[faces]]
         points = np.einsum("nc,snci->sni", shares, corners)
-        normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+        normals = cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-30)
         to_eye = self.translations[:count, None] - points
         to_eye /= np.maximum(np.linalg.norm(to_eye, axis=2, keepdims=True), 1e-30)
@@ -416,7 +423,7 @@ class TrackedPlaces(Correspondences):
         association = self.association
         body = association.body
         corners = body.nodes_m[body.mesh.surface]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         faces, _ = self._faces
         centres = association.centre_places_m.copy()
