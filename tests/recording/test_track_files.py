@@ -120,16 +120,26 @@ def test_labels_of_sleap_are_read(version: float, tmp_path: Path) -> None:
     ]
     kinds = ["instance_id", "instance_type", "frame_id", "track", "point_id_start", "point_id_end"]
     instances = [(k, 1, k, -1, count * k, count * (k + 1)) for k in range(len(PIXELS))]
+    # What a person placed in the last image precedes what is predicted there.
+    last = len(PIXELS) - 1
+    wrong = [(0.0, 0.0, True, False, 0.5)] * count
+    instances.append((last + 1, 1, last, -1, count * (last + 1), count * (last + 2)))
+    instances[last] = (last, 0, last, -1, 0, count)
     heads = ["frame_id", "video", "frame_idx", "instance_id_start", "instance_id_end"]
-    frames = [(k, 0, k, k, k + 1) for k in range(len(PIXELS))]
+    frames = [(k, 0, k, k, k + 1 + (k == last)) for k in range(len(PIXELS))]
     with h5py.File(tmp_path / "bar.slp", "w") as file:
         file.create_group("metadata").attrs["format_id"] = version
         stated = {"nodes": nodes, "skeletons": [{"nodes": order}]}
         file["metadata"].attrs["json"] = np.bytes_(json.dumps(stated))
-        file["pred_points"] = np.array(points, dtype=point)
-        file["instances"] = np.array(instances, dtype=[(name, "i8") for name in kinds])
+        file["pred_points"] = np.array([*points, *wrong], dtype=point)
+        file["points"] = np.array([each[:4] for each in points[-count:]], dtype=point[:4])
+        types = [(name, "u1" if name == "instance_type" else "i8") for name in kinds]
+        file["instances"] = np.array(instances, dtype=types)
         file["frames"] = np.array(frames, dtype=[(name, "i8") for name in heads])
-    require_same(read_tracks(tmp_path / "bar.slp"))
+    read = read_tracks(tmp_path / "bar.slp")
+    assert read.names == NAMES
+    np.testing.assert_allclose(read.pixels, PIXELS)
+    np.testing.assert_allclose(read.likelihood, [*SCORES[:-1], np.ones(count)])
 
 
 @pytest.mark.parametrize("name", ["t_ms", "Time (ms)", "Zeit in ms"])

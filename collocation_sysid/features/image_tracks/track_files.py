@@ -370,7 +370,7 @@ def _sleap_labels(content: Any) -> TrackFile:
     offset = 0.5 if version < CENTRED_PIXELS else 0.0
     for frame in frames:
         rows = instances[frame["instance_id_start"] : frame["instance_id_end"]]
-        for row in sorted(rows, key=lambda each: -each["instance_type"]):
+        for row in sorted(rows, key=lambda each: -int(each["instance_type"])):
             is_predicted = bool(row["instance_type"])
             points = points_of[is_predicted][row["point_id_start"] : row["point_id_end"]]
             at = int(frame["frame_idx"]) - first, tracks.index(int(row["track"]))

@@ -103,7 +103,7 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
         Name of the camera in messages, error bars and files.
     file : str, optional
         Pixels: a table with `t_s` and the columns `NAME_u`, `NAME_v`, `NAME_likelihood` of each
-        point, a long table, DeepLabCut .csv or .h5, SLEAP .h5, CoTracker or TAPIR .npz. A
+        point, a long table, DeepLabCut .csv or .h5, SLEAP .h5 or .slp, CoTracker or TAPIR .npz. A
         simulation writes the file.
     camera : ImageCameraSection
         Calibration and pose of the camera.
