@@ -116,7 +116,7 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
     if stated_px > OF_DEFORMATION * size_px or stated_px >= FAR_PX:
         corrections = [*trial.corrections(stated)]
         if stated_px > usual_px:
-            corrections += trial.shifted(stated)
+            corrections += trial.corrected_pixels(stated)
         tried = [(trial.distance_px(other), other) for other in corrections]
         best_px = min(distance for distance, _ in tried)
         near = sorted(
@@ -351,7 +351,6 @@ class _Trial:
     def corrections(self, stated: _Described, with_times: bool = False) -> Iterator[_Described]:
         """Yield the description with one mistake corrected, also of the times if stated."""
         yield from self._corrected_images(stated)
-        yield from self._corrected_pixels(stated)
         yield from _corrected_poses(stated)
         if with_times:
             yield from self._corrected_times(stated)
@@ -375,7 +374,10 @@ class _Trial:
         for new_u, new_v, mistake in flips:
             yield replace(stated, pixels=np.stack([new_u, new_v], axis=-1), mistake=mistake)
 
-    def _corrected_pixels(self, stated: _Described) -> Iterator[_Described]:
+    def corrected_pixels(self, stated: _Described) -> Iterator[_Described]:
+        """Yield the description with pixels scaled, shifted or of another unit corrected, which
+        errors of the pose resemble.
+        """
         camera = stated.camera
         matrix = camera.require_matrix()
         for scale in SCALES:
@@ -394,9 +396,6 @@ class _Trial:
         exchanged[[0, 1], 2] = matrix[[1, 0], 2]
         mistake = "the coordinates cx and cy of the principal point are exchanged"
         yield replace(stated, camera=replace(camera, matrix=exchanged), mistake=mistake)
-
-    def shifted(self, stated: _Described) -> Iterator[_Described]:
-        """Yield the description with all pixels shifted."""
         by_px = self._shift_px(stated)
         if np.isfinite(by_px).all():
             mistake = (
