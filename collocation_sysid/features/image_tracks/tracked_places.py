@@ -26,14 +26,7 @@ from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from .camera_images import POSE_UNKNOWNS
-from .rays import (
-    FEWEST_POINTS,
-    cross,
-    is_behind,
-    is_occluded,
-    points_on_surface,
-    poses_from_points,
-)
+from .rays import FEWEST_POINTS, cross, is_behind, is_occluded, points_on_surface, poses_from_points
 from .tracks import ImageTracks, stated_places
 
 # Sine of the angle by which a ray may miss the body if the pose of the camera is exact, and in
