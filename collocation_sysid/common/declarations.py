@@ -72,6 +72,7 @@ def key(
     *,
     converter: Callable[[S], T] | None = None,
     read: Callable[[Any], Any] | None = None,
+    accepted: Any = None,
     metadata: Mapping[str, Any] | None = None,
     **field_options: Any,
 ) -> Any:
@@ -86,12 +87,14 @@ def key(
         `form` if there is one, and otherwise kept as it is.
     read : callable, optional
         Conversion from the value in the file to the field; a `Key` as `form` has its own instead.
+    accepted : type, optional
+        Form of the value in Python, where it differs from `form`.
     metadata : mapping, optional
         Further metadata of the field, such as `time_dependence.over_time()`.
     **field_options
         See `dataclasses.field`.
     """
-    own = {"converter": converter, "form": form, "read": read}
+    own = {"converter": converter, "form": form, "read": read, "accepted": accepted}
     return field(metadata={**own, **(metadata or {})}, **field_options)
 
 
@@ -150,7 +153,7 @@ def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
                 lambda value: value if value is None and is_optional else converter(value)
             ),
         ]
-    form = field.metadata.get("form")
+    form = field.metadata.get("accepted") or field.metadata.get("form")
     if form is None or isinstance(form, Key):
         form = form_of(field.type, names)
         is_number = field.type in ("float", "float | None") and field.default is not MISSING

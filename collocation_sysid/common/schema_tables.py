@@ -29,7 +29,7 @@ from pydantic import (
 from ..errors import located
 from .declarations import Key, keys_of
 from .field_descriptions import attributes
-from .validated_types import Boundless, Finite
+from .validated_types import Boundless, Finite, Positive, Text
 
 Vector = tuple[Finite, Finite, Finite]
 Corner = tuple[Boundless, Boundless, Boundless]
@@ -57,6 +57,10 @@ class ByForm:
     def _tag(self, value: Any) -> str:
         """Return the tag of the form that a value has."""
         return "<first>" if isinstance(value, self.first) else "<second>"
+
+
+# Standard deviation of all samples, or the name of the column that has that of each sample.
+Noise = Annotated[Text | Positive, ByForm(str)]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,13 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 
 from ..errors import hint_at
 
@@ -42,11 +48,18 @@ def _no_nan(value: float) -> float:
     return value if math.isinf(value) else _of_usual_size(value)
 
 
+def _number_unless_array(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
+    """Return an array unchanged, and anything else validated."""
+    return value if np.ndim(value) else validated(value)
+
+
 _Usual = AfterValidator(_of_usual_size)
 _Scalar = BeforeValidator(_python_scalar)
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), _Usual, _Scalar]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0), _Usual, _Scalar]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), _Usual, _Scalar]
+# A number for all samples, or an array with one for each, whose values the class checks.
+PositivePerSample = Annotated[Positive, WrapValidator(_number_unless_array)]
 AboveOne = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1), _Usual, _Scalar]
 OneOrMore = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1), _Usual, _Scalar]
 Boundless = Annotated[float, Field(strict=True), _Scalar]

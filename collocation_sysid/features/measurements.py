@@ -152,7 +152,7 @@ def instrument_misfits(experiment: Experiment, predicted: Predictions) -> list[I
                 )
         elif values is not None and measurement.has_samples():
             difference = values - measurement.measured_values
-            ratio = difference / measurement.value_sigmas
+            ratio = difference / measurement.sample_sigmas
             size = measurement.rms_text(difference)
             misfits.append(misfit(title, measurement.sigma_text, ratio=ratio, size=size))
     return misfits

@@ -15,12 +15,13 @@ import numpy as np
 from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
-from ..recording import Experiment, Grasp
+from ..recording import Experiment, Grasp, Wrench
 from ..recording.formats.columns import (
     DISPLACEMENT,
     DISPLACEMENTS,
     FORCE,
     FORCES,
+    NOISES,
     STRAIN,
     STRESS,
     TIME,
@@ -209,6 +210,17 @@ def add_loads(table: BenchTable, layout: ForceSensorSection, at_s: Array, loads:
     table.add(layout, {key: values[key] for key in chosen}, known)
 
 
+def add_noises(table: BenchTable, layout: ForceSensorSection, wrench: Wrench) -> None:
+    """Add the columns of standard deviations that the layout names to a table, in place."""
+    rows = np.searchsorted((table.t_s[1:] + table.t_s[:-1]) / 2, wrench.t_s)
+    for key, column in layout.noise_columns.items():
+        noise = NOISES[key]
+        table.columns[column] = np.full(len(table.t_s), np.nan)
+        sigma = wrench.sample_sigmas[:, 0 if key == "sigma_n" else 3]
+        factor = si_factor(name_and_unit(column)[1] or noise.unit, noise.dimension) or 1.0
+        table.columns[column][rows] = layout.symmetry * sigma / factor
+
+
 def _named_quantities(layout: TableSection) -> list[str]:
     """Return the keys of the quantities whose columns the table names; empty if it names none. The
     time does not count.
@@ -270,5 +282,7 @@ def bench_tables(
     for declared, grasp in moved:
         if (sensed := declared.sensor) is not None and grasp.wrench is not None:
             at_s = grasp.wrench.t_s
-            add_loads(table_of(sensed, at_s), sensed, at_s=at_s, loads=next(measured))
+            table = table_of(sensed, at_s)
+            add_loads(table, sensed, at_s=at_s, loads=next(measured))
+            add_noises(table, sensed, grasp.wrench)
     return tables

@@ -95,7 +95,7 @@ def problem_arguments(
             mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
         else:
             first = file.list_specimens()[0]
-            body = cells.body_for(first.test, first.cut_angle_deg)
+            body = cells.body_for(first.deformation, first.cut_angle_deg)
             unknowns = with_undamped(unknowns, body.constants)
     with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
@@ -112,7 +112,10 @@ def problem_arguments(
             where = f"experiment '{section.name}'"
             if isinstance(section, SpecimenSection):
                 specimen_reader = SpecimenReader(
-                    section, folder, cells.body_for(section.test, section.cut_angle_deg), simulation
+                    section,
+                    folder,
+                    cells.body_for(section.deformation, section.cut_angle_deg),
+                    simulation,
                 )
                 with _locate_in_table(path, where):
                     specimens[section.name], experiment = specimen_reader.read()

@@ -34,7 +34,7 @@ from ..recording import (
     prescribed_dofs,
     read_displacement,
     read_poses,
-    read_wrench,
+    read_wrench_and_noise,
 )
 from ..recording.alignment import AlignedRecording
 from ..recording.formats.logs import stored_files
@@ -304,13 +304,19 @@ class RecordingReader:
 
     # What is measured, and what acts --------------------------------------------------------------
 
-    def _read_wrench(self, section: ForceSensorSection, key: str) -> tuple[Array, Array]:
-        """Return times (S,) [s] and values (S, 6) [N, N m] of a wrench's file, divided by the
-        section's `symmetry`; `key` is that of the section, for messages.
+    def _read_wrench(
+        self, section: ForceSensorSection, key: str
+    ) -> tuple[Array, Array, dict[str, Array]]:
+        """Return times (S,) [s], values (S, 6) [N, N m] and columns (S,) of σ by their keys of a
+        wrench's file, divided by the section's `symmetry`; `key` is that of the section, for
+        messages.
         """
         file = self._table_file(section, f"{key}.file")
         layout = section.dump_layout()
-        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._requires_times)
+        layout["noise_columns"] = section.noise_columns
+        return read_wrench_and_noise(
+            file, **layout, symmetry=section.symmetry, timed=self._requires_times
+        )
 
     def _wrench(self, section: ForceSensorSection, key: str, k: int, t_s: Array) -> Wrench:
         """Return the measured wrench within the times t_s of the experiment, and note how many
@@ -324,12 +330,15 @@ class RecordingReader:
         """
         name = self.section.file_of(section)
         arguments: dict[str, Any] = declared_in(section, where=key)
-        for sigma in {"sigma_n", "sigma_nm"} & arguments.keys():
+        for sigma in {"sigma_n", "sigma_nm"} & arguments.keys() - section.noise_columns.keys():
             arguments[sigma] /= section.symmetry
         with located(where=key):
             if not self._recording_folder.must_read(name):
+                for sigma, column in section.noise_columns.items():
+                    message = f"found the column {column!r} without a file; expected a number"
+                    raise InputError(message, where=sigma)
                 return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **arguments})
-            at_s, values = self._read_wrench(section, key)
+            at_s, values, sigmas = self._read_wrench(section, key)
             mounting = self._frames.sensor_mounting(section, key, k=k)
             if note := self._frames.sensor_note(section, mounting):
                 self._add_notes(note)
@@ -343,6 +352,7 @@ class RecordingReader:
                 is_at_sample = np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
                 is_used &= is_at_sample if is_at_sample.any() else True
             self._add_notes(f"{name}: {is_used.sum()} of {len(at_s)} samples are used")
+            arguments |= {sigma: column[is_used] for sigma, column in sigmas.items()}
             return Wrench(at_s[is_used], values[is_used], **arguments)
 
     def _custom_sensor(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
@@ -360,9 +370,19 @@ class RecordingReader:
             message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
             raise InputError(message, where=f"{key}.grasp")
         with located(where=key):
+            noise = [section.sigma] if isinstance(section.sigma, str) else []
+            sought = [*section.columns, *noise] if section.columns else []
             at_s, values, columns = self._recording_folder.read_samples(
-                section.file, key, t_s=t_s, columns=section.columns
+                section.file, key, t_s=t_s, columns=sought
             )
+            for column in noise:
+                if values is None or column not in columns:
+                    message = f"found {column!r}; expected a number, or one of the file's columns"
+                    raise InputError(message, where="sigma")
+                place = columns.index(column)
+                arguments["sigma"] = values[:, place]
+                values = np.delete(values, place, axis=1)
+                columns = [name for name in columns if name != column]
             arguments["columns"] = columns
             return Gauge(t_s=at_s, values=values, **arguments)
 
@@ -530,7 +550,10 @@ class RecordingReader:
             )
             raise InputError(message, where="markers")
         names = tuple(table.names[k] for k in indices)
-        return MarkerTable(table.t_s, names, positions_m=table.positions_m[:, indices])
+        sigma_m = None if table.sigma_m is None else table.sigma_m[:, indices]
+        return MarkerTable(
+            table.t_s, names, positions_m=table.positions_m[:, indices], sigma_m=sigma_m
+        )
 
     def _align(self, poses: list[PoseSequence]) -> AlignedRecording:
         """Return times, poses and tracks on one clock and time grid, and add notes.
@@ -610,7 +633,8 @@ class RecordingReader:
         estimated.
 
         The standard deviation of a marker is its sigma_m over the square root of its weight, which
-        is 1 unless stated. If the experiment has no markers, the result has none.
+        is 1 unless stated; a column of σ of the file precedes sigma_m. If the experiment has no
+        markers, the result has none.
         """
         if not self.section.has_markers:
             return Markers.none(t_s)
@@ -624,6 +648,9 @@ class RecordingReader:
                 f"found no value for the marker {missing_name!r}; expected one for every marker"
             )
             raise InputError(message, where="markers.sigma_m")
+        if table.sigma_m is not None:
+            is_stated = np.isnan(table.sigma_m).all(axis=0)
+            sigma_m = np.where(is_stated, sigma_m, table.sigma_m)
         arguments: dict[str, Any] = declared_in(section, where="markers")
         return Markers(
             t_s,

@@ -164,6 +164,12 @@ class ForceSensorSection(TableSection, of=Wrench):
     area_m2: Positive | None = None
 
     @property
+    def noise_columns(self) -> dict[str, str]:
+        """Columns of standard deviations by the keys that name them."""
+        stated = {key: getattr(self, key) for key in ("sigma_n", "sigma_nm")}
+        return {key: value for key, value in stated.items() if isinstance(value, str)}
+
+    @property
     def states_axes(self) -> bool:
         """Whether the table states the axes of the components or the point of the torque."""
         return bool({"frame", "point_m"} & self.model_fields_set)

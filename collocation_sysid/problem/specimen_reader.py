@@ -22,7 +22,7 @@ from ..recording.specimen_checks import (
 )
 from ..recording.specimen_files import SpecimenLayout, SpecimenTable, read_specimen
 from .named_files import existing_file
-from .specimen_schema import SpecimenSection, deviation
+from .specimen_schema import RELAXATIONS, SpecimenSection, deviation
 
 # Strain of the first sample, over the largest, above which a memory's unknown past matters.
 UNKNOWN_PAST = 0.05
@@ -69,7 +69,10 @@ class SpecimenReader:
         table = read_specimen(
             file,
             layout_from_section(
-                section, requires_times=self.body.has_memory or section.window_s is not None
+                section,
+                requires_times=self.body.has_memory
+                or section.window_s is not None
+                or section.test in RELAXATIONS,
             ),
         )
         if table.is_incompressible:
@@ -91,8 +94,9 @@ class SpecimenReader:
             require_plausible_specimen(
                 specimen, is_stretch=not {"stretch", "volume_ratio"}.isdisjoint(table.columns)
             )
-        for warning in order_warnings(specimen):
-            self._add_note(warning)
+        if section.test not in RELAXATIONS:
+            for warning in order_warnings(specimen):
+                self._add_note(warning)
         if table.is_displacement and section.area_m2 is None:
             self._add_note(
                 "the compliance of the test bench is not part of the budget: state area_m2, the "
@@ -124,7 +128,20 @@ class SpecimenReader:
         if len(rows) < len(table.t_s):
             self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
         arguments = values_over_time(at_times(table, rows))
+        if section.test in RELAXATIONS:
+            sigma = arguments["sigma_pa"]
+            specimen = Specimen.relaxation(
+                arguments["t_s"],
+                arguments["stress_pa"],
+                self._sigma_pa() if sigma is None else sigma,
+                section.deformation,
+            )
+            return replace(specimen, area_error=deviation(section.area_error))
         arguments |= dict.fromkeys(self._placeholders(arguments))
+        if arguments["sigma_pa"] is None:
+            arguments["sigma_pa"] = self._sigma_pa()
+        if arguments["lateral_sigma"] is None:
+            arguments["lateral_sigma"] = section.lateral_sigma
         if table.is_displacement and section.area_m2 is not None:
             arguments |= {"length_m": section.length_m, "area_m2": section.area_m2}
         return Specimen(
@@ -133,8 +150,6 @@ class SpecimenReader:
             axial_stretch=section.axial_stretch,
             transverse_stretch=section.transverse_stretch,
             cut_angle_deg=section.cut_angle_deg,
-            sigma_pa=self._sigma_pa(),
-            lateral_sigma=section.lateral_sigma,
             strain_zero=deviation(section.strain_zero),
             area_error=deviation(section.area_error),
             stress_zero_pa=deviation(section.stress_zero_pa),
@@ -192,9 +207,9 @@ class SpecimenReader:
         that of the force over the undeformed area (the schema requires one of both).
         """
         section = self.section
-        if section.sigma_pa is not None:
+        if isinstance(section.sigma_pa, float):
             return section.sigma_pa
-        assert section.sigma_n is not None
+        assert isinstance(section.sigma_n, float)
         assert section.area_m2 is not None
         return section.sigma_n / section.area_m2
 
@@ -218,7 +233,9 @@ def layout_from_section(
     file must contain times.
     """
     return SpecimenLayout(
-        test=section.test,
+        test=section.deformation,
+        is_relaxation=section.test in RELAXATIONS,
+        noise_columns=section.noise_columns,
         columns=section.columns,
         strain_sign=section.strain_sign,
         stress_sign=section.stress_sign,

@@ -6,12 +6,21 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from ..common.schema_tables import Among, ByForm, require_one
+from ..common.schema_tables import Among, ByForm, Noise, require_one
 from ..common.validated_types import AtLeastOne, Boundless, Count, Finite, Flag, Positive, Text
 from ..recording.homogeneous_deformation import TESTS
 from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
 from .measurement_section import NamedSection
 
+# Kind of deformation of the tables of a relaxation modulus.
+RELAXATIONS = {"relaxation": "uniaxial", "shear-relaxation": "simple-shear"}
+# Keys that such a table has.
+RELAXATION_KEYS = frozenset(
+    (
+        *("kind", "name", "test", "file", "columns", "sigma_pa", "area_error", "window_s"),
+        *("every", "validation"),
+    )
+)
 Prior = Annotated[Literal["none"] | Positive, ByForm(str)]
 
 
@@ -26,7 +35,8 @@ class SpecimenSection(NamedSection):
     kind : {"specimen"}
         Homogeneous specimen.
     test : str
-        Kind of test; stresses across free surfaces vanish.
+        Kind of test; stresses across free surfaces vanish. "relaxation" is a table of the times and
+        of the relaxation modulus E(t), "shear-relaxation" one of G(t).
     file : str
         Table with a row for each sample, in the order of time.
     columns : mapping of name to str
@@ -54,13 +64,14 @@ class SpecimenSection(NamedSection):
         z of the sheet to the axis of the first strain, positive toward the axis x.
     area_m2 : float, optional
         Undeformed area by which a force is divided.
-    sigma_pa : float, optional
-        Standard deviation of the noise of the stress.
-    sigma_n : float, optional
-        Standard deviation of the noise of the force, which is divided by area_m2; instead of
-        sigma_pa.
-    lateral_sigma : float
-        Standard deviation of the noise of the lateral stretch.
+    sigma_pa : float or str, optional
+        Standard deviation of the noise of the stress, or the column of the file that has that of
+        each row.
+    sigma_n : float or str, optional
+        Standard deviation of the noise of the force, or its column, which is divided by area_m2;
+        instead of sigma_pa.
+    lateral_sigma : float or str
+        Standard deviation of the noise of the lateral stretch, or its column.
     strain_zero : float or "none"
         Standard deviation of a constant offset of the strains, which is estimated.
     area_error : float or "none"
@@ -83,7 +94,7 @@ class SpecimenSection(NamedSection):
     """
 
     kind: Literal["specimen"]
-    test: Annotated[str, Among(TESTS)]
+    test: Annotated[str, Among((*TESTS, *RELAXATIONS))]
     file: Text
     columns: dict[str, Text] = Field(default_factory=dict)
     strain_sign: Literal[1, -1] = 1
@@ -94,9 +105,9 @@ class SpecimenSection(NamedSection):
     transverse_stretch: Positive | None = None
     cut_angle_deg: Finite = 0.0
     area_m2: Positive | None = None
-    sigma_pa: Positive | None = None
-    sigma_n: Positive | None = None
-    lateral_sigma: Positive = LATERAL_SIGMA
+    sigma_pa: Noise | None = None
+    sigma_n: Noise | None = None
+    lateral_sigma: Noise = LATERAL_SIGMA
     strain_zero: Prior = STRAIN_ZERO
     area_error: Prior = AREA_ERROR
     stress_zero_pa: Prior = "none"
@@ -106,12 +117,28 @@ class SpecimenSection(NamedSection):
     every: AtLeastOne = 1
     validation: Flag = False
 
+    @property
+    def deformation(self) -> str:
+        """Kind of test of the homogeneous deformation."""
+        return RELAXATIONS.get(self.test, self.test)
+
+    @property
+    def noise_columns(self) -> dict[str, str]:
+        """Columns of standard deviations by the keys that name them."""
+        stated = {key: getattr(self, key) for key in ("sigma_pa", "sigma_n", "lateral_sigma")}
+        return {key: value for key, value in stated.items() if isinstance(value, str)}
+
     @model_validator(mode="after")
     def _require_consistent(self) -> SpecimenSection:
         """Return the section itself, or raise `ValueError`: unless exactly one of sigma_pa and
-        sigma_n is given, for sigma_n without area_m2, and for a window that does not begin
-        before it ends.
+        sigma_n is given, for sigma_n without area_m2, for a window that does not begin before it
+        ends, and for keys that a table of a relaxation modulus does not have.
         """
+        if self.test in RELAXATIONS and (more := self.model_fields_set - RELAXATION_KEYS):
+            raise ValueError(
+                f'found {", ".join(sorted(more))} with test = "{self.test}"; expected only the times '
+                "and the modulus of the table, with sigma_pa"
+            )
         require_one(self, "sigma_pa", "sigma_n")
         if self.sigma_n is not None and self.area_m2 is None:
             raise ValueError(

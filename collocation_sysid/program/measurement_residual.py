@@ -444,6 +444,7 @@ class MeasurementResidual(ABC):
         other = replace(self.at_samples(known_s, ReactionGrid.from_times(known_s)), **changes)
         # Derivatives of the same expression are generated once.
         vars(other)["_expressions"] = self._expressions
+        vars(other)["sigma_ratios"] = 1.0  # the noise of other samples is the usual one
         return other
 
     def expression_for(self, vectors: int, data: int) -> ResidualExpression:
@@ -464,11 +465,22 @@ class MeasurementResidual(ABC):
         return self._expressions[vectors, data]
 
     @cached_property
+    def sigma_ratios(self) -> Array | float:
+        """σ of each number over `sigmas`, (S, G, g); 1 if all samples have the same."""
+        ratios = self.measurement.sigma_ratios
+        if ratios is None:
+            return 1.0
+        padded = np.ones((len(ratios), len(self.names) * self.group_size))
+        padded[:, : ratios.shape[1]] = ratios
+        return padded.reshape(len(ratios), len(self.names), self.group_size)
+
+    @cached_property
     def _data_and_weights(self) -> tuple[Array, Array]:
         """Measurements ŷ (m, S, E), zero where missing, and 1/σ (m, S, E), zero where nothing is
         compared.
         """
-        weight = (self.is_compared / self.sigmas[:, None]).reshape(self.measured.shape)
+        scaled = self.is_compared / (self.sigmas[:, None] * self.sigma_ratios)
+        weight = scaled.reshape(self.measured.shape)
         return np.moveaxis(np.nan_to_num(self.measured), 2, 0), np.moveaxis(weight, 2, 0)
 
     def _inputs_at(self, values: Array, phi: Array) -> _SampleInputs:
@@ -576,7 +588,8 @@ class MeasurementResidual(ABC):
             Factor of the difference.
         """
         of_fit, of_simulation = (self.predict_samples(each, phi) for each in (fitted, simulated))
-        return share * np.nan_to_num((of_simulation - of_fit) / self.sigmas[:, None])
+        sigmas = self.sigmas[:, None] * self.sigma_ratios
+        return share * np.nan_to_num((of_simulation - of_fit) / sigmas)
 
     def residuals(self, values: Array, phi: Array) -> Array:
         """Return residuals (y − ŷ) / σ (s, G, g) of the samples that the values suffice for, zero

@@ -103,10 +103,14 @@ def align(
     grid = table.t_s
     if resample_hz is not None and not static:
         t_s = grid = _even_grid(table.t_s, resample_hz)
+        sigma_m = table.sigma_m
+        if sigma_m is not None:
+            sigma_m = interpolate_without_gaps(grid, table.t_s, sigma_m)
         table = MarkerTable(
             grid,
             table.names,
             positions_m=interpolate_without_gaps(grid, table.t_s, table.positions_m),
+            sigma_m=sigma_m,
         )
     moved = []
     for k, sequence in enumerate(poses):

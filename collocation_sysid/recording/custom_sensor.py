@@ -18,13 +18,13 @@ from ..common.array_types import Array
 from ..common.checked_arrays import float_array, read_only_floats, unconverted, unconverted_or_none
 from ..common.declarations import declaration, identity, key
 from ..common.files import reason
-from ..common.schema_tables import Vector
-from ..common.validated_types import AtLeastOne, Positive, Text
+from ..common.schema_tables import Noise, Vector
+from ..common.validated_types import AtLeastOne, Positive, PositivePerSample, Text
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.laws.constants import unit_of, without_unit
 from .deviation import Deviation
-from .measurement import Measurement
+from .measurement import Measurement, checked_ratios, split_sigma
 from .nuisance import GAUGE
 from .poses import Frame
 from .sample_times import first_unordered_time
@@ -188,7 +188,7 @@ class CustomSensor(Measurement):
 
     @property
     def value_sigmas(self) -> Array:
-        """(m,) standard deviations of the numbers, which are equal."""
+        """(m,) standard deviations of the numbers, which are equal; medians if samples differ."""
         return np.full(self.measured_values.shape[1], self.sigma)
 
     @property
@@ -206,7 +206,8 @@ class CustomSensor(Measurement):
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with other samples (S, m) at the times `t_s` (S,) [s]."""
-        return replace(self, t_s=t_s, values=values)
+        changes = {} if self.sigma_ratios is None else {"sigma_ratios": self._ratios_for(t_s)}
+        return replace(self, t_s=t_s, values=values, **changes)
 
     def simulated_text(self, experiment: Any, positions_m: Array) -> str | None:
         """Return the content of the file that a simulation with the motion (T, n, 3) [m] of an
@@ -337,8 +338,10 @@ class Gauge(CustomSensor):
     values : (S,) or (S, m) array, or None
         Measured values; NaN where missing. None before they are measured or simulated: such a
         sensor can be simulated, but a problem that contains it cannot be solved.
-    sigma : float
-        Standard deviation of the noise of each measured number, in the unit of that number.
+    sigma : float, (S,) or (S, m) array
+        Standard deviation of the noise of each measured number, in the unit of that number: one for
+        all, one for each sample, or one for each number. An array is stored as its median, and as
+        the ratios to it, `sigma_ratios`.
     points_m : (P, 3) array, optional
         Points [x, y, z] on the undeformed body whose motion the sensor measures.
     unknowns : mapping of name to float
@@ -368,13 +371,26 @@ class Gauge(CustomSensor):
     expression: Callable[..., SensorValues]
     t_s: Array = key(converter=unconverted)
     values: Array | None = key(converter=unconverted_or_none)
-    sigma: float = key(Positive)
+    sigma: float = key(Noise, accepted=PositivePerSample)
     points_m: Array = key(list[Vector], converter=unconverted, default=())
     unknowns: Mapping[str, float] = key(dict[str, Positive], default_factory=dict)
     grasp: int | None = key(AtLeastOne | None, converter=identity, default=None)
     frame: Frame = key(Frame, default="grasp")
     columns: Sequence[str] = key(list[Text], converter=identity, default=())
     unit: str = key(str, default="")
+    sigma_ratios: Array | None = key(converter=unconverted_or_none, default=None)
+
+    def __post_init__(self) -> None:
+        """Check and complete the sensor, see `CustomSensor`; then split σ of each sample."""
+        super().__post_init__()
+        where = f"the reading '{self.name}'"
+        shape = self.measured_values.shape
+        if np.ndim(self.sigma):
+            known = np.ones(shape, bool) if self.values is None else self.is_measured
+            sigma, ratios = split_sigma(self.sigma, known, f"sigma of {where}")
+            vars(self).update(sigma=sigma, sigma_ratios=ratios)
+        if self.sigma_ratios is not None:
+            vars(self)["sigma_ratios"] = checked_ratios(self.sigma_ratios, shape, where)
 
     def predict(
         self, at: PointQuantities | GraspQuantities, **unknowns: ca.SX | float

@@ -139,6 +139,7 @@ def evenly_sampled(table: MarkerTable) -> tuple[MarkerTable, list[str]]:
         positions_m=assignment.spread(table.positions_m),
         notes=table.notes,
         offsets_s=offsets_s,
+        sigma_m=None if table.sigma_m is None else assignment.spread(table.sigma_m),
     )
     note = _assignment_note(assignment, is_jittered=is_jittered, has_markers=bool(table.names))
     return even, [note]

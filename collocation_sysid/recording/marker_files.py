@@ -46,6 +46,8 @@ class MarkerTable:
         What was missing or assumed in the file, a sentence each.
     offsets_s : (T,) array, optional
         Time of each measured frame less `t_s` [s]; None if they are the same.
+    sigma_m : (T, M) array, optional
+        Standard deviation of each sample, NaN for markers without a column of them.
     """
 
     t_s: Array = key(converter=float_converter((None,), "t_s of the markers"), metadata=over_time())
@@ -53,6 +55,7 @@ class MarkerTable:
     positions_m: Array = key(converter=np.asarray, metadata=over_time())
     notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
     offsets_s: Array | None = key(converter=np.asarray, default=None, metadata=over_time())
+    sigma_m: Array | None = key(converter=np.asarray, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
         """Check times and shapes, in place; an `InputError` for times that do not increase or
@@ -77,9 +80,10 @@ def read_markers(
     """Read marker tracks; the format is recognised by the file's content.
 
     Known are C3D (with the extra ``collocation-sysid[c3d]``), TRC, Qualisys TSV, Motive CSV, and
-    plain CSV, wide (t_s, <name>_x, <name>_y, <name>_z …, in metres) or long (t_s, marker, x_m,
-    y_m, z_m). A blank cell or NaN is a missing sample; in motion-capture formats, though not in
-    plain CSV, so is one at exactly (0, 0, 0).
+    plain CSV, wide (t_s, <name>_x, <name>_y, <name>_z …, in metres, and optionally <name>_sigma,
+    the standard deviation of each sample) or long (t_s, marker, x_m, y_m, z_m). A blank cell or NaN
+    is a missing sample; in motion-capture formats, though not in plain CSV, so is one at exactly
+    (0, 0, 0).
 
     Parameters
     ----------
@@ -111,7 +115,11 @@ def read_markers(
     used_names = [labels.get(label, label) for label in raw.labels]
     coordinates, notes = _mark_missing(raw, used_names)
     return MarkerTable(
-        t_s, tuple(used_names), positions_m=coordinates * metres, notes=(*raw.notes, *notes)
+        t_s,
+        tuple(used_names),
+        positions_m=coordinates * metres,
+        notes=(*raw.notes, *notes),
+        sigma_m=None if raw.sigmas is None else raw.sigmas * metres,
     )
 
 

@@ -24,7 +24,7 @@ from ..common.declarations import Key, declaration, identity_or_none, key
 from ..common.time_dependence import over_time
 from ..common.validated_types import Positive
 from ..errors import InputError
-from .measurement import Measurement
+from .measurement import Measurement, checked_ratios, split_sigma
 from .placement import AttachmentRule, LocatedBody, Placement, place_markers
 
 if TYPE_CHECKING:
@@ -55,8 +55,9 @@ class Markers(Measurement):
         Sample times.
     positions_m : (T, M, 3) array
         Measured positions; NaN where missing, which may be one coordinate of a sample.
-    sigma_m : (M,) array or float
-        Standard deviation of each marker's coordinates.
+    sigma_m : (M,) array, (T, M) array or float
+        Standard deviation of each marker's coordinates, also of each sample. Those of samples are
+        stored as the median of each marker, and as ratios to it, `sigma_ratios`.
     names : sequence of str, optional
         M distinct names; m1, m2, … by default.
     places_m : (M, 3) array, optional
@@ -110,6 +111,7 @@ class Markers(Measurement):
     attach: AttachmentRule = key(AttachmentRule, default="auto")
     max_distance_m: float | None = key(Positive | None, default=None)
     offsets_s: Array | None = key(converter=as_array_or_none, default=None, metadata=over_time())
+    sigma_ratios: Array | None = key(converter=as_array_or_none, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
         """Check the markers and complete the fields, in place: names m1, m2, … by default, and
@@ -127,7 +129,13 @@ class Markers(Measurement):
             raise InputError(
                 f"the marker name '{repeated[0]}' is given more than once; expected different names"
             )
-        sigma_m = float_array(self.sigma_m, "sigma_m", ((), (m,)))
+        sigma_m = self.sigma_m
+        if np.ndim(sigma_m) == 2:
+            sigma_m = self._split_sigma(tracks)
+        if self.sigma_ratios is not None:
+            ratios = checked_ratios(self.sigma_ratios, (len(self.t_s), 3 * m), "the markers")
+            vars(self)["sigma_ratios"] = ratios
+        sigma_m = float_array(sigma_m, "sigma_m", ((), (m,)))
         sigma_m = read_only_floats(np.broadcast_to(sigma_m, m), (m,), name="sigma_m")
         for name, sigma in zip(self.names, sigma_m, strict=True):
             if not sigma >= SMALLEST_SIGMA_M:
@@ -140,6 +148,20 @@ class Markers(Measurement):
             offsets_s = read_only_floats(self.offsets_s, (len(self.t_s),), name="offsets_s")
             vars(self)["offsets_s"] = offsets_s
         self._check_places(m)
+
+    def _split_sigma(self, tracks: Array) -> Array:
+        """Return the median σ (M,) [m] of each marker, and store the ratios to it, in place."""
+        t, m, _ = tracks.shape
+        given = float_array(self.sigma_m, "sigma_m", (t, m), finite=False)
+        is_seen = np.isfinite(tracks).any(axis=2)
+        sigma_m, ratios = np.ones(m), np.ones((t, m))
+        for k, name in enumerate(self.names):
+            seen = is_seen[:, k : k + 1]
+            sigma_m[k], each = split_sigma(given[:, k], seen, f"sigma_m of marker '{name}'")
+            assert each is not None
+            ratios[:, k] = each[:, 0]
+        vars(self)["sigma_ratios"] = np.repeat(ratios, 3, axis=1)
+        return sigma_m
 
     def _check_places(self, m: int) -> None:
         """Check the places of the m markers, and store them in place: without a placement
@@ -234,7 +256,8 @@ class Markers(Measurement):
         times `t_s` (T,) [s].
         """
         positions_m = np.reshape(values, (len(np.atleast_1d(t_s)), len(self.names), 3))
-        return replace(self, t_s=t_s, positions_m=positions_m, offsets_s=None)
+        ratios = self._ratios_for(t_s)
+        return replace(self, t_s=t_s, positions_m=positions_m, offsets_s=None, sigma_ratios=ratios)
 
     def without_later_values(self, end_s: float) -> Markers:
         """Return the markers with NaN after `end_s` [s]."""

@@ -7,20 +7,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array
-from ..common.checked_arrays import float_array, float_converter, read_only_floats
+from ..common.checked_arrays import as_array_or_none, float_array, float_converter, read_only_floats
 from ..common.declarations import declaration, key
-from ..common.schema_tables import Vector
+from ..common.schema_tables import Noise, Vector
 from ..common.time_dependence import at_times, over_time
-from ..common.validated_types import AtLeastOne, Positive
+from ..common.validated_types import AtLeastOne, PositivePerSample
 from ..errors import InputError
 from .formats.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
-from .measurement import Measurement
+from .measurement import Measurement, checked_ratios, split_sigma
 from .poses import Frame
 from .recording_writers import write_columns_csv
 from .sample_times import first_unordered_time
@@ -51,9 +51,10 @@ class Wrench(Measurement):
         Sample times, at any rate, on the clock of the grasps.
     values : (S, 3) or (S, 6) array
         fx, fy, fz [N], and tx, ty, tz [N m]; NaN where missing.
-    sigma_n : float
-        Standard deviation of the noise of each force [N].
-    sigma_nm : float, optional
+    sigma_n : float, (S,) or (S, 3) array
+        Standard deviation of the noise of each force [N]: one for all, one for each sample, or one
+        for each component. An array is stored as its median, and as ratios, `sigma_ratios`.
+    sigma_nm : float, (S,) or (S, 3) array, optional
         Standard deviation of the noise of each torque [N m]; needed if torques are measured.
     frame : {"world", "grasp"}
         Axes of the components. "world": those of the world frame of the poses. "grasp": those of
@@ -81,13 +82,14 @@ class Wrench(Measurement):
 
     t_s: Array = key(converter=float_converter((None,), "t_s of the wrench"), metadata=over_time())
     values: Array = key(converter=_with_torques, metadata=over_time())
-    sigma_n: float = key(Positive)
-    sigma_nm: float | None = key(Positive | None, default=None)
+    sigma_n: float = key(Noise, accepted=PositivePerSample)
+    sigma_nm: float | None = key(Noise | None, accepted=PositivePerSample | None, default=None)
     frame: Frame = key(Frame, default="world")
     point_m: Array = key(
         Vector, converter=float_converter((3,), "point_m of the wrench"), default=(0.0,) * 3
     )
     symmetry: int = key(AtLeastOne, default=1)
+    sigma_ratios: Array | None = key(converter=as_array_or_none, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
         """Check the measurements and store them as read-only floats (S, 6), in place."""
@@ -112,6 +114,21 @@ class Wrench(Measurement):
                 "the measured wrench contains torques, but sigma_nm is missing; expected the standard "
                 "deviation of the noise of the torques [N m]"
             )
+        self._split_sigmas()
+
+    def _split_sigmas(self) -> None:
+        """Store σ of each sample as medians and ratios, in place."""
+        shape = self.values.shape
+        ratios = np.ones(shape) if self.sigma_ratios is None else np.array(self.sigma_ratios)
+        own = checked_ratios(ratios, shape, "the wrench").copy()
+        for name, part in (("sigma_n", slice(3)), ("sigma_nm", slice(3, 6))):
+            if not np.ndim(getattr(self, name)):
+                continue
+            sigma, each = split_sigma(getattr(self, name), self.is_measured[:, part], name)
+            vars(self)[name] = sigma
+            own[:, part] = each
+        if self.sigma_ratios is not None or (own != 1).any():
+            vars(self)["sigma_ratios"] = checked_ratios(own, shape, "the wrench")
 
     def __repr__(self) -> str:
         names = ", ".join(self.list_component_names())
@@ -119,7 +136,7 @@ class Wrench(Measurement):
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike) -> Wrench:
         """Return a copy with other forces [N] and torques [N m], (S, 3) or (S, 6), NaN where missing."""
-        return replace(self, t_s=t_s, values=values)
+        return replace(self, t_s=t_s, values=values, sigma_ratios=self._ratios_for(t_s))
 
     def with_zeros_at(self, t_s: ArrayLike) -> Wrench:
         """Return a copy with zeros at the times `t_s` (S,) [s], as placeholders; NaN for components
@@ -196,7 +213,7 @@ class Wrench(Measurement):
         ]
 
 
-def read_wrench(
+def read_wrench_and_noise(
     path: str | Path,
     columns: Mapping[str, str] | None = None,
     axis: str = "z",
@@ -204,7 +221,8 @@ def read_wrench(
     area_m2: float | None = None,
     symmetry: int = 1,
     timed: bool = True,
-) -> tuple[Array, Array]:
+    noise_columns: Mapping[str, str] | None = None,
+) -> tuple[Array, Array, dict[str, Array]]:
     """Read force and torque of a grasp over time, columns in any order; blank cells are missing.
 
     Parameters
@@ -223,12 +241,16 @@ def read_wrench(
         Number of equal parts of the specimen, of which the body is one; loads are divided by it.
     timed : bool
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
+    noise_columns : mapping, optional
+        Column by the key, "sigma_n" or "sigma_nm", of the standard deviations that it holds.
 
     Returns
     -------
     t_s : (S,) array
     values : (S, 6) array
         fx, fy, fz [N], tx, ty, tz [N m]; NaN where missing.
+    sigmas : dict
+        Standard deviations (S,) by the keys of `noise_columns` [N, N m].
 
     Raises
     ------
@@ -238,12 +260,26 @@ def read_wrench(
     """
     quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
     table = read_columns(
-        path, quantities, column_names=columns, blank_allowed=True, requires_times=timed
+        path,
+        quantities,
+        column_names=columns,
+        blank_allowed=True,
+        requires_times=timed,
+        noise_columns=noise_columns,
     )
     factor = sign * (area_m2 or 1.0) / symmetry
-    return without_rounding(table.t_s), factor * axis_components(
-        table, (*FORCES, *TORQUES), axis=axis
-    )
+    values = factor * axis_components(table, (*FORCES, *TORQUES), axis=axis)
+    sigmas = {key: column / symmetry for key, column in table.noises.items()}
+    return without_rounding(table.t_s), values, sigmas
+
+
+def read_wrench(
+    path: str | Path, columns: Mapping[str, str] | None = None, **layout: Any
+) -> tuple[Array, Array]:
+    """Return times (S,) [s] and values (S, 6) [N, N m] of force and torque of a grasp, see
+    `read_wrench_and_noise`.
+    """
+    return read_wrench_and_noise(path, columns, **layout)[:2]
 
 
 def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> None:

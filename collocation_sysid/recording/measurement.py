@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, root_mean
+from ..common.checked_arrays import float_array, read_only_floats
 from ..common.display import quantity
+from ..errors import InputError
 from .sample_times import TIME_TOLERANCE_S
 
 
@@ -36,6 +38,9 @@ class Measurement:
         Plural of its unlabelled points; not used without any.
     precedence : int
         Of several kinds, the one with the smallest number is the main measurement.
+    sigma_ratios : (S, m) array or None
+        Standard deviation of each number over its `value_sigmas`; None if those hold for all
+        samples.
     counts_pixels : bool
         Whether its numbers are pixels from a corner of an image: their sign, unit and zero cannot be
         wrong, and a flipped image shows a mirror image of the body.
@@ -51,6 +56,7 @@ class Measurement:
     points_name: ClassVar[str] = "points"
     precedence: ClassVar[int] = 3
     counts_pixels: ClassVar[bool] = False
+    sigma_ratios: Array | None = None
 
     @property
     @abstractmethod
@@ -79,8 +85,14 @@ class Measurement:
 
     @property
     def value_sigmas(self) -> Array:
-        """Standard deviations (m,) of the noise of its numbers."""
+        """Standard deviations (m,) of the noise of its numbers; medians if samples differ."""
         return np.zeros(0)
+
+    @property
+    def sample_sigmas(self) -> Array:
+        """Standard deviations of the noise of each sample, (S, m), or (1, m) if they are equal."""
+        ratios = np.ones((1, 1)) if self.sigma_ratios is None else self.sigma_ratios
+        return self.value_sigmas * ratios
 
     @property
     def identity(self) -> Any:
@@ -116,6 +128,13 @@ class Measurement:
     def has_samples(self) -> bool:
         """Return whether a number or a point is measured."""
         return bool(np.isfinite(self.measured_values).any() or any(self.point_counts))
+
+    def _ratios_for(self, t_s: ArrayLike) -> Array | None:
+        """Return the ratios of σ for other samples at times `t_s`: the same for as many samples,
+        else None, so that the usual σ holds.
+        """
+        is_same = self.sigma_ratios is not None and np.size(t_s) == len(self.sigma_ratios)
+        return self.sigma_ratios if is_same else None
 
     # Other samples, and a part of them ---------------------------------------------------------
 
@@ -166,3 +185,43 @@ class Measurement:
         is_later = (self.sample_times_s > end_s)[:, None]
         values = np.where(is_later, np.nan, self.measured_values)
         return self.with_samples(self.sample_times_s, values)
+
+
+def split_sigma(
+    sigma: ArrayLike, is_measured: NDArray[np.bool_], name: str
+) -> tuple[float, Array | None]:
+    """Return the median of standard deviations, and their ratios (S, m) to it, 1 where nothing is
+    measured; the ratios are None for one standard deviation of all samples.
+
+    Parameters
+    ----------
+    sigma : float, (S,) or (S, m) array
+        Standard deviations; any value, also NaN, where nothing is measured.
+    is_measured : (S, m) array of bool
+    name : str
+        What they are, for messages.
+
+    Raises
+    ------
+    InputError
+        If the shape differs, or a number is measured whose standard deviation is not above 0.
+    """
+    if not np.ndim(sigma):
+        return float(np.asarray(sigma)), None
+    count, numbers = is_measured.shape
+    given = float_array(sigma, name, ((count,), (count, 1), (count, numbers)), finite=False)
+    each = np.broadcast_to(given.reshape(count, -1), is_measured.shape)
+    wrong = is_measured & ~(np.isfinite(each) & (each > 0))
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
+        raise InputError(
+            f"{name} is {each[row, column]:g} in row {row + 1}; expected more than 0 in every row "
+            "with a measured number"
+        )
+    usual = float(np.median(each[is_measured])) if is_measured.any() else 1.0
+    return usual, np.where(is_measured, each / usual, 1.0)
+
+
+def checked_ratios(ratios: ArrayLike, shape: tuple[int, int], where: str) -> Array:
+    """Return the ratios of σ as a read-only array (S, m)."""
+    return read_only_floats(ratios, shape, name=f"sigma_ratios of {where}")

@@ -8,7 +8,7 @@ excludes reflections, Umeyama 1991).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -158,7 +158,7 @@ class TemplateFit(NamedTuple):
         table is unchanged.
         """
         positions_m = table.positions_m @ self.rotation.T + self.translation_m
-        return MarkerTable(table.t_s, table.names, positions_m=positions_m, notes=table.notes)
+        return replace(table, positions_m=positions_m, offsets_s=None)
 
 
 def align_to_template(

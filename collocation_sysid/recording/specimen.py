@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array, float_converter
 from ..common.declarations import declaration, key
-from ..common.validated_types import Finite, Flag, NotNegative, Positive, Text
+from ..common.validated_types import Finite, Flag, NotNegative, Positive, PositivePerSample, Text
 from ..errors import InputError
 from ..fem.body import Body, Made
 from ..fem.laws.fibres import Fibres
@@ -77,8 +77,8 @@ class Specimen:
         P_xz on a plane that keeps its normal; in "volumetric" the normal stress −p J^(2/3) of a
         pressure p; in "biaxial-difference" the difference of the true stresses along the first and
         the second axis, multiplied by J.
-    sigma_pa : float
-        Standard deviation of the noise of the stresses.
+    sigma_pa : float or (T,) array
+        Standard deviation of the noise of the stresses, of all samples or of each.
     t_s : (T,) array, optional
         Times, ascending; rows are numbered in seconds by default, which a material with memory
         does not accept from files.
@@ -88,7 +88,7 @@ class Specimen:
         Stress along the second axis of a "biaxial" or "planar" test; NaN where missing.
     lateral_stretch : (T,) array, optional
         Stretch of a free direction, which determines Poisson's ratio; NaN where missing.
-    lateral_sigma : float
+    lateral_sigma : float or (T,) array
         Standard deviation of the noise of the lateral stretch.
     strain_zero : float
         Standard deviation of a constant offset of the strains, which is estimated; 0 if exact.
@@ -131,7 +131,7 @@ class Specimen:
     test: str
     strain: Array = key(converter=float_converter((None,), "strain"))
     stress_pa: Array = key(converter=float_converter((None,), "stress_pa", finite=False))
-    sigma_pa: float = key(Positive)
+    sigma_pa: float | Array = key(Positive, accepted=PositivePerSample)
     t_s: Array | None = key(converter=float_converter((None,), "t_s"), default=None)
     second_strain: Array | None = key(
         converter=float_converter((None,), "second_strain"), default=None
@@ -142,7 +142,7 @@ class Specimen:
     lateral_stretch: Array | None = key(
         converter=float_converter((None,), "lateral_stretch", finite=False), default=None
     )
-    lateral_sigma: float = key(Positive, default=LATERAL_SIGMA)
+    lateral_sigma: float | Array = key(Positive, accepted=PositivePerSample, default=LATERAL_SIGMA)
     strain_zero: float = key(NotNegative, default=STRAIN_ZERO)
     area_error: float = key(NotNegative, default=AREA_ERROR)
     stress_zero_pa: float = key(NotNegative, default=0.0)
@@ -179,9 +179,12 @@ class Specimen:
                 None,
                 where="length_m",
             )
-        for name in ("stress_pa", "t_s", "second_strain", "second_stress_pa", "lateral_stretch"):
+        for name in (
+            *("stress_pa", "sigma_pa", "t_s", "second_strain", "second_stress_pa"),
+            *("lateral_stretch", "lateral_sigma"),
+        ):
             values = getattr(self, name)
-            if values is not None and len(values) != len(self.strain):
+            if np.ndim(values) and len(values) != len(self.strain):
                 raise InputError(
                     f"found {len(values)} values for {len(self.strain)} strains; expected one value "
                     "for each strain",
@@ -253,7 +256,7 @@ class Specimen:
         cls,
         t_s: ArrayLike,
         modulus_pa: ArrayLike,
-        sigma_pa: float,
+        sigma_pa: float | ArrayLike,
         test: str = "uniaxial",
         *,
         shift: str = "",
@@ -269,7 +272,7 @@ class Specimen:
             Times since the strain was applied, positive.
         modulus_pa : (T,) array
             Relaxation modulus [Pa]; NaN where missing.
-        sigma_pa : float
+        sigma_pa : float or (T,) array
             Standard deviation of the noise of the modulus [Pa].
         test : {"uniaxial", "simple-shear"}
         shift, temperature_difference_k
@@ -287,11 +290,12 @@ class Specimen:
         modulus = float_array(modulus_pa, "modulus_pa", ((len(times),),), False)
         # A ramp that is short compared with the first time; before it the specimen is at rest.
         ramp_s = 1e-6 * times[0]
+        sigma = np.asarray(sigma_pa)
         return cls(
             test,
             RELAXED_STRAIN * np.r_[0.0, 1.0, np.ones(len(times))],
             RELAXED_STRAIN * np.r_[np.nan, np.nan, modulus],
-            sigma_pa=RELAXED_STRAIN * sigma_pa,
+            sigma_pa=RELAXED_STRAIN * (np.r_[np.nan, np.nan, sigma] if sigma.ndim else sigma),
             t_s=np.r_[-ramp_s, 0.0, times],
             strain_zero=0.0,
             shift=shift,

@@ -209,7 +209,8 @@ def _reversal_share(specimen: Specimen) -> float:
     larger than `NOISE_SIGMAS` standard deviations; changes from or to NaN are none.
     """
     changes = np.diff(specimen.stress_pa)
-    limit = NOISE_SIGMAS * specimen.sigma_pa
+    sigma_pa = np.broadcast_to(np.nan_to_num(specimen.sigma_pa, nan=np.inf), len(changes) + 1)
+    limit = NOISE_SIGMAS * np.lib.stride_tricks.sliding_window_view(sigma_pa, 3).max(axis=1)
     reverses = (changes[1:] * changes[:-1] < 0) & (
         np.minimum(np.abs(changes[1:]), np.abs(changes[:-1])) > limit
     )

@@ -25,6 +25,8 @@ from .formats.columns import (
     FORCE,
     LATERAL_STRAIN,
     LATERAL_STRETCH,
+    MODULUS,
+    NOISES,
     PRESSURE,
     SECOND_STRAIN,
     SECOND_STRESS,
@@ -79,6 +81,11 @@ class SpecimenLayout:
         Whether the table must have times.
     axial_stretch, transverse_stretch
         Those of `Specimen`.
+    is_relaxation : bool
+        Whether the table has the relaxation modulus over time, E(t) of a "uniaxial" and G(t) of a
+        "simple-shear" test.
+    noise_columns : mapping of str to str
+        Columns of standard deviations by their keys "sigma_pa" or "sigma_n", and "lateral_sigma".
     """
 
     test: str
@@ -91,6 +98,8 @@ class SpecimenLayout:
     requires_times: bool = False
     axial_stretch: float = 1.0
     transverse_stretch: float | None = None
+    is_relaxation: bool = False
+    noise_columns: Mapping[str, str] = field(default_factory=dict)
 
     def list_quantities(self) -> tuple[Quantity, ...]:
         """Return the quantities that the table of this kind of test may have.
@@ -99,8 +108,10 @@ class SpecimenLayout:
         "volumetric" tests have volume ratio, stretch, strain, pressure and stress only,
         "biaxial-difference" tests the difference of the stresses and no other. The second axis and
         a lateral stretch or strain are added where the test has them, true stress if `stress` is
-        "true".
+        "true". A relaxation has its modulus only.
         """
+        if self.is_relaxation:
+            return (MODULUS,)
         deformation = DEFORMATIONS[self.test]
         stresses = (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
         if self.test == "volumetric":
@@ -129,7 +140,7 @@ class SpecimenLayout:
     @property
     def loads(self) -> tuple[Quantity, ...]:
         """Quantities of which the table must have exactly one, the first load."""
-        known = (STRESS, TRUE_STRESS, FORCE, PRESSURE, STRESS_DIFFERENCE)
+        known = (STRESS, TRUE_STRESS, FORCE, PRESSURE, STRESS_DIFFERENCE, MODULUS)
         return tuple(each for each in known if each in self.list_quantities())
 
     def list_second_deformations(self) -> tuple[Quantity, ...]:
@@ -157,6 +168,9 @@ class SpecimenTable:
         Quantities that the table has, such as "stretch" and "lateral_strain".
     unread : tuple of str
         Columns with a unit that are not read.
+    sigma_pa, lateral_sigma : (T,) array or None
+        Standard deviations of stress, or of the modulus, and of the lateral stretch; None without a
+        column of them.
     """
 
     t_s: Array = field(metadata=over_time())
@@ -168,6 +182,8 @@ class SpecimenTable:
     is_incompressible: bool
     columns: tuple[str, ...]
     unread: tuple[str, ...]
+    sigma_pa: Array | None = field(default=None, metadata=over_time())
+    lateral_sigma: Array | None = field(default=None, metadata=over_time())
 
     @property
     def is_displacement(self) -> bool:
@@ -205,20 +221,28 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         blank_allowed=True,
         requires_times=layout.requires_times,
         column_advice=partial(column_advice, layout=layout),
+        noise_columns=layout.noise_columns,
     )
+    sigma_pa = table.noises.get("sigma_pa")
+    if layout.is_relaxation:
+        return _relaxation(table, sigma_pa)
     strain = _strain(table, layout)
     second_strain = _second_strain(table, layout)
     lateral = _lateral_stretch(table, layout)
     areas = _area_ratios(layout, strain, second_strain=second_strain, lateral=lateral)
     stress_pa = _stress_pa(table, layout)
     second_pa = table.values.get(SECOND_STRESS.key)
+    factor = np.ones_like(strain)
     if layout.test == "volumetric":
-        stress_pa = stress_pa * (1 + strain) ** 2
+        factor = (1 + strain) ** 2
     elif layout.test == "biaxial-difference":
         assert second_strain is not None
-        stress_pa = stress_pa * _volume_ratio(strain, second_strain, lateral)
+        factor = _volume_ratio(strain, second_strain, lateral)
     elif layout.stress == "true":
-        stress_pa = stress_pa * areas[0]
+        factor = areas[0]
+    stress_pa = stress_pa * factor
+    if "sigma_n" in table.noises and layout.area_m2 is not None:
+        sigma_pa = table.noises["sigma_n"] / layout.area_m2
     if second_pa is not None:
         second_pa = layout.stress_sign * second_pa
         second_pa = second_pa * areas[1] if layout.stress == "true" else second_pa
@@ -234,6 +258,29 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         and bool(DEFORMATIONS[layout.test].lateral),
         columns=tuple(table.values),
         unread=table.unread,
+        sigma_pa=None if sigma_pa is None else sigma_pa * factor,
+        lateral_sigma=table.noises.get("lateral_sigma"),
+    )
+
+
+def _relaxation(table: QuantityTable, sigma_pa: Array | None) -> SpecimenTable:
+    """Return the table of a relaxation modulus, which counts as stress, at a strain of one."""
+    if table.t_s[0] <= 0:
+        raise table.grid.error_at(
+            f"the time is {table.t_s[0]:g} s; expected times after the strain was applied, above 0",
+            0,
+        )
+    return SpecimenTable(
+        table.t_s,
+        np.ones_like(table.t_s),
+        stress_pa=table.values[MODULUS.key],
+        second_strain=None,
+        second_stress_pa=None,
+        lateral_stretch=None,
+        is_incompressible=False,
+        columns=(MODULUS.key,),
+        unread=table.unread,
+        sigma_pa=sigma_pa,
     )
 
 
@@ -329,7 +376,7 @@ def _column_choices(
                 if name not in taken
             ]
     if not choices and not is_optional:
-        return [{quantities[-1].key: "…"}]
+        return [{quantities[-1].key: "…"} if quantities else {}]
     return choices
 
 
@@ -565,11 +612,43 @@ def specimen_columns(
                 unit = name_and_unit(name)[1] or quantity.unit
                 factor = si_factor(unit, quantity.dimension) or 1.0
                 columns[name] = column / factor
+    return columns | _noise_columns(experiment, values, layout)
+
+
+def _noise_columns(
+    experiment: Experiment, values: Mapping[str, Array], layout: SpecimenLayout
+) -> dict[str, Array]:
+    """Return the columns (T,) of standard deviations that the layout names."""
+    if not layout.noise_columns:
+        return {}
+    sigmas = {
+        gauge.name: np.broadcast_to(gauge.sample_sigmas[:, 0], experiment.t_s.shape)
+        for gauge in experiment.readings
+    }
+    noise = {
+        quantity: np.abs(column)
+        for quantity, column in _specimen_quantities(
+            experiment, dict(values) | {STRESS_NAME: sigmas.get(STRESS_NAME, np.zeros(0))}, layout
+        ).items()
+    }
+    sources = {
+        "sigma_pa": noise.get(MODULUS, noise.get(STRESS, noise.get(STRESS_DIFFERENCE))),
+        "sigma_n": noise.get(FORCE),
+        "lateral_sigma": sigmas.get(LATERAL_NAME),
+    }
+    columns: dict[str, Array] = {}
+    for key, name in layout.noise_columns.items():
+        column = sources[key]
+        assert column is not None
+        unit = name_and_unit(name)[1] or NOISES[key].unit
+        columns[name] = column / (si_factor(unit, NOISES[key].dimension) or 1.0)
     return columns
 
 
 def _usual_quantities(layout: SpecimenLayout) -> tuple[Quantity, ...]:
     """Return the quantities that are written for a test if the layout names no columns."""
+    if layout.is_relaxation:
+        return (MODULUS,)
     if layout.test == "volumetric":
         return VOLUME_RATIO, PRESSURE
     deformation = STRAIN if layout.test == "simple-shear" else STRETCH
@@ -585,6 +664,10 @@ def _specimen_quantities(
     sensors, in SI units and with the signs of `layout`; arguments as of `specimen_columns`.
     """
     strain, second_strain = specimen_strains(experiment)
+    if layout.is_relaxation:
+        # The first two samples are those of the step of the strain.
+        modulus_pa = values[STRESS_NAME][2:] / strain[2:]
+        return {TIME: experiment.t_s[2:], MODULUS: modulus_pa}
     stretch = 1 + strain
     lateral = values.get(LATERAL_NAME)
     areas = _area_ratios(layout, strain, second_strain=second_strain, lateral=lateral)

@@ -27,6 +27,7 @@ from ..problem import Problem
 from ..problem.bench_files import (
     BenchTable,
     add_loads,
+    add_noises,
     bench_tables,
     has_displacement_table,
     table_name,
@@ -280,15 +281,23 @@ def _write_tables(
         for k, (sensor, layout) in enumerate(zip(experiment.wrenches, layouts, strict=True)):
             table = BenchTable(sensor.t_s)
             add_loads(table, layout, at_s=sensor.t_s, loads=wrenches[k])
+            add_noises(table, layout, sensor)
             write_columns_csv(files[_numbered_key("wrench", k)], table.columns)
+    readings = [] if section is None else section.reading
+    noise_columns = {each.name: each.sigma for each in readings if isinstance(each.sigma, str)}
     for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
-        noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
+        noise = recipe.noise_own * gauge.sample_sigmas * rng.normal(size=read.shape)
         key = f"reading_{gauge.name}"
         text = gauge.simulated_text(experiment, trajectory.positions_m)
         if text is not None:
             files[key].write_text(text, encoding="utf-8")
             continue
-        write_gauge_csv(files[key], gauge.sample_times_s, names=gauge.columns, values=read + noise)
+        names, columns = [*gauge.columns], read + noise
+        if column := noise_columns.get(gauge.name):
+            names.append(column)
+            sigma = np.broadcast_to(gauge.sample_sigmas[:, :1], (len(read), 1))
+            columns = np.hstack([columns, sigma])
+        write_gauge_csv(files[key], gauge.sample_times_s, names=names, values=columns)
 
 
 def _write_specimen(
@@ -303,7 +312,7 @@ def _write_specimen(
     assert experiment.specimen is not None
     values = {}
     for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
-        noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
+        noise = recipe.noise_own * gauge.sample_sigmas * rng.normal(size=read.shape)
         values[gauge.name] = (read + noise)[:, 0]
     layout = SpecimenLayout(test=experiment.specimen.test, columns={})
     if section is not None:

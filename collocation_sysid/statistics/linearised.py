@@ -179,6 +179,8 @@ class ResidualBlock:
         Samples of known errors of the residuals besides their noise, in units of σ.
     has_noise_floor : bool
         See `MeasurementResidual`.
+    sigma_ratios : (T, M, 3) array or float
+        σ of each number over `sigma_m`.
     """
 
     name: str
@@ -196,6 +198,7 @@ class ResidualBlock:
     places_m: Array | None = None
     disturbances: Array | None = None
     has_noise_floor: bool = False
+    sigma_ratios: Array | float = 1.0
 
     @cached_property
     def is_measured(self) -> Mask:
@@ -399,6 +402,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
                     is_relaxed_at_start=relaxed,
                     places_m=reading.pooled_groups.places_m,
                     has_noise_floor=reading.has_noise_floor,
+                    sigma_ratios=reading.sigma_ratios,
                 )
             )
     prior_residual, prior_slope = collocation.prior_residuals(p)

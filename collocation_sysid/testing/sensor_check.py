@@ -212,7 +212,7 @@ def _small_program(sensor: CustomSensor) -> Collocation:
     mesh = TetMesh(box.points_m + low - MARGIN_M, box.tetrahedra)
     t_s = np.linspace(1.3, STEPS - 1.3, SAMPLES) * TIMESTEP_S
     grasp = {} if sensor.grasp in (None, 1) else {"grasp": 1}
-    retimed = replace(sensor, t_s=t_s, values=None, **grasp)
+    retimed = replace(sensor.with_samples(t_s, None), **grasp)
     body = Body(mesh, density_kg_m3=DENSITY_KG_M3)
     return program_of(swung_experiment(body, readings=[retimed]), {})
 

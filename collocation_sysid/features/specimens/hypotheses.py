@@ -281,7 +281,12 @@ def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
     count = len(experiment.t_s)
     chosen = np.unique(np.linspace(0, count - 1, min(count, most_samples)).astype(int))
     readings = [
-        replace(gauge, t_s=gauge.sample_times_s[chosen], values=gauge.measured_values[chosen])
+        replace(
+            gauge,
+            t_s=gauge.sample_times_s[chosen],
+            values=gauge.measured_values[chosen],
+            sigma_ratios=None if gauge.sigma_ratios is None else gauge.sigma_ratios[chosen],
+        )
         for gauge in experiment.readings
         if np.isfinite(gauge.measured_values[chosen]).any()
     ]
@@ -324,7 +329,7 @@ def _residuals(part: ExperimentIterate) -> list[Array]:
     for sensor in part.transcription.residuals_of(CustomSensorResidual):
         motion = part.motion_for(sensor.observable)
         predicted = sensor.numbers(sensor.predict_motion(motion, part.phi))
-        residuals = (predicted - sensor.sensor.measured_values) / sensor.sensor.sigma
+        residuals = (predicted - sensor.sensor.measured_values) / sensor.sensor.sample_sigmas
         rows += [row[np.isfinite(row)] for row in residuals.T]
     return rows
 
@@ -408,7 +413,12 @@ def _of_another_kind(experiment: Experiment, test: str) -> Experiment | None:
         return None
     made = {gauge.name: gauge for gauge in other.readings}
     readings = [
-        replace(made[gauge.name], sigma=gauge.sigma, unknowns=gauge.unknowns)
+        replace(
+            made[gauge.name],
+            sigma=gauge.sigma,
+            sigma_ratios=gauge.sigma_ratios,
+            unknowns=gauge.unknowns,
+        )
         for gauge in experiment.readings
     ]
     return replace(other, readings=readings, nuisance=experiment.nuisance)

@@ -94,7 +94,8 @@ def _stacked(fit: LinearisedFit, offsets: Sequence[int]) -> tuple[Array, Array, 
         mask = block.is_measured
         residuals.append(block.residual[mask])
         slopes.append(block.jacobian[mask])
-        weights = (block.compute_root_weight() / block.sigma_m[:, None]) * mask
+        sigmas = block.sigma_m[:, None] * block.sigma_ratios
+        weights = block.compute_root_weight() / sigmas * mask
         here = np.zeros((int(mask.sum()), len(offsets)))
         if index in offsets:
             here[:, offsets.index(index)] = weights[mask]

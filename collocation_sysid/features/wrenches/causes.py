@@ -328,7 +328,7 @@ class _OneSensor:
         noise, without what its tare explains; NaN in the same places.
         """
         wrench = trial.wrench
-        sigmas = trial.wrench.value_sigmas
+        sigmas = trial.wrench.sample_sigmas
         predicted = np.where(wrench.is_measured, self._predicted(wrench), np.nan) / sigmas
         measured = np.where(np.isfinite(predicted), wrench.values / sigmas, np.nan)
         return _without_tare(measured, trial.tare), _without_tare(predicted, trial.tare)
@@ -378,7 +378,7 @@ class _OneSensor:
         wrench = self.declared.wrench
         forces = self._predicted(wrench)[:, FORCES]
         by_shift = (
-            np.cross(forces[:, None], np.eye(3)[None]) / wrench.value_sigmas[3]
+            np.cross(forces[:, None], np.eye(3)[None]) / wrench.sample_sigmas[:, 3, None, None]
         )  # (S, shift, 3)
         by_shift = np.where(np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan)
         slopes = np.stack(

@@ -65,14 +65,14 @@ class _Stress:
         Direction; in simple shear that of the larger principal stretch, of a difference that of
         the first stress.
     values : (T,) array
-    sigma : float
+    sigma : (T,) or (1,) array
     deviations : (2,) array
         Prior standard deviations of the relative error of the area and of the zero; 0 if exact.
     """
 
     axis: int
     values: Array
-    sigma: float
+    sigma: Array
     deviations: Array
 
 
@@ -103,7 +103,7 @@ class _Test:
     test: str
     strain_zero: float
     stresses: list[_Stress]
-    lateral: tuple[Array, float] | None
+    lateral: tuple[Array, Array] | None
 
     @property
     def measurements(self) -> int:
@@ -265,7 +265,7 @@ class _PowerLawFits:
             free = _free_stretch(test, logs, alpha, np.ones(len(alpha)), beta)
             for stress in test.stresses:
                 matrix = _nominal_stresses(test, logs, stress.axis, free, alpha, beta)
-                rows.append(matrix / stress.sigma)
+                rows.append(matrix / stress.sigma[:, None])
                 right.append(stress.values / stress.sigma)
             if test.lateral is not None:
                 values, sigma = test.lateral
@@ -654,10 +654,11 @@ def _test(experiment: Experiment, is_foam: bool) -> _Test | None:
         assert gauge.values is not None
         values = np.asarray(gauge.values, dtype=float)[:, 0]
         if gauge.name == LATERAL_NAME:
-            lateral = values, gauge.sigma
+            lateral = values, gauge.sample_sigmas[:, 0]
         elif gauge.name in axes:
             sigmas = [gauge.unknowns.get(name, 0.0) for name in ("area_error", "stress_zero_pa")]
-            stresses.append(_Stress(axes[gauge.name], values, gauge.sigma, np.array(sigmas)))
+            noise = gauge.sample_sigmas[:, 0]
+            stresses.append(_Stress(axes[gauge.name], values, noise, np.array(sigmas)))
     if not stresses:
         return None
     zero = experiment.nuisance.strain_zero or 0.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -111,11 +111,24 @@ TRUE_STRESS = Quantity(
 STRESS_DIFFERENCE = Quantity(
     "stress_difference", "pressure", unit="pa", words=STRESS.words, qualifier="difference"
 )
+MODULUS = Quantity(
+    "modulus", "pressure", unit="pa", words="modulus modul module", qualifier="modulus"
+)
+# Standard deviations of samples, by the key of a problem file that names their column.
+NOISES = {
+    noise.key: noise
+    for noise in (
+        Quantity("sigma_pa", "pressure", unit="pa"),
+        Quantity("sigma_n", "force", unit="n"),
+        Quantity("sigma_nm", "torque", unit="nm"),
+        Quantity("lateral_sigma", "ratio", unit="1", unitless=True),
+    )
+}
 KNOWN_QUANTITIES = (
     *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
     *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
     *(STRETCH, SECOND_STRETCH, LATERAL_STRETCH, SECOND_STRAIN, LATERAL_STRAIN),
-    *(VOLUME_RATIO, SECOND_STRESS, TRUE_STRESS, STRESS_DIFFERENCE),
+    *(VOLUME_RATIO, SECOND_STRESS, TRUE_STRESS, STRESS_DIFFERENCE, MODULUS),
 )
 
 # A column's name and its unit: Load (kN), Load [kN], Load / kN, Load in kN, load_kn.
@@ -137,13 +150,14 @@ QUALIFIERS = {
     "second": {"second", "zweite"},
     "lateral": {"lateral", "transverse", "quer"},
     "difference": {"difference", "differenz", "différence"},
+    "modulus": {"modulus", "modul", "module"},
     # Of no quantity: values that are computed from others, of something else, or not measured.
     "other": {
         *("deviatoric", "hydrostatic", "mises", "tresca"),
         *("volumetric", "rate", "energy", "error", "fehler", "deviation", "abweichung", "std"),
         *("uncertainty", "residual", "target", "setpoint", "command", "commanded", "sollwert"),
-        *("soll", "vor"),
-        *("amplitude", "range", "modulus", "strength", "limit", "noise"),
+        *("soll", "vor", "storage", "loss"),
+        *("amplitude", "range", "strength", "limit", "noise"),
     },
 }
 
@@ -161,12 +175,15 @@ class QuantityTable:
         (T,) array by the key of each quantity that the table has, NaN where missing.
     unread : tuple of str
         Columns with a unit that hold none of the quantities; empty if the user named the columns.
+    noises : dict
+        (T,) array of standard deviations by their key of `NOISES`, NaN where missing.
     """
 
     grid: TextTable
     t_s: Array
     values: Mapping[str, Array]
     unread: tuple[str, ...] = ()
+    noises: Mapping[str, Array] = field(default_factory=dict)
 
 
 @names_file_in_errors
@@ -178,6 +195,7 @@ def read_columns(
     requires_times: bool = True,
     requires_all: bool = False,
     column_advice: Callable[[TextTable], str] | None = None,
+    noise_columns: Mapping[str, str] | None = None,
 ) -> QuantityTable:
     """Read those of some quantities that a table has, in any order, in SI units.
 
@@ -198,6 +216,8 @@ def read_columns(
     column_advice : callable, optional
         Returns for the table the remedy that a message names if several columns fit one quantity;
         by default the statements that choose one of them, see `column_statement`.
+    noise_columns : mapping, optional
+        Column name by the key of `NOISES` that names it; these columns hold no other quantity.
 
     Raises
     ------
@@ -206,6 +226,11 @@ def read_columns(
         number, or time does not increase; the line is named.
     """
     grid = read_table(decode(read_bytes(path)))
+    noises = {}
+    for key, name in (noise_columns or {}).items():
+        place, factor = _column_named_by_user(grid, NOISES[key], name=name, where=key)
+        noises[key] = factor * numeric_cells(grid, [place], blank_allowed=True)[:, 0]
+        grid = grid.without_column(place)
     if "t_s" in grid.columns and not column_names:
         _require_known_columns(grid, quantities, all_of=requires_all)
     places = _find_columns(grid, quantities, mapped=column_names or {}, column_advice=column_advice)
@@ -225,7 +250,8 @@ def read_columns(
         for place, column in enumerate(grid.columns)
         if place not in used and name_and_unit(column)[1] is not None
     ]
-    return QuantityTable(grid, t_s, values=values, unread=() if column_names else tuple(unread))
+    unread = [] if column_names else unread
+    return QuantityTable(grid, t_s, values=values, unread=tuple(unread), noises=noises)
 
 
 # Choice of columns --------------------------------------------------------------------------------
@@ -258,7 +284,9 @@ def _find_columns(
     return chosen | recognised
 
 
-def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tuple[int, float]:
+def _column_named_by_user(
+    grid: TextTable, quantity: Quantity, name: str, where: str = ""
+) -> tuple[int, float]:
     """Return index and factor to SI of the column that the user names for a quantity.
 
     The unit is in the name of the column or else behind it in `name`, as in "Load (N)"; a quantity
@@ -270,7 +298,7 @@ def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tup
     if grid.columns.count(column) != 1:
         fault = "exists twice" if column in grid.columns else "does not exist"
         raise grid.error_at(
-            f"columns.{quantity.key} is {name!r}, which {fault}; the columns are "
+            f"{where or f'columns.{quantity.key}'} is {name!r}, which {fault}; the columns are "
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
     units = [each for each in (name_and_unit(column)[1], unit_of_user) if each]
@@ -448,7 +476,7 @@ def _other_word(column: str) -> str:
     """Return the word of a column's name that makes it another quantity than any that is read; ""
     without one.
     """
-    others = QUALIFIERS["other"] | QUALIFIERS["difference"]
+    others = QUALIFIERS["other"] | QUALIFIERS["difference"] | QUALIFIERS["modulus"]
     return next(iter(sorted(_words(name_and_unit(column)[0]) & others)), "")
 
 

@@ -1,6 +1,7 @@
 """Plain CSV of marker tracks, the project's own format, with a row of column names.
 
-Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres. Long: t_s, marker, and x_m,
+Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres, and optionally <name>_sigma,
+the standard deviation of its coordinates in each sample. Long: t_s, marker, and x_m,
 y_m, z_m (or _cm, _mm, _in; or x, y, z and a given unit); a marker without a row at a time is
 missing there. In both, the unit may stand in brackets behind the names, as in "tip_x (mm)" or "tip X
 (mm)", a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place. A column "Frame" of
@@ -25,7 +26,9 @@ from .units import METRES_PER_UNIT, length_unit_of_spelling
 
 _BRACKETED = re.compile(r"(?P<name>.*?)\s*[(\[](?P<unit>[^()\[\]]+)[)\]]")
 # A column of a marker: the axis behind its name, as in "tip_x", "tip X" or "tip:x".
-_PLACE = re.compile(r"(?P<marker>.+?)[ .:_](?P<axis>[xyz])", re.IGNORECASE)
+_PLACE = re.compile(r"(?P<marker>.+?)[ .:_](?P<axis>[xyz]|sigma)", re.IGNORECASE)
+# End of the name of a column of standard deviations.
+SIGMA = "_sigma"
 # Columns without a measurement.
 _IGNORED = ("Frame", "frame")
 # Number of columns that messages list.
@@ -60,7 +63,7 @@ def _without_units(table: TextTable) -> tuple[TextTable, str | None, float]:
         name, stated = (column, "") if parts is None else (parts["name"], parts["unit"].strip())
         if place := _PLACE.fullmatch(name):
             name = f"{place['marker']}_{place['axis'].lower()}"
-        if not (name in ("x", "y", "z") or name[-2:] in ("_x", "_y", "_z")):
+        if not (name in ("x", "y", "z") or name.endswith(("_x", "_y", "_z", SIGMA))):
             continue
         unit = length_unit_of_spelling(stated)
         if stated and unit not in METRES_PER_UNIT:
@@ -89,15 +92,24 @@ def _read_wide(table: TextTable, choose: LabelChooser, to_seconds: float) -> Raw
     labels = _wide_labels(table)
     place = {column: k for k, column in enumerate(table.columns)}
     places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
-    return tracks_of_table(
+    chosen = choose(labels)
+    tracks = tracks_of_table(
         table,
         labels,
         coordinate_columns=places,
-        chosen=choose(labels),
+        chosen=chosen,
         time=(place["t_s"], to_seconds),
         zeros_are_missing=False,
         default_unit="m",
     )
+    noises = [place.get(f"{labels[k]}{SIGMA}") for k in chosen]
+    if noises == [None] * len(noises):
+        return tracks
+    sigmas = np.full((len(table.rows), len(chosen)), np.nan)
+    for k, column in enumerate(noises):
+        if column is not None:
+            sigmas[:, k] = numeric_cells(table, [column], blank_allowed=True)[:, 0]
+    return replace(tracks, sigmas=sigmas)
 
 
 def _wide_labels(table: TextTable) -> list[str]:
@@ -112,7 +124,7 @@ def _wide_labels(table: TextTable) -> list[str]:
     )
     expected = ["t_s", *(f"{label}_{axis}" for label in labels for axis in "xyz")]
     counts = Counter(header)
-    known = set(expected)
+    known = {*expected, *(f"{label}{SIGMA}" for label in labels)}
     faulty = {
         "unknown": [column for column in header if column not in known],
         "missing": [column for column in expected if column not in counts],

@@ -40,6 +40,8 @@ class RawTracks:
         Unit if neither file nor user states one: only for this project's own CSV.
     notes : tuple of str
         Assumptions that were made.
+    sigmas : (T, M) array or None
+        Standard deviations of the samples in the file's unit, NaN for markers without any.
     """
 
     labels: Sequence[str]
@@ -52,6 +54,7 @@ class RawTracks:
     zeros_are_missing: bool = True
     default_unit: str | None = None
     notes: tuple[str, ...] = ()
+    sigmas: Array | None = None
 
 
 class LabelChooser(Protocol):

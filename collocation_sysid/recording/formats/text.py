@@ -62,6 +62,15 @@ class TextTable:
     rows: list[Row]
     names_line: int = 1
 
+    def without_column(self, place: int) -> TextTable:
+        """Return the table without the column of an index."""
+        names, *rows = (
+            [cell for k, cell in enumerate(cells) if k != place]
+            for cells in (self.columns, *(row.cells for row in self.rows))
+        )
+        kept = [Row(row.line, cells) for row, cells in zip(self.rows, rows, strict=True)]
+        return TextTable(names, kept, self.names_line)
+
     def error_at(self, message: str, row: int | None = None) -> InputError:
         """Return an `InputError` about a row, by its index from 0, or about the column names if
         `row` is None; the error names the line.

@@ -557,8 +557,8 @@ def _lag_s(fitted: Solution) -> float:
         numbers = [pair for pair in numbers if pair[0] is experiment.markers]
     lagged = moved = 0.0
     for each, values in numbers:
-        residual = (values - each.measured_values) / each.value_sigmas
-        rates = np.gradient(values, each.sample_times_s, axis=0) / each.value_sigmas
+        residual = (values - each.measured_values) / each.sample_sigmas
+        rates = np.gradient(values, each.sample_times_s, axis=0) / each.sample_sigmas
         known = np.isfinite(residual) & np.isfinite(rates)
         lagged += float(np.sum((residual * rates)[known]))
         moved += float(np.sum(rates[known] ** 2))

@@ -46,7 +46,7 @@ def sensor_misfits(solution: Solution, number: int) -> dict[Measurement, float]:
             experiment.measurements, solution.fitted_values[experiment.name], strict=True
         )
         if isinstance(values, np.ndarray) and each.has_samples()
-        for ratio in [(values - each.measured_values) / each.value_sigmas]
+        for ratio in [(values - each.measured_values) / each.sample_sigmas]
     }
 
 
@@ -108,7 +108,7 @@ def _mistakes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
     """
     measured = sensor.measured_values
     t_s = sensor.sample_times_s
-    sigmas = sensor.value_sigmas
+    sigmas = sensor.sample_sigmas
     yield Hypothesis("sensor-sign", corrected=(-measured, t_s))
     known = np.isfinite(measured + predicted)
     size = root_mean((measured / sigmas)[known] ** 2)
@@ -133,7 +133,7 @@ def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
     measured = sensor.measured_values
 
     def misfit(values: Array) -> float:
-        ratio = (values - predicted) / sensor.value_sigmas
+        ratio = (values - predicted) / sensor.sample_sigmas
         return root_mean(ratio[np.isfinite(ratio)] ** 2) if np.isfinite(ratio).any() else np.inf
 
     turned = dict(with_other_axes(measured, has_sign=False))
@@ -153,8 +153,8 @@ def _linear_mistakes(
     measured = sensor.measured_values
     t_s = sensor.sample_times_s
     used = np.flatnonzero(np.isfinite(measured).any(axis=0))
-    units = np.diag(1 / sensor.value_sigmas)
-    columns = [np.broadcast_to(units[k], measured.shape) for k in used]
+    units = np.broadcast_to(1 / sensor.sample_sigmas, measured.shape)
+    columns = [np.eye(measured.shape[1])[k] * units for k in used]
     zeros = np.zeros(measured.shape[1])
     decrease, zeros[used] = _linear_step(fit, columns, own)
     whole = np.nanmean((origin.measured_values - measured)[:, used] + zeros[used], axis=0)
@@ -165,7 +165,7 @@ def _linear_mistakes(
     if fit.blocks[own].is_static or len(t_s) < 3:
         return
     rates = np.nan_to_num(np.gradient(predicted, t_s, axis=0))
-    decrease, (more_s,) = _linear_step(fit, [rates / sensor.value_sigmas], own)
+    decrease, (more_s,) = _linear_step(fit, [rates / sensor.sample_sigmas], own)
     lag_s = float(np.mean(t_s - origin.sample_times_s) + more_s)
     if decrease > LEAST_DECREASE and 0 < abs(lag_s) < LATEST * float(np.ptp(t_s)):
         named = {"by_ms": 1e3 * abs(lag_s), "when": "later" if lag_s > 0 else "earlier"}

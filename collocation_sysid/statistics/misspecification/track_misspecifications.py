@@ -114,7 +114,7 @@ def filtered_signals(experiment: Experiment, fitted: Iterable[Predicted]) -> Ite
         t_s = measurement.sample_times_s
         if experiment.is_static or not isinstance(predicted, np.ndarray):
             continue
-        scaled = (predicted - measurement.measured_values) / measurement.value_sigmas
+        scaled = (predicted - measurement.measured_values) / measurement.sample_sigmas
         used = np.isfinite(scaled).any(axis=1)
         complete = np.isfinite(scaled[used]).all(axis=0)
         if used.sum() < FEWEST_SAMPLES or not complete.any():
