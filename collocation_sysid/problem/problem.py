@@ -206,6 +206,13 @@ class Problem:
         """
         return self.uncertainty.collect_considered(self.bodies, self.parameters)
 
+    @property
+    def is_declared_simulated(self) -> bool:
+        """Whether the assumptions state that the damping law is exact, which declares that the
+        recordings were simulated: the law of a real body is never known.
+        """
+        return self.uncertainty.assumptions.damping_law == "none"
+
     def collect_lengths_m(self) -> dict[str, float]:
         """Return the correlation lengths of spatially varying constants [m], by name of the
         constant with its region; empty without fields.

@@ -418,6 +418,7 @@ class ReadingSection(NamedSection, of=Gauge):
     frame: Declared
     columns: Declared
     unit: Declared
+    sigma: Declared
     code: Text
     function: Text
     file: Text | None = None

@@ -196,14 +196,6 @@ class CustomSensor(Measurement):
         """(S, m) whether each value is measured."""
         return np.isfinite(self.measured_values)
 
-    def without_later_values(self, end_s: float) -> Self:
-        """Return a copy with measurements after `end_s` [s] replaced by NaN; self if none would
-        remain.
-        """
-        values = np.where((self.sample_times_s > end_s)[:, None], np.nan, self.measured_values)
-        measured = np.isfinite(values).any()
-        return self.with_samples(self.sample_times_s, values) if measured else self
-
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with other samples (S, m) at the times `t_s` (S,) [s]."""
         changes = {} if self.sigma_ratios is None else {"sigma_ratios": self._ratios_for(t_s)}

@@ -153,7 +153,7 @@ class Markers(Measurement):
         """Return the median σ (M,) [m] of each marker, and store the ratios to it, in place."""
         t, m, _ = tracks.shape
         given = float_array(self.sigma_m, "sigma_m", (t, m), finite=False)
-        is_seen = np.isfinite(tracks).any(axis=2)
+        is_seen: NDArray[np.bool_] = np.asarray(np.isfinite(tracks).any(axis=2))
         sigma_m, ratios = np.ones(m), np.ones((t, m))
         for k, name in enumerate(self.names):
             seen = is_seen[:, k : k + 1]

@@ -177,13 +177,15 @@ class Measurement:
 
     def without_later_values(self, end_s: float) -> Self | None:
         """Return the sensor without measurements after `end_s` [s] in a recording that continues;
-        None to leave the sensor out. Here NaN in their place, or for unlabelled points the same as
-        `until_time`.
+        None if nothing is measured before. Here NaN in their place, or for unlabelled points the
+        same as `until_time`.
         """
         if not self.value_sigmas.size:
             return self.until_time(end_s)
         is_later = (self.sample_times_s > end_s)[:, None]
         values = np.where(is_later, np.nan, self.measured_values)
+        if not np.isfinite(values).any():
+            return None
         return self.with_samples(self.sample_times_s, values)
 
 

@@ -8,6 +8,7 @@ linear tetrahedra, which represents the homogeneous deformation exactly, see
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -502,7 +503,7 @@ class Specimen:
                     LateralStretch(axis),
                     t_s=self.t_s,
                     values=self.lateral_stretch,
-                    sigma=self.lateral_sigma,
+                    sigma=cast(float, self.lateral_sigma),
                     points_m=[point_m],
                     unit="1",
                 )
@@ -523,7 +524,7 @@ class Specimen:
             quantity,
             t_s=self.t_s,
             values=values,
-            sigma=self.sigma_pa,
+            sigma=cast(float, self.sigma_pa),
             grasp=2 + normal,
             frame="world",
             unknowns={unknown: sigma for unknown, sigma in deviations.items() if sigma},

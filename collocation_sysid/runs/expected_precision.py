@@ -36,8 +36,8 @@ from ..statistics.combinations import (
     widest_after,
 )
 from ..statistics.estimates import relative_derivatives
-from ..statistics.linearised import linearise_fit
-from ..statistics.uncertainty import ErrorModel, uncertainty_from_fit
+from ..statistics.linearised import LinearisedFit, linearise_fit
+from ..statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 # Noise of an added instrument over its largest value.
 NOISE = 0.01
@@ -102,12 +102,9 @@ def expected_precision(
         If the equations of motion are singular.
     """
     collocation = replace(collocation, huber=UNWEIGHTED)
-    fit = linearise_fit(collocation, z)
-    exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
-    fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
+    fit, known = _exact_fit(collocation, z)
     parameters = collocation.parameters
     q = z[: collocation.nq]
-    known = uncertainty_from_fit(fit, parameters, q, ErrorModel("given", "independent"))
     changes = changes_of_assumptions(collocation, z, deviations)
     sources = VarianceSources.from_fit(fit, changes, parameters, q, known, deviations=deviations)
     sizes = relative_derivatives(parameters, q)
@@ -129,16 +126,24 @@ def expected_precision(
     )
 
 
+def _exact_fit(collocation: Collocation, z: Array) -> tuple[LinearisedFit, Uncertainty]:
+    """Return the fit linearised at z as if all residuals were zero, and its uncertainty by noise of
+    the stated σ.
+    """
+    fit = linearise_fit(collocation, z)
+    exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
+    fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
+    noise = ErrorModel("given", "independent")
+    q = z[: collocation.nq]
+    return fit, uncertainty_from_fit(fit, collocation.parameters, q, noise)
+
+
 def expected_deviations(collocation: Collocation, z: Array) -> dict[str, float]:
     """Return the relative standard deviation of each estimated scalar parameter by noise of the
     stated σ and the errors of the sensors, if all residuals were zero at z.
     """
     collocation = replace(collocation, huber=UNWEIGHTED)
-    fit = linearise_fit(collocation, z)
-    exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
-    fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
-    q = z[: collocation.nq]
-    known = uncertainty_from_fit(fit, collocation.parameters, q, ErrorModel("given", "independent"))
+    fit, known = _exact_fit(collocation, z)
     kept = [k for k in collocation.parameters.scalar_coordinates if not fit.at_bound[k]]
     deviations = np.sqrt(np.diag(known.complete_covariance))
     return {known.names[k]: float(deviations[k]) for k in kept}
@@ -149,17 +154,15 @@ def views_note(collocation: Collocation, z: Array) -> str:
     with the best of their other places; empty if there is no such sensor.
     """
     experiments = [each.experiment for each in collocation.transcriptions]
-    number = next(
-        (
-            k
-            for k, each in enumerate(experiments)
-            if any(True for sensor in each.readings for _ in sensor.other_views(each))
-        ),
-        None,
-    )
+    views_of = [
+        [(sensor, views) for sensor in each.readings if (views := [*sensor.other_views(each)])]
+        for each in experiments
+    ]
+    number = next((k for k, each in enumerate(views_of) if each), None)
     if number is None:
         return ""
     experiment = experiments[number]
+    views = [sensor for sensor, _ in views_of[number]]
 
     def expected(readings: Sequence[CustomSensor]) -> dict[str, float]:
         changed = replace(experiment, readings=tuple(readings))
@@ -175,15 +178,15 @@ def views_note(collocation: Collocation, z: Array) -> str:
         return f"{what} {', '.join(known)}"
 
     stated = [*experiment.readings]
-    views = [each for each in stated if any(True for _ in each.other_views(experiment))]
     now = expected(stated)
     lines = [in_words("as stated", now)]
     if len(views) > 1:
         for view in views:
             alone = [each for each in stated if each is view or each not in views]
             lines.append(in_words(f"with '{view.name}' alone", expected(alone)))
-    tried = [(expected([*stated, other]), what) for what, other in views[0].other_views(experiment)]
-    if tried and now:
+    others = views_of[number][0][1]
+    tried = [(expected([*stated, other]), what) for what, other in others]
+    if now:
         first = next(iter(now))
         best, what = min(tried, key=lambda each: each[0].get(first, np.inf))
         lines.append(in_words(f"with {what}", best))

@@ -23,7 +23,6 @@ from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
 from .check.body_check import LINEAR, bending_concerns, slenderness
-from .check.grasp_extent import is_declared_simulated
 
 # Value of `RefinementLevel.refined` of a solve on a finer mesh.
 MESH = "mesh"
@@ -66,7 +65,7 @@ def estimate_mesh_error(
     collocation = solution.collocation
     fitted = [each.experiment for each in collocation.transcriptions]
     bodies = list(dict.fromkeys(each.body for each in fitted if each.specimen is None))
-    if not bodies or is_declared_simulated(problem):
+    if not bodies or problem.is_declared_simulated:
         return known, ""
     nodes = max(len(body.nodes.points_m) for body in bodies)
     if nodes > LARGEST_NODE_COUNT:
@@ -110,7 +109,7 @@ def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) ->
     """Return a "check" concern for each body whose mesh is too coarse for its bending: of linear
     tetrahedra, and of other elements where the error of the mesh could not be estimated.
 
-    Empty if the recordings are declared to be simulated (`is_declared_simulated`), or if a solve on
+    Empty if the recordings are declared to be simulated (`Problem.is_declared_simulated`), or if a solve on
     a finer mesh has measured the error.
 
     Parameters
@@ -119,7 +118,7 @@ def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) ->
         Discretisation errors of the estimates.
     """
     levels = () if refinement is None else refinement.levels
-    if is_declared_simulated(problem) or any(level.refined == MESH for level in levels):
+    if problem.is_declared_simulated or any(level.refined == MESH for level in levels):
         return []
     few = [each for each in _coarse_mesh_concerns(problem) if _is_reason(each, refinement)]
     return [*_large_error_concerns(problem, refinement), *few]
@@ -159,7 +158,7 @@ def mesh_resolution_notes(problem: Problem, refinement: Refinement | None = None
     """Return the same sentences as notes where they are no concerns: for recordings that are
     declared to be simulated, and for other elements with a known error of the mesh.
     """
-    is_simulated = is_declared_simulated(problem)
+    is_simulated = problem.is_declared_simulated
     return [
         concern.message
         for concern in _coarse_mesh_concerns(problem)

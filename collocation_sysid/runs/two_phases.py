@@ -110,7 +110,8 @@ def solve_two_phases(
     solution = solve_once(problem.with_fields({search.name: search.modes.to_smooth_field()}), start)
     if not solution.status.converged:
         return solution
-    posterior, temperature, rounds, is_simulated = _sample_posterior(problem, search, solution)
+    fit = linearise_fit(solution.collocation, solution.z)
+    posterior, temperature, rounds, is_simulated = _sample_posterior(problem, search, solution, fit)
     phase = _representative_phases(posterior.draws.compute_probability(), search.modes.volumes_m3)
     best = solve_once(
         problem.with_fields({search.name: replace(search.modes, phase=phase)}),
@@ -119,7 +120,7 @@ def solve_two_phases(
     if not best.status.converged:
         return best
     samples = _samples(posterior, is_simulated, search=search, solution=best)
-    misfit = _chi_squared_per_measurement(linearise_fit(solution.collocation, solution.z))
+    misfit = _chi_squared_per_measurement(fit)
     best = _with_samples(best, replace(samples, smooth_misfit=misfit))
     note = (
         f"two phases of {search.name}: started from a smooth field (χ² per measurement "
@@ -131,9 +132,11 @@ def solve_two_phases(
 
 
 def _sample_posterior(
-    problem: Problem, search: _PhaseSearch, solution: Solution
+    problem: Problem, search: _PhaseSearch, solution: Solution, fit: LinearisedFit
 ) -> tuple[PhasePosterior, float, int, bool]:
-    """Sample the posterior of phases and parameters, from the solution with a smooth field on."""
+    """Sample the posterior of phases and parameters, from the solution with a smooth field and its
+    measurements, linearised, on.
+    """
     in_logarithms = _linearise_at(problem, search, solution=solution)
     phases = initial_phases(
         in_logarithms.information(), in_logarithms.faces, volumes_m3=search.modes.volumes_m3
@@ -166,7 +169,6 @@ def _sample_posterior(
     temperature = 1.0
     if np.isfinite(least_chi_squared):
         # Temperature of `statistics.phase_sampling`: lack of fit per shape of the smooth field.
-        fit = linearise_fit(solution.collocation, solution.z)
         determined = max(1.0, factorise_information(fit).count_determined())
         temperature = max(1.0, (least_chi_squared - fit.compute_chi_squared()) / determined)
     if temperature > 1:

@@ -32,6 +32,15 @@ def test_later_values_are_missing_and_times_stay():
     np.testing.assert_array_equal(early.is_measured.any(axis=1), [True, True, True, False, False])
 
 
+def test_a_sensor_without_earlier_values_is_left_out():
+    cube = sensing(hung_cube())
+    late = np.where(cube.t_s > 0.05, 1.0, np.nan)
+    string = Gauge("string", lambda at: at.position_m[0, 0], cube.t_s, late, 1e-3, [[0, 0, 0]])
+    assert string.without_later_values(0.05) is None
+    assert string.without_later_values(0.06).is_measured.sum() == 1
+    assert forces().without_later_values(-1.0) is None
+
+
 def test_placeholders_are_zero_where_a_component_is_measured():
     zero = forces().with_zeros_at([0.0, 0.05])
     np.testing.assert_array_equal(zero.values[:, :3], 0.0)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from kit.filmed import NAMES, TRUTH, filming, swung, tracks_of, unknown_young
 
 import collocation_sysid as cs
+from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.solve_recorder import initial_variables
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.runs import check
 from collocation_sysid.runs.expected_precision import expected_deviations, views_note
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
@@ -76,3 +79,14 @@ def test_markers_alone_have_no_other_views() -> None:
     parameters = unknown_young(TRUTH["young_pa"])
     collocation = cs.Problem([swung()], parameters=parameters).collocation()
     assert views_note(collocation, np.zeros(0)) == ""
+
+
+def test_check_goes_on_if_what_other_views_promise_cannot_be_computed(monkeypatch):
+    def singular(*_):
+        raise SimulationError("singular", 0.0)
+
+    collocation = SimpleNamespace(nq=1)
+    monkeypatch.setattr(check, "views_note", singular)
+    assert check._views_notes(collocation, np.zeros(1)) == []
+    monkeypatch.setattr(check, "views_note", lambda *_: "expected")
+    assert check._views_notes(collocation, np.zeros(1)) == ["expected"]

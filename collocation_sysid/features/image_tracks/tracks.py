@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ...common.array_types import Array, root_mean
+from ...common.array_types import Array
 from ...common.checked_arrays import float_array, read_only_floats, unconverted_or_none
 from ...common.declarations import declaration, identity, key
 from ...common.validated_types import NotNegative, Positive
@@ -149,11 +149,6 @@ class ImageTracks(CameraImages):
     def vectors(self, values: Array) -> Array:
         """Return numbers (S, 2N) as pixels (S, N, 2)."""
         return values.reshape(len(values), -1, 2)
-
-    def rms_text(self, difference: Array) -> str:
-        """Return the RMS of a coordinate in pixels."""
-        known = difference[np.isfinite(difference)]
-        return f"{root_mean(known**2):.3g} px RMS" if known.size else ""
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with other pixels (S, 2N) at the times `t_s` (S,) [s]."""

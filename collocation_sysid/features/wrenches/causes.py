@@ -427,6 +427,8 @@ class _OneSensor:
             for unit, factor in units.items() if wrench.measured_components[columns].any() else ():
                 without = _multiplied(wrench, columns, factor=factor)
                 yield hypothesis("wrench-unit", without, what=what, unit=unit, factor=factor)
+        body = self.part.transcription.body
+        section = None if body.has_declared_mass else other_section(body.mesh, body.mesh.points_m)
         for what, columns in (
             ("forces and torques", BOTH),
             ("forces", FORCES),
@@ -436,14 +438,7 @@ class _OneSensor:
             if factor > 0 and abs(factor - 1) > SAME_GAIN:
                 data: dict[str, Any] = {"what": what, "factor": factor}
                 code = "wrench-gain"
-                body = self.part.transcription.body
-                section = other_section(body.mesh, body.mesh.points_m)
-                is_weighed = body.has_declared_mass
-                if (
-                    section
-                    and not is_weighed
-                    and abs(factor * section.volume_ratio - 1) < LIKE_SECTION
-                ):
+                if section and abs(factor * section.volume_ratio - 1) < LIKE_SECTION:
                     code += "/section"
                     data |= {"ratio": section.volume_ratio, "real": section.name}
                 yield hypothesis(

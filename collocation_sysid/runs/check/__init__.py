@@ -306,7 +306,7 @@ def check_problem(
     if simulated is not first and not start_notes:
         report_progress("computing what the recordings determine")
         combinations = _expected_combinations(problem, collocation, z)
-        notes += filter(None, [views_note(collocation, z)] if collocation.nq else [])
+        notes += _views_notes(collocation, z)
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
@@ -366,6 +366,16 @@ def _expected_combinations(
         return with_measurements(found, collocation, z, deviations)
     except SimulationError:
         return ()
+
+
+def _views_notes(collocation: Collocation, z: Array) -> list[str]:
+    """Return `views_note` as a list of one; empty without it, or if it cannot be computed."""
+    if not collocation.nq:
+        return []
+    try:
+        return [note] if (note := views_note(collocation, z)) else []
+    except SimulationError:
+        return []
 
 
 def expected_search_s(problem: Problem) -> float | None:

@@ -24,13 +24,6 @@ LARGEST_SHARE = 0.005
 LAYER_SHARE = 1e-6
 
 
-def is_declared_simulated(problem: Problem) -> bool:
-    """Return whether the assumptions state that the damping law is exact, which declares that the
-    recordings were simulated: the law of a real body is never known.
-    """
-    return problem.uncertainty.assumptions.damping_law == "none"
-
-
 def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[tuple[str, float, float]]:
     """Yield the gaps of a grasp that exceed `LARGEST_SHARE` of the free length: axis, distance [m] of
     the outermost held nodes from the face of the box, and length [m] of the free part of the body
@@ -60,10 +53,10 @@ def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[tuple[str, floa
 def grasp_extent_concerns(problem: Problem) -> list[Concern]:
     """Return a "check" concern for each gap of a grasp, see `grasp_gaps`.
 
-    Empty if the recordings are declared to be simulated (`is_declared_simulated`), where the grasp
+    Empty if the recordings are declared to be simulated (`Problem.is_declared_simulated`), where the grasp
     of the simulation is usually that of the model.
     """
-    if is_declared_simulated(problem):
+    if problem.is_declared_simulated:
         return []
     return list(_gap_concerns(problem))
 
@@ -72,7 +65,7 @@ def grasp_extent_notes(problem: Problem) -> list[str]:
     """Return the same sentences as notes for recordings that are declared to be simulated;
     otherwise an empty list.
     """
-    if not is_declared_simulated(problem):
+    if not problem.is_declared_simulated:
         return []
     return [concern.message for concern in _gap_concerns(problem)]
 
