@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 import collocation_sysid as cs
 from kit.depth import looking
 
-TRUTH = {"young_pa": 4e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
+TRUTH = {"young_pa": 1e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 SIZE_PX = (640, 480)
 MATRIX = [[900.0, 0.0, 320.0], [0.0, 905.0, 240.0], [0.0, 0.0, 1.0]]
 POSE = looking(np.array([0.06, -0.35, 0.06]), np.array([0.06, 0.015, -0.01]))

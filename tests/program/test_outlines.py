@@ -104,7 +104,7 @@ def test_derivatives_agree_with_differences() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("guess_pa", [1.2e5, 1.2e6])
+@pytest.mark.parametrize("guess_pa", [3e4, 3e5])
 def test_the_modulus_of_a_hanging_bar_follows_from_one_photograph(guess_pa: float) -> None:
     solution = solved(outlines_of(), guess_pa)
     estimate = uncertainty_at(solution.collocation, solution.z).estimates["young_pa"]
@@ -120,7 +120,7 @@ def test_masks_that_are_too_large_all_around_are_estimated() -> None:
 
     cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=bool)
     wide = binary_dilation(photograph(), cross, iterations=2)
-    solution = solved(outlines_of(wide), 3e5)
+    solution = solved(outlines_of(wide), 1.5e5)
     assert solution.nuisance("edge_px") == pytest.approx(-2.0, abs=0.3)
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
 
@@ -190,7 +190,7 @@ PROBLEM = """
 mesh = "bar.vtu"
 density_kg_m3 = 1070.0
 [parameters]
-young_pa = { guess = 8e5 }
+young_pa = { guess = 2e5 }
 poisson = 0.45
 gamma_r_s = 1e-3
 gamma_m_1_s = 0.1
@@ -257,10 +257,12 @@ def test_a_photograph_is_no_mask(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_simulation_writes_masks_that_are_identified(tmp_path: Path) -> None:
     file = folder_with(tmp_path, "hung_reading_front.json")
-    simulated = run_command("simulate", str(file), "--out", str(tmp_path), "--set", "young_pa=4e5")
+    simulated = run_command(
+        "simulate", str(file), "--out", str(tmp_path), "--set", "parameters.young_pa=1e5"
+    )
     assert simulated.code == 0, simulated.err
     assert (tmp_path / "hung_reading_front.json").exists()
     run = cs.run(cs.Problem.read(file))
     low, high = run.interval("young_pa")
-    assert low < 4e5 < high
+    assert low < 1e5 < high
     assert any("points of the outline in 1 masks of 'front'" in each for each in run.result.notes)

@@ -53,9 +53,11 @@ class OutlinesSection(MeasurementSection, of=Outlines):
     )
 
     def read_times_s(self, folder: RecordingFolder, where: str) -> Array:
-        """Return the times of all masks [s]."""
+        """Return the times of all masks [s]; in a simulation without them, the stated ones, by
+        default that of a single photograph.
+        """
         if not folder.must_read(self.file):
-            return np.zeros(0)
+            return np.array([0.0] if self.t_s is None else self.t_s)
         return self._read_file(folder, where)[1]
 
     def read(self, folder: RecordingFolder, where: str, t_s: Array) -> Outlines:
